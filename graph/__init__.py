@@ -1,0 +1,1 @@
+"""Where things are: geometry, cameras, trajectories and the factor graph."""

@@ -1,0 +1,1 @@
+"""What surfaces look like: inverse-depth maps, fusion, submaps."""

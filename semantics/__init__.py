@@ -1,0 +1,1 @@
+"""What things are: labels, instances and the network that finds them."""

@@ -1,0 +1,25 @@
+"""What a sequence yields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One registered RGB-D frame.
+
+    Attributes:
+        index: position in the sequence, from 0, counting skipped and broken frames too.
+        timestamp_s: stamp of the colour image in seconds.
+        rgb: (H, W, 3) uint8, red first.
+        depth_m: (H, W) float32 z-depth in metres, NaN where missing.
+    """
+
+    index: int
+    timestamp_s: float
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
