@@ -1,0 +1,212 @@
+"""Stamped camera poses, the TUM text format, and association by time. Needs numpy alone."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.errors import InputError
+from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
+
+MAX_TIME_DIFFERENCE_S = 0.02
+MAX_TYPICAL_STEP_S = 5.0
+TUM_HEADER = "# timestamp_s tx ty tz qx qy qz qw (T_world_camera, metres)"
+
+logger = logging.getLogger(__name__)
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Camera poses in time; sorted by stamp on construction, each stamp once.
+
+    Attributes:
+        timestamps_s: (N,) float64, strictly increasing.
+        poses_world_camera: (N, 4, 4) float64, ``p_world = T_world_camera @ p_camera``.
+
+    Raises:
+        ValueError: shapes that do not fit, a value that is not finite, or a repeated stamp.
+    """
+
+    timestamps_s: Array
+    poses_world_camera: Array
+
+    def __post_init__(self) -> None:
+        stamps = np.asarray(self.timestamps_s, float).reshape(-1)
+        poses = np.asarray(self.poses_world_camera, float).reshape(-1, 4, 4)
+        if len(stamps) != len(poses):
+            raise ValueError(f"{len(stamps)} timestamps for {len(poses)} poses")
+        if not (np.isfinite(stamps).all() and np.isfinite(poses).all()):
+            raise ValueError("a trajectory holds only finite numbers")
+        order = np.argsort(stamps, kind="stable")
+        stamps, poses = stamps[order], poses[order]
+        if (np.diff(stamps) == 0).any():
+            raise ValueError(f"repeated timestamp {stamps[:-1][np.diff(stamps) == 0][0]:.6f} s")
+        object.__setattr__(self, "timestamps_s", stamps)
+        object.__setattr__(self, "poses_world_camera", poses)
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+    @property
+    def positions_world(self) -> Array:
+        """Camera centres (N, 3) in metres."""
+        return self.poses_world_camera[:, :3, 3]
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first pose to the last, 0 when there are fewer than two."""
+        return float(self.timestamps_s[-1] - self.timestamps_s[0]) if len(self) else 0.0
+
+    def select(self, indices: NDArray) -> Trajectory:
+        """The poses at these indices (or under this mask)."""
+        return Trajectory(self.timestamps_s[indices], self.poses_world_camera[indices])
+
+    def moved(self, T_new_world: Array) -> Trajectory:
+        """The same motion seen from another world frame: ``T_new_camera``."""
+        return Trajectory(self.timestamps_s, T_new_world @ self.poses_world_camera)
+
+
+def nearest_indices(stamps_s: Array, queries_s: Array) -> Indices:
+    """Index (M,) of the stamp nearest to each query; ``stamps_s`` (N,) sorted and not empty.
+
+    Of two equally near stamps the earlier is taken.
+    """
+    right = np.clip(np.searchsorted(stamps_s, queries_s), 1, max(len(stamps_s) - 1, 1))
+    right = np.minimum(right, len(stamps_s) - 1)
+    left = np.maximum(right - 1, 0)
+    nearer_right = np.abs(stamps_s[right] - queries_s) < np.abs(queries_s - stamps_s[left])
+    return np.where(nearer_right, right, left)
+
+
+def associate_stamps(
+    a_s: Array, b_s: Array, max_difference_s: float = MAX_TIME_DIFFERENCE_S
+) -> tuple[Indices, Indices]:
+    """Pairs of stamps that belong together: indices into ``a_s`` (N,) and ``b_s`` (M,), sorted.
+
+    The closest pair is taken first, then the closest of what is left, as TUM's associate script
+    does, so that each stamp is used at most once. That greedy choice is reached here by taking
+    all mutually nearest pairs at once and repeating on the rest; two or three rounds are usual.
+    """
+    left_a, left_b = np.arange(len(a_s)), np.arange(len(b_s))
+    pairs: list[tuple[Indices, Indices]] = [(left_a[:0], left_b[:0])]
+    while len(left_a) and len(left_b):
+        to_b = nearest_indices(b_s[left_b], a_s[left_a])
+        to_a = nearest_indices(a_s[left_a], b_s[left_b])
+        near = np.abs(a_s[left_a] - b_s[left_b[to_b]]) <= max_difference_s
+        taken_a = np.flatnonzero((to_a[to_b] == np.arange(len(left_a))) & near)
+        if not len(taken_a):
+            break
+        taken_b = to_b[taken_a]
+        pairs.append((left_a[taken_a], left_b[taken_b]))
+        left_a, left_b = np.delete(left_a, taken_a), np.delete(left_b, taken_b)
+    i, j = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
+    order = np.argsort(i)
+    return i[order], j[order]
+
+
+def associate(
+    estimate: Trajectory, reference: Trajectory, max_difference_s: float = MAX_TIME_DIFFERENCE_S
+) -> tuple[Trajectory, Trajectory]:
+    """Both trajectories cut to the poses that belong together, pairwise; may be empty."""
+    i, j = associate_stamps(estimate.timestamps_s, reference.timestamps_s, max_difference_s)
+    return estimate.select(i), reference.select(j)
+
+
+def check_seconds(stamps_s: Array, path: Path) -> None:
+    """Refuse sorted stamps (N,) whose typical step is too long to be seconds.
+
+    Raises:
+        InputError: naming the file, the step and the factor that cures it.
+    """
+    typical = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 2 else 0.0
+    if typical <= MAX_TYPICAL_STEP_S:
+        return
+    unit, factor = "nanoseconds", "1e9"
+    if typical < 5e3:
+        unit, factor = "milliseconds", "1000"
+    elif typical < 5e6:
+        unit, factor = "microseconds", "1e6"
+    raise InputError(
+        f"{path}: timestamps are {typical:g} apart, which looks like {unit}; "
+        f"they must be seconds, divide them by {factor}"
+    )
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read ``timestamp tx ty tz qx qy qz qw`` lines (seconds, metres, T_world_camera).
+
+    Lines may come in any order; empty lines and those that begin with # are passed over. Of
+    lines with the same stamp the first is kept, with a warning: TUM's own freiburg2_desk ground
+    truth has such a pair.
+
+    Raises:
+        InputError: the file is missing or empty, or a line has the wrong number of columns, a
+            value that is no finite number or a zero quaternion, or the stamps are not in seconds.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such trajectory file; give a file in TUM format")
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    rows = [
+        _tum_row(line, f"{path}:{number}")
+        for number, line in enumerate(map(str.strip, text.splitlines()), start=1)
+        if line and not line.startswith("#")
+    ]
+    if not rows:
+        raise InputError(f"{path}: no pose in the file; expected lines of {TUM_HEADER[2:]}")
+    values = np.array(rows)
+    stamps_s, first = np.unique(values[:, 0], return_index=True)
+    if len(first) < len(values):
+        logger.warning("%s: %d repeated timestamps left out", path, len(values) - len(first))
+    check_seconds(stamps_s, path)
+    quaternions, positions = values[first, 4:], values[first, 1:4]
+    return Trajectory(stamps_s, make_pose(rotation_from_quaternion(quaternions), positions))
+
+
+def _tum_row(content: str, where: str) -> list[float]:
+    """The eight numbers of one line; ``where`` is its file and line for the message."""
+    columns = content.replace(",", " ").split()
+    if len(columns) != 8:
+        hint = " (12 columns are KITTI's format: convert it)" if len(columns) == 12 else ""
+        raise InputError(
+            f"{where}: {len(columns)} columns in {content[:60]!r}, expected 8: "
+            f"timestamp tx ty tz qx qy qz qw{hint}"
+        )
+    row = []
+    for column in columns:
+        try:
+            value = float(column)
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise InputError(
+                f"{where}: {column!r} is not a finite number; correct or remove the line"
+            )
+        row.append(value)
+    if sum(q * q for q in row[4:]) < 1e-12:
+        raise InputError(f"{where}: zero quaternion {columns[4:]}; no rotation, remove the line")
+    return row
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write a TUM file that appears whole or not at all; the same poses give the same bytes.
+
+    Stamps have 6 decimals, positions and quaternions (w >= 0) have 9.
+    """
+    path = Path(path)
+    quaternions = quaternion_from_rotation(trajectory.poses_world_camera[:, :3, :3])
+    numbers = np.round(np.hstack([trajectory.positions_world, quaternions]), 9) + 0.0  # no -0.0
+    rows = [
+        f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in row)
+        for stamp, row in zip(trajectory.timestamps_s, numbers, strict=True)
+    ]
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text("\n".join([TUM_HEADER, *rows]) + "\n", encoding="utf-8", newline="\n")
+    os.replace(temporary, path)
