@@ -1,0 +1,126 @@
+"""Where a sequence's camera comes from: camera.yaml, or TUM's three known cameras."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from pathlib import Path
+
+import yaml
+
+from graph.camera import Camera
+from graph.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+# TUM RGB-D benchmark, ROS/OpenCV calibrations of the colour cameras; freiburg3's images are
+# published undistorted. freiburg2's depth is stored with 5208 to the metre (its depth images
+# were scaled by 1.035 against the others' 5000 when they were published), as ORB-SLAM2 uses it.
+TUM_CAMERAS = {
+    "freiburg1": Camera(
+        640, 480, 517.306408, 516.469215, 318.643040, 255.313989,
+        distortion=(0.262383, -0.953104, -0.005358, 0.002628, 1.163314), depth_scale=5000.0,
+    ),
+    "freiburg2": Camera(
+        640, 480, 520.908620, 521.007327, 325.141442, 249.701764,
+        distortion=(0.231222, -0.784899, -0.003257, -0.000105, 0.917205), depth_scale=5208.0,
+    ),
+    "freiburg3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6, depth_scale=5000.0),
+}  # fmt: skip
+
+CAMERA_EXAMPLE = (
+    "{width: 640, height: 480, fx: 525.0, fy: 525.0, cx: 319.5, cy: 239.5, "
+    "distortion: [0, 0, 0, 0, 0], depth_scale: 5000, fps: 30}"
+)
+REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
+OPTIONAL = ("distortion", "fps", "stereo_bf")
+
+
+def find_camera(folder: Path) -> tuple[Camera, str]:
+    """The camera of a sequence and where it came from: camera.yaml wins over the folder's name.
+
+    Raises:
+        InputError: a broken camera.yaml, or none and a folder name that is not TUM's.
+    """
+    path = folder / "camera.yaml"
+    match = re.search(r"(?:freiburg|fr)([123])(?![0-9])", folder.resolve().name.lower())
+    if path.is_file():
+        camera, source = read_camera(path), str(path)
+    elif match:
+        name = f"freiburg{match.group(1)}"
+        camera = TUM_CAMERAS[name]
+        source = f"built-in {name} (folder name {folder.resolve().name!r}, no camera.yaml)"
+    else:
+        raise InputError(
+            f"{path}: no such file, and the folder name {folder.resolve().name!r} is not one of "
+            f"TUM's (freiburg1, 2, 3); write a camera.yaml such as {CAMERA_EXAMPLE}"
+        )
+    logger.info(
+        "camera: %s; fx %.3f fy %.3f cx %.3f cy %.3f, depth scale %g to the metre",
+        source, camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale,
+    )  # fmt: skip
+    return camera, source
+
+
+def read_camera(path: Path) -> Camera:
+    """Read camera.yaml: width, height, fx, fy, cx, cy, depth_scale; distortion, fps, stereo_bf.
+
+    Raises:
+        InputError: naming the key, its value and the cure.
+    """
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: not YAML ({reason}); write e.g. {CAMERA_EXAMPLE}") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: {values!r} is no mapping; write e.g. {CAMERA_EXAMPLE}")
+    for key in values:
+        if key not in REQUIRED + OPTIONAL:
+            known = ", ".join(REQUIRED + OPTIONAL)
+            raise InputError(f"{path}: unknown key {key!r}; the keys are {known}")
+    for key in REQUIRED:
+        if key not in values:
+            raise InputError(f"{path}: {key} is missing; write e.g. {CAMERA_EXAMPLE}")
+    numbers = {k: _number(path, k, v) for k, v in values.items() if k != "distortion"}
+    _check_range(path, numbers)
+    optional = {"fps": numbers.get("fps"), "stereo_bf_px_m": numbers.get("stereo_bf")}
+    return Camera(
+        width=int(numbers["width"]),
+        height=int(numbers["height"]),
+        **{key: numbers[key] for key in ("fx", "fy", "cx", "cy", "depth_scale")},
+        distortion=_distortion(path, values.get("distortion", [0, 0, 0, 0, 0])),
+        **{key: value for key, value in optional.items() if value is not None},
+    )
+
+
+def _number(path: Path, key: str, value: object) -> float:
+    """A finite number, not a truth value and not text."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{path}: {key} is {value!r}; it must be a number, e.g. 525.0")
+    return float(value)
+
+
+def _check_range(path: Path, numbers: dict[str, float]) -> None:
+    """Refuse sizes, focal lengths and scales that no camera has."""
+    for key, value in numbers.items():
+        if key not in ("cx", "cy") and value <= 0:
+            raise InputError(f"{path}: {key} is {value:g}; it must be positive")
+    for key in ("width", "height"):
+        if numbers[key] != int(numbers[key]):
+            raise InputError(f"{path}: {key} is {numbers[key]:g}; it must be a whole number")
+    for key, size in (("cx", "width"), ("cy", "height")):
+        if not 0 <= numbers[key] <= numbers[size] - 1:
+            raise InputError(
+                f"{path}: {key} is {numbers[key]:g}, outside the image of {size} "
+                f"{numbers[size]:g}; give the principal point in pixels of this image size"
+            )
+
+
+def _distortion(path: Path, value: object) -> tuple[float, float, float, float, float]:
+    """OpenCV's (k1, k2, p1, p2, k3); k3 may be left out."""
+    if not isinstance(value, list) or len(value) not in (4, 5):
+        raise InputError(f"{path}: distortion is {value!r}; write [k1, k2, p1, p2, k3]")
+    k1, k2, p1, p2, k3 = [_number(path, "distortion", v) for v in [*value, 0][:5]]
+    return k1, k2, p1, p2, k3

@@ -1,0 +1,145 @@
+"""The image lists of a TUM folder: rgb.txt and depth.txt, or associations.txt."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graph.errors import InputError
+from graph.geometry import Array
+from graph.trajectory import associate_stamps, check_seconds
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageList:
+    """Stamped image files, sorted by stamp, each stamp once."""
+
+    timestamps_s: Array
+    files: tuple[Path, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePairs:
+    """Colour and depth images that belong together, sorted by the colour image's stamp.
+
+    Attributes:
+        timestamps_s: (N,) stamps of the colour images in seconds.
+        rgb_files: the N colour images.
+        depth_files: the N depth images.
+        unpaired_rgb: colour images without a depth image near enough.
+        unpaired_depth: depth images without a colour image near enough.
+    """
+
+    timestamps_s: Array
+    rgb_files: tuple[Path, ...]
+    depth_files: tuple[Path, ...]
+    unpaired_rgb: int = 0
+    unpaired_depth: int = 0
+
+
+def read_pairs(folder: Path, max_difference_s: float) -> ImagePairs:
+    """The image pairs of a TUM folder; rgb.txt and depth.txt come before associations.txt.
+
+    Raises:
+        InputError: a missing or broken list, or no two stamps within the limit.
+    """
+    if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():
+        rgb, depth = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
+    elif (folder / "associations.txt").is_file():
+        rgb, depth = read_associations(folder / "associations.txt")
+    else:
+        missing = "rgb.txt" if not (folder / "rgb.txt").is_file() else "depth.txt"
+        raise InputError(
+            f"{folder / missing}: no such list; a sequence needs rgb.txt and depth.txt with lines "
+            "'timestamp file', or associations.txt with 'timestamp rgb timestamp depth'"
+        )
+    i, j = associate_stamps(rgb.timestamps_s, depth.timestamps_s, max_difference_s)
+    if not len(i):
+        raise InputError(
+            f"{folder}: no colour and depth image within {max_difference_s:g} s of each other "
+            f"(colour begins at {rgb.timestamps_s[0]:.6f} s, depth at "
+            f"{depth.timestamps_s[0]:.6f} s); bring both lists to the same clock"
+        )
+    return ImagePairs(
+        rgb.timestamps_s[i],
+        tuple(rgb.files[k] for k in i),
+        tuple(depth.files[k] for k in j),
+        len(rgb.files) - len(i),
+        len(depth.files) - len(j),
+    )
+
+
+def read_list(path: Path) -> ImageList:
+    """Read ``timestamp file`` lines in any order; files are relative to the list's folder.
+
+    Raises:
+        InputError: an empty list, a line of another form, or stamps that are repeated, not finite
+            or not in seconds.
+    """
+    rows = [
+        (number, _stamp(columns[0], f"{path}:{number}"), columns[1])
+        for number, columns in _lines(path, 2, "timestamp file")
+    ]
+    return _image_list(path, rows)
+
+
+def read_associations(path: Path) -> tuple[ImageList, ImageList]:
+    """Colour and depth lists from ``timestamp rgb timestamp depth`` lines in any order.
+
+    Lines with the depth image first (TUM's script called with depth.txt before rgb.txt) are
+    recognised by their folder names. Raises InputError as ``read_list`` does.
+    """
+    lines = _lines(path, 4, "timestamp rgb timestamp depth")
+    first = [(n, _stamp(c[0], f"{path}:{n}"), c[1]) for n, c in lines]
+    second = [(n, _stamp(c[2], f"{path}:{n}"), c[3]) for n, c in lines]
+    if first[0][2].startswith("depth") and second[0][2].startswith("rgb"):
+        logger.info("%s: depth comes first in the lines", path)
+        first, second = second, first
+    return _image_list(path, first), _image_list(path, second)
+
+
+def _lines(path: Path, count: int, form: str) -> list[tuple[int, list[str]]]:
+    """Line number and columns of each line that is neither empty nor a comment."""
+    lines = []
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    for number, line in enumerate(map(str.strip, text.splitlines()), start=1):
+        if not line or line.startswith("#"):
+            continue
+        columns = line.split(maxsplit=1) if count == 2 else line.split()
+        if len(columns) != count:
+            raise InputError(f"{path}:{number}: {line[:60]!r} is not of the form '{form}'")
+        lines.append((number, columns))
+    if not lines:
+        raise InputError(f"{path}: the list is empty; expected lines of '{form}'")
+    return lines
+
+
+def _stamp(text: str, where: str) -> float:
+    """A finite stamp in seconds."""
+    try:
+        stamp_s = float(text)
+    except ValueError:
+        stamp_s = math.nan
+    if not math.isfinite(stamp_s):
+        raise InputError(f"{where}: timestamp {text!r} is not a finite number; correct the line")
+    return stamp_s
+
+
+def _image_list(path: Path, rows: list[tuple[int, float, str]]) -> ImageList:
+    """Sort (line, stamp, file) rows by stamp and refuse stamps that cannot be."""
+    rows = sorted(rows, key=lambda row: row[1])
+    for (line, stamp_s, _), (other_line, other_s, _) in zip(rows[1:], rows, strict=False):
+        if stamp_s == other_s:
+            raise InputError(
+                f"{path}:{line}: timestamp {stamp_s:.6f} is already on line {other_line}; "
+                "stamps must increase, correct or remove one of the lines"
+            )
+    stamps_s = np.array([row[1] for row in rows])
+    check_seconds(stamps_s, path)
+    return ImageList(stamps_s, tuple(path.parent / row[2] for row in rows))

@@ -1,0 +1,208 @@
+"""An RGB-D sequence: its camera, stamps and ground truth, and an iterator over its frames."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.geometry import Array
+from graph.trajectory import Trajectory, read_tum
+from slam.frame import Frame
+from slam.sequences.cameras import find_camera
+from slam.sequences.images import read_depth, read_rgb
+from slam.sequences.lists import ImagePairs, read_pairs
+from slam.sequences.prefetch import prefetched
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class SequenceConfig:
+    """How a sequence is read.
+
+    Attributes:
+        max_time_difference_s: largest difference between the stamps of a colour/depth pair.
+        max_broken_share: share of broken frames above which the sequence is refused; a single
+            one is always passed over.
+        depth_check_frames: frames in which depth is looked for when the first has none.
+    """
+
+    max_time_difference_s: float = 0.02
+    max_broken_share: float = 0.2
+    depth_check_frames: int = 5
+
+
+class Sequence:
+    """Registered RGB-D frames in the order of their stamps; made by ``open_sequence``.
+
+    Attributes:
+        name: the folder's name.
+        folder: where it lies.
+        camera: the colour camera to which depth is registered.
+        camera_source: where the camera's numbers came from.
+        pairs: the image files with their stamps.
+        groundtruth: T_world_camera of the colour camera, or None.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        camera: tuple[Camera, str],
+        pairs: ImagePairs,
+        groundtruth: Trajectory | None,
+        config: SequenceConfig,
+    ) -> None:
+        self.name = folder.resolve().name
+        self.folder = folder
+        self.camera, self.camera_source = camera
+        self.pairs = pairs
+        self.groundtruth = groundtruth
+        self.config = config
+        self._skipped: dict[int, str] = {}
+
+    def __len__(self) -> int:
+        return len(self.pairs.timestamps_s)
+
+    @property
+    def timestamps_s(self) -> Array:
+        """Stamps (N,) of the colour images, increasing."""
+        return self.pairs.timestamps_s
+
+    @property
+    def skipped(self) -> list[tuple[int, str]]:
+        """Index and reason of every broken frame met so far."""
+        return sorted(self._skipped.items())
+
+    def load(self, index: int) -> Frame:
+        """Decode one frame.
+
+        Raises:
+            InputError: its colour or depth image is broken.
+        """
+        return Frame(
+            index,
+            float(self.pairs.timestamps_s[index]),
+            read_rgb(self.pairs.rgb_files[index], self.camera),
+            read_depth(self.pairs.depth_files[index], self.camera),
+        )
+
+    @overload
+    def frames(
+        self, start: int = 0, stop: int | None = None, stride: int = 1, prefetch: int = 4
+    ) -> Iterator[Frame]: ...
+
+    @overload
+    def frames(
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        prefetch: int = 4,
+        *,
+        prepare: Callable[[Frame], T],
+    ) -> Iterator[tuple[Frame, T]]: ...
+
+    def frames(
+        self,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        prefetch: int = 4,
+        *,
+        prepare: Callable[[Frame], Any] | None = None,
+    ) -> Iterator[Any]:
+        """Decode the frames ``start:stop:stride`` in a thread, up to ``prefetch`` ahead.
+
+        With ``prepare`` that function is applied in the same thread, and pairs (frame, result)
+        are yielded. Broken frames are passed over with a warning and listed in ``skipped``.
+
+        Raises:
+            InputError: more than ``max_broken_share`` of the sequence is broken.
+            ValueError: a stride below 1.
+        """
+        if stride < 1:
+            raise ValueError(f"stride {stride} must be at least 1")
+        indices = range(len(self))[start:stop:stride]
+        if prepare is None:
+            return prefetched(self._decoded(indices), prefetch)
+        return prefetched(((f, prepare(f)) for f in self._decoded(indices)), prefetch)
+
+    def _decoded(self, indices: range) -> Iterator[Frame]:
+        for index in indices:
+            try:
+                frame = self.load(index)
+            except InputError as error:
+                self.skip(index, str(error))
+                continue
+            yield frame
+
+    def skip(self, index: int, reason: str) -> None:
+        """Note a broken frame; refuse the sequence when there are too many."""
+        if index not in self._skipped:
+            logger.warning("frame %d skipped: %s", index, reason)
+        self._skipped[index] = reason
+        if len(self._skipped) > max(1, self.config.max_broken_share * len(self)):
+            raise InputError(
+                f"{self.folder}: {len(self._skipped)} of {len(self)} frames are broken, the last: "
+                f"{reason}"
+            )
+
+
+def open_sequence(path: Path, config: SequenceConfig | None = None) -> Sequence:
+    """Open a folder in TUM layout, in which the order of lines never matters, only stamps.
+
+    ``rgb.txt`` and ``depth.txt`` (or ``associations.txt``), optional ``groundtruth.txt`` and
+    ``camera.yaml``. Everything that can be checked without decoding all images is checked here.
+
+    Raises:
+        InputError: naming the file, the value and the cure.
+    """
+    folder, config = Path(path), config or SequenceConfig()
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the folder that holds rgb.txt")
+    pairs = read_pairs(folder, config.max_time_difference_s)
+    camera = find_camera(folder)
+    truth_path = folder / "groundtruth.txt"
+    truth = read_tum(truth_path) if truth_path.is_file() else None
+    sequence = Sequence(folder, camera, pairs, truth, config)
+    _check_images(sequence)
+    logger.info("%s: %d frames, ground truth: %s", folder, len(sequence), truth is not None)
+    return sequence
+
+
+def _check_images(sequence: Sequence) -> None:
+    """Decode the first pair, look for depth, and note every listed image that is missing."""
+    first = sequence.load(0)
+    for index, files in enumerate(
+        zip(sequence.pairs.rgb_files, sequence.pairs.depth_files, strict=True)
+    ):
+        for file in files:
+            if not file.is_file():
+                sequence.skip(index, f"{file}: no such image; restore it or correct the list")
+    if np.isnan(first.depth_m).all() and not _has_depth(sequence):
+        raise InputError(
+            f"{sequence.pairs.depth_files[0]}: no depth at all, every value is 0 here and in "
+            f"{sequence.config.depth_check_frames} frames of the sequence; check the depth images"
+        )
+
+
+def _has_depth(sequence: Sequence) -> bool:
+    """Whether any of a few frames, spread over the sequence, holds depth."""
+    spread = np.linspace(0, len(sequence) - 1, sequence.config.depth_check_frames, dtype=int)
+    for index in np.unique(spread):
+        try:
+            frame = sequence.load(int(index))
+        except InputError:
+            continue
+        if np.isfinite(frame.depth_m).any():
+            return True
+    return False
