@@ -1,0 +1,171 @@
+"""Absolute and relative trajectory errors (Sturm et al., IROS 2012), in numpy alone.
+
+The estimate lives in its own world frame, ``estimate``, the reference in ``reference``. Both
+functions take trajectories whose k-th poses belong together: see ``graph.trajectory.associate``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph.geometry import Array, inverse, so3_log
+from graph.trajectory import Indices, Trajectory, nearest_indices
+
+RELATIVE_DELTA_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorStatistics:
+    """Errors (N,), never negative, at least one, and what is usually said of them."""
+
+    errors: Array
+
+    @property
+    def rmse(self) -> float:
+        """Root of the mean square."""
+        return float(np.sqrt(np.mean(self.errors**2)))
+
+    @property
+    def mean(self) -> float:
+        return float(np.mean(self.errors))
+
+    @property
+    def median(self) -> float:
+        return float(np.median(self.errors))
+
+    @property
+    def max(self) -> float:
+        return float(np.max(self.errors))
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """``p_reference = scale * R_reference_estimate @ p_estimate + t_reference_estimate``.
+
+    ``T_reference_estimate`` (4, 4) holds R and t; scale is 1 for a rigid alignment.
+    """
+
+    T_reference_estimate: Array
+    scale: float = 1.0
+
+    def apply(self, estimate: Trajectory) -> Trajectory:
+        """The estimate in the reference's world frame."""
+        scaled = estimate.poses_world_camera.copy()
+        scaled[:, :3, 3] *= self.scale
+        return Trajectory(estimate.timestamps_s, self.T_reference_estimate @ scaled)
+
+
+@dataclass(frozen=True, eq=False)
+class AbsoluteError:
+    """Absolute trajectory error: what is left after the best alignment.
+
+    Attributes:
+        alignment: of the estimate to the reference.
+        aligned: the estimate's poses in the reference's frame.
+        translation_m: distance of the camera centres at each pose.
+        rotation_rad: angle between the aligned and the reference orientation at each pose. The
+            alignment is by positions alone, as is usual.
+    """
+
+    alignment: Alignment
+    aligned: Trajectory
+    translation_m: ErrorStatistics
+    rotation_rad: ErrorStatistics
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeError:
+    """Relative pose error ``E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`` over pairs (i, j) of poses.
+
+    Attributes:
+        timestamps_s: (M,) stamp of the estimate's pose i of each pair.
+        translation_m: length of E's translation.
+        rotation_rad: angle of E's rotation.
+    """
+
+    timestamps_s: Array
+    translation_m: ErrorStatistics
+    rotation_rad: ErrorStatistics
+
+
+def align(points_estimate: Array, points_reference: Array, with_scale: bool = False) -> Alignment:
+    """Least-squares SE(3) (or Sim(3)) alignment of points (N, 3) that belong together.
+
+    Umeyama, PAMI 1991, eqs. (34)-(43). Points on a line or in one spot leave the rotation
+    partly free; any of the best ones is returned, and the remaining distances are unaffected.
+
+    Raises:
+        ValueError: no points, or a scale asked for points that do not move.
+    """
+    if not len(points_estimate) or points_estimate.shape != points_reference.shape:
+        raise ValueError(f"cannot align {points_estimate.shape} with {points_reference.shape}")
+    mean_e, mean_r = points_estimate.mean(axis=0), points_reference.mean(axis=0)
+    centred_e, centred_r = points_estimate - mean_e, points_reference - mean_r
+    U, D, Vt = np.linalg.svd(centred_r.T @ centred_e / len(centred_e))
+    S = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])  # no reflection
+    scale = 1.0
+    if with_scale:
+        variance = np.mean(np.sum(centred_e**2, axis=1))
+        if variance < 1e-18:
+            raise ValueError("a scale cannot be found from a camera that does not move")
+        scale = float(D @ S / variance)
+    T = np.eye(4)
+    T[:3, :3] = U @ (S[:, None] * Vt)
+    T[:3, 3] = mean_r - scale * T[:3, :3] @ mean_e
+    return Alignment(T, scale)
+
+
+def absolute_error(
+    estimate: Trajectory, reference: Trajectory, with_scale: bool = False
+) -> AbsoluteError:
+    """Absolute trajectory error of poses that belong together, after ``align``."""
+    alignment = align(estimate.positions_world, reference.positions_world, with_scale)
+    aligned = alignment.apply(estimate)
+    E = inverse(reference.poses_world_camera) @ aligned.poses_world_camera
+    return AbsoluteError(alignment, aligned, *_sizes(E))
+
+
+def relative_error(
+    estimate: Trajectory, reference: Trajectory, pairs: tuple[Indices, Indices]
+) -> RelativeError | None:
+    """Relative pose error over index pairs (i, j); None when there is no pair.
+
+    It depends on neither world frame, so that nothing is aligned.
+    """
+    i, j = pairs
+    if not len(i):
+        return None
+    P, Q = estimate.poses_world_camera, reference.poses_world_camera
+    E = inverse(inverse(Q[i]) @ Q[j]) @ inverse(P[i]) @ P[j]
+    return RelativeError(estimate.timestamps_s[i], *_sizes(E))
+
+
+def frame_pairs(count: int, delta: int = 1) -> tuple[Indices, Indices]:
+    """Every pair (i, i + delta) of ``count`` poses (evo's delta in frames with all pairs)."""
+    i = np.arange(max(count - delta, 0))
+    return i, i + delta
+
+
+def time_pairs(timestamps_s: Array, delta_s: float = 1.0) -> tuple[Indices, Indices]:
+    """For each i the j whose stamp is nearest to ``t_i + delta_s``, as TUM's script pairs them.
+
+    A pair whose time difference is off by more than a tenth of ``delta_s`` is left out, so that
+    gaps and the end of the trajectory count for nothing. evo knows no such delta; on evenly
+    sampled poses this is its delta of ``delta_s * fps`` frames with all pairs.
+    """
+    if not len(timestamps_s):
+        return frame_pairs(0)
+    i = np.arange(len(timestamps_s))
+    j = nearest_indices(timestamps_s, timestamps_s + delta_s)
+    difference_s = timestamps_s[j] - timestamps_s - delta_s
+    good = (np.abs(difference_s) <= RELATIVE_DELTA_TOLERANCE * delta_s) & (j > i)
+    return i[good], j[good]
+
+
+def _sizes(E: Array) -> tuple[ErrorStatistics, ErrorStatistics]:
+    """Translation in metres and rotation angle in radians of error transforms (N, 4, 4)."""
+    translation_m = np.linalg.norm(E[:, :3, 3], axis=-1)
+    rotation_rad = np.linalg.norm(so3_log(E[:, :3, :3]), axis=-1)
+    return ErrorStatistics(translation_m), ErrorStatistics(rotation_rad)
