@@ -1,0 +1,203 @@
+"""How good a trajectory is: one call from files to a table of named numbers."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+
+from graph.errors import InputError
+from graph.metrics import (
+    AbsoluteError,
+    RelativeError,
+    absolute_error,
+    frame_pairs,
+    relative_error,
+    time_pairs,
+)
+from graph.trajectory import (
+    MAX_TIME_DIFFERENCE_S,
+    Trajectory,
+    associate,
+    nearest_indices,
+    read_tum,
+)
+
+logger = logging.getLogger(__name__)
+
+MIN_POSES = 3
+
+
+class Row(TypedDict):
+    """One line of metrics.json; unit "1" is a share."""
+
+    name: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluationResult:
+    """The errors of a trajectory, and the same as rows for metrics.json.
+
+    Attributes:
+        absolute: pose by pose after alignment.
+        per_frame: relative error of consecutive associated poses; across a gap in the estimate
+            such a pair spans the gap.
+        per_second: relative error over one second, None where no two poses are that far apart.
+        rows: what is printed and saved.
+    """
+
+    absolute: AbsoluteError
+    per_frame: RelativeError | None
+    per_second: RelativeError | None
+    rows: list[Row]
+
+    def value(self, name: str) -> float:
+        """The value of a row; KeyError when there is no such row."""
+        return {row["name"]: row["value"] for row in self.rows}[name]
+
+
+def evaluate_trajectory(
+    estimate: Trajectory,
+    reference: Trajectory,
+    expected_frames: int | None = None,
+    with_scale: bool = False,
+) -> EvaluationResult:
+    """Compare an estimate with a reference whose world frame may be another.
+
+    Poses are associated by stamp (0.02 s); the alignment is SE(3), or Sim(3) with ``with_scale``
+    (for monocular systems only). ``expected_frames``, the frames that the system was given, adds
+    the share that it tracked.
+
+    Raises:
+        InputError: fewer than three poses belong together.
+    """
+    matched, truth = associate(estimate, reference)
+    if len(matched) < MIN_POSES:
+        raise InputError(
+            f"{len(matched)} of {len(estimate)} poses have a reference pose within "
+            f"{MAX_TIME_DIFFERENCE_S:g} s, at least {MIN_POSES} are needed; estimate "
+            f"{_span(estimate)}, reference {_span(reference)}: use the same clock in both"
+        )
+    absolute = absolute_error(matched, truth, with_scale)
+    per_frame = relative_error(matched, truth, frame_pairs(len(matched)))
+    per_second = relative_error(matched, truth, time_pairs(matched.timestamps_s))
+    rows = _absolute_rows(absolute) + _relative_rows("frame", per_frame)
+    rows += _relative_rows("second", per_second)
+    rows += _coverage_rows(estimate, reference, matched)
+    if expected_frames:
+        rows.append(_row("tracked_share", len(estimate) / expected_frames, "1"))
+    return EvaluationResult(absolute, per_frame, per_second, rows)
+
+
+def evaluate(
+    run_or_trajectory: Path,
+    reference: Path,
+    plot: Path | None = None,
+    with_scale: bool = False,
+) -> EvaluationResult:
+    """Evaluate a run folder or a TUM file against a TUM file or a sequence folder.
+
+    Raises:
+        InputError: a file that is missing or broken, or trajectories that share no time.
+    """
+    run_or_trajectory, reference = Path(run_or_trajectory), Path(reference)
+    file = _file_in(run_or_trajectory, "trajectory.txt", "a run folder or a TUM trajectory file")
+    truth_file = _file_in(
+        reference, "groundtruth.txt", "a sequence with ground truth or a TUM file"
+    )
+    estimate, truth = read_tum(file), read_tum(truth_file)
+    try:
+        result = evaluate_trajectory(estimate, truth, _frames_given(file), with_scale)
+    except InputError as error:
+        raise InputError(f"{file} against {truth_file}: {error}") from error
+    if plot is not None:
+        from slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib loads slowly
+
+        plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().name, with_scale)
+    return result
+
+
+def format_table(rows: list[Row]) -> str:
+    """Rows as aligned text, shares in per cent."""
+    lines = []
+    for row in rows:
+        value, unit = row["value"], row["unit"]
+        if unit == "1":
+            value, unit = 100 * value, "%"
+        number = f"{value:d}" if isinstance(value, int) else f"{value:.4f}"
+        lines.append(f"{row['name']:<24}{number:>12} {unit}")
+    return "\n".join(lines)
+
+
+def format_json(rows: list[Row]) -> str:
+    """Rows as the JSON list that metrics.json holds."""
+    return json.dumps(rows, indent=1)
+
+
+def _row(name: str, value: float, unit: str) -> Row:
+    return {"name": name, "value": value, "unit": unit}
+
+
+def _absolute_rows(error: AbsoluteError) -> list[Row]:
+    names = ("rmse", "mean", "median", "max")
+    return [_row(f"ate_{name}", getattr(error.translation_m, name), "m") for name in names]
+
+
+def _relative_rows(step: str, error: RelativeError | None) -> list[Row]:
+    """Rows for the step "frame" or "second"; none, with a warning, when no pair was found."""
+    if error is None:
+        logger.warning("no two associated poses one %s apart: no RPE per %s", step, step)
+        return []
+    degrees = float(np.rad2deg(error.rotation_rad.rmse))
+    return [
+        _row(f"rpe_trans_rmse_{step}", error.translation_m.rmse, "m"),
+        _row(f"rpe_rot_rmse_{step}", degrees, "deg"),
+    ]
+
+
+def _coverage_rows(estimate: Trajectory, reference: Trajectory, matched: Trajectory) -> list[Row]:
+    """How much was compared: of the estimate by poses, of the reference by time.
+
+    A reference pose counts as covered when the estimate has a pose within its own typical step,
+    so that a reference at 100 Hz can be covered whole by an estimate at 30 Hz.
+    """
+    step_s = max(float(np.median(np.diff(estimate.timestamps_s))), MAX_TIME_DIFFERENCE_S)
+    nearest = nearest_indices(estimate.timestamps_s, reference.timestamps_s)
+    covered = np.abs(estimate.timestamps_s[nearest] - reference.timestamps_s) <= step_s
+    estimate_share = len(matched) / len(estimate)
+    if estimate_share < 0.5:
+        logger.warning("only %.0f %% of the estimate has a reference pose", 100 * estimate_share)
+    return [
+        _row("associated_poses", len(matched), "poses"),
+        _row("estimate_share", estimate_share, "1"),
+        _row("reference_share", float(covered.mean()), "1"),
+    ]
+
+
+def _span(trajectory: Trajectory) -> str:
+    stamps_s = trajectory.timestamps_s
+    return f"{stamps_s[0]:.3f} to {stamps_s[-1]:.3f} s" if len(stamps_s) else "without a pose"
+
+
+def _file_in(path: Path, name: str, expected: str) -> Path:
+    """The file itself, or the file of this name in a folder."""
+    file = path / name if path.is_dir() else path
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; give {expected}")
+    return file
+
+
+def _frames_given(trajectory_file: Path) -> int | None:
+    """The number of rows of the frames.csv beside a run's trajectory, None without one."""
+    path = trajectory_file.parent / "frames.csv"
+    if trajectory_file.name != "trajectory.txt" or not path.is_file():
+        return None
+    with path.open(encoding="utf-8", newline="") as file:
+        return sum(1 for _ in csv.DictReader(file))

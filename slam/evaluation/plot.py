@@ -1,0 +1,130 @@
+"""The picture of a run: top view against the reference, errors over time (paper figs. 10, 11)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from graph.geometry import Array
+from graph.metrics import AbsoluteError, absolute_error
+from graph.trajectory import Trajectory, associate
+
+ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#30302e", "#d6302a"
+GAP_STEPS = 5
+
+
+def plot_trajectory(
+    path: Path,
+    estimate: Trajectory,
+    reference: Trajectory | None,
+    title: str,
+    with_scale: bool = False,
+) -> None:
+    """Write the picture; its suffix names the format. It appears whole or not at all.
+
+    Without a reference, or with fewer than three poses that belong to it, only the top view is
+    drawn, in the estimate's own world frame.
+    """
+    path = Path(path)
+    matched, truth = associate(estimate, reference) if reference else (estimate, None)
+    if truth is None or len(truth) < 3:
+        figure = Figure(figsize=(6.4, 5.6), dpi=150, layout="constrained")
+        draw_top_view(figure.add_subplot(), estimate)
+    else:
+        error = absolute_error(matched, truth, with_scale)
+        figure = Figure(figsize=(11, 5.2), dpi=150, layout="constrained")
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1))
+        aligned = error.alignment.apply(estimate)
+        draw_top_view(figure.add_subplot(grid[:, 0]), aligned, reference, (error.aligned, truth))
+        draw_errors([figure.add_subplot(grid[k, 1]) for k in range(2)], error)
+        rmse_cm = 100 * error.translation_m.rmse
+        title = f"{title}: ATE RMSE {rmse_cm:.2f} cm over {len(matched)} poses"
+    figure.suptitle(title, fontsize=11)
+    temporary = path.with_name(path.name + ".tmp")
+    figure.savefig(temporary, format=path.suffix[1:].lower() or "png")
+    os.replace(temporary, path)
+
+
+def draw_top_view(
+    axes: Axes,
+    estimate: Trajectory,
+    reference: Trajectory | None = None,
+    matched: tuple[Trajectory, Trajectory] | None = None,
+) -> None:
+    """Draw the plane of the two axes in which the camera moved most, both in one world frame.
+
+    ``matched`` are poses of estimate and reference that belong together; red lines join them.
+    """
+    plane = view_plane((reference or estimate).positions_world)
+    if reference is not None:
+        within = _same_time(reference, estimate)
+        axes.plot(*_path(within)[:, plane].T, color=REFERENCE, lw=1.1, label="reference", zorder=2)
+    if matched is not None:
+        ends = np.stack([pose.positions_world[:, plane] for pose in matched], axis=1)
+        axes.add_collection(LineCollection(list(ends), colors=DIFFERENCE, linewidths=0.5, zorder=1))
+        axes.plot([], [], color=DIFFERENCE, lw=0.8, label="difference")
+    axes.plot(*_path(estimate)[:, plane].T, color=ESTIMATE, lw=1.1, label="estimate", zorder=3)
+    start = estimate.positions_world[:1, plane]
+    axes.plot(*start.T, "o", color=ESTIMATE, ms=5, label="start", zorder=4)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel(f"{'xyz'[plane[0]]} (m)")
+    axes.set_ylabel(f"{'xyz'[plane[1]]} (m)")
+    axes.grid(alpha=0.25, lw=0.5)
+    axes.legend(frameon=False, fontsize=8, loc="best")
+
+
+def draw_errors(axes: list[Axes], error: AbsoluteError) -> None:
+    """Draw translation and rotation error over time, each with its RMSE."""
+    time_s = error.aligned.timestamps_s - error.aligned.timestamps_s[0]
+    rows = (
+        (axes[0], 100.0, error.translation_m, "translation error (cm)"),
+        (axes[1], 180 / np.pi, error.rotation_rad, "rotation error (deg)"),
+    )
+    for axis, factor, statistics, label in rows:
+        rmse = factor * statistics.rmse
+        axis.plot(
+            *_with_gaps(time_s, factor * statistics.errors[:, None]).T, color=DIFFERENCE, lw=0.9
+        )
+        axis.axhline(rmse, color=REFERENCE, lw=0.8, ls="--", label=f"RMSE {rmse:.2f}")
+        axis.set_ylabel(label)
+        axis.set_xlim(0, max(time_s[-1], 1e-3))
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.25, lw=0.5)
+        axis.legend(frameon=False, fontsize=8, loc="upper right")
+    axes[0].tick_params(labelbottom=False)
+    axes[1].set_xlabel("time (s)")
+
+
+def view_plane(positions_world: Array) -> list[int]:
+    """The two axes of largest extent of positions (N, 3), in the order x, y, z."""
+    if not len(positions_world):
+        return [0, 2]
+    extent_m = np.ptp(positions_world, axis=0)
+    return sorted(np.argsort(-extent_m, kind="stable")[:2].tolist())
+
+
+def _same_time(reference: Trajectory, estimate: Trajectory) -> Trajectory:
+    """The reference within the estimate's span, a second more on both sides."""
+    first_s, last_s = estimate.timestamps_s[[0, -1]]
+    stamps_s = reference.timestamps_s
+    return reference.select((stamps_s >= first_s - 1) & (stamps_s <= last_s + 1))
+
+
+def _path(trajectory: Trajectory) -> Array:
+    """Positions (M, 3) in metres with a row of NaN wherever the trajectory has a gap."""
+    return _with_gaps(trajectory.timestamps_s, trajectory.positions_world)[:, 1:]
+
+
+def _with_gaps(timestamps_s: Array, values: Array) -> Array:
+    """Columns (stamp, values...) with a row of NaN in each gap, so that no line crosses it."""
+    rows = np.column_stack([timestamps_s, values])
+    if len(rows) < 3:
+        return rows
+    step_s = np.diff(timestamps_s)
+    gaps = np.flatnonzero(step_s > GAP_STEPS * np.median(step_s)) + 1
+    return np.insert(rows, gaps, np.nan, axis=0)
