@@ -1,0 +1,203 @@
+"""The factor graph of keyframe poses and landmarks, kept optimal by ISAM2."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graph.admission import Admitted, admit, describe
+from graph.camera import Camera
+from graph.geometry import Array
+from graph.pruning import Removal, anchor_components, remove
+from graph.recovery import Repair, repair
+from graph.shadow import Shadow, ids_array
+from graph.smoother_config import SmootherConfig
+from graph.solver import Change, Solver, SolverError, Variable
+from graph.support import diagonal_covariance
+from graph.updates import (
+    NO_LANDMARK,
+    GraphEstimate,
+    GraphUpdate,
+    PosePrior,
+    RefusalReason,
+    Refusals,
+    RefusedFactor,
+)
+
+__all__ = ["Smoother", "SmootherConfig"]
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class _Report:
+    """What one update did beyond its orders, collected on the way."""
+
+    refused: Refusals = field(default_factory=Refusals)
+    refused_factors: tuple[RefusedFactor, ...] = ()
+    landmarks: set[int] = field(default_factory=set)
+    keyframes: set[int] = field(default_factory=set)
+    bridged: set[int] = field(default_factory=set)
+    rebuilt: bool = False
+    failed: Variable | None = None
+
+    @property
+    def failed_variable(self) -> str:
+        """The variable that ISAM2 named last, in words."""
+        return "" if self.failed is None else "{} {}".format(*self.failed)
+
+    def add_removal(self, removal: Removal) -> None:
+        self.landmarks.update(removal.dropped_landmarks.tolist())
+        self.bridged.update(removal.bridged_keyframes.tolist())
+
+    def refuse_all(self, admitted: Admitted) -> None:
+        """Refuse everything that had been admitted, as SOLVER_FAILED."""
+        seen, keyframes = admitted.observations, admitted.keyframe_ids
+        nothing = np.full(len(keyframes), NO_LANDMARK)
+        self.refused = Refusals(
+            np.concatenate([self.refused.keyframe_ids, seen.keyframe_ids, keyframes]),
+            np.concatenate([self.refused.landmark_ids, seen.landmark_ids, nothing]),
+            np.concatenate(
+                [
+                    self.refused.reasons,
+                    np.full(len(seen) + len(keyframes), RefusalReason.SOLVER_FAILED),
+                ]
+            ),
+        )
+        self.refused_factors += tuple(
+            RefusedFactor(*describe(factor), RefusalReason.SOLVER_FAILED)
+            for factor in admitted.pose_factors
+        )
+
+    def add_repair(self, repair: Repair) -> None:
+        self.landmarks.update(repair.dropped_landmarks.tolist())
+        self.keyframes.update(repair.dropped_keyframes.tolist())
+        self.bridged.update(repair.bridged_keyframes.tolist())
+
+
+class Smoother:
+    """Keyframe poses and landmarks under ISAM2, with a shadow that survives its failures.
+
+    An update never raises for what it is asked to add: whatever cannot enter is refused with
+    a reason, and a failure of ISAM2 is repaired and reported in the estimate. The first
+    keyframe gets a prior at its initial value unless the first update brings one.
+    """
+
+    def __init__(self, camera: Camera, config: SmootherConfig | None = None) -> None:
+        self._camera = camera
+        self._config = config or SmootherConfig()
+        self._shadow = Shadow()
+        self._solver = Solver(camera, self._config)
+
+    def update(self, update: GraphUpdate) -> GraphEstimate:
+        """Remove, add, optimise one step, and read everything back."""
+        started_s = time.perf_counter()
+        self._solver.elapsed_s = 0.0
+        removal = remove(update, self._shadow, self._config)
+        admitted = admit(self._with_first_prior(update), self._shadow, self._camera, self._config)
+        report = _Report(admitted.refused, admitted.refused_factors)
+        report.add_removal(removal)
+        change = self._enter(admitted, removal)
+        try:
+            self._solver.update(self._shadow, change)
+        except SolverError as failure:
+            self._recover(failure, admitted, change, report)
+        return self._estimate(report, started_s)
+
+    def marginal_covariance(self, keyframe_id: int) -> Array:
+        """Covariance (6, 6) of ``[rotation rad, translation m]`` in the keyframe's own frame."""
+        return self._solver.marginal_covariance(ids_array([keyframe_id]), ids_array([]))
+
+    def _with_first_prior(self, update: GraphUpdate) -> GraphUpdate:
+        if len(self._shadow.keyframes.ids) or update.priors or not len(update.keyframe_ids):
+            return update
+        covariance = diagonal_covariance(
+            self._config.prior_sigma_rotation_rad, self._config.prior_sigma_translation_m
+        )
+        first = int(np.argmin(update.keyframe_ids))
+        prior = PosePrior(
+            int(update.keyframe_ids[first]), update.poses_world_camera[first], covariance
+        )
+        return dataclasses.replace(update, priors=(prior,))
+
+    def _enter(self, admitted: Admitted, removal: Removal) -> Change:
+        """Put what was admitted into the shadow, and say what ISAM2 must be told."""
+        self._shadow.keyframes.insert(admitted.keyframe_ids, admitted.poses_world_camera)
+        self._shadow.landmarks.insert(admitted.landmark_ids, admitted.points_world)
+        rows = self._shadow.observations.add(admitted.observations)
+        numbers = self._shadow.add_pose_factors(admitted.pose_factors)
+        return Change(
+            rows,
+            [*removal.pose_factors, *numbers],
+            admitted.keyframe_ids,
+            admitted.landmark_ids,
+            removal.slots,
+        )
+
+    def _recover(
+        self, failure: SolverError, admitted: Admitted, change: Change, report: _Report
+    ) -> None:
+        """Repair the shadow and rebuild until ISAM2 solves; else give the update up.
+
+        The first attempt drops only what is visibly loose, later ones the named variable too.
+        """
+        report.rebuilt = True
+        for attempt in range(self._config.max_recoveries):
+            report.failed = failure.variable or report.failed
+            logger.warning("ISAM2 failed near %s; rebuilding", report.failed_variable)
+            done = repair(
+                failure.variable if attempt else None,
+                admitted.keyframe_ids,
+                self._shadow,
+                self._camera,
+                self._config,
+            )
+            report.add_repair(done)
+            try:
+                self._solver.rebuild(self._shadow)
+                return
+            except SolverError as again:
+                failure = again
+                if attempt and not done.changed:
+                    break
+        self._retract(admitted, change, report)
+
+    def _retract(self, admitted: Admitted, change: Change, report: _Report) -> None:
+        """Take the whole update out again, refused as SOLVER_FAILED."""
+        seen = admitted.observations
+        pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+        undo = GraphUpdate(
+            remove_keyframes=admitted.keyframe_ids,
+            remove_landmarks=admitted.landmark_ids,
+            remove_observations=pairs,
+        )
+        report.add_removal(remove(undo, self._shadow, self._config))
+        present = [n for n in change.numbers if n in self._shadow.pose_factors]
+        self._shadow.remove_pose_factors(present)
+        anchor_components(self._shadow, self._config)
+        report.refuse_all(admitted)
+        try:
+            self._solver.rebuild(self._shadow)
+        except SolverError as failure:
+            logger.error("ISAM2 cannot solve the graph (%s); values stay as they were", failure)
+
+    def _estimate(self, report: _Report, started_s: float) -> GraphEstimate:
+        return GraphEstimate(
+            self._shadow.keyframes.ids,
+            self._shadow.keyframes.values,
+            self._shadow.landmarks.ids,
+            self._shadow.landmarks.values,
+            report.refused,
+            report.refused_factors,
+            dropped_landmarks=ids_array(report.landmarks),
+            dropped_keyframes=ids_array(report.keyframes),
+            bridged_keyframes=ids_array(report.bridged),
+            rebuilt=report.rebuilt,
+            failed_variable=report.failed_variable,
+            update_ms=1e3 * (time.perf_counter() - started_s),
+            solver_ms=1e3 * self._solver.elapsed_s,
+            factors=len(self._shadow),
+        )

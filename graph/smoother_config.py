@@ -1,0 +1,50 @@
+"""The smoother's settings, apart from the class so that the numpy-only modules can read them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SmootherConfig:
+    """Settings of `graph.smoother.Smoother`.
+
+    Attributes:
+        relinearize_threshold: change of a variable (rad, m) above which ISAM2 linearises anew.
+        relinearize_skip: ISAM2 looks for such variables every so many updates.
+        extra_iterations: further ISAM2 updates without new factors after each update.
+        robust: Huber's kernel on observations; off, factors are plain Gaussian.
+        huber_stereo, huber_mono: where the kernel starts, in standard deviations: the square
+            roots of the 95 % chi-square bounds with 3 and 2 degrees of freedom.
+        robust_pose_k: constant of the kernel of a relative pose that asks for one.
+        gate_sigmas: an observation whose reprojection error at the initial values is larger
+            is refused; generous, since the values are not optimised yet.
+        min_depth_m, max_range_m: z-depth at which an observed landmark may be.
+        min_parallax_deg: angle between two viewing rays that a landmark without any stereo
+            observation needs.
+        min_shared_observations: landmarks known to the graph that a keyframe without a prior
+            or relative pose must observe.
+        prior_sigma_rotation_rad, prior_sigma_translation_m: of the prior on the first pose.
+        bridge_sigma_rotation_rad, bridge_sigma_translation_m: of the loose relative pose that
+            holds a keyframe when a removal took its support.
+        max_recoveries: attempts to rebuild after failures before the update is given up.
+    """
+
+    relinearize_threshold: float = 0.01
+    relinearize_skip: int = 1
+    extra_iterations: int = 0
+    robust: bool = True
+    huber_stereo: float = math.sqrt(7.815)
+    huber_mono: float = math.sqrt(5.991)
+    robust_pose_k: float = 1.0
+    gate_sigmas: float = 20.0
+    min_depth_m: float = 0.05
+    max_range_m: float = 60.0
+    min_parallax_deg: float = 1.0
+    min_shared_observations: int = 6
+    prior_sigma_rotation_rad: float = 1e-4
+    prior_sigma_translation_m: float = 1e-4
+    bridge_sigma_rotation_rad: float = 0.05
+    bridge_sigma_translation_m: float = 0.1
+    max_recoveries: int = 10
