@@ -120,7 +120,7 @@ def evaluate(
     if plot is not None:
         from slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib loads slowly
 
-        plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().name, with_scale)
+        plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, with_scale)
     return result
 
 

@@ -14,7 +14,7 @@ from graph.geometry import Array
 from graph.metrics import AbsoluteError, absolute_error
 from graph.trajectory import Trajectory, associate
 
-ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#30302e", "#d6302a"
+ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#9a9a96", "#d6302a"
 GAP_STEPS = 5
 
 
@@ -63,7 +63,7 @@ def draw_top_view(
     plane = view_plane((reference or estimate).positions_world)
     if reference is not None:
         within = _same_time(reference, estimate)
-        axes.plot(*_path(within)[:, plane].T, color=REFERENCE, lw=1.1, label="reference", zorder=2)
+        axes.plot(*_path(within)[:, plane].T, color=REFERENCE, lw=2.2, label="reference", zorder=2)
     if matched is not None:
         ends = np.stack([pose.positions_world[:, plane] for pose in matched], axis=1)
         axes.add_collection(LineCollection(list(ends), colors=DIFFERENCE, linewidths=0.5, zorder=1))
@@ -88,12 +88,12 @@ def draw_errors(axes: list[Axes], error: AbsoluteError) -> None:
     for axis, factor, statistics, label in rows:
         rmse = factor * statistics.rmse
         axis.plot(
-            *_with_gaps(time_s, factor * statistics.errors[:, None]).T, color=DIFFERENCE, lw=0.9
+            *_with_gaps(time_s, factor * statistics.errors[:, None]).T, color=DIFFERENCE, lw=0.7
         )
-        axis.axhline(rmse, color=REFERENCE, lw=0.8, ls="--", label=f"RMSE {rmse:.2f}")
+        axis.axhline(rmse, color="black", lw=0.8, ls="--", label=f"RMSE {rmse:.2f}")
         axis.set_ylabel(label)
         axis.set_xlim(0, max(time_s[-1], 1e-3))
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.25 * factor * statistics.max + 1e-3)  # room for the legend
         axis.grid(alpha=0.25, lw=0.5)
         axis.legend(frameon=False, fontsize=8, loc="upper right")
     axes[0].tick_params(labelbottom=False)

@@ -1,5 +1,13 @@
 """Reading RGB-D sequences in TUM layout."""
 
+from slam.sequences.info import SequenceInfo, format_info, sequence_info
 from slam.sequences.sequence import Sequence, SequenceConfig, open_sequence
 
-__all__ = ["Sequence", "SequenceConfig", "open_sequence"]
+__all__ = [
+    "Sequence",
+    "SequenceConfig",
+    "SequenceInfo",
+    "format_info",
+    "open_sequence",
+    "sequence_info",
+]
