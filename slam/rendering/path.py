@@ -1,0 +1,85 @@
+"""Smooth camera motion, as a person carries a camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from graph.geometry import Array, make_pose, so3_exp, so3_log
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Way points of the camera, joined by a smooth curve.
+
+    Attributes:
+        eyes_world: (N, 3) positions in metres, z up.
+        targets_world: (N, 3) points looked at.
+        speed_m_s: walking speed; slower where the turn would exceed ``turn_deg_s``.
+        turn_deg_s: largest turn rate.
+    """
+
+    eyes_world: Array
+    targets_world: Array
+    speed_m_s: float = 0.42
+    turn_deg_s: float = 26.0
+
+
+def look_at(eyes: Array, targets: Array) -> Array:
+    """Poses T_world_camera (N, 4, 4) with z toward the target, x right and y down; no roll."""
+    forward = targets - eyes
+    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = right / np.linalg.norm(right, axis=-1, keepdims=True)
+    return make_pose(np.stack([right, np.cross(forward, right), forward], axis=-1), eyes)
+
+
+def camera_poses(path: CameraPath, fps: float, seed: int) -> Array:
+    """All poses T_world_camera (F, 4, 4) along the path, with the tremor of a hand."""
+    fine = _sampled(path, 4000)
+    step_m = np.linalg.norm(np.diff(fine[:, :3, 3], axis=0), axis=1)
+    relative = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
+    step_deg = np.rad2deg(np.linalg.norm(so3_log(relative), axis=1))
+    slowness = np.maximum(step_m / path.speed_m_s, step_deg / path.turn_deg_s)
+    slowness = np.maximum(gaussian_filter1d(slowness, 60, mode="nearest"), 0.9 * slowness)
+    slowness = gaussian_filter1d(slowness, 25, mode="nearest")
+    time_s = np.r_[0.0, np.cumsum(slowness)]
+    stamps = np.arange(int(time_s[-1] * fps) + 1) / fps
+    share = np.interp(_eased(stamps, time_s[-1]), time_s, np.linspace(0, 1, len(fine)))
+    poses = _at(path, share)
+    return _shaken(poses, stamps, np.random.default_rng([seed, 7]))
+
+
+def _eased(stamps: Array, total_s: float) -> Array:
+    """Start from rest within a second."""
+    start = 0.5 * np.minimum(stamps, 1.0) ** 2 + np.maximum(stamps - 1.0, 0)
+    return np.minimum(start, total_s)
+
+
+def _sampled(path: CameraPath, count: int) -> Array:
+    return _at(path, np.linspace(0, 1, count))
+
+
+def _at(path: CameraPath, share: Array) -> Array:
+    chord = np.linalg.norm(np.diff(path.eyes_world, axis=0), axis=1) + 0.35 * np.linalg.norm(
+        np.diff(path.targets_world, axis=0), axis=1
+    )
+    knots = np.r_[0.0, np.cumsum(chord)] / chord.sum()
+    eyes = CubicSpline(knots, path.eyes_world)(share)
+    targets = CubicSpline(knots, path.targets_world)(share)
+    return look_at(eyes, targets)
+
+
+def _shaken(poses: Array, stamps: Array, rng: np.random.Generator) -> Array:
+    """Add sums of sines between 0.3 and 2.5 Hz: some millimetres and tenths of a degree."""
+    frequency = rng.uniform(0.3, 2.5, (6, 6))
+    phase = rng.uniform(0, 2 * np.pi, (6, 6))
+    waves = np.sin(2 * np.pi * stamps[:, None, None] * frequency + phase) / (1 + 2 * frequency)
+    motion = waves.sum(-1) * np.r_[np.full(3, np.deg2rad(0.5)), np.full(3, 0.006)]
+    T = poses.copy()
+    T[:, :3, :3] = poses[:, :3, :3] @ so3_exp(motion[:, :3])
+    T[:, :3, 3] += np.einsum("nij,nj->ni", poses[:, :3, :3], motion[:, 3:])
+    return T

@@ -1,0 +1,203 @@
+"""Rendered indoor sequences with exact ground truth, in TUM layout."""
+
+from __future__ import annotations
+
+import importlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.geometry import Array, inverse
+from slam.rendering.annotations import FrameMarks, coco, frame_marks
+from slam.rendering.builder import Image, SceneBuilder
+from slam.rendering.path import camera_poses
+from slam.rendering.people import Cast, hire
+from slam.rendering.raycast import Renderer, View, to_image
+from slam.rendering.scene import Scene, build_scene
+from slam.rendering.sensor import blur, exposure_gain, measure_depth, optical_flow
+from slam.rendering.writer import (
+    new_folder,
+    stored_depth,
+    write_camera,
+    write_json,
+    write_lists,
+    write_png,
+)
+
+SCENES: dict[str, str] = {
+    "office": "an office for three with desks, computers and bookcases; one round through it",
+    "living_room": "a living room with sofa, television, dining table and bookcase; one round",
+    "corridor": "a square corridor, a loop of 30 m that ends where it began",
+}
+"""Names and one-line descriptions of the scenes."""
+
+_WORKERS = 2
+_SHUTTER_SHARE = 0.6
+_IMAGE_NOISE = 2.0
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """What to render; equal configurations give equal bytes.
+
+    Attributes:
+        name: one of SCENES.
+        frames: number of frames from the start of the path; None for the whole path.
+        seed: of people, noise, textures and the hand's tremor.
+        people: how many people stand, sit, walk and carry things in the scene.
+        noise: apply the Kinect's depth noise and holes, and image noise of 2 grey levels.
+        exposure_change: let the brightness vary slowly.
+        motion_blur: blur along the image motion while the shutter is open.
+        fps: frame rate in hertz.
+        width, height: image size in pixels; the field of view stays the Kinect's.
+        true_depth: also write the noise-free depth to ``depth_true/``.
+        normals: also write camera-frame normals to ``normals/`` as round(127.5 n + 127.5).
+    """
+
+    name: str
+    frames: int | None = None
+    seed: int = 0
+    people: int = 0
+    noise: bool = True
+    exposure_change: bool = False
+    motion_blur: bool = False
+    fps: float = 30.0
+    width: int = 640
+    height: int = 480
+    true_depth: bool = False
+    normals: bool = False
+
+
+def kinect_camera(config: RenderConfig) -> Camera:
+    """A Kinect's intrinsics, scaled to the image size by (u + 0.5) s - 0.5."""
+    sx, sy = config.width / 640, config.height / 480
+    return Camera(
+        config.width, config.height, fx=525.0 * sx, fy=525.0 * sy,
+        cx=320.0 * sx - 0.5, cy=240.0 * sy - 0.5, fps=config.fps, stereo_bf_px_m=40.0 * sx,
+    )  # fmt: skip
+
+
+def render_sequence(
+    config: RenderConfig, out: Path, progress: Callable[[int, int], None] | None = None
+) -> Path:
+    """Render a sequence to the new folder ``out`` and return it.
+
+    ``progress(done, total)`` is called after every frame. The folder appears under its name only
+    when it is complete.
+
+    Raises:
+        InputError: unknown scene, impossible number, or ``out`` not empty or not writable.
+    """
+    _check(config)
+    with new_folder(Path(out)) as folder:
+        job = _prepare(config, folder)
+        marks: list[FrameMarks] = []
+        for found in _draw_all(job):
+            marks.append(found)
+            if progress is not None:
+                progress(len(marks), len(job.poses))
+        write_lists(folder, job.stamps, job.poses)
+        write_camera(folder, job.camera)
+        write_json(folder / "annotations.json", coco(marks, job.stamps, job.camera, job.scene))
+    return Path(out)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Everything that stays the same from frame to frame; poses are T_world_camera (N, 4, 4)."""
+
+    config: RenderConfig
+    folder: Path
+    camera: Camera
+    poses: Array
+    stamps: list[str]
+    scene: Scene
+    cast: Cast
+    renderer: Renderer
+
+
+def _check(config: RenderConfig) -> None:
+    if config.name not in SCENES:
+        raise InputError(f"scene {config.name!r} is unknown; choose one of {', '.join(SCENES)}")
+    if config.frames is not None and config.frames < 1:
+        raise InputError(f"frames={config.frames}: must be at least 1")
+    if config.people < 0:
+        raise InputError(f"people={config.people}: must not be negative")
+    if not 1 <= config.fps <= 1000:
+        raise InputError(f"fps={config.fps}: must be between 1 and 1000")
+    if min(config.width, config.height) < 16:
+        raise InputError(f"{config.width}x{config.height}: too small; use at least 16x16")
+
+
+def _prepare(config: RenderConfig, folder: Path) -> _Job:
+    plan = importlib.import_module(f"slam.rendering.{config.name}")
+    poses = camera_poses(plan.PATH, config.fps, config.seed)
+    if config.frames is not None and config.frames > len(poses):
+        raise InputError(
+            f"frames={config.frames}: the path of {config.name!r} has {len(poses)} frames at "
+            f"{config.fps:g} Hz; ask for at most as many"
+        )
+    poses = poses[: config.frames]
+    builder = SceneBuilder(config.seed)
+    plan.furnish(builder)
+    cast = hire(builder, plan.ROLES, config.people, config.seed)
+    scene = build_scene(builder, plan.LIGHTING, cast.parts, config.seed)
+    camera = kinect_camera(config)
+    stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]
+    renderer = Renderer(camera, scene.atlas, scene.static)
+    return _Job(config, folder, camera, poses, stamps, scene, cast, renderer)
+
+
+def _draw_all(job: _Job) -> Iterator[FrameMarks]:
+    """Draw and write frames on worker threads; annotations come in order."""
+    waiting: deque[Future[FrameMarks]] = deque()
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        for i in range(len(job.poses)):
+            waiting.append(pool.submit(_draw, job, i))
+            if len(waiting) > 2 * _WORKERS:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _draw(job: _Job, i: int) -> FrameMarks:
+    """Draw, disturb and write frame ``i``: a function of the configuration and ``i`` alone."""
+    time_s = i / job.config.fps
+    moving = job.cast.geometry(time_s, job.scene) if job.cast.parts else None
+    view = job.renderer.render(job.poses[i], moving)
+    rng = np.random.default_rng([job.config.seed, 3, i])
+    rgb = _exposed(job, i, view, rng)
+    depth_m = view.depth_m
+    if job.config.noise:
+        depth_m = measure_depth(view.depth_m, view.normals, job.camera, rng)
+    name = f"{job.stamps[i]}.png"
+    write_png(job.folder / "rgb" / name, rgb)
+    write_png(job.folder / "depth" / name, stored_depth(depth_m, job.camera.depth_scale))
+    write_png(job.folder / "instances" / name, view.instances)
+    if job.config.true_depth:
+        true = stored_depth(view.depth_m, job.camera.depth_scale)
+        write_png(job.folder / "depth_true" / name, true)
+    if job.config.normals:
+        write_png(job.folder / "normals" / name, to_image(127.5 * view.normals + 127.5))
+    return frame_marks(view.instances)
+
+
+def _exposed(job: _Job, i: int, view: View, rng: np.random.Generator) -> Image:
+    """The picture the camera takes: blurred, exposed, noisy, (H, W, 3) uint8."""
+    config, rgb = job.config, view.rgb
+    if config.motion_blur:
+        pair = job.poses[max(i - 1, 0)], job.poses[min(i + 1, len(job.poses) - 1)]
+        steps = max(1, min(i + 1, len(job.poses) - 1) - max(i - 1, 0))
+        flow = optical_flow(view.depth_m, job.camera, inverse(pair[1]) @ pair[0])
+        rgb = blur(rgb, _SHUTTER_SHARE / steps * flow)
+    if config.exposure_change:
+        rgb = rgb * np.float32(exposure_gain(i / config.fps, config.seed))
+    if config.noise:
+        rgb = rgb + _IMAGE_NOISE * rng.standard_normal(rgb.shape, dtype=np.float32)
+    return to_image(rgb)

@@ -1,0 +1,93 @@
+"""Files of a rendered sequence, in TUM layout."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.geometry import Array, quaternion_from_rotation
+
+_FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A temporary sibling of ``out`` that takes its place when the block ends well.
+
+    Raises:
+        InputError: ``out`` is a file, holds something, or cannot be written.
+    """
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(f"{out}: the folder is not empty; choose another --out or delete it")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, not a folder; choose another --out")
+    temporary = out.parent / f".{out.name}.{uuid.uuid4().hex[:8]}.part"
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir()
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out") from error
+    try:
+        yield temporary
+        if out.exists():
+            out.rmdir()
+        os.replace(temporary, out)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_png(path: Path, picture: NDArray[Any]) -> None:
+    """Write 8-bit RGB (H, W, 3) or 16-bit grey (H, W); missing folders are made."""
+    path.parent.mkdir(exist_ok=True)
+    if picture.ndim == 3:
+        picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    if not cv2.imwrite(str(path), picture, _FAST_PNG):
+        raise OSError(f"{path}: could not be written")
+
+
+def stored_depth(depth_m: NDArray[np.floating], scale: float) -> NDArray[np.uint16]:
+    """Depth as the TUM benchmark stores it: round(scale * metres), 0 where missing."""
+    values = np.round(np.nan_to_num(depth_m, nan=0.0) * scale)
+    return np.where(values > 65535, 0, values).astype(np.uint16)
+
+
+def write_lists(folder: Path, stamps: list[str], poses: Array) -> None:
+    """Write rgb.txt, depth.txt and groundtruth.txt for T_world_camera (N, 4, 4)."""
+    for kind in ("rgb", "depth"):
+        lines = [f"# {kind} images, rendered", "# timestamp filename"]
+        lines += [f"{stamp} {kind}/{stamp}.png" for stamp in stamps]
+        (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
+    lines = ["# ground truth of the camera, exact: T_world_camera, world z up, metres",
+             "# timestamp tx ty tz qx qy qz qw"]  # fmt: skip
+    quaternions = quaternion_from_rotation(poses[:, :3, :3])
+    for stamp, t, q in zip(stamps, poses[:, :3, 3], quaternions, strict=True):
+        lines.append(" ".join([stamp, *(f"{x:.9f}" for x in (*t, *q))]))
+    (folder / "groundtruth.txt").write_text("\n".join(lines) + "\n")
+
+
+def write_camera(folder: Path, camera: Camera) -> None:
+    """Write camera.yaml."""
+    rows = {
+        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
+        "cx": camera.cx, "cy": camera.cy, "distortion": list(camera.distortion),
+        "depth_scale": camera.depth_scale, "fps": camera.fps,
+    }  # fmt: skip
+    text = "".join(f"{key}: {value}\n" for key, value in rows.items())
+    (folder / "camera.yaml").write_text(text)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write compact JSON with sorted keys, so that equal content gives equal bytes."""
+    path.write_text(json.dumps(content, sort_keys=True, separators=(",", ":")) + "\n")
