@@ -1,0 +1,122 @@
+"""camera.yaml and the cameras that are built in."""
+
+import logging
+
+import pytest
+
+from graph.camera import Camera
+from graph.errors import InputError
+from slam.sequences.cameras import CAMERA_EXAMPLE, find_camera, read_camera
+
+LINES = {
+    "width": "640",
+    "height": "480",
+    "fx": "527.27",
+    "fy": "528.5",
+    "cx": "321.42",
+    "cy": "237.05",
+    "distortion": "[0.1, -0.2, 0.003, -0.004, 0.5]",
+    "depth_scale": "5000",
+    "fps": "25",
+    "stereo_bf": "41.5",
+}
+
+
+def write_camera(folder, **changes):
+    values = {**LINES, **changes}
+    text = "\n".join(f"{key}: {value}" for key, value in values.items() if value is not None)
+    (folder / "camera.yaml").write_text(text)
+    return folder / "camera.yaml"
+
+
+def test_every_key(tmp_path):
+    assert read_camera(write_camera(tmp_path)) == Camera(
+        640, 480, 527.27, 528.5, 321.42, 237.05, (0.1, -0.2, 0.003, -0.004, 0.5), 5000, 25, 41.5
+    )  # fmt: skip
+
+
+def test_optional_keys(tmp_path):
+    path = write_camera(tmp_path, distortion=None, fps=None, stereo_bf=None)
+    assert read_camera(path) == Camera(640, 480, 527.27, 528.5, 321.42, 237.05)
+    path = write_camera(tmp_path, distortion="[0.1, 0.2, 0.3, 0.4]")
+    assert read_camera(path).distortion == (0.1, 0.2, 0.3, 0.4, 0)
+
+
+def test_the_example_in_the_messages_is_valid(tmp_path):
+    (tmp_path / "camera.yaml").write_text(CAMERA_EXAMPLE)
+    assert read_camera(tmp_path / "camera.yaml") == Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fx": None}, "fx is missing"),
+        ({"depth_scale": None}, "depth_scale is missing"),
+        ({"fx": "-527"}, "fx is -527; it must be positive"),
+        ({"fy": "0"}, "fy is 0; it must be positive"),
+        ({"depth_scale": "0"}, "depth_scale is 0"),
+        ({"stereo_bf": "-1"}, "stereo_bf is -1"),
+        ({"width": "640.5"}, "width is 640.5; it must be a whole number"),
+        ({"cx": "640"}, "cx is 640, outside the image of width 640"),
+        ({"cy": "-1"}, "cy is -1, outside the image of height 480"),
+        ({"fx": "wide"}, "fx is 'wide'; it must be a number"),
+        ({"fx": "true"}, "fx is True"),
+        ({"fx": ".nan"}, "fx is nan"),
+        ({"fx": ".inf"}, "fx is inf"),
+        ({"fx": "[1, 2]"}, r"fx is \[1, 2\]"),
+        ({"distortion": "[1, 2]"}, r"distortion is \[1, 2\]"),
+        ({"distortion": "0"}, "distortion is 0"),
+        ({"distortion": "[0, 0, 0, 0, x]"}, "distortion is 'x'"),
+        ({"focal": "500"}, "unknown key 'focal'; the keys are width"),
+        ({"fx": "[1, 2"}, "not YAML"),
+    ],
+)
+def test_impossible_cameras(tmp_path, changes, words):
+    path = write_camera(tmp_path, **changes)
+    with pytest.raises(InputError, match=words) as caught:
+        read_camera(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "just text", "- 1\n- 2\n"])
+def test_not_a_mapping(tmp_path, text):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(InputError, match="no mapping"):
+        read_camera(tmp_path / "camera.yaml")
+
+
+@pytest.mark.parametrize(
+    ("name", "fx", "k1", "depth_scale"),
+    [
+        ("rgbd_dataset_freiburg1_xyz", 517.306408, 0.262383, 5000),
+        ("rgbd_dataset_freiburg2_large_with_loop", 520.908620, 0.231222, 5208),
+        ("rgbd_dataset_freiburg3_walking_xyz", 535.4, 0.0, 5000),
+        ("fr2_desk", 520.908620, 0.231222, 5208),
+    ],
+)
+def test_built_in_by_folder_name(tmp_path, caplog, name, fx, k1, depth_scale):
+    caplog.set_level(logging.INFO)
+    (tmp_path / name).mkdir()
+    camera, source = find_camera(tmp_path / name)
+    assert (camera.fx, camera.distortion[0]) == (fx, k1)
+    assert camera.depth_scale == depth_scale
+    assert name in source
+    assert f"depth scale {depth_scale} to the metre" in caplog.text
+
+
+def test_camera_file_wins(tmp_path):
+    folder = tmp_path / "rgbd_dataset_freiburg2_desk"
+    folder.mkdir()
+    write_camera(folder)
+    camera, source = find_camera(folder)
+    assert camera.depth_scale == 5000
+    assert source.endswith("camera.yaml")
+
+
+@pytest.mark.parametrize("name", ["kitchen", "freiburg4_new", "fr12", "frame1"])
+def test_no_camera(tmp_path, name):
+    (tmp_path / name).mkdir()
+    with pytest.raises(InputError, match=r"write a camera\.yaml such as") as caught:
+        find_camera(tmp_path / name)
+    assert name in str(caught.value)

@@ -1,0 +1,185 @@
+"""Sequences in TUM layout: what is read, in which order, and by which thread."""
+
+import re
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from graph.errors import InputError
+from slam.sequences import format_info, open_sequence, sequence_info
+
+KITCHEN = Path(__file__).resolve().parents[3] / "../shared/data/redkitchen"
+
+
+def prefetch_threads() -> int:
+    return sum(thread.name == "prefetch" for thread in threading.enumerate())
+
+
+def test_frames(folder):
+    sequence = open_sequence(folder)
+    frames = list(sequence.frames())
+    assert len(sequence) == len(frames) == 12
+    assert sequence.name == "seq"
+    assert sequence.groundtruth is None
+    assert [f.index for f in frames] == list(range(12))
+    np.testing.assert_allclose([f.timestamp_s for f in frames], sequence.timestamps_s)
+    frame = frames[3]
+    assert frame.rgb.shape == (24, 32, 3)
+    assert frame.rgb.dtype == np.uint8
+    assert frame.rgb[5, 5].tolist() == [30, 20, 200]  # red first
+    assert frame.depth_m.dtype == np.float32
+    assert np.isnan(frame.depth_m[0]).all()
+    np.testing.assert_allclose(frame.depth_m[1:], 0.4)  # 400 at 1000 to the metre
+
+
+@pytest.mark.parametrize("prefetch", [0, 1, 4, 100])
+def test_slices_and_prepare(folder, prefetch):
+    sequence = open_sequence(folder)
+    taken = [f.index for f in sequence.frames(2, 11, 4, prefetch=prefetch)]
+    assert taken == [2, 6, 10]
+    pairs = list(sequence.frames(stride=5, prefetch=prefetch, prepare=lambda f: f.index**2))
+    assert [(f.index, x) for f, x in pairs] == [(0, 0), (5, 25), (10, 100)]
+
+
+def test_prepare_runs_ahead_in_one_other_thread(folder):
+    names = []
+    frames = open_sequence(folder).frames(
+        prepare=lambda _: names.append(threading.current_thread().name)
+    )
+    next(frames)
+    deadline = time.monotonic() + 5
+    while len(names) < 5 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert 5 <= len(names) <= 7  # one consumed, four waiting, at most two in hand
+    assert set(names) == {"prefetch"}
+    frames.close()
+
+
+def test_early_stop_ends_the_thread(folder):
+    frames = open_sequence(folder).frames(prefetch=2)
+    next(frames)
+    assert prefetch_threads() == 1
+    frames.close()
+    assert prefetch_threads() == 0
+
+
+def test_exceptions_cross_over(folder):
+    def prepare(frame):
+        if frame.index == 3:
+            raise ZeroDivisionError("from prepare")
+        return frame.index
+
+    seen = []
+    with pytest.raises(ZeroDivisionError, match="from prepare"):
+        for _, x in open_sequence(folder).frames(prepare=prepare):
+            seen.append(x)
+    assert seen == [0, 1, 2]
+    assert prefetch_threads() == 0
+
+
+def test_order_of_lines_never_matters(folder):
+    before = open_sequence(folder)
+    for name in ("rgb.txt", "depth.txt"):
+        lines = (folder / name).read_text().splitlines()
+        (folder / name).write_text("\n".join(lines[::-1]) + "\n")
+    after = open_sequence(folder)
+    np.testing.assert_array_equal(after.timestamps_s, before.timestamps_s)
+    assert after.pairs.rgb_files == before.pairs.rgb_files
+    assert after.pairs.depth_files == before.pairs.depth_files
+
+
+def test_pairs_by_time_not_by_line(folder):
+    """Without its first depth image the first colour image stays alone; the rest keep theirs."""
+    lines = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join(lines[1:]))
+    sequence = open_sequence(folder)
+    assert len(sequence) == 11
+    assert sequence.pairs.unpaired_rgb == 1
+    frame = sequence.load(0)
+    assert frame.rgb[0, 0, 0] == 10
+    np.testing.assert_allclose(frame.depth_m[1:], 0.2)
+
+
+@pytest.mark.parametrize("depth_first", [False, True])
+def test_associations(folder, depth_first):
+    before = open_sequence(folder)
+    lines = []
+    for k in (3, 1, 2, 0):
+        rgb, depth = f"{k / 10} rgb/{k}.png", f"{k / 10 + 0.004} depth/{k}.png"
+        lines.append(f"{depth} {rgb}" if depth_first else f"{rgb} {depth}")
+    (folder / "associations.txt").write_text("\n".join(lines))
+    (folder / "rgb.txt").unlink()
+    sequence = open_sequence(folder)
+    np.testing.assert_allclose(sequence.timestamps_s, [0, 0.1, 0.2, 0.3])
+    assert sequence.pairs.rgb_files == before.pairs.rgb_files[:4]
+    assert sequence.pairs.depth_files == before.pairs.depth_files[:4]
+
+
+def test_grey_and_alpha_images_are_expanded(folder):
+    cv2.imwrite(str(folder / "rgb/4.png"), np.full((24, 32), 77, np.uint8))
+    cv2.imwrite(str(folder / "rgb/5.png"), np.full((24, 32, 4), (1, 2, 3, 128), np.uint8))
+    sequence = open_sequence(folder)
+    assert (sequence.load(4).rgb == 77).all()
+    assert sequence.load(5).rgb[0, 0].tolist() == [3, 2, 1]
+
+
+def test_groundtruth(folder):
+    (folder / "groundtruth.txt").write_text("0.1 1 2 3 0 0 0 1\n0.0 0 2 3 0 0 0 1\n")
+    truth = open_sequence(folder).groundtruth
+    np.testing.assert_array_equal(truth.positions_world, [[0, 2, 3], [1, 2, 3]])
+    (folder / "groundtruth.txt").write_text("0.1 1 2 3\n")
+    with pytest.raises(InputError, match=r"groundtruth\.txt:1"):
+        open_sequence(folder)
+
+
+def test_info(folder):
+    """Frames 5 to 8 are taken out; one colour image stays alone at 7 s."""
+    for name in ("rgb.txt", "depth.txt"):
+        lines = (folder / name).read_text().splitlines()
+        lines = [line for line in lines if not re.search(r"/[5-8]", line)]
+        lines += ["7.0 rgb/5.png"] * (name == "rgb.txt")
+        (folder / name).write_text("\n".join(lines))
+    (folder / "groundtruth.txt").write_text(
+        "0 0 0 0 0 0 0 1\n0.1 0 3 0 0 0 0 1\n0.2 4 3 0 0 0 0 1\n50 99 0 0 0 0 0 1\n"
+    )
+    info = sequence_info(open_sequence(folder))
+    assert info.frames == 8
+    assert info.fps_hz == pytest.approx(10)
+    assert info.duration_s == pytest.approx(1.1)
+    ((start_s, length_s),) = info.gaps
+    assert (start_s, length_s) == pytest.approx((0.4, 0.5))
+    assert (info.unpaired_rgb, info.unpaired_depth, info.broken) == (1, 0, 0)
+    assert info.depth_valid_share == pytest.approx(23 / 24)
+    assert info.depth_percentiles_m[1] == pytest.approx(0.45)  # 0.1 to 0.5 and 1.0 to 1.2 m
+    assert info.groundtruth_share == pytest.approx(3 / 8)
+    assert info.groundtruth_length_m == pytest.approx(7)
+    text = format_info(info)
+    for words in ("8 in 1.10 s, 10.00 Hz", "32x24", "camera.yaml", "1000 to the metre", "37.5 %"):
+        assert words in text
+
+
+@pytest.mark.skipif(not KITCHEN.is_dir(), reason="no ../shared/data/redkitchen here")
+def test_red_kitchen():
+    """A real frame: a point of the first image lies on the surface that the 30th sees."""
+    sequence = open_sequence(KITCHEN)
+    assert len(sequence) == 600
+    assert sequence.camera.fx == pytest.approx(527.27)
+    a, b = (frame for frame in sequence.frames(stop=11, stride=10))
+    T_world_a, T_world_b = sequence.groundtruth.poses_world_camera[[0, 10]]
+    v, u = np.mgrid[20:460:5, 20:620:5].reshape(2, -1)
+    seen = np.isfinite(a.depth_m[v, u])
+    pixels = np.column_stack([u, v])[seen]
+    points_a = sequence.camera.backproject(
+        pixels.astype(float), a.depth_m[v, u][seen].astype(float)
+    )
+    T_b_a = np.linalg.inv(T_world_b) @ T_world_a
+    points_b = points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    projected = np.rint(sequence.camera.project(points_b)).astype(int)
+    inside = ((projected >= 0) & (projected < (640, 480))).all(axis=1)
+    measured_m = b.depth_m[projected[inside, 1], projected[inside, 0]]
+    difference_m = np.abs(measured_m - points_b[inside, 2])
+    assert np.nanmedian(difference_m) < 0.015
