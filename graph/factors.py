@@ -107,4 +107,5 @@ def read_values(values: gtsam.Values) -> tuple[Array, Array]:
     """
     rows = np.asarray(gtsam.utilities.extractPose3(values)).reshape(-1, 12)
     poses = make_pose(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
-    return poses, np.asarray(gtsam.utilities.extractPoint3(values)).reshape(-1, 3)
+    points = np.ascontiguousarray(gtsam.utilities.extractPoint3(values))
+    return poses, points.reshape(-1, 3)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph.admission import reprojection
 from graph.camera import Camera
+from graph.gates import reprojection
 from graph.pruning import bridge, remove
 from graph.shadow import Shadow, ids_array
 from graph.smoother_config import SmootherConfig

@@ -6,22 +6,27 @@ import dataclasses
 import logging
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
-from graph.admission import Admitted, admit, describe
+from graph.admission import Admitted, admit
 from graph.camera import Camera
+from graph.gates import describe, reprojection
 from graph.geometry import Array
 from graph.pruning import Removal, anchor_components, remove
 from graph.recovery import Repair, repair
 from graph.shadow import Shadow, ids_array
 from graph.smoother_config import SmootherConfig
 from graph.solver import Change, Solver, SolverError, Variable
+from graph.storage import read_graph, write_graph
 from graph.support import diagonal_covariance
 from graph.updates import (
     NO_LANDMARK,
     GraphEstimate,
     GraphUpdate,
+    IntArray,
+    ObservationErrors,
     PosePrior,
     RefusalReason,
     Refusals,
@@ -107,9 +112,71 @@ class Smoother:
             self._recover(failure, admitted, change, report)
         return self._estimate(report, started_s)
 
+    def optimise_batch(self, max_iterations: int = 100) -> GraphEstimate:
+        """Full bundle adjustment (Levenberg-Marquardt, with the kernels) of the whole graph.
+
+        ISAM2 is thrown away and made anew from the result if another update comes.
+        """
+        started_s = time.perf_counter()
+        self._solver.elapsed_s = 0.0
+        before, after = self._solver.optimise_batch(self._shadow, max_iterations)
+        estimate = self._estimate(_Report(), started_s)
+        return dataclasses.replace(estimate, cost_before=before, cost_after=after)
+
+    def estimate(self) -> GraphEstimate:
+        """The current estimate, without optimising."""
+        return self._estimate(_Report(), time.perf_counter())
+
+    def observation_errors(self) -> ObservationErrors:
+        """Chi-square of every observation at the current estimate, to find outliers by."""
+        table = self._shadow.observations
+        seen = table.select(table.all_rows())
+        poses = self._shadow.keyframes.get(seen.keyframe_ids)
+        points = self._shadow.landmarks.get(seen.landmark_ids)
+        depth_m, chi2 = reprojection(seen, poses, points, self._camera)
+        is_stereo = np.isfinite(seen.measurements[:, 2])
+        return ObservationErrors(seen.keyframe_ids, seen.landmark_ids, chi2, depth_m, is_stereo)
+
     def marginal_covariance(self, keyframe_id: int) -> Array:
-        """Covariance (6, 6) of ``[rotation rad, translation m]`` in the keyframe's own frame."""
-        return self._solver.marginal_covariance(ids_array([keyframe_id]), ids_array([]))
+        """Covariance (6, 6) of a pose's ``[rotation rad, translation m]`` on its right side.
+
+        The true pose is about ``T_world_camera @ se3_exp(xi)``, xi ~ N(0, covariance).
+        Raises KeyError for an unknown id.
+        """
+        return self.joint_covariance(np.array([keyframe_id]))
+
+    def joint_covariance(
+        self, keyframe_ids: IntArray, landmark_ids: IntArray | None = None
+    ) -> Array:
+        """Joint covariance (6K + 3L square): keyframes in the given order, then landmarks."""
+        landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
+        for table, ids in (
+            (self._shadow.keyframes, keyframe_ids),
+            (self._shadow.landmarks, landmarks),
+        ):
+            if not table.contains(ids).all():
+                raise KeyError(f"not in the graph: {ids[~table.contains(ids)].tolist()}")
+        return self._solver.marginal_covariance(self._shadow, keyframe_ids, landmarks)
+
+    def restart(self) -> None:
+        """Throw ISAM2 away; the next update makes it from the current values.
+
+        A loaded smoother starts so too: an undisturbed run that restarts where it saves goes
+        on exactly like one that is loaded from the file.
+        """
+        self._solver.reset()
+
+    def save(self, path: Path) -> None:
+        """Write the graph, its values and ids into one file, atomically."""
+        write_graph(path, self._shadow, self._camera)
+
+    @classmethod
+    def load(cls, path: Path, config: SmootherConfig | None = None) -> Smoother:
+        """A smoother that goes on from a saved graph. Raises InputError for a bad file."""
+        shadow, camera = read_graph(path)
+        smoother = cls(camera, config)
+        smoother._shadow = shadow
+        return smoother
 
     def _with_first_prior(self, update: GraphUpdate) -> GraphUpdate:
         if len(self._shadow.keyframes.ids) or update.priors or not len(update.keyframe_ids):

@@ -82,24 +82,52 @@ class Solver:
         )
         self._apply(shadow, everything)
 
-    def graph(self, shadow: Shadow) -> gtsam.NonlinearFactorGraph:
-        """All factors of the shadow, in an order that depends on its contents alone."""
-        return make_graph(
-            self._factors(shadow, shadow.observations.all_rows(), sorted(shadow.pose_factors))
-        )
+    def optimise_batch(self, shadow: Shadow, max_iterations: int) -> tuple[float, float]:
+        """Levenberg-Marquardt on everything; the cost before and after.
 
-    def marginal_covariance(self, keyframes: IntArray, landmarks: IntArray) -> Array:
-        """Joint covariance of keyframes (6 each, ``[rad, m]``), then landmarks (3 each, m)."""
-        if self._isam is None:
-            raise SolverError("there is no solved graph to take covariances from", None)
+        Raises SolverError; the shadow's values are then those of before.
+        """
+        self._isam = None
+        graph, values = self._everything(shadow)
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(max_iterations)
+        parameters.setRelativeErrorTol(1e-7)
+        started_s = time.perf_counter()
+        try:
+            before = graph.error(values)
+            values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+            after = graph.error(values)
+        except RuntimeError as error:
+            raise self._failure(error) from error
+        poses, points = read_values(values)
+        self.elapsed_s += time.perf_counter() - started_s
+        self._check_finite(shadow, poses, points)
+        shadow.keyframes.values, shadow.landmarks.values = poses, points
+        return before, after
+
+    def marginal_covariance(
+        self, shadow: Shadow, keyframes: IntArray, landmarks: IntArray
+    ) -> Array:
+        """Joint covariance of keyframes (6 each, ``[rad, m]``), then landmarks (3 each, m).
+
+        From ISAM2, or from the shadow at its current values when there is none.
+        """
         keys = keyframe_keys(keyframes) + landmark_keys(landmarks)
         try:
+            source = self._isam or gtsam.Marginals(*self._everything(shadow))
             if len(keys) == 1:
-                return np.asarray(self._isam.marginalCovariance(keys[0]))
-            joint = self._isam.jointMarginalCovariance(keys)
+                return np.asarray(source.marginalCovariance(keys[0]))
+            joint = source.jointMarginalCovariance(keys)
             return np.block([[joint.at(a, b) for b in keys] for a in keys])
         except RuntimeError as error:
             raise self._failure(error) from error
+
+    def _everything(self, shadow: Shadow) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """All factors and values, in an order that depends on the shadow's contents alone."""
+        numbers = sorted(shadow.pose_factors)
+        graph = make_graph(self._factors(shadow, shadow.observations.all_rows(), numbers))
+        keyframes, landmarks = shadow.keyframes, shadow.landmarks
+        return graph, make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
 
     def _factors(self, shadow: Shadow, rows: IntArray, numbers: list[int]) -> list:
         factors = self._maker.observations(shadow.observations.select(rows))

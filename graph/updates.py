@@ -7,6 +7,7 @@ thing at a time, and an id that was removed can be used again.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -189,6 +190,8 @@ class GraphEstimate:
             graph lost its prior, by a prior at its current estimate.
         rebuilt: ISAM2 failed and was made anew from the shadow.
         failed_variable: the variable it named last, such as "landmark 17"; "" if none.
+        cost_before, cost_after: half the sum of (robust) squared whitened errors before and
+            after a batch optimisation; NaN after an incremental update.
         update_ms: wall time of the whole update; solver_ms: of GTSAM's part of it.
         factors: number of factors in the graph now.
     """
@@ -204,6 +207,27 @@ class GraphEstimate:
     bridged_keyframes: IntArray = field(default_factory=_no_ids)
     rebuilt: bool = False
     failed_variable: str = ""
+    cost_before: float = math.nan
+    cost_after: float = math.nan
     update_ms: float = 0.0
     solver_ms: float = 0.0
     factors: int = 0
+
+
+@dataclass(frozen=True)
+class ObservationErrors:
+    """How well each observation in the graph fits the current estimate.
+
+    Attributes:
+        keyframe_ids, landmark_ids: (M,) int64, ordered by keyframe, then landmark.
+        chi2: (M,) squared whitened reprojection errors WITHOUT any robust kernel; compare
+            with 7.815 (stereo, 3 degrees of freedom) or 5.991 (monocular, 2) at 95 %.
+        depth_m: (M,) z-depth of the landmark in the keyframe's camera, in metres.
+        is_stereo: (M,) bool.
+    """
+
+    keyframe_ids: IntArray
+    landmark_ids: IntArray
+    chi2: Array
+    depth_m: Array
+    is_stereo: NDArray[np.bool_]

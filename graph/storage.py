@@ -1,0 +1,175 @@
+"""A saved graph: one file of numpy arrays that holds every factor, value and id.
+
+ISAM2 itself cannot be saved; from this it is made anew. The file is a zip of .npy arrays
+(``numpy.load`` opens it) with a JSON header, the same bytes for the same graph, and independent
+of GTSAM's version. It is written under a temporary name and renamed, so that a killed run
+leaves the old file or the new one, never half of one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.shadow import Shadow
+from graph.updates import Observations, PosePrior, RelativePose
+
+FORMAT = "bmask-slam graph"
+VERSION = 1
+_SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
+    "keyframe_ids": ("keyframe", ()),
+    "poses_world_camera": ("keyframe", (4, 4)),
+    "landmark_ids": ("landmark", ()),
+    "points_world": ("landmark", (3,)),
+    "observation_keyframe_ids": ("observation", ()),
+    "observation_landmark_ids": ("observation", ()),
+    "measurements": ("observation", (3,)),
+    "sigmas_px": ("observation", (3,)),
+    "pose_factor_keyframes": ("pose factor", (2,)),
+    "pose_factor_T": ("pose factor", (4, 4)),
+    "pose_factor_covariances": ("pose factor", (6, 6)),
+    "pose_factor_kinds": ("pose factor", ()),
+    "pose_factor_robust": ("pose factor", ()),
+}
+_PRIOR = "prior"
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError)
+
+
+def write_graph(path: Path, shadow: Shadow, camera: Camera) -> None:
+    """Save a shadow and its camera in one file, atomically. Raises InputError if it cannot."""
+    header = {"format": FORMAT, "version": VERSION, "camera": dataclasses.asdict(camera)}
+    arrays = {"header": np.array(json.dumps(header, sort_keys=True)), **_arrays(shadow)}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            np.savez(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(
+            f"{path}: the graph cannot be written ({error.strerror}); choose another folder"
+        ) from error
+
+
+def read_graph(path: Path) -> tuple[Shadow, Camera]:
+    """Load what write_graph saved. Raises InputError for a missing, foreign or broken file."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no saved graph here; give the graph file of a run")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays["header"]))
+        found = header["format"], header["version"]
+    except _UNREADABLE as error:
+        raise InputError(
+            f"{path}: not a saved graph, or a damaged one ({error}); save it again"
+        ) from error
+    if found != (FORMAT, VERSION):
+        raise InputError(
+            f"{path}: holds {found[0]!r} version {found[1]!r}, expected {FORMAT!r} version "
+            f"{VERSION}; save it again with this version of bmask-slam"
+        )
+    _check(path, arrays)
+    return _shadow(arrays), _camera(path, header)
+
+
+def _arrays(shadow: Shadow) -> dict[str, Any]:
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    factors = [shadow.pose_factors[number].factor for number in sorted(shadow.pose_factors)]
+    return {
+        "keyframe_ids": shadow.keyframes.ids,
+        "poses_world_camera": np.ascontiguousarray(shadow.keyframes.values),
+        "landmark_ids": shadow.landmarks.ids,
+        "points_world": np.ascontiguousarray(shadow.landmarks.values),
+        "observation_keyframe_ids": seen.keyframe_ids,
+        "observation_landmark_ids": seen.landmark_ids,
+        "measurements": seen.measurements,
+        "sigmas_px": seen.sigmas_px,
+        "pose_factor_keyframes": np.array([_ends(factor) for factor in factors], np.int64).reshape(
+            -1, 2
+        ),
+        "pose_factor_T": np.array([_measured(f) for f in factors], float).reshape(-1, 4, 4),
+        "pose_factor_covariances": np.array(
+            [factor.covariance for factor in factors], float
+        ).reshape(-1, 6, 6),
+        "pose_factor_kinds": np.array([getattr(f, "kind", _PRIOR) for f in factors], np.str_),
+        "pose_factor_robust": np.array([getattr(f, "robust", "") or "" for f in factors], np.str_),
+    }
+
+
+def _ends(factor: RelativePose | PosePrior) -> tuple[int, int]:
+    if isinstance(factor, PosePrior):
+        return factor.keyframe_id, factor.keyframe_id
+    return factor.keyframe_a, factor.keyframe_b
+
+
+def _measured(factor: RelativePose | PosePrior) -> np.ndarray:
+    return factor.T_world_camera if isinstance(factor, PosePrior) else factor.T_a_b
+
+
+def _check(path: Path, arrays: dict[str, Any]) -> None:
+    """Every array there, of its shape, sorted ids, no factor on a variable that is missing."""
+    counts: dict[str, int] = {}
+    for name, (what, shape) in _SHAPES.items():
+        array = arrays.get(name)
+        if array is None or array.shape[1:] != shape or array.ndim != 1 + len(shape):
+            raise InputError(f"{path}: array {name!r} is missing or misshapen; save it again")
+        if counts.setdefault(what, len(array)) != len(array):
+            raise InputError(f"{path}: array {name!r} has {len(array)} rows; save it again")
+    for ids, references in (
+        ("keyframe_ids", ("observation_keyframe_ids", "pose_factor_keyframes")),
+        ("landmark_ids", ("observation_landmark_ids",)),
+    ):
+        if (np.diff(arrays[ids]) <= 0).any():
+            raise InputError(f"{path}: {ids} are not ascending; save it again")
+        for name in references:
+            unknown = np.setdiff1d(arrays[name], arrays[ids])
+            if len(unknown):
+                raise InputError(f"{path}: {name} has unknown id {unknown[0]}; save it again")
+
+
+def _shadow(arrays: dict[str, Any]) -> Shadow:
+    shadow = Shadow()
+    shadow.keyframes.insert(arrays["keyframe_ids"], arrays["poses_world_camera"])
+    shadow.landmarks.insert(arrays["landmark_ids"], arrays["points_world"])
+    shadow.observations.add(
+        Observations(
+            arrays["observation_keyframe_ids"],
+            arrays["observation_landmark_ids"],
+            arrays["measurements"],
+            arrays["sigmas_px"],
+        )
+    )
+    columns = (
+        arrays["pose_factor_keyframes"].tolist(),
+        arrays["pose_factor_T"],
+        arrays["pose_factor_covariances"],
+        arrays["pose_factor_kinds"].tolist(),
+        arrays["pose_factor_robust"].tolist(),
+    )
+    for (a, b), T, covariance, kind, robust in zip(*columns, strict=True):
+        factor: RelativePose | PosePrior = PosePrior(a, T, covariance)
+        if kind != _PRIOR:
+            factor = RelativePose(a, b, T, covariance, robust or None, kind)
+        shadow.add_pose_factors([factor])
+    return shadow
+
+
+def _camera(path: Path, header: dict[str, Any]) -> Camera:
+    try:
+        fields = dict(header["camera"])
+        fields["distortion"] = tuple(fields["distortion"])
+        return Camera(**fields)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: its camera cannot be read ({error}); save it again") from error
