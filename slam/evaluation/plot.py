@@ -10,12 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from graph.errors import InputError
 from graph.geometry import Array
 from graph.metrics import AbsoluteError, absolute_error
 from graph.trajectory import Trajectory, associate
 
 ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#9a9a96", "#d6302a"
 GAP_STEPS = 5
+FORMATS = ("png", "pdf", "svg")
 
 
 def plot_trajectory(
@@ -29,9 +31,16 @@ def plot_trajectory(
 
     Without a reference, or with fewer than three poses that belong to it, only the top view is
     drawn, in the estimate's own world frame.
+
+    Raises:
+        InputError: the folder does not exist, or the suffix is no picture format.
     """
-    path = Path(path)
-    matched, truth = associate(estimate, reference) if reference else (estimate, None)
+    path, form = Path(path), Path(path).suffix[1:].lower()
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: no such folder for the picture; make it first")
+    if form not in FORMATS:
+        raise InputError(f"{path}: unknown suffix {path.suffix!r}; use .png, .pdf or .svg")
+    matched, truth = associate(estimate, reference) if reference is not None else (estimate, None)
     if truth is None or len(truth) < 3:
         figure = Figure(figsize=(6.4, 5.6), dpi=150, layout="constrained")
         draw_top_view(figure.add_subplot(), estimate)
@@ -46,7 +55,7 @@ def plot_trajectory(
         title = f"{title}: ATE RMSE {rmse_cm:.2f} cm over {len(matched)} poses"
     figure.suptitle(title, fontsize=11)
     temporary = path.with_name(path.name + ".tmp")
-    figure.savefig(temporary, format=path.suffix[1:].lower() or "png")
+    figure.savefig(temporary, format=form)
     os.replace(temporary, path)
 
 
@@ -60,7 +69,7 @@ def draw_top_view(
 
     ``matched`` are poses of estimate and reference that belong together; red lines join them.
     """
-    plane = view_plane((reference or estimate).positions_world)
+    plane = view_plane((estimate if reference is None else reference).positions_world)
     if reference is not None:
         within = _same_time(reference, estimate)
         axes.plot(*_path(within)[:, plane].T, color=REFERENCE, lw=2.2, label="reference", zorder=2)

@@ -44,7 +44,7 @@ def find_camera(folder: Path) -> tuple[Camera, str]:
         InputError: a broken camera.yaml, or none and a folder name that is not TUM's.
     """
     path = folder / "camera.yaml"
-    match = re.search(r"(?:freiburg|fr)([123])(?![0-9])", folder.resolve().name.lower())
+    match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", folder.resolve().name.lower())
     if path.is_file():
         camera, source = read_camera(path), str(path)
     elif match:

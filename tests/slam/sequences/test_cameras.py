@@ -114,7 +114,7 @@ def test_camera_file_wins(tmp_path):
     assert source.endswith("camera.yaml")
 
 
-@pytest.mark.parametrize("name", ["kitchen", "freiburg4_new", "fr12", "frame1"])
+@pytest.mark.parametrize("name", ["kitchen", "freiburg4_new", "fr12", "frame1", "afr1"])
 def test_no_camera(tmp_path, name):
     (tmp_path / name).mkdir()
     with pytest.raises(InputError, match=r"write a camera\.yaml such as") as caught:

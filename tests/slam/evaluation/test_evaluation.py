@@ -1,0 +1,168 @@
+"""From files to numbers and a picture."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from graph.errors import InputError
+from graph.geometry import make_pose, se3_exp, so3_exp
+from graph.trajectory import Trajectory, write_tum
+from slam.evaluation import evaluate, evaluate_trajectory, format_json, format_table
+from slam.evaluation.plot import plot_trajectory, view_plane
+
+SHARED = Path(__file__).resolve().parents[3] / "../shared/data/trajectories"
+
+
+def arc(count: int = 300, fps: float = 30.0) -> Trajectory:
+    """Two metres across in x, one in z, nothing in y, looking along the tangent."""
+    angle = np.linspace(0, np.pi, count)
+    positions = np.column_stack([-np.cos(angle), 0 * angle, np.sin(angle)])
+    rotations = so3_exp(np.column_stack([0 * angle, angle, 0 * angle]))
+    return Trajectory(100 + np.arange(count) / fps, make_pose(rotations, positions))
+
+
+def shaken(t: Trajectory, sigma: float = 0.01) -> Trajectory:
+    xi = np.random.default_rng(0).normal(0, sigma, (len(t), 6))
+    return Trajectory(t.timestamps_s, t.poses_world_camera @ se3_exp(xi))
+
+
+def test_rows():
+    reference = arc()
+    result = evaluate_trajectory(shaken(reference), reference, expected_frames=400)
+    units = {row["name"]: row["unit"] for row in result.rows}
+    assert units == {
+        "ate_rmse": "m", "ate_mean": "m", "ate_median": "m", "ate_max": "m",
+        "rpe_trans_rmse_frame": "m", "rpe_rot_rmse_frame": "deg",
+        "rpe_trans_rmse_second": "m", "rpe_rot_rmse_second": "deg",
+        "associated_poses": "poses", "estimate_share": "1", "reference_share": "1",
+        "tracked_share": "1",
+    }  # fmt: skip
+    # Independent noise of 1 cm an axis: sqrt(3) cm at a pose, twice the variance between two.
+    assert result.value("ate_rmse") == pytest.approx(0.01 * np.sqrt(3), rel=0.06)
+    assert result.value("rpe_trans_rmse_frame") == pytest.approx(0.01 * np.sqrt(6), rel=0.06)
+    degrees = np.rad2deg(0.01 * np.sqrt(6))
+    assert result.value("rpe_rot_rmse_frame") == pytest.approx(degrees, rel=0.06)
+    assert result.value("rpe_rot_rmse_second") == pytest.approx(degrees, rel=0.06)
+    assert result.value("tracked_share") == pytest.approx(0.75)
+    assert len(result.per_second.timestamps_s) > 250
+
+
+def test_shares():
+    """The reference, at 90 Hz, covers the first half of the time only."""
+    reference = arc(450, fps=90)
+    estimate = arc(300, fps=30)
+    rows = evaluate_trajectory(estimate, reference)
+    assert rows.value("associated_poses") == 151  # the last is 11 ms after the reference ends
+    assert rows.value("estimate_share") == pytest.approx(0.5, abs=0.004)
+    assert rows.value("reference_share") == 1.0
+    short = estimate.select(np.arange(75))
+    covered = evaluate_trajectory(short, reference).value("reference_share")
+    assert covered == pytest.approx(0.5, abs=0.01)
+
+
+def test_scale_only_on_request():
+    reference = arc()
+    poses = reference.poses_world_camera.copy()
+    poses[:, :3, 3] *= 0.5
+    estimate = Trajectory(reference.timestamps_s, poses)
+    assert evaluate_trajectory(estimate, reference).value("ate_rmse") > 0.1
+    scaled = evaluate_trajectory(estimate, reference, with_scale=True)
+    assert scaled.value("ate_rmse") < 1e-9
+
+
+def test_no_row_where_there_is_no_number(caplog):
+    reference = arc(10)  # a third of a second
+    names = [row["name"] for row in evaluate_trajectory(reference, reference).rows]
+    assert "rpe_trans_rmse_frame" in names
+    assert "rpe_trans_rmse_second" not in names
+    assert "no RPE per second" in caplog.text
+
+
+def test_table_and_json():
+    rows = evaluate_trajectory(shaken(arc()), arc(), 300).rows
+    assert json.loads(format_json(rows)) == rows
+    table = {line.split()[0]: line.split()[1:] for line in format_table(rows).splitlines()}
+    assert table["associated_poses"] == ["300", "poses"]
+    assert table["tracked_share"] == ["100.0000", "%"]
+    assert table["ate_rmse"] == [f"{rows[0]['value']:.4f}", "m"]
+
+
+def test_run_folder_against_sequence_folder(tmp_path):
+    run, sequence = tmp_path / "run", tmp_path / "sequence"
+    run.mkdir()
+    sequence.mkdir()
+    write_tum(run / "trajectory.txt", shaken(arc()).moved(se3_exp([1, 2, 3, 4, 5, 6])))
+    (run / "frames.csv").write_text("index,timestamp\n" + "0,0\n" * 600)
+    write_tum(sequence / "groundtruth.txt", arc())
+    result = evaluate(run, sequence, tmp_path / "picture.png")
+    assert result.value("tracked_share") == pytest.approx(0.5)
+    assert result.value("ate_rmse") == pytest.approx(0.0173, abs=0.001)
+    assert cv2.imread(str(tmp_path / "picture.png")) is not None
+    direct = evaluate(run / "trajectory.txt", sequence / "groundtruth.txt")
+    assert direct.rows == result.rows
+
+
+def test_bad_input(tmp_path):
+    write_tum(tmp_path / "late.txt", Trajectory(arc().timestamps_s + 50, arc().poses_world_camera))
+    write_tum(tmp_path / "groundtruth.txt", arc())
+    with pytest.raises(InputError, match="no such file; give a run folder or a TUM"):
+        evaluate(tmp_path / "none", tmp_path)
+    with pytest.raises(InputError, match=r"trajectory\.txt: no such file"):
+        evaluate(tmp_path, tmp_path)
+    with pytest.raises(InputError, match="give a sequence with ground truth"):
+        evaluate(tmp_path / "late.txt", tmp_path / "none")
+    with pytest.raises(InputError, match=r"late\.txt against .*: 0 of 300 poses.*150\.000 to"):
+        evaluate(tmp_path / "late.txt", tmp_path, tmp_path / "picture.png")
+    assert not (tmp_path / "picture.png").exists()
+    for name, words in (("none/picture.png", "no such folder"), ("picture.xyz", "suffix '.xyz'")):
+        with pytest.raises(InputError, match=words):
+            evaluate(tmp_path / "groundtruth.txt", tmp_path, tmp_path / name)
+
+
+@pytest.mark.parametrize("with_reference", [False, True])
+def test_picture(tmp_path, with_reference):
+    """It shows the estimate's blue, and the red of differences only against a reference."""
+    estimate = shaken(arc().moved(se3_exp([0, 0, 1, 0, 0, 0])), 0.05)
+    estimate = estimate.select(np.r_[:100, 180:300])
+    path = tmp_path / "picture.png"
+    plot_trajectory(path, estimate, arc() if with_reference else None, "title")
+    image = cv2.imread(str(path)).astype(int)
+    blue, _, red = np.moveaxis(image, -1, 0)
+    assert image.shape[1] > image.shape[0] > 500
+    assert (blue - red > 80).sum() > 500
+    assert ((red - blue > 80).sum() > 500) == with_reference
+    assert [p.name for p in tmp_path.iterdir()] == ["picture.png"]
+    before = path.read_bytes()
+    plot_trajectory(path, estimate, arc() if with_reference else None, "title")
+    assert path.read_bytes() == before
+
+
+def test_picture_of_nothing(tmp_path):
+    """A run that was lost from the start still leaves its picture."""
+    empty = arc().select(np.arange(0))
+    for reference in (None, arc()):
+        plot_trajectory(tmp_path / "picture.png", empty, reference, "nothing")
+        assert (tmp_path / "picture.png").stat().st_size > 1000
+
+
+def test_view_plane_is_the_plane_of_motion():
+    positions = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    assert view_plane(positions * [3, 1, 2]) == [0, 2]
+    assert view_plane(positions * [1, 3, 2]) == [1, 2]
+    assert view_plane(positions * [2, 3, 1]) == [0, 1]
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data/trajectories here")
+@pytest.mark.parametrize(
+    ("estimate", "reference", "ate_cm"),
+    [
+        ("freiburg1_xyz-rgbdslam.txt", "freiburg1_xyz-groundtruth.txt", 1.35),
+        ("fr2_desk_ORB.txt", "fr2_desk_groundtruth.txt", 0.81),
+    ],
+)
+def test_published_figures(estimate, reference, ate_cm):
+    result = evaluate(SHARED / estimate, SHARED / reference)
+    assert 100 * result.value("ate_rmse") == pytest.approx(ate_cm, abs=0.006)
