@@ -1,0 +1,8 @@
+"""``python -m slam``: the command line."""
+
+import sys
+
+from slam.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,222 @@
+"""The command line. Each handler builds a configuration, calls one library function and prints.
+
+Heavy modules are imported inside the handlers, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from graph.errors import InputError
+from slam import __version__
+
+if TYPE_CHECKING:
+    from slam.runner import RunSummary
+
+DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
+EPILOG = """\
+first steps:
+  bmask-slam render office --frames 200 --out office   make a small sequence with exact truth
+  bmask-slam run office                                run on it; results go to runs/office
+  bmask-slam evaluate runs/office --reference office   compare a trajectory with a reference
+"""
+CONFIG_HELP = "YAML file, or the name of a shipped one such as 'paper'"
+SET_HELP = "one value of the configuration, such as tracking.min_inliers=20; may be repeated"
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit status is 0, 1 for broken input, 2 for a wrong command line, and
+    128 + signal when a signal ended it.
+    """
+    arguments = make_parser().parse_args(argv)
+    try:
+        return int(arguments.handler(arguments))
+    except InputError as error:
+        return _fail(str(error))
+    except BrokenPipeError:  # `bmask-slam info ... | head`: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise
+        return _fail(f"{error.filename or 'output'}: {error.strerror}; free some space")
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 128 + signal.SIGINT
+
+
+def _fail(message: str) -> int:
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return 1
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of all commands; each stores its function as ``handler``."""
+    parser = argparse.ArgumentParser(
+        prog="bmask-slam",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"bmask-slam {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_run(commands)
+    _add_evaluate(commands)
+    _add_render(commands)
+    _add_info(commands)
+    return parser
+
+
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
+
+
+# --- run -----------------------------------------------------------------------------------------
+
+
+def _add_run(commands: _Commands) -> None:
+    text = "run the system over a sequence and write a run folder"
+    parser = commands.add_parser("run", help=text, description=text)
+    parser.set_defaults(handler=_run)
+    parser.add_argument("sequence", type=Path, help="folder in TUM layout")
+    parser.add_argument("--out", type=Path, help="run folder (default: runs/<sequence>, numbered)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the run that --out holds")
+    parser.add_argument("--config", metavar="F", help=CONFIG_HELP)
+    parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
+    parser.add_argument("--print-config", action="store_true", help="print it resolved, and end")
+    parser.add_argument("--reference", type=Path, metavar="F", help="TUM trajectory to compare to")
+    parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
+    parser.add_argument("--stride", type=int, default=1, metavar="N", help="take every N-th frame")
+    parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from slam.configuration import dump, find_config, resolve
+    from slam.progress import console_log
+    from slam.runner import RunOptions, run
+    from slam.system import SystemConfig
+
+    file = find_config(arguments.config) if arguments.config else None
+    config = resolve(SystemConfig, file, arguments.set)
+    if arguments.print_config:
+        print(dump(config), end="")
+        return 0
+    options = RunOptions(
+        sequence=arguments.sequence,
+        config=config,
+        config_name=file.stem if file else "",
+        out=arguments.out,
+        overwrite=arguments.overwrite,
+        reference=arguments.reference,
+        max_frames=arguments.max_frames,
+        stride=arguments.stride,
+        quiet=arguments.quiet,
+    )
+    with console_log():
+        summary = run(options)
+    _print_summary(summary, arguments.quiet)
+    return 128 + summary.stopped_by if summary.stopped_by else 0
+
+
+def _print_summary(summary: RunSummary, quiet: bool) -> None:
+    from slam.evaluation import format_table
+
+    if quiet:
+        print(summary.folder)
+        return
+    print(format_table(summary.rows))
+    if summary.skipped:
+        print(f"\n{summary.skipped} broken frames were skipped, see log.txt")
+    if summary.stopped_by:
+        print(f"\nStopped by {summary.stopped_by.name} after {summary.frames} frames; all is saved")
+    print(f"\nRun folder  {summary.folder}\nPicture     {summary.folder / 'trajectory.png'}")
+
+
+# --- evaluate ------------------------------------------------------------------------------------
+
+
+def _add_evaluate(commands: _Commands) -> None:
+    text = "compare a trajectory with a reference"
+    parser = commands.add_parser("evaluate", help=text, description=text)
+    parser.set_defaults(handler=_evaluate)
+    parser.add_argument("run_or_trajectory", type=Path, help="run folder or TUM trajectory")
+    parser.add_argument(
+        "--reference", type=Path, required=True, help="TUM trajectory, or sequence with one"
+    )
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON")
+    parser.add_argument("--plot", type=Path, metavar="F", help="write the picture (png, pdf, svg)")
+    parser.add_argument("--with-scale", action="store_true", help="align with Sim(3): monocular")
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from slam.evaluation import evaluate, format_json, format_table
+    from slam.progress import console_log
+
+    with console_log():
+        result = evaluate(
+            arguments.run_or_trajectory, arguments.reference, arguments.plot, arguments.with_scale
+        )
+    print(format_json(result.rows) if arguments.json else format_table(result.rows))
+    return 0
+
+
+# --- render --------------------------------------------------------------------------------------
+
+
+def _add_render(commands: _Commands) -> None:
+    text = "render an indoor sequence with exact ground truth, in TUM layout"
+    parser = commands.add_parser("render", help=text, description=text)
+    parser.set_defaults(handler=_render)
+    parser.add_argument("name", help="office, living_room or corridor")
+    parser.add_argument("--out", type=Path, required=True, help="folder to make")
+    parser.add_argument("--frames", type=int, metavar="N", help="number of frames (default: all)")
+    parser.add_argument("--fps", type=float, default=30.0, help="frame rate (default: 30)")
+    parser.add_argument("--seed", type=int, default=0, help="of people, noise and textures")
+    parser.add_argument("--people", type=int, default=0, metavar="N", help="people in the scene")
+    parser.add_argument("--no-noise", action="store_true", help="exact depth and colours")
+    parser.add_argument("--exposure-change", action="store_true", help="brightness that varies")
+    parser.add_argument("--motion-blur", action="store_true", help="blur along the motion")
+    parser.add_argument("--true-depth", action="store_true", help="also write noise-free depth")
+    parser.add_argument("--normals", action="store_true", help="also write surface normals")
+    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+
+
+def _render(arguments: argparse.Namespace) -> int:
+    from slam.progress import console_log, counting_bar
+    from slam.rendering.sequence import RenderConfig, render_sequence
+
+    names = ("name", "frames", "fps", "seed", "people")
+    flags = ("exposure_change", "motion_blur", "true_depth", "normals")
+    given = {name: getattr(arguments, name) for name in names + flags}
+    config = RenderConfig(noise=not arguments.no_noise, **given)
+    with console_log(), counting_bar(arguments.quiet) as progress:
+        folder = render_sequence(config, arguments.out, progress)
+    print(folder if arguments.quiet else f"Sequence {folder}; next: bmask-slam run {folder}")
+    return 0
+
+
+# --- info ----------------------------------------------------------------------------------------
+
+
+def _add_info(commands: _Commands) -> None:
+    text = "say what a sequence holds: frames, camera, depth, ground truth"
+    parser = commands.add_parser("info", help=text, description=text)
+    parser.set_defaults(handler=_info)
+    parser.add_argument("sequence", type=Path, help="folder in TUM layout")
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from slam.progress import console_log
+    from slam.sequences import format_info, open_sequence, sequence_info
+
+    with console_log():
+        info = sequence_info(open_sequence(arguments.sequence))
+    print(format_info(info))
+    return 0

@@ -1,0 +1,89 @@
+"""What a person sees while frames are worked on: a bar with rate, status and keyframes."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import TracebackType
+
+from tqdm import tqdm
+
+from slam.results import FrameResult, TrackingStatus
+
+TERMINAL_INTERVAL_S = 0.1
+FILE_INTERVAL_S = 10.0
+
+
+def make_bar(total: int | None, quiet: bool) -> tqdm:
+    """A bar on stderr; a line every 10 s where that is no terminal, nothing if quiet."""
+    interval_s = TERMINAL_INTERVAL_S if sys.stderr.isatty() else FILE_INTERVAL_S
+    return tqdm(
+        total=total,
+        disable=quiet,
+        unit="frame",
+        mininterval=interval_s,
+        maxinterval=interval_s,
+        dynamic_ncols=True,
+    )
+
+
+@contextmanager
+def counting_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A function ``(done, total)`` that moves a bar."""
+    with make_bar(None, quiet) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+class Progress:
+    """The bar of a run."""
+
+    def __init__(self, total: int, quiet: bool) -> None:
+        self._bar = make_bar(total, quiet)
+        self._keyframes = 0
+        self._lost = 0
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.close()
+
+    def update(self, result: FrameResult) -> None:
+        """Count a frame."""
+        self._keyframes += result.keyframe_id is not None
+        self._lost += result.status is TrackingStatus.LOST
+        text = f"{result.status.value}, {self._keyframes} keyframes, {self._lost} lost"
+        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.update()
+
+
+class _BarHandler(logging.Handler):
+    """Writes log records above the bar."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        tqdm.write(self.format(record), file=sys.stderr)
+
+
+@contextmanager
+def console_log(level: int = logging.WARNING) -> Iterator[None]:
+    """Show log records from ``level`` on stderr, without tearing the bar."""
+    handler = _BarHandler(level)
+    handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    root = logging.getLogger()
+    root.addHandler(handler)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)

@@ -1,0 +1,200 @@
+"""The run folder: a contract that other tools read, complete after a run and usable in the middle.
+
+====================  ============================================================================
+config.yaml           the resolved configuration; ``--config RUN/config.yaml`` repeats it
+trajectory.txt        TUM format, T_world_camera, every frame with a pose
+keyframes.txt         the same of the keyframes
+frames.csv            one line a frame: status, matches, inliers, milliseconds a stage, keyframe
+landmarks.ply         x y z (world, metres), red green blue, observations, id
+graph/                the saved factor graph and values
+metrics.json          a list of {"name", "value", "unit"}
+trajectory.png        top view, and errors against the reference
+log.txt               what the program had to say
+====================  ============================================================================
+
+``frames.csv`` and ``log.txt`` grow line by line; everything else is written under a temporary name
+and renamed, so that a killed run leaves whole files.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import logging
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+
+from graph.errors import InputError
+from graph.trajectory import Trajectory, write_tum
+from slam.results import FrameResult
+
+STAGES = ("features", "tracking", "keyframe", "graph")
+FILES = (
+    "config.yaml",
+    "trajectory.txt",
+    "keyframes.txt",
+    "frames.csv",
+    "landmarks.ply",
+    "graph",
+    "metrics.json",
+    "trajectory.png",
+    "log.txt",
+)
+LOGGERS = ("graph", "semantics", "mapping", "slam")
+COLUMNS = (
+    *("index", "timestamp", "status", "segment", "matches", "inliers"),
+    *(f"{stage}_ms" for stage in STAGES),
+    *("keyframe", "keyframe_reason"),
+)
+
+
+def free_run_path(stem: str, root: Path = Path("runs")) -> Path:
+    """``root/stem``, or with -2, -3, ... the first that does not exist yet."""
+    names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
+    return next(root / name for name in names if not os.path.lexists(root / name))
+
+
+class RunFolder:
+    """An open run folder; a context manager that closes its files.
+
+    A run that is refused before its first frame leaves nothing: the folder is removed again.
+    """
+
+    def __init__(self, path: Path, overwrite: bool = False) -> None:
+        """Make the folder, with an empty frames.csv and log.txt.
+
+        Raises:
+            InputError: it cannot be written, or already holds a run and ``overwrite`` is not set.
+        """
+        self.path = path
+        self._made = _make_folder(path)
+        held = [name for name in FILES if os.path.lexists(path / name)]
+        if held and not overwrite:
+            raise InputError(
+                f"{path}: already holds a run ({held[0]}); choose another --out or add --overwrite"
+            )
+        try:
+            _remove(path, held)
+            self._log = logging.FileHandler(path / "log.txt", mode="x", encoding="utf-8")
+            self._frames = (path / "frames.csv").open("x", encoding="utf-8", newline="")
+        except OSError as error:
+            _remove_empty(self._made)
+            raise _unwritable(path, error) from error
+        self._rows = csv.DictWriter(self._frames, COLUMNS, lineterminator="\n")
+        self._rows.writeheader()
+        self._frames.flush()
+        self._written = 0
+        self._levels: dict[str, int] = {}
+
+    def __enter__(self) -> RunFolder:
+        self._log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        for name in LOGGERS:
+            logger = logging.getLogger(name)
+            self._levels[name] = logger.level
+            logger.setLevel(logging.INFO)
+            logger.addHandler(self._log)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if error is not None:
+            details = None if isinstance(error, InputError) else (type(error), error, traceback)
+            self._log.handle(
+                logging.LogRecord(
+                    __name__, logging.ERROR, __file__, 0, "stopped: %s", (error,), details
+                )
+            )
+        for name, level in self._levels.items():
+            logging.getLogger(name).removeHandler(self._log)
+            logging.getLogger(name).setLevel(level)
+        self._log.close()
+        self._frames.close()
+        if isinstance(error, InputError) and not self._written:
+            _remove(self.path, FILES)
+            _remove_empty(self._made)
+
+    def write_frame(self, result: FrameResult) -> None:
+        """Append a frame to frames.csv, at once on disk.
+
+        Raises:
+            ValueError: a stage that is no column.
+        """
+        keyframe = "" if result.keyframe_id is None else result.keyframe_id
+        row: dict[str, object] = {
+            "index": result.index,
+            "timestamp": f"{result.timestamp_s:.6f}",
+            "status": result.status.value,
+            "segment": result.segment,
+            "matches": result.matches,
+            "inliers": result.inliers,
+            "keyframe": keyframe,
+            "keyframe_reason": result.keyframe_reason,
+        }
+        row |= {f"{stage}_ms": f"{ms:.3f}" for stage, ms in result.stage_ms.items()}
+        self._rows.writerow(row)
+        self._frames.flush()
+        self._written += 1
+
+    def write_trajectory(self, trajectory: Trajectory, name: str = "trajectory.txt") -> None:
+        """Replace trajectory.txt (or keyframes.txt) by the poses of T_world_camera."""
+        write_tum(self.path / name, trajectory)
+
+    def write_text(self, name: str, text: str) -> None:
+        """Replace a text file."""
+        with self.replacing(name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    @contextmanager
+    def replacing(self, name: str) -> Iterator[Path]:
+        """A temporary path beside ``name``, a file or a folder, that takes its place at the end."""
+        path = self.path / name
+        temporary = path.with_name(f".partial-{name}")
+        try:
+            yield temporary
+            if path.is_dir():
+                shutil.rmtree(path)
+            os.replace(temporary, path)
+        finally:
+            _remove(self.path, [temporary.name])
+
+
+def _make_folder(path: Path) -> list[Path]:
+    """Make a folder and its parents; those that were made, the innermost first."""
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise InputError(f"{path}: is a file; choose another folder with --out") from error
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    return missing
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    reason = error.strerror or error
+    return InputError(f"{path}: cannot be written ({reason}); choose another folder with --out")
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders from the innermost on, as far as they are empty."""
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _remove(folder: Path, names: Iterable[str]) -> None:
+    """Remove these files and folders where they exist."""
+    for name in names:
+        path = folder / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)

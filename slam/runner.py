@@ -1,0 +1,294 @@
+"""One offline run: a sequence through the system into a run folder."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.ply import write_ply
+from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps, read_tum
+from slam import __version__
+from slam.configuration import dump
+from slam.evaluation import Row, evaluate_trajectory, format_json
+from slam.evaluation.plot import plot_trajectory
+from slam.frame import Frame
+from slam.memory import peak_rss_mb
+from slam.progress import Progress
+from slam.results import FrameResult, TrackingStatus
+from slam.run_folder import RunFolder, free_run_path
+from slam.sequences import Sequence, open_sequence
+from slam.stop import StopRequest
+
+if TYPE_CHECKING:
+    from slam.system import LandmarkCloud, SystemConfig
+
+logger = logging.getLogger(__name__)
+
+SNAPSHOT_FRAMES = 30
+SNAPSHOT_GROWTH = 1.05
+EVALUATION_ROWS = (
+    "ate_rmse",
+    "rpe_trans_rmse_frame",
+    "rpe_trans_rmse_second",
+    "rpe_rot_rmse_second",
+)
+MIN_REFERENCE_POSES = 3
+
+
+class System(Protocol):
+    """What a run asks of a SLAM system; ``slam.system.SlamSystem`` is the real one."""
+
+    def prepare(self, frame: Frame) -> Any: ...
+    def process(self, frame: Frame, features: Any = None) -> FrameResult: ...
+    def finish(self) -> None: ...
+    def trajectory(self) -> Trajectory: ...
+    def keyframe_trajectory(self) -> Trajectory: ...
+    def landmarks(self) -> LandmarkCloud: ...
+    def save_graph(self, folder: Path) -> None: ...
+    def statistics(self) -> dict[str, Any]: ...
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What to run and where to put it.
+
+    Attributes:
+        sequence: folder in TUM layout.
+        config: of the system.
+        config_name: for the name of the run folder, where ``out`` is None.
+        out: the run folder; None: the first free ``runs/<sequence>[-<config_name>][-<n>]``.
+        overwrite: replace the run that ``out`` holds.
+        reference: TUM file or sequence folder to compare with; None: the sequence's own, if any.
+        max_frames: stop after so many frames.
+        stride: take every n-th frame.
+        quiet: no progress bar.
+    """
+
+    sequence: Path
+    config: SystemConfig
+    config_name: str = ""
+    out: Path | None = None
+    overwrite: bool = False
+    reference: Path | None = None
+    max_frames: int | None = None
+    stride: int = 1
+    quiet: bool = False
+
+    def __post_init__(self) -> None:
+        for option in ("stride", "max_frames"):
+            value = getattr(self, option)
+            if value is not None and value < 1:
+                name = option.replace("_", "-")
+                raise InputError(f"--{name} {value}: must be a whole number of at least 1")
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """How a run ended.
+
+    Attributes:
+        folder: the run folder.
+        rows: what metrics.json holds.
+        frames: frames given to the system.
+        skipped: frames that were broken, not counted in ``frames``.
+        stopped_by: the signal that ended the run early, or None.
+    """
+
+    folder: Path
+    rows: list[Row]
+    frames: int
+    skipped: int
+    stopped_by: signal.Signals | None = None
+
+
+@dataclass
+class Tally:
+    """What is counted while frames go by."""
+
+    tracking_ms: list[float] = field(default_factory=list)
+    lost: int = 0
+    next_index: int = 0
+    wall_s: float = 0.0
+
+
+def slam_system(camera: Camera, config: SystemConfig) -> System:
+    """The real system."""
+    from slam.system import SlamSystem  # noqa: PLC0415
+
+    return SlamSystem(camera, config)
+
+
+def run(
+    options: RunOptions, make_system: Callable[[Camera, SystemConfig], System] = slam_system
+) -> RunSummary:
+    """Run the system over a sequence and fill the run folder.
+
+    SIGINT and SIGTERM end it after the current frame; what was tracked so far is then finished
+    and saved like a whole run.
+
+    Raises:
+        InputError: a broken sequence or reference, or a run folder that cannot be used; nothing is
+            left behind unless frames had been tracked before.
+    """
+    sequence = open_sequence(options.sequence)
+    reference = find_reference(options.reference, sequence)
+    name = "-".join(filter(None, (sequence.name, options.config_name)))
+    with (
+        RunFolder(options.out or free_run_path(name), options.overwrite) as folder,
+        StopRequest() as stop,
+    ):
+        describe_run(folder, options, sequence)
+        system = make_system(sequence.camera, options.config)
+        tally = track(system, sequence, folder, options, stop)
+        system.finish()
+        rows = measure(system, reference, tally, options.stride)
+        save(system, folder, rows, reference, name)
+    skipped = sum(index < tally.next_index for index, _ in sequence.skipped)
+    return RunSummary(folder.path, rows, len(tally.tracking_ms), skipped, stop.signal)
+
+
+def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
+    """The trajectory to compare with: a TUM file's, a sequence folder's, or the sequence's own.
+
+    Raises:
+        InputError: the given file is missing or broken, or shares no time with the sequence.
+    """
+    if path is None:
+        return sequence.groundtruth
+    file = path / "groundtruth.txt" if path.is_dir() else path
+    reference = read_tum(file)
+    shared = len(associate_stamps(sequence.timestamps_s, reference.timestamps_s)[0])
+    if shared < MIN_REFERENCE_POSES:
+        raise InputError(
+            f"{file}: has a pose within {MAX_TIME_DIFFERENCE_S:g} s for {shared} frames of "
+            f"{sequence.folder}; give the reference of this sequence, in its clock"
+        )
+    return reference
+
+
+def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> None:
+    """Write the resolved configuration, and to the log what is run, by what and where."""
+    origin = f"bmask-slam {__version__}, sequence {sequence.folder}, stride {options.stride}"
+    folder.write_text("config.yaml", f"# {origin}\n{dump(options.config)}")
+    logger.info("%s: %s", origin, shlex.join(sys.argv))
+    packages = ("gtsam", "numpy", "opencv-python-headless")
+    versions = ", ".join(f"{package} {version(package)}" for package in packages)
+    logger.info("%s, Python %s, %s", platform.platform(), platform.python_version(), versions)
+    logger.info("camera %s: %s", sequence.camera_source, sequence.camera)
+
+
+def track(
+    system: System, sequence: Sequence, folder: RunFolder, options: RunOptions, stop: StopRequest
+) -> Tally:
+    """Process frames until the end, ``max_frames`` or a stop request, recording each."""
+    end = len(sequence)
+    if options.max_frames is not None:
+        end = min(end, options.max_frames * options.stride)
+    frames = sequence.frames(0, end, options.stride, prepare=_timed(system.prepare))
+    tally, snapshot = Tally(), SNAPSHOT_FRAMES
+    start_s = time.perf_counter()
+    with closing(frames), Progress(len(range(0, end, options.stride)), options.quiet) as bar:  # type: ignore[type-var]
+        for frame, (features, features_ms) in frames:
+            result = system.process(frame, features)
+            result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
+            folder.write_frame(result)
+            _count(tally, result)
+            bar.update(result)
+            if len(tally.tracking_ms) >= snapshot:
+                folder.write_trajectory(system.trajectory())
+                snapshot = int(len(tally.tracking_ms) * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
+            if stop.signal is not None:
+                break
+        else:
+            tally.next_index = end
+    tally.wall_s = time.perf_counter() - start_s
+    logger.info("%d frames in %.1f s", len(tally.tracking_ms), tally.wall_s)
+    return tally
+
+
+def _timed(prepare: Callable[[Frame], Any]) -> Callable[[Frame], tuple[Any, float]]:
+    """The function with the milliseconds it took."""
+
+    def timed(frame: Frame) -> tuple[Any, float]:
+        start_s = time.perf_counter()
+        features = prepare(frame)
+        return features, 1e3 * (time.perf_counter() - start_s)
+
+    return timed
+
+
+def _count(tally: Tally, result: FrameResult) -> None:
+    stages = result.stage_ms
+    tally.tracking_ms.append(stages["features"] + stages.get("tracking", 0.0))
+    tally.lost += result.status is TrackingStatus.LOST
+    tally.next_index = result.index + 1
+
+
+def measure(system: System, reference: Trajectory | None, tally: Tally, stride: int) -> list[Row]:
+    """The rows of metrics.json; errors only where there is a reference that covers the run."""
+    trajectory, statistics = system.trajectory(), system.statistics()
+    given = len(range(0, tally.next_index, stride))
+    rows = [_row("tracked_share", len(trajectory) / max(given, 1), "1")]
+    if reference is not None:
+        try:
+            errors = evaluate_trajectory(trajectory, reference).rows
+            rows += [row for row in errors if row["name"] in EVALUATION_ROWS]
+        except InputError as error:
+            logger.warning("no comparison with the reference: %s", error)
+    rows += _percentiles("tracking_ms", tally.tracking_ms)
+    rows.append(_row("frames_per_second", len(tally.tracking_ms) / tally.wall_s, "Hz"))
+    rows.append(_row("keyframes", int(statistics["keyframes"]), "keyframes"))
+    rows.append(_row("landmarks", int(statistics["landmarks"]), "landmarks"))
+    rows += _percentiles("isam2_update_ms", statistics["isam2_update_ms"])
+    rows.append(_row("peak_rss_mb", peak_rss_mb(), "MB"))
+    return rows
+
+
+def _row(name: str, value: float, unit: str) -> Row:
+    return {"name": name, "value": value, "unit": unit}
+
+
+def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
+    """Median and 95th percentile; nothing of nothing."""
+    if not values_ms:
+        return []
+    median, high = np.percentile(values_ms, (50, 95))
+    return [_row(f"{name}_median", float(median), "ms"), _row(f"{name}_p95", float(high), "ms")]
+
+
+def save(
+    system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
+) -> None:
+    """Write everything that is known only at the end."""
+    trajectory = system.trajectory()
+    folder.write_trajectory(trajectory)
+    folder.write_trajectory(system.keyframe_trajectory(), "keyframes.txt")
+    write_landmarks(folder.path / "landmarks.ply", system.landmarks())
+    with folder.replacing("graph") as graph:
+        system.save_graph(graph)
+    folder.write_text("metrics.json", format_json(rows))
+    plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title)
+
+
+def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:
+    """Landmarks as PLY: position in the world in metres, colour, number of keyframes, id."""
+    x, y, z = cloud.points_world.T.astype(np.float32)
+    red, green, blue = cloud.colours.T.astype(np.uint8)
+    columns = {"x": x, "y": y, "z": z, "red": red, "green": green, "blue": blue}
+    columns["observations"] = cloud.observations.astype(np.int32)
+    columns["id"] = cloud.ids.astype(np.int32)
+    write_ply(path, columns, "bmask-slam landmarks, world frame, metres")
