@@ -126,7 +126,9 @@ def _flatten(
         if key not in fields:
             raise InputError(f"{source}: unknown key {path}; {_suggestion(root, prefix, str(key))}")
         nested = _nested(fields[key])
-        if nested is None or (value is None and nested is not fields[key]):
+        if nested is not None and nested is not fields[key] and value is None:
+            given[path] = _Given(None, source)
+        elif nested is None:
             given[path] = _Given(_check(value, fields[key], path, source), source)
         else:
             given |= _flatten(nested, value, source, f"{path}.", root)

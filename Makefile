@@ -1,0 +1,49 @@
+# make demo    sets everything up in .venv, runs SLAM on a rendered sequence and says where the picture is
+# make test    sets up and runs the tests
+# make check   lint, format, types and tests (with the layer rule)
+# make bench   measures and writes docs/benchmarks.md; BENCH="..." passes arguments
+# make clean   removes what these made, but for runs/
+
+PYTHON ?= python3
+VENV ?= .venv
+BENCH ?=
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+DEMO := runs/demo-sequence
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_ROOT_USER_ACTION := ignore
+
+.PHONY: demo test check bench setup clean
+.DELETE_ON_ERROR:
+
+demo: $(DEMO)
+	@$(BIN)/bmask-slam run $(DEMO) --out runs/demo --overwrite
+
+$(DEMO): | $(READY)
+	@$(BIN)/bmask-slam render office --frames 200 --out $@
+
+test: $(READY)
+	@$(BIN)/python -m pytest
+
+check: $(READY)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/python -m pytest
+
+bench: $(READY)
+	@$(BIN)/python benchmarks/run.py $(BENCH)
+
+setup: $(READY)
+
+# Again whenever what is to be installed has changed.
+$(READY): pyproject.toml constraints.txt
+	@echo "Setting up $(VENV) (some minutes the first time) ..."
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: Python 3.11 or newer is needed; give it as make PYTHON=python3.11")'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,215 @@
+"""Configuration: precedence, types, messages, and the round trip through YAML."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from graph.errors import InputError
+from slam.configuration import data_path, dump, find_config, resolve
+
+
+class Kernel(Enum):
+    HUBER = "huber"
+    OFF = "off"
+
+
+@dataclass(frozen=True)
+class Tracking:
+    min_inliers: int = 20
+    sigma_px: float = 1.5
+    use_depth: bool = True
+    kernel: Kernel = Kernel.HUBER
+
+    def __post_init__(self) -> None:
+        if self.min_inliers < 3:
+            raise ValueError(f"min_inliers = {self.min_inliers}: must be at least 3")
+
+
+@dataclass(frozen=True)
+class Window:
+    low_m: float = 1.0
+    high_m: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.low_m >= self.high_m:
+            raise ValueError(f"low_m = {self.low_m} must be below high_m = {self.high_m}")
+
+
+@dataclass(frozen=True)
+class Config:
+    tracking: Tracking = field(default_factory=lambda: Tracking(min_inliers=30))
+    window: Window | None = None
+    name: str = "x"
+    mode: Literal["all", "none", 3] = "all"
+    limit_s: float | None = None
+    scales: tuple[float, ...] = (1.0, 2.0)
+    size: tuple[int, int] = (640, 480)
+    labels: tuple[str, ...] = ()
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "c.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(file: Path | None, *overrides: str) -> str:
+    with pytest.raises(InputError) as error:
+        resolve(Config, file, overrides)
+    return str(error.value)
+
+
+def test_defaults_file_and_overrides_in_this_order(tmp_path: Path) -> None:
+    file = write(tmp_path, "tracking: {sigma_px: 3, use_depth: false}\nname: f")
+    config = resolve(Config, file, ["tracking.sigma_px=4", "tracking.sigma_px=5.5"])
+    assert config.tracking == Tracking(30, 5.5, False)  # 30 is the parent's default, not 20
+    assert config.name == "f"
+    assert type(config.tracking.sigma_px) is float
+
+
+def test_nothing_given_is_the_default() -> None:
+    assert resolve(Config) == Config()
+
+
+def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
+    assert resolve(Config, write(tmp_path, "# nothing\n")) == Config()
+
+
+@pytest.mark.parametrize(
+    ("override", "path", "expected"),
+    [
+        ("tracking.sigma_px=1e-3", "sigma_px", 1e-3),  # a text in YAML 1.1
+        ("tracking.sigma_px=2", "sigma_px", 2.0),
+        ("tracking.sigma_px=.inf", "sigma_px", math.inf),
+        ("tracking.min_inliers=010", "min_inliers", 10),  # eight in YAML 1.1
+        ("tracking.kernel=off", "kernel", Kernel.OFF),  # false in YAML 1.1
+        ("tracking.kernel=HUBER", "kernel", Kernel.HUBER),
+        ("tracking.use_depth=false", "use_depth", False),
+    ],
+)
+def test_values_of_the_tracking_group(override: str, path: str, expected: object) -> None:
+    value = getattr(resolve(Config, None, [override]).tracking, path)
+    assert value == expected
+    assert type(value) is type(expected)
+
+
+def test_optional_literal_and_tuple_values() -> None:
+    overrides = ["limit_s=2", "mode=3", "scales=[1, 2.5, 3]", "size=[3, 4]", "labels=[on, b]"]
+    config = resolve(Config, None, overrides)
+    assert config.limit_s == 2.0
+    assert type(config.limit_s) is float
+    assert (config.mode, config.scales, config.size) == (3, (1.0, 2.5, 3.0), (3, 4))
+    assert config.labels == ("on", "b")
+    assert resolve(Config, None, [*overrides, "limit_s=null"]).limit_s is None
+
+
+def test_an_optional_group_appears_when_it_is_given() -> None:
+    assert resolve(Config, None, ["window.high_m=7"]).window == Window(1.0, 7.0)
+    both = ["window.low_m=5", "window.high_m=7"]  # the first alone would be refused
+    assert resolve(Config, None, both).window == Window(5.0, 7.0)
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("tracking.min_inliers=2.5", "tracking.min_inliers = 2.5 is not a whole number"),
+        ("tracking.min_inliers=2.0", "is not a whole number"),
+        ("tracking.min_inliers=true", "is not a whole number"),
+        ("tracking.sigma_px=fast", "tracking.sigma_px = fast is not a number"),
+        ("tracking.sigma_px=true", "is not a number"),
+        ("tracking.sigma_px=.nan", "is not a number"),
+        ("tracking.sigma_px=", "tracking.sigma_px = null is not a number"),
+        ("tracking.use_depth=1", "is not true or false"),
+        ("tracking.use_depth=yes", "is not true or false"),
+        ("tracking.kernel=cauchy", "is not one of: huber, off"),
+        ("mode=4", "mode = 4 is not one of: all, none, 3"),
+        ("limit_s=never", "is not a number or null"),
+        ("scales=1", "is not a list [a number, ...]"),
+        ("size=[1, 2, 3]", "size = [1, 2, 3] is not a list [a whole number, a whole number]"),
+        ("name=12", "is not a text"),
+        ("tracking=3", "tracking is a group of keys"),
+        ("name.first=3", "name = {first: 3} is not a text"),
+        ("tracking.min_inlier=3", "did you mean tracking.min_inliers?"),
+        ("min_inliers=3", "did you mean tracking.min_inliers?"),
+        ("tracking.qqq=3", "there are: tracking.min_inliers, tracking.sigma_px"),
+        ("tracking.min_inliers=2", "tracking: min_inliers = 2: must be at least 3"),
+        ("window.low_m=9", "window: low_m = 9.0 must be below high_m = 2.0"),
+        ("tracking.min_inliers", "write it as key.subkey=value"),
+        ("name=[", "--set name=["),
+        ("tracking.sigma_px=1" + "0" * 400, "is not a number"),
+    ],
+)
+def test_refusals_name_the_path_the_value_and_the_cure(override: str, expected: str) -> None:
+    message = refusal(None, override)
+    assert message.startswith(f"--set {override}")
+    assert expected in message
+
+
+def test_a_refusal_in_a_file_names_the_file(tmp_path: Path) -> None:
+    file = write(tmp_path, "tracking: {sigma_px: fast}")
+    assert refusal(file) == f"{file}: tracking.sigma_px = fast is not a number"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("name: a\nname: b\n", "line 2: the key 'name' is given twice"),
+        ("name: [a\n", "line 2"),
+        ("- 1\n", "is a group of keys"),
+        ("1: 2\n", "unknown key 1"),
+        ("name: !!python/object:os.system x\n", "could not determine a constructor"),
+    ],
+)
+def test_broken_files_name_the_file_and_line(tmp_path: Path, text: str, expected: str) -> None:
+    file = write(tmp_path, text)
+    message = refusal(file)
+    assert message.startswith(str(file))
+    assert expected in message
+
+
+def test_a_missing_file_and_a_binary_file(tmp_path: Path) -> None:
+    assert "no.yaml: cannot be read: No such file" in refusal(tmp_path / "no.yaml")
+    binary = tmp_path / "b.yaml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    assert "not a text file" in refusal(binary)
+
+
+NUMBERS = st.floats(allow_nan=False)
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
+CONFIGS = st.builds(
+    Config,
+    tracking=st.builds(Tracking, st.integers(3), NUMBERS, st.booleans(), st.sampled_from(Kernel)),
+    window=st.none() | st.builds(Window, NUMBERS.map(lambda x: -abs(x) - 1), st.just(0.0)),
+    name=TEXTS | st.sampled_from(["null", "1e-3", "off", "010", "~", "", "1:30", "2020-01-01"]),
+    mode=st.sampled_from(["all", "none", 3]),
+    limit_s=st.none() | NUMBERS,
+    scales=st.lists(NUMBERS, max_size=3).map(tuple),
+    size=st.tuples(st.integers(), st.integers()),
+    labels=st.lists(TEXTS, max_size=3).map(tuple),
+)
+
+
+@given(config=CONFIGS)
+def test_a_dumped_configuration_resolves_to_an_equal_one(
+    config: Config, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    file = tmp_path_factory.getbasetemp() / "round_trip.yaml"
+    file.write_text("# a comment\n" + dump(config), encoding="utf-8", newline="")
+    assert resolve(Config, file) == config
+
+
+def test_shipped_configurations_are_found_by_name() -> None:
+    with pytest.raises(InputError, match=r"nothing\.yaml: no such file; there are: "):
+        find_config("nothing")
+    assert find_config("./nothing") == Path("nothing")
+    assert find_config("a/b.yaml") == Path("a/b.yaml")
+    for path in data_path("configs").glob("*.yaml"):
+        assert find_config(path.stem) == path
