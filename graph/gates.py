@@ -135,6 +135,9 @@ def check_observations(
         candidates.points(observations.landmark_ids),
         camera,
     )
+    is_new = ~candidates.shadow.landmarks.contains(observations.landmark_ids)
+    with np.errstate(invalid="ignore"):
+        disparity_ratio = (z[:, 0] - z[:, 2]) * depth_m / camera.stereo_bf_px_m
     checks = (
         (bad_z | bad_sigma, RefusalReason.NOT_FINITE),
         (~candidates.has_keyframes(observations.keyframe_ids), RefusalReason.UNKNOWN_KEYFRAME),
@@ -143,6 +146,7 @@ def check_observations(
         (~(depth_m >= config.min_depth_m), RefusalReason.BEHIND_CAMERA),
         (~(depth_m <= config.max_range_m), RefusalReason.OUT_OF_RANGE),
         (~(chi2 <= config.gate_sigmas**2), RefusalReason.REPROJECTION),
+        (is_new & (disparity_ratio > config.max_disparity_ratio), RefusalReason.REPROJECTION),
     )
     reasons = np.zeros(len(observations), np.int64)
     for failed, reason in reversed(checks):

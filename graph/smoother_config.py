@@ -19,7 +19,11 @@ class SmootherConfig:
             roots of the 95 % chi-square bounds with 3 and 2 degrees of freedom.
         robust_pose_k: constant of the kernel of a relative pose that asks for one.
         gate_sigmas: an observation whose reprojection error at the initial values is larger
-            is refused; generous, since the values are not optimised yet.
+            is refused. Generous: a landmark seen once has a depth sigma of z^2/bf pixels of
+            disparity noise, which from 30 degrees aside is tens of pixels; Huber does the rest.
+        max_disparity_ratio: a stereo observation of a new landmark whose disparity is more
+            than so many times that of the initial values is refused: at 2 a Gauss-Newton step
+            throws the landmark behind the camera, z (2 - d_measured / d).
         min_depth_m, max_range_m: z-depth at which an observed landmark may be.
         min_parallax_deg: angle between two viewing rays that a landmark without any stereo
             observation needs.
@@ -38,7 +42,8 @@ class SmootherConfig:
     huber_stereo: float = math.sqrt(7.815)
     huber_mono: float = math.sqrt(5.991)
     robust_pose_k: float = 1.0
-    gate_sigmas: float = 20.0
+    gate_sigmas: float = 100.0
+    max_disparity_ratio: float = 1.7
     min_depth_m: float = 0.05
     max_range_m: float = 60.0
     min_parallax_deg: float = 1.0

@@ -1,0 +1,152 @@
+"""The one place where our arrays become GTSAM's: order, frame and sign of every factor."""
+
+import gtsam
+import numpy as np
+import pytest
+from synthetic_room import CAMERA, make_room
+
+from graph.factors import FactorMaker, make_graph, make_values, read_values
+from graph.geometry import inverse, se3_exp, se3_log, transform
+from graph.keys import keyframe_keys, landmark_keys, variable_named_in
+from graph.smoother_config import SmootherConfig
+from graph.updates import Observations, PosePrior, RelativePose
+
+RNG = np.random.default_rng(3)
+T_WORLD_CAMERA = se3_exp(np.array([0.3, -0.2, 0.5, 1.0, -2.0, 0.7]))
+POINT_WORLD = transform(T_WORLD_CAMERA, np.array([[0.4, -0.3, 2.5]]))[0]
+OFFSET_PX = np.array([1.5, -2.5, 0.8])
+SIGMAS_PX = np.array([0.5, 1.0, 2.0])
+
+
+def one_observation(mono: bool) -> Observations:
+    z = CAMERA.project_stereo(np.array([0.4, -0.3, 2.5])) - OFFSET_PX
+    if mono:
+        z[2] = np.nan
+    return Observations(np.array([7]), np.array([9]), z[None], SIGMAS_PX[None])
+
+
+def values_at(T: np.ndarray, point: np.ndarray) -> gtsam.Values:
+    return make_values(np.array([7]), T[None], np.array([9]), point[None])
+
+
+@pytest.mark.parametrize("mono", [False, True])
+def test_error_is_half_of_whitened_projection_minus_measurement(mono: bool) -> None:
+    (factor,) = FactorMaker(CAMERA, SmootherConfig(robust=False)).observations(
+        one_observation(mono)
+    )
+    whitened = (OFFSET_PX / SIGMAS_PX)[: 2 if mono else 3]
+    error = factor.error(values_at(T_WORLD_CAMERA, POINT_WORLD))
+    assert error == pytest.approx(0.5 * np.sum(whitened**2), rel=1e-9)
+
+
+@pytest.mark.parametrize("mono", [False, True])
+def test_jacobians_agree_with_finite_differences_of_our_camera(mono: bool) -> None:
+    """GTSAM's linear factor against central differences of Camera.project_stereo."""
+    maker = FactorMaker(CAMERA, SmootherConfig(robust=False))
+    (factor,) = maker.observations(one_observation(mono))
+    linear = factor.linearize(values_at(T_WORLD_CAMERA, POINT_WORLD))
+    J, b = linear.jacobian()
+    rows = [0, 1] if mono else [0, 2, 1]  # GTSAM's order of a stereo measurement
+
+    def whitened(T: np.ndarray, p: np.ndarray) -> np.ndarray:
+        camera_point = transform(inverse(T), p[None])[0]
+        r = (
+            CAMERA.project_stereo(camera_point) - one_observation(False).measurements[0]
+        ) / SIGMAS_PX
+        return r[rows]
+
+    h = 1e-6
+    d_pose = [
+        (
+            whitened(T_WORLD_CAMERA @ se3_exp(h * e), POINT_WORLD)
+            - whitened(T_WORLD_CAMERA @ se3_exp(-h * e), POINT_WORLD)
+        )
+        / (2 * h)
+        for e in np.eye(6)
+    ]
+    d_point = [
+        (
+            whitened(T_WORLD_CAMERA, POINT_WORLD + h * e)
+            - whitened(T_WORLD_CAMERA, POINT_WORLD - h * e)
+        )
+        / (2 * h)
+        for e in np.eye(3)
+    ]
+    assert list(linear.keys()) == keyframe_keys(np.array([7])) + landmark_keys(np.array([9]))
+    np.testing.assert_allclose(J, np.array(d_pose + d_point).T, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(-b, whitened(T_WORLD_CAMERA, POINT_WORLD), rtol=1e-9)
+
+
+def test_huber_starts_at_the_chi_square_bound() -> None:
+    config = SmootherConfig(huber_stereo=2.0)
+    z = one_observation(False)
+    (factor,) = FactorMaker(CAMERA, config).observations(z)
+    distance = np.linalg.norm(OFFSET_PX / SIGMAS_PX)
+    expected = 2.0 * (distance - 1.0)  # Huber's loss beyond k = 2
+    assert distance > 2.0
+    error = factor.error(values_at(T_WORLD_CAMERA, POINT_WORLD))
+    assert error == pytest.approx(expected, rel=1e-9)
+
+
+def test_relative_pose_is_T_a_b_with_the_covariance_at_b() -> None:
+    T_world_a, T_a_b = T_WORLD_CAMERA, se3_exp(np.array([0.1, 0.2, -0.1, 0.5, 0.1, -0.4]))
+    xi = np.array([0.001, -0.002, 0.003, 0.02, -0.01, 0.03])
+    covariance = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4])
+    factor = FactorMaker(CAMERA, SmootherConfig()).pose_factor(
+        RelativePose(1, 2, T_a_b, covariance)
+    )
+    T_world_b = T_world_a @ T_a_b @ se3_exp(xi)
+    values = make_values(
+        np.array([1, 2]), np.stack([T_world_a, T_world_b]), np.zeros(0, int), np.zeros((0, 3))
+    )
+    expected = 0.5 * xi @ np.linalg.solve(covariance, xi)
+    assert factor.error(values) == pytest.approx(expected, rel=1e-6)
+
+
+def test_prior_is_T_world_camera() -> None:
+    xi = np.array([0.001, -0.002, 0.003, 0.02, -0.01, 0.03])
+    covariance = np.diag([1e-6] * 3 + [1e-4] * 3)
+    prior = PosePrior(7, T_WORLD_CAMERA, covariance)
+    factor = FactorMaker(CAMERA, SmootherConfig()).pose_factor(prior)
+    error = factor.error(values_at(T_WORLD_CAMERA @ se3_exp(xi), POINT_WORLD))
+    assert error == pytest.approx(0.5 * xi @ np.linalg.solve(covariance, xi), rel=1e-6)
+
+
+def test_factors_keep_the_order_of_mixed_observations() -> None:
+    room = make_room(noise_px=1.0, mono_share=0.5)
+    seen = room.observations
+    factors = FactorMaker(CAMERA, SmootherConfig()).observations(seen)
+    keys = [list(factor.keys()) for factor in factors]
+    expected = zip(keyframe_keys(seen.keyframe_ids), landmark_keys(seen.landmark_ids), strict=True)
+    assert keys == [list(pair) for pair in expected]
+    is_stereo = [isinstance(factor, gtsam.GenericStereoFactor3D) for factor in factors]
+    assert is_stereo == np.isfinite(seen.measurements[:, 2]).tolist()
+    assert make_graph(factors).size() == len(seen)
+
+
+def test_values_come_back_in_the_order_of_ids() -> None:
+    keyframe_ids = np.array([2, 11, 100, 1000])
+    landmark_ids = np.array([0, 5, 70, 10_000_000])
+    poses, points = se3_exp(RNG.normal(size=(4, 6))), RNG.normal(size=(4, 3))
+    shuffled = np.array([2, 0, 3, 1])
+    values = make_values(
+        keyframe_ids[shuffled], poses[shuffled], landmark_ids[shuffled], points[shuffled]
+    )
+    read_poses, read_points = read_values(values)
+    np.testing.assert_allclose(read_poses, poses, atol=1e-12)
+    np.testing.assert_array_equal(read_points, points)
+    assert np.abs(se3_log(inverse(poses) @ read_poses)).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("text", "variable"),
+    [
+        ("near variable\n7782220156096217121 (Symbol: l33).", ("landmark", 33)),
+        ('Attempting to at the key "x1", which does not exist', ("keyframe", 1)),
+        ("something else", None),
+    ],
+)
+def test_a_variable_is_read_from_the_text_of_an_error(
+    text: str, variable: tuple[str, int] | None
+) -> None:
+    assert variable_named_in(text) == variable
