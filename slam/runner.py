@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -32,9 +32,7 @@ from slam.results import FrameResult, TrackingStatus
 from slam.run_folder import RunFolder, free_run_path
 from slam.sequences import Sequence, open_sequence
 from slam.stop import StopRequest
-
-if TYPE_CHECKING:
-    from slam.system import LandmarkCloud, SystemConfig
+from slam.system import LandmarkCloud, SlamSystem, SystemConfig
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +77,7 @@ class RunOptions:
     """
 
     sequence: Path
-    config: SystemConfig
+    config: SystemConfig = field(default_factory=SystemConfig)
     config_name: str = ""
     out: Path | None = None
     overwrite: bool = False
@@ -125,15 +123,8 @@ class Tally:
     wall_s: float = 0.0
 
 
-def slam_system(camera: Camera, config: SystemConfig) -> System:
-    """The real system."""
-    from slam.system import SlamSystem  # noqa: PLC0415
-
-    return SlamSystem(camera, config)
-
-
 def run(
-    options: RunOptions, make_system: Callable[[Camera, SystemConfig], System] = slam_system
+    options: RunOptions, make_system: Callable[[Camera, SystemConfig], System] = SlamSystem
 ) -> RunSummary:
     """Run the system over a sequence and fill the run folder.
 
