@@ -160,7 +160,7 @@ def time_pairs(timestamps_s: Array, delta_s: float = 1.0) -> tuple[Indices, Indi
     i = np.arange(len(timestamps_s))
     j = nearest_indices(timestamps_s, timestamps_s + delta_s)
     difference_s = timestamps_s[j] - timestamps_s - delta_s
-    good = (np.abs(difference_s) <= RELATIVE_DELTA_TOLERANCE * delta_s) & (j > i)
+    good = np.abs(difference_s) <= RELATIVE_DELTA_TOLERANCE * delta_s
     return i[good], j[good]
 
 

@@ -93,6 +93,8 @@ def associate_stamps(
     The closest pair is taken first, then the closest of what is left, as TUM's associate script
     does, so that each stamp is used at most once. That greedy choice is reached here by taking
     all mutually nearest pairs at once and repeating on the rest; two or three rounds are usual.
+    Pairs that cross in time (possible where the limit is longer than the steps) exchange their
+    partners, which makes no difference larger than the larger of the two: both results increase.
     """
     left_a, left_b = np.arange(len(a_s)), np.arange(len(b_s))
     pairs: list[tuple[Indices, Indices]] = [(left_a[:0], left_b[:0])]
@@ -107,8 +109,7 @@ def associate_stamps(
         pairs.append((left_a[taken_a], left_b[taken_b]))
         left_a, left_b = np.delete(left_a, taken_a), np.delete(left_b, taken_b)
     i, j = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
-    order = np.argsort(i)
-    return i[order], j[order]
+    return np.sort(i), np.sort(j)
 
 
 def associate(

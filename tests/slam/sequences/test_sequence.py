@@ -67,6 +67,21 @@ def test_early_stop_ends_the_thread(folder):
     assert prefetch_threads() == 0
 
 
+def test_early_stop_wastes_no_work(folder):
+    """Only the frame in hand is finished; those that wait behind it are never prepared."""
+    prepared, go = [], threading.Event()
+
+    def prepare(frame):
+        prepared.append(frame.index)
+        assert frame.index == 0 or go.wait(5)
+
+    frames = open_sequence(folder).frames(prepare=prepare)
+    next(frames)
+    threading.Timer(0.05, go.set).start()
+    frames.close()
+    assert prepared == [0, 1]
+
+
 def test_exceptions_cross_over(folder):
     def prepare(frame):
         if frame.index == 3:
