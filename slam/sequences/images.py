@@ -18,9 +18,15 @@ def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
     """The colour image (H, W, 3), red first; grey images are expanded.
 
     Raises:
-        InputError: a missing, truncated or unreadable file, or another size than the camera's.
+        InputError: a missing, truncated or unreadable file, more than 8 bits a channel, or
+            another size than the camera's.
     """
-    bgr = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    bgr = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if bgr.dtype != np.uint8:
+        raise InputError(
+            f"{path}: {8 * bgr.dtype.itemsize} bits a channel where colour is expected; "
+            "list 8-bit colour images (are rgb and depth swapped?)"
+        )
     _check_size(path, bgr, camera)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 

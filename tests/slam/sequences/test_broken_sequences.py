@@ -57,6 +57,10 @@ def break_colour(folder, k):
     cv2.imwrite(str(folder / f"depth/{k}.png"), np.full((24, 32, 3), 100, np.uint8))
 
 
+def break_depth_as_rgb(folder, k):
+    (folder / f"rgb/{k}.png").write_bytes((folder / f"depth/{k}.png").read_bytes())
+
+
 BREAKS = [
     (break_missing, "no such image"),
     (break_truncated_png, "truncated"),
@@ -68,6 +72,7 @@ BREAKS = [
     (break_rgb_size, "64x48 pixels.*32x24"),
     (break_8_bit, "8-bit depth"),
     (break_colour, "3 channels where depth"),
+    (break_depth_as_rgb, "16 bits a channel where colour"),
 ]
 
 
