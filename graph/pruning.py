@@ -60,7 +60,7 @@ def remove(update: GraphUpdate, shadow: Shadow, config: SmootherConfig) -> Remov
     shadow.landmarks.remove(ids_array([*landmarks, *dropped.tolist()]))
     shadow.keyframes.remove(ids_array(keyframes))
     added = _bridge(neighbours, shadow, config)
-    return Removal(slots, dropped, added, _keyframes_of(added, shadow))
+    return Removal(slots, dropped, added, keyframes_held_by(added, shadow))
 
 
 def anchor_components(shadow: Shadow, config: SmootherConfig) -> list[int]:
@@ -191,7 +191,8 @@ def _is_supported(keyframe: int, shadow: Shadow, config: SmootherConfig) -> bool
     return shared >= config.min_shared_observations
 
 
-def _keyframes_of(numbers: list[int], shadow: Shadow) -> IntArray:
+def keyframes_held_by(numbers: list[int], shadow: Shadow) -> IntArray:
+    """The keyframes (N,) that these bridges and priors were made for."""
     return ids_array(shadow.pose_factors[number].keyframes[-1] for number in numbers)
 
 

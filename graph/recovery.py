@@ -13,7 +13,7 @@ import numpy as np
 
 from graph.camera import Camera
 from graph.gates import reprojection
-from graph.pruning import bridge, remove
+from graph.pruning import anchor_components, bridge, keyframes_held_by, remove
 from graph.shadow import Shadow, ids_array
 from graph.smoother_config import SmootherConfig
 from graph.solver import Variable
@@ -47,27 +47,42 @@ def repair(
     config: SmootherConfig,
 ) -> Repair:
     """Take out what makes the system singular; ``new_keyframes`` go rather than be bridged."""
+    held = keyframes_held_by(anchor_components(shadow, config), shadow)
+    pairs = _broken_observations(shadow, camera)
+    broken = remove(GraphUpdate(remove_observations=pairs), shadow, config)
     landmarks = _loose_landmarks(shadow, camera, config)
-    loose = _loose_keyframes(shadow, config)
-    if named is not None and not len(landmarks) and not len(loose):
+    keyframes = _loose_keyframes(shadow, config)
+    if named is not None and not (len(held) or broken or len(landmarks) or len(keyframes)):
         landmarks = ids_array([named[1]] if named[0] == "landmark" else [])
-        loose = ids_array([named[1]] if named[0] == "keyframe" else [])
-    bridged_before = {
-        k
-        for f in shadow.pose_factors.values()
-        if not f.is_prior and getattr(f.factor, "kind", "") == "bridge"
-        for k in f.keyframes
-    }
-    dropped = ids_array(k for k in loose.tolist() if k in new_keyframes or k in bridged_before)
-    removal = remove(
-        GraphUpdate(remove_landmarks=landmarks, remove_keyframes=dropped), shadow, config
+        keyframes = ids_array([named[1]] if named[0] == "keyframe" else [])
+    leaving = ids_array(
+        k for k in keyframes.tolist() if k in new_keyframes or _is_bridged(k, shadow)
     )
-    tied = _tie(np.setdiff1d(loose, dropped), shadow, config)
+    update = GraphUpdate(remove_landmarks=landmarks, remove_keyframes=leaving)
+    removal = remove(update, shadow, config)
+    tied = _tie(np.setdiff1d(keyframes, leaving), shadow, config)
+    bridged = (held, broken.bridged_keyframes, removal.bridged_keyframes, tied)
+    dropped = (landmarks, broken.dropped_landmarks, removal.dropped_landmarks)
     return Repair(
-        np.union1d(landmarks, removal.dropped_landmarks),
-        dropped,
-        np.union1d(tied, removal.bridged_keyframes),
+        np.unique(np.concatenate(dropped)),
+        leaving,
+        np.intersect1d(np.concatenate(bridged), shadow.keyframes.ids),
     )
+
+
+def _is_bridged(keyframe: int, shadow: Shadow) -> bool:
+    factors = (shadow.pose_factors[n].factor for n in shadow.numbers_of_keyframes([keyframe]))
+    return any(getattr(factor, "kind", "") == "bridge" for factor in factors)
+
+
+def _broken_observations(shadow: Shadow, camera: Camera) -> IntArray:
+    """Pairs (N, 2) of observations without a finite error; a NaN spoils every value."""
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    poses = shadow.keyframes.get(seen.keyframe_ids)
+    points = shadow.landmarks.get(seen.landmark_ids)
+    _, chi2 = reprojection(seen, poses, points, camera)
+    bad = ~np.isfinite(chi2)
+    return np.stack([seen.keyframe_ids[bad], seen.landmark_ids[bad]], axis=1)
 
 
 def _loose_landmarks(shadow: Shadow, camera: Camera, config: SmootherConfig) -> IntArray:
