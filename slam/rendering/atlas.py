@@ -65,22 +65,15 @@ def _mip_levels(texture: Image) -> list[Image]:
 
 
 def sample(atlas: Atlas, texture: NDArray[np.integer], uv: Floats, level: Floats) -> Floats:
-    """Trilinear look-up: colours (N, 3) float32 at uv (N, 2) in [0, 1] and mip ``level`` (N,)."""
-    level = np.clip(level, 0, _LEVELS - 1)
-    low = level.astype(np.int32)
-    share = (level - low)[:, None]
-    fine = _bilinear(atlas, texture * _LEVELS + low, uv)
-    coarse = _bilinear(atlas, texture * _LEVELS + np.minimum(low + 1, _LEVELS - 1), uv)
-    return fine + share * (coarse - fine)
-
-
-def _bilinear(atlas: Atlas, slot: NDArray[np.integer], uv: Floats) -> Floats:
-    place = atlas.slots[slot]
-    size = place[:, 2:]
-    where = place[:, :2] + np.clip(uv * size - 0.5, -0.5, size - 0.5)
+    """Bilinear look-up: colours (N, 3) float32 at uv (N, 2) in [0, 1] of mip ``floor(level)``."""
+    slot = texture * _LEVELS + np.clip(level, 0, _LEVELS - 1).astype(np.int32)
+    place = atlas.slots.take(slot, axis=0)
+    where = np.minimum(np.maximum(uv, 0), 1)
+    where *= place[:, 2:]
+    where += place[:, :2]
+    where -= np.float32(0.5)
     n = len(where)
-    padded = np.zeros((-(-n // _LANE) * _LANE, 2), np.float32)
-    padded[:n] = where
-    lanes = padded.reshape(-1, _LANE, 2)
+    lanes = np.zeros((-(-n // _LANE), _LANE, 2), np.float32)
+    lanes.reshape(-1, 2)[:n] = where
     colours = cv2.remap(atlas.image, lanes, None, cv2.INTER_LINEAR)
     return colours.reshape(-1, 3)[:n].astype(np.float32)

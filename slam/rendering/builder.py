@@ -91,7 +91,7 @@ class SceneBuilder:
         T[:3, 3] = centre
         height = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
         width = float(2 * np.pi * points[:, 0].max())
-        self._curved(lathe(points, segments).moved(T), painter, (width, height), px_per_m)
+        self.solid(lathe(points, segments).moved(T), painter, (width, height), px_per_m)
 
     def rod(self, p: ArrayLike, q: ArrayLike, radius: float, painter: Painter) -> None:
         """Add a closed cylinder between two points."""
@@ -107,16 +107,16 @@ class SceneBuilder:
             (0, length),
         ]
         shape = lathe(np.array(profile), 12).moved(between(p, q))
-        self._curved(shape, painter, (2 * np.pi * radius, length), 700.0)
+        self.solid(shape, painter, (2 * np.pi * radius, length), 700.0)
 
     def ball(self, centre: ArrayLike, radii: tuple[float, float, float], painter: Painter) -> None:
         """Add an ellipsoid with the given half axes."""
         T = np.eye(4)
         T[:3, 3] = centre
         size = (2 * np.pi * max(radii[:2]), np.pi * max(radii))
-        self._curved(ellipsoid(radii).moved(T), painter, size, 600.0)
+        self.solid(ellipsoid(radii).moved(T), painter, size, 600.0)
 
-    def _curved(
+    def solid(
         self, shape: Shape, painter: Painter, size_m: tuple[float, float], px_per_m: float
     ) -> None:
         texture = self._paint(painter, size_m[0], size_m[1], px_per_m)

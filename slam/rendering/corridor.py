@@ -31,7 +31,19 @@ LIGHTING = Lighting(
     ambient=0.4,
 )  # fmt: skip
 
-ROLES: tuple[Role, ...] = ()
+_ROUND = (
+    (9.15, 1.45), (8.1, 1.1), (7.0, 1.45), (3.5, 1.45), (1.45, 1.45), (1.45, 4.4), (1.45, 7.3),
+    (3.5, 7.35), (5.2, 7.45), (7.0, 7.35), (9.15, 7.3), (9.15, 4.4),
+)  # fmt: skip
+ROLES = (
+    Role("walk", _ROUND, carries="suitcase", speed_m_s=0.9),
+    Role("stand", ((10.1, 5.0),), -80, "cell phone"),
+    Role("sit", ((8.6, 8.45),), -12),
+    Role("walk", _ROUND, carries="book", speed_m_s=1.0),
+    Role("stand", ((0.45, 5.6),), 100, "cup"),
+    Role("walk", _ROUND, speed_m_s=0.8),
+)
+"""Who may be there, in the order in which they come; walkers go clockwise, along the block."""
 
 
 def _centre_line(distance_m: Array) -> Array:
@@ -42,9 +54,30 @@ def _centre_line(distance_m: Array) -> Array:
     points = []
     for s in np.mod(distance_m, total):
         quarter_turns = 0
-        lengths = [straight_x, bend, 2 * straight_y, bend, 2 * straight_x, bend, 2 * straight_y, bend, straight_x]
-        centres = [(straight_x, -straight_y), (straight_x, straight_y), (-straight_x, straight_y), (-straight_x, -straight_y)]
-        starts = [(0, -half_y), (half_x, -straight_y), (straight_x, half_y), (-half_x, straight_y), (-straight_x, -half_y)]
+        lengths = [
+            straight_x,
+            bend,
+            2 * straight_y,
+            bend,
+            2 * straight_x,
+            bend,
+            2 * straight_y,
+            bend,
+            straight_x,
+        ]
+        centres = [
+            (straight_x, -straight_y),
+            (straight_x, straight_y),
+            (-straight_x, straight_y),
+            (-straight_x, -straight_y),
+        ]
+        starts = [
+            (0, -half_y),
+            (half_x, -straight_y),
+            (straight_x, half_y),
+            (-half_x, straight_y),
+            (-straight_x, -half_y),
+        ]
         for k, length in enumerate(lengths):
             if s <= length or k == 8:
                 break
@@ -88,7 +121,7 @@ def furnish(b: SceneBuilder) -> None:
         ((0, 0, _HEIGHT), (_X, 0, 0), (0, w, 0)), ((x1, w, _HEIGHT), (w, 0, 0), (0, y1 - w, 0)),
         ((0, y1, _HEIGHT), (_X, 0, 0), (0, w, 0)), ((0, w, _HEIGHT), (w, 0, 0), (0, y1 - w, 0)),
     ):  # fmt: skip
-        b.quad(origin, right, away, tiles((206, 206, 200), 0.6), 250)
+        b.quad(origin, right, away, tiles((206, 206, 200), 0.6, 0.3), 250)
     _outer(b)
     _inner(b)
 
@@ -102,7 +135,9 @@ def _wall(b: SceneBuilder, length: float, painter: Painter) -> None:
     b.quad((0, 0, _HEIGHT), (length, 0, 0), (0, 0, -_HEIGHT), painter, 400)
 
 
-def _hang(b: SceneBuilder, x: float, size: tuple[float, float], painter: Painter, top: float = 2.05) -> None:
+def _hang(
+    b: SceneBuilder, x: float, size: tuple[float, float], painter: Painter, top: float = 2.05
+) -> None:
     """A picture on the wall with its left edge at x."""
     b.quad((x, -0.012, top), (size[0], 0, 0), (0, 0, -size[1]), painter, 650)
 

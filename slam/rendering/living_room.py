@@ -35,7 +35,20 @@ PATH = CameraPath(
     ]),
 )  # fmt: skip
 
-ROLES: tuple[Role, ...] = ()
+ROLES = (
+    Role(
+        "walk",
+        ((3.9, 0.9), (4.4, 1.3), (4.3, 4.3), (3.2, 4.6), (3.3, 4.1), (4.0, 3.9)),
+        carries="book",
+    ),
+    Role("sit", ((1.9, 0.62),), 180),
+    Role("stand", ((0.9, 3.6),), 50, "cup"),
+    Role("sit", ((5.93, 2.6),), -95),
+    Role(
+        "walk", ((1.0, 3.2), (1.3, 4.4), (2.8, 4.5), (2.0, 3.9)), carries="umbrella", speed_m_s=0.6
+    ),
+)
+"""Who may be there, in the order in which they come."""
 
 
 def furnish(b: SceneBuilder) -> None:

@@ -93,8 +93,8 @@ def trophy(b: SceneBuilder) -> None:
             b.rod(p, q, 0.007, plain(_GOLD))
 
 
-def suitcase(b: SceneBuilder, colour: Colour) -> None:
-    """A hard-shell trolley, standing, with ribs, wheels and a pulled-out handle."""
+def suitcase(b: SceneBuilder, colour: Colour, pulled_out: bool = True) -> None:
+    """A hard-shell trolley, standing, with ribs, wheels and perhaps a pulled-out handle."""
     b.box((0.42, 0.25, 0.62), plain(colour, 10), (0, 0, 0.05))
     for k in range(5):
         b.box(
@@ -105,8 +105,10 @@ def suitcase(b: SceneBuilder, colour: Colour) -> None:
     for x in (-0.17, 0.17):
         for y in (-0.09, 0.09):
             b.ball((x, y, 0.028), (0.02, 0.028, 0.028), plain(_BLACK))
-        b.rod((x * 0.5, 0.09, 0.66), (x * 0.5, 0.09, 1.0), 0.009, plain((150, 150, 154)))
-    b.rod((-0.09, 0.09, 1.0), (0.09, 0.09, 1.0), 0.016, plain(_BLACK))
+        if pulled_out:
+            b.rod((x * 0.5, 0.09, 0.66), (x * 0.5, 0.09, 1.0), 0.009, plain((150, 150, 154)))
+    if pulled_out:
+        b.rod((-0.09, 0.09, 1.0), (0.09, 0.09, 1.0), 0.016, plain(_BLACK))
     b.box((0.16, 0.03, 0.03), plain(_BLACK), (0, 0, 0.69))
     b.quad((0.06, -0.138, 0.6), (0.1, 0, 0), (0, 0, -0.06), sign("FLY"), 1200)
 

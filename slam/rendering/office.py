@@ -30,6 +30,17 @@ PATH = CameraPath(
     ]),
 )  # fmt: skip
 
+ROLES = (
+    Role("walk", ((1.1, 1.1), (2.6, 1.15), (4.2, 1.25), (5.0, 1.3), (4.6, 1.75), (3.0, 1.45), (1.4, 1.5)),
+         carries="suitcase"),
+    Role("sit", ((1.4, 3.92),), 180),
+    Role("stand", ((4.3, 3.75),), -40, "cup"),
+    Role("walk", ((1.3, 1.6), (1.2, 2.6), (1.5, 3.3), (1.7, 2.5)), carries="book", speed_m_s=0.6),
+    Role("sit", ((4.92, 2.25),), 90),
+    Role("stand", ((2.4, 0.7),), 190, "cell phone"),
+)  # fmt: skip
+"""Who may be there, in the order in which they come."""
+
 
 def furnish(b: SceneBuilder) -> None:
     """Build the room: x to the right, y away, door side at y = 0."""
@@ -127,4 +138,3 @@ def _east(b: SceneBuilder) -> None:
     b.quad((_WIDTH - 0.01, 3.3, 2.3), (0, -0.9, 0), (0, 0, -0.65), poster(), 800)
     b.quad((_WIDTH - 0.01, 2.2, 2.3), (0, -0.6, 0), (0, 0, -0.85), poster(), 800)
     b.quad((_WIDTH - 0.01, 1.4, 2.1), (0, -0.8, 0), (0, 0, -0.55), painting(), 800)
-ROLES: tuple[Role, ...] = ()

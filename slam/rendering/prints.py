@@ -105,7 +105,7 @@ def landscape(rows: int, columns: int, rng: np.random.Generator) -> Image:
     share = np.linspace(0, 1, rows, dtype=np.float32)[:, None, None]
     picture = (1 - share) * np.float32([110, 160, 220]) + share * np.float32([220, 228, 235])
     clouds = np.clip(octaves(rows, columns, [columns / 4, columns / 9, columns / 25], rng), 0, 1.5)
-    picture = picture + 45 * clouds[..., None] + 0 * field(rows, columns, (3, 3), rng)[..., None]
+    picture = picture + 45 * clouds[..., None]
     u = np.arange(columns)
     for k in range(4):
         ridge = (
@@ -149,8 +149,7 @@ def window() -> Painter:
             np.uint8
         )
         bar = max(2, int(0.05 * px_per_m))
-        for u in (columns // 2, columns // 2):
-            cv2.line(picture, (u, 0), (u, rows), (205, 205, 200), bar)
+        cv2.line(picture, (columns // 2, 0), (columns // 2, rows), (205, 205, 200), bar)
         cv2.line(picture, (0, rows // 3), (columns, rows // 3), (205, 205, 200), bar // 2)
         return _framed(picture, bar, (212, 212, 206))
 
@@ -315,7 +314,7 @@ def desktop() -> Painter:
             dark = rng.random() < 0.6
             page = _canvas(h, w, (30, 32, 40) if dark else (240, 240, 240), rng)
             line = max(5, rows // 42)
-            for k, row in enumerate(range(2 * line, h - line // 2, round(1.4 * line))):
+            for row in range(2 * line, h - line // 2, round(1.4 * line)):
                 ink = random_colour(rng, 130, 255) if dark else random_colour(rng, 0, 120)
                 indent = int(rng.integers(1, 5) * line)
                 write(
@@ -325,7 +324,6 @@ def desktop() -> Painter:
                     0.7 * line,
                     ink,
                 )
-                del k
             cv2.rectangle(page, (0, 0), (w, line), (70, 110, 180), -1)
             cv2.circle(page, (w - line, line // 2), line // 3, (220, 80, 70), -1, cv2.LINE_AA)
             picture[v : v + h, u : u + w] = page
@@ -434,7 +432,8 @@ def sign(text: str, colour: Colour = (240, 240, 236), ink: Colour = (30, 40, 60)
 
     def paint(rows: int, columns: int, px_per_m: float, rng: np.random.Generator) -> Image:
         picture = _canvas(rows, columns, colour, rng)
-        height = min(0.5 * rows, 1.2 * columns / max(1, len(text)))
+        unit_width = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)[0][0] / 22
+        height = min(0.5 * rows, 0.84 * columns / unit_width)
         write(picture, text, (int(0.08 * columns), int(0.5 * rows + height / 2)), height, ink)
         return _framed(picture, max(1, rows // 30), ink)
 

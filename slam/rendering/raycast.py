@@ -16,6 +16,11 @@ from slam.rendering.builder import Image
 
 Floats = NDArray[np.float32]
 _MISS = np.uint32(0xFFFFFFFF)
+_QUARTERS = (
+    (-0.25, -0.25, 0.125), (0.25, -0.25, 0.625), (-0.25, 0.25, 0.875), (0.25, 0.25, 0.375),
+)  # fmt: skip
+"""Offsets in x and y within the pixel, and what is added to the mip level before truncation."""
+_EDGE_CONTRAST = 14.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,8 @@ class Renderer:
         t, triangle, rays = self._cast(layers, self._pixels, T_world_camera)
         hit = triangle >= 0
         colour, normals = self._shade(tables, (t, triangle, rays), T_world_camera)
-        edges = _edges(tables[1][triangle].reshape(h, w), t.reshape(h, w)).ravel()
+        surface = tables[1][triangle].reshape(h, w)
+        edges = _edges(surface, t.reshape(h, w), colour.reshape(h, w, 3)).ravel()
         colour[edges] = self._supersample(layers, tables, self._pixels[edges], T_world_camera)
         instances = np.where(hit, tables[2][triangle], 0).astype(np.uint16)
         depth = np.where(hit, t, np.nan).astype(np.float32)
@@ -118,11 +124,12 @@ class Renderer:
     def _cast(self, layers: list[Geometry], pixels: Floats, T_world_camera: Array) -> _Hits:
         """Nearest hits of rays whose direction has z = 1 in the camera, so that t is z-depth."""
         camera, R = self._camera, T_world_camera[:3, :3].astype(np.float32)
-        local = np.ones((len(pixels), 3), np.float32)
-        local[:, :2] = (pixels - (camera.cx, camera.cy)) / np.float32((camera.fx, camera.fy))
+        x = (pixels[:, 0] - np.float32(camera.cx)) / np.float32(camera.fx)
+        y = (pixels[:, 1] - np.float32(camera.cy)) / np.float32(camera.fy)
         rays = np.empty((len(pixels), 6), np.float32)
         rays[:, :3] = T_world_camera[:3, 3]
-        rays[:, 3:] = local @ R.T
+        for k in range(3):
+            rays[:, 3 + k] = R[k, 0] * x + R[k, 1] * y + R[k, 2]
         o3d = load_open3d()
         t = np.full(len(rays), np.inf, np.float32)
         triangle = np.full(len(rays), -1, np.int64)
@@ -131,7 +138,8 @@ class Renderer:
             answer = layer.scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
             t_layer, ids = answer["t_hit"].numpy(), answer["primitive_ids"].numpy()
             nearer = (t_layer < t) & (ids != _MISS)
-            t[nearer], triangle[nearer] = t_layer[nearer], ids[nearer] + first
+            np.copyto(t, t_layer, where=nearer)
+            np.copyto(triangle, ids.astype(np.int64) + first, where=nearer)
             first += len(layer.rows)
         return t, triangle, rays[:, 3:]
 
@@ -140,11 +148,12 @@ class Renderer:
 
         The footprint of a pixel in the texture is exact: with p = o + t d on the plane of normal
         n, dp/dx = t (D - d (n.D)/(n.d)) for the change D of the ray d from pixel to pixel.
-        Four trilinear look-ups, one for each quarter of the pixel, filter it.
+        Four bilinear look-ups, one for each quarter of the pixel, filter it; their mip levels are
+        rounded at four thresholds, so that their mean blends the levels.
         """
         t, triangle, d = hits
-        rows = tables[0][triangle]
-        texture = tables[1][triangle]
+        rows = tables[0].take(triangle, axis=0, mode="clip")
+        texture = tables[1].take(triangle, mode="clip")
         t = np.where(triangle >= 0, t, 1).astype(np.float32)
         A, n = rows[:, :12].reshape(-1, 3, 4), rows[:, 12:15]
         points = T_world_camera[:3, 3].astype(np.float32) + t[:, None] * d
@@ -158,12 +167,13 @@ class Renderer:
             D = R[:, axis] / np.float32(focal)
             move = t[:, None] * (D - d * ((n @ D) / slope)[:, None])
             steps.append(np.einsum("ncj,nj->nc", A[:, :2, :3], move))
-        texels = [np.abs(step * self._atlas.sizes[texture]).max(1) for step in steps]
-        level = np.log2(np.maximum(np.maximum(*texels) / 2, 1e-3))
+        sizes = self._atlas.sizes.take(texture, axis=0)
+        texels = np.maximum(*(_longer(step, sizes) for step in steps))
+        level = np.log2(np.maximum(texels / 2, np.float32(1e-3)))
         colour = np.zeros((len(t), 3), np.float32)
-        for a, b in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
+        for a, b, round_up in _QUARTERS:
             uv = value[:, :2] + np.float32(a) * steps[0] + np.float32(b) * steps[1]
-            colour += sample(self._atlas, texture, uv, level)
+            colour += sample(self._atlas, texture, uv, level + np.float32(round_up))
         colour *= 0.25 * value[:, 2:]
         colour[triangle < 0] = 0
         return colour, n
@@ -183,12 +193,21 @@ def _stack(layers: list[Geometry]) -> _Tables:
     )
 
 
-def _edges(texture: NDArray[np.integer], depth_m: Floats) -> NDArray[np.bool_]:
-    """Pixels beside another surface or a jump in depth, (H, W)."""
+def _longer(step: Floats, sizes: Floats) -> Floats:
+    """The longer side (N,) in texels of steps (N, 2) in textures of ``sizes`` (N, 2)."""
+    texels = np.abs(step * sizes)
+    longer: Floats = np.maximum(texels[:, 0], texels[:, 1])
+    return longer
+
+
+def _edges(texture: NDArray[np.integer], depth_m: Floats, rgb: Floats) -> NDArray[np.bool_]:
+    """Pixels beside another surface, or a jump in depth, of another colour, (H, W)."""
     edges = np.zeros(texture.shape, bool)
+    grey = rgb[..., 1] + 0.5 * (rgb[..., 0] + rgb[..., 2])
     for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         jump = np.abs(depth_m[a] - depth_m[b]) > 0.05 * np.minimum(depth_m[a], depth_m[b])
-        change = (texture[a] != texture[b]) | jump
+        contrast = np.abs(grey[a] - grey[b]) > 2 * _EDGE_CONTRAST
+        change = ((texture[a] != texture[b]) | jump) & contrast
         edges[a] |= change
         edges[b] |= change
     return edges

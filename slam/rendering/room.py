@@ -23,7 +23,7 @@ def shell(
     """Add floor, ceiling and the walls south (y = 0), north, west (x = 0) and east."""
     w, d, h = room.width, room.depth, room.height
     b.quad((0, d, 0), (w, 0, 0), (0, -d, 0), floor, px_per_m)
-    b.quad((0, 0, h), (w, 0, 0), (0, d, 0), tiles((205, 205, 200), 0.6), 250)
+    b.quad((0, 0, h), (w, 0, 0), (0, d, 0), tiles((205, 205, 200), 0.6, 0.3), 250)
     b.quad((0, d, h), (w, 0, 0), (0, 0, -h), walls["north"], px_per_m)
     b.quad((w, 0, h), (-w, 0, 0), (0, 0, -h), walls["south"], px_per_m)
     b.quad((0, 0, h), (0, d, 0), (0, 0, -h), walls["west"], px_per_m)

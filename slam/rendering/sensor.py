@@ -45,7 +45,9 @@ def measure_depth(
         cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE,
     )  # fmt: skip
     # Within a surface the offset moves along its plane; across an edge nothing is interpolated.
-    smooth = cv2.remap(depth_m, u + where[0], v + where[1], cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    smooth = cv2.remap(
+        depth_m, u + where[0], v + where[1], cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE
+    )
     read = np.where(np.abs(smooth - read) < 0.02 * read, smooth, read)
     read = np.maximum(read, np.float32(0.1))
     bf = np.float32(camera.stereo_bf_px_m)
@@ -93,7 +95,9 @@ def _in_shadow(depth_m: Floats, camera: Camera) -> NDArray[np.bool_]:
 def _ragged(depth_m: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:
     """A random rim, about a pixel wide, on the far side of jumps in depth, (H, W)."""
     z = np.nan_to_num(depth_m, nan=0.0)
-    jump = cv2.dilate(z, np.ones((3, 3))) - cv2.erode(z, np.ones((3, 3))) > 0.05 * np.maximum(z, 0.3)
+    jump = cv2.dilate(z, np.ones((3, 3))) - cv2.erode(z, np.ones((3, 3))) > 0.05 * np.maximum(
+        z, 0.3
+    )
     rim = cv2.dilate(jump.astype(np.uint8), np.ones((3, 3))) > 0
     chance = rng.random(z.shape, dtype=np.float32)
     return (jump & (chance < 0.75)) | (rim & (chance < 0.35))
@@ -103,7 +107,9 @@ def exposure_gain(time_s: float, seed: int) -> float:
     """A slow change of brightness between about 0.7 and 1.3."""
     phase = np.random.default_rng([seed, 11]).uniform(0, 2 * np.pi, 2)
     return float(
-        1 + 0.2 * np.sin(2 * np.pi * time_s / 9 + phase[0]) + 0.1 * np.sin(2 * np.pi * time_s / 3.7 + phase[1])
+        1
+        + 0.2 * np.sin(2 * np.pi * time_s / 9 + phase[0])
+        + 0.1 * np.sin(2 * np.pi * time_s / 3.7 + phase[1])
     )
 
 

@@ -146,7 +146,7 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     poses = poses[: config.frames]
     builder = SceneBuilder(config.seed)
     plan.furnish(builder)
-    cast = hire(builder, plan.ROLES, config.people, config.seed)
+    cast = hire(builder, plan.ROLES, plan.LIGHTING, config.people)
     scene = build_scene(builder, plan.LIGHTING, cast.parts, config.seed)
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]

@@ -170,19 +170,17 @@ def bricks(colour: Colour, mortar: Colour = (188, 182, 170)) -> Painter:
     return paint
 
 
-def tiles(colour: Colour, size_m: float = 0.3) -> Painter:
+def tiles(colour: Colour, size_m: float = 0.3, veins: float = 1.0) -> Painter:
     """Stone tiles, each cut from its own slab, with dark joints."""
 
     def paint(rows: int, columns: int, px_per_m: float, rng: np.random.Generator) -> Image:
         step = max(4, round(size_m * px_per_m))
-        tone = np.repeat(
-            np.repeat(rng.normal(0, 11, (rows // step + 1, columns // step + 1)), step, 0), step, 1
-        )
-        veins = np.abs(
-            octaves(rows, columns, [0.25 * px_per_m, 0.06 * px_per_m, 0.02 * px_per_m], rng)
-        )
-        shade = tone[:rows, :columns] + 7 * octaves(rows, columns, [1.5, 6, 25], rng)
-        shade -= 45 * np.clip(0.12 - veins, 0, 0.12) / 0.12
+        tones = rng.normal(0, 11, (rows // step + 1, columns // step + 1))
+        tone = tones.repeat(step, 0).repeat(step, 1)[:rows, :columns]
+        cells = [c * px_per_m for c in (0.25, 0.06, 0.02)]
+        distance = np.abs(octaves(rows, columns, cells, rng))
+        shade = tone + 7 * octaves(rows, columns, [1.5, 6, 25], rng)
+        shade -= 45 * veins * np.clip(0.12 - distance, 0, 0.12) / 0.12
         specks = field(rows, columns, (0.008 * px_per_m, 0.008 * px_per_m), rng)
         shade += 40 * np.clip(specks - 2.0, 0, 1) - 50 * np.clip(-specks - 1.9, 0, 1)
         joint = (np.arange(rows)[:, None] % step < 3) | (np.arange(columns)[None] % step < 3)
