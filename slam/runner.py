@@ -8,8 +8,8 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -190,18 +190,20 @@ def track(
     if options.max_frames is not None:
         end = min(end, options.max_frames * options.stride)
     frames = sequence.frames(0, end, options.stride, prepare=_timed(system.prepare))
-    tally, snapshot = Tally(), SNAPSHOT_FRAMES
+    tally, total = Tally(), len(range(0, end, options.stride))
     start_s = time.perf_counter()
-    with closing(frames), Progress(len(range(0, end, options.stride)), options.quiet) as bar:  # type: ignore[type-var]
+    with (
+        closing(frames),  # type: ignore[type-var]
+        Progress(total, options.quiet) as bar,
+        _snapshots(system, folder) as snapshot,
+    ):
         for frame, (features, features_ms) in frames:
             result = system.process(frame, features)
             result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
             folder.write_frame(result)
             _count(tally, result)
             bar.update(result)
-            if len(tally.tracking_ms) >= snapshot:
-                folder.write_trajectory(system.trajectory())
-                snapshot = int(len(tally.tracking_ms) * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
+            snapshot(len(tally.tracking_ms))
             if stop.signal is not None:
                 break
         else:
@@ -209,6 +211,29 @@ def track(
     tally.wall_s = time.perf_counter() - start_s
     logger.info("%d frames in %.1f s", len(tally.tracking_ms), tally.wall_s)
     return tally
+
+
+@contextmanager
+def _snapshots(system: System, folder: RunFolder) -> Iterator[Callable[[int], None]]:
+    """A function that, told the number of frames, saves the trajectory now and then.
+
+    It grows rarer with the trajectory, so that the cost of a frame does not grow. Whatever ends
+    the block, the trajectory is saved once more if there were any frames.
+    """
+    frames, due = 0, SNAPSHOT_FRAMES
+
+    def snapshot(count: int) -> None:
+        nonlocal frames, due
+        frames = count
+        if count >= due:
+            folder.write_trajectory(system.trajectory())
+            due = int(count * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
+
+    try:
+        yield snapshot
+    finally:
+        if frames:
+            folder.write_trajectory(system.trajectory())
 
 
 def _timed(prepare: Callable[[Frame], Any]) -> Callable[[Frame], tuple[Any, float]]:

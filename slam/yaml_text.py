@@ -40,9 +40,14 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper whose plain scalars read back under the same rules."""
+    """SafeDumper whose plain scalars read back under the same rules; lists are on one line."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - PyYAML's own name
+
+    def represent_sequence(
+        self, tag: str, sequence: Any, flow_style: bool | None = None
+    ) -> yaml.SequenceNode:
+        return super().represent_sequence(tag, sequence, flow_style=True)
 
 
 def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
@@ -96,6 +101,6 @@ def format_yaml(document: Any, flow: bool = False) -> str:
         sort_keys=False,
         allow_unicode=True,
         width=100 if not flow else 10**6,
-        default_flow_style=None if not flow else True,
+        default_flow_style=flow,
     )
     return text.removesuffix("...\n").strip() if flow else text

@@ -1,0 +1,117 @@
+"""A tiny sequence on disk and a system that knows the answer, for the tests of the runner."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from graph.camera import Camera
+from graph.trajectory import Trajectory, write_tum
+from slam.frame import Frame
+from slam.results import FrameResult, TrackingStatus
+from slam.system import LandmarkCloud, SystemConfig
+
+CAMERA = "{width: 32, height: 24, fx: 30, fy: 31, cx: 15, cy: 12, depth_scale: 1000, fps: 10}\n"
+FPS_HZ = 10.0
+
+
+def make_sequence(folder: Path, count: int = 20, truth: bool = True) -> Path:
+    """Frame k is stamped k / 10 s, its red is k, and its true pose is ``true_pose(k)``."""
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+        lines = [f"{k / FPS_HZ:.6f} {kind}/{k}.png" for k in range(count)]
+        (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
+    for k in range(count):
+        cv2.imwrite(str(folder / f"rgb/{k}.png"), np.full((24, 32, 3), (9, 9, k), np.uint8))
+        cv2.imwrite(str(folder / f"depth/{k}.png"), np.full((24, 32), 1500, np.uint16))
+    (folder / "camera.yaml").write_text(CAMERA)
+    if truth:
+        write_tum(folder / "groundtruth.txt", true_trajectory(count))
+    return folder
+
+
+def true_pose(k: int) -> np.ndarray:
+    """T_world_camera of frame k: on a parabola, so that the alignment is unique."""
+    T = np.eye(4)
+    T[:3, 3] = 0.1 * k, 0.01 * k * k, 0.0
+    return T
+
+
+def true_trajectory(count: int) -> Trajectory:
+    return Trajectory(np.arange(count) / FPS_HZ, np.stack([true_pose(k) for k in range(count)]))
+
+
+class FakeSystem:
+    """Reads the frame's number off its red channel; every seventh frame is lost.
+
+    ``trajectory()`` is true but for ``z_error_m`` at each odd frame. ``on_frame(k)`` is called
+    while frame k is processed.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: SystemConfig,
+        on_frame: Callable[[int], None] | None = None,
+        z_error_m: float = 0.0,
+    ) -> None:
+        self.camera = camera
+        self.on_frame = on_frame or (lambda k: None)
+        self.z_error_m = z_error_m
+        self.numbers: list[int] = []
+        self.finished = False
+
+    def prepare(self, frame: Frame) -> int:
+        return int(frame.rgb[0, 0, 0])
+
+    def process(self, frame: Frame, features: int | None = None) -> FrameResult:
+        k = self.prepare(frame) if features is None else features
+        self.on_frame(k)
+        lost = k % 7 == 6
+        if not lost:
+            self.numbers.append(k)
+        return FrameResult(
+            index=frame.index,
+            timestamp_s=frame.timestamp_s,
+            status=TrackingStatus.LOST if lost else TrackingStatus.OK,
+            T_world_camera=None if lost else true_pose(k),
+            matches=100 + k,
+            inliers=90 + k,
+            keyframe_id=k // 5 if k % 5 == 0 else None,
+            keyframe_reason="new view" if k % 5 == 0 else "",
+            stage_ms={"tracking": 1000.0 + k, "keyframe": 5e6, "graph": 7e6},
+        )
+
+    def finish(self) -> None:
+        self.finished = True
+
+    def trajectory(self) -> Trajectory:
+        poses = np.array([true_pose(k) for k in self.numbers]).reshape(-1, 4, 4)
+        poses[1::2, 2, 3] += self.z_error_m
+        return Trajectory(np.array(self.numbers) / FPS_HZ, poses)
+
+    def keyframe_trajectory(self) -> Trajectory:
+        keep = np.array(self.numbers, int) % 5 == 0
+        return self.trajectory().select(np.flatnonzero(keep))
+
+    def landmarks(self) -> LandmarkCloud:
+        points = np.array([[1.0, 2.0, 3.0], [-4.5, 5.25, 6.0]])
+        colours = np.array([[255, 1, 2], [3, 4, 250]], np.uint8)
+        return LandmarkCloud(np.array([3, 8]), points, colours, np.array([2, 300]))
+
+    def save_graph(self, folder: Path) -> None:
+        assert self.finished
+        folder.write_bytes(b"graph and values")
+
+    def statistics(self) -> dict[str, float | list[float]]:
+        return {"keyframes": 4, "landmarks": 2, "isam2_update_ms": [1.0, 2.0, 9.0]}
+
+
+def signal_at(frame: int, number: signal.Signals) -> Callable[[int], None]:
+    """Sends this process a signal while the frame is processed."""
+    return lambda k: os.kill(os.getpid(), number) if k == frame else None
