@@ -9,12 +9,6 @@ import numpy as np
 
 from graph.geometry import Array
 
-POSE_KERNELS: dict[str, Any] = {
-    "huber": gtsam.noiseModel.mEstimator.Huber,
-    "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
-    "dcs": gtsam.noiseModel.mEstimator.DCS,
-}
-
 
 def pixel_noises(sigmas_px: Array, huber_k: float | None) -> list[gtsam.noiseModel.Base]:
     """A diagonal model for each row of sigmas (M, 2 or 3), shared between equal rows.
@@ -34,8 +28,17 @@ def pixel_noises(sigmas_px: Array, huber_k: float | None) -> list[gtsam.noiseMod
 
 
 def pose_noise(covariance: Array, robust: str | None, k: float) -> gtsam.noiseModel.Base:
-    """A full (6, 6) model of the tangent ``[rad, m]``, with a kernel of POSE_KERNELS or none."""
+    """A full (6, 6) model of the tangent ``[rad, m]``, with a kernel or none.
+
+    ``robust`` is None, "huber", "cauchy" or "dcs"; ``k`` the whitened error up to which it
+    trusts the measurement. DCS (dynamic covariance scaling) compares its constant with the
+    SQUARED error, so it is given k^2.
+    """
     model = gtsam.noiseModel.Gaussian.Covariance(covariance)
-    if robust is None:
-        return model
-    return gtsam.noiseModel.Robust.Create(POSE_KERNELS[robust].Create(k), model)
+    estimators = gtsam.noiseModel.mEstimator
+    kernels: dict[str, Any] = {
+        "huber": lambda: estimators.Huber.Create(k),
+        "cauchy": lambda: estimators.Cauchy.Create(k),
+        "dcs": lambda: estimators.DCS.Create(k * k),
+    }
+    return model if robust is None else gtsam.noiseModel.Robust.Create(kernels[robust](), model)

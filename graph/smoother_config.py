@@ -17,7 +17,7 @@ class SmootherConfig:
         robust: Huber's kernel on observations; off, factors are plain Gaussian.
         huber_stereo, huber_mono: where the kernel starts, in standard deviations: the square
             roots of the 95 % chi-square bounds with 3 and 2 degrees of freedom.
-        robust_pose_k: constant of the kernel of a relative pose that asks for one.
+        robust_pose_k: the same for a relative pose that asks for a kernel (6 degrees).
         gate_sigmas: an observation whose reprojection error at the initial values is larger
             is refused. Generous: a landmark seen once has a depth sigma of z^2/bf pixels of
             disparity noise, which from 30 degrees aside is tens of pixels; Huber does the rest.
@@ -41,7 +41,7 @@ class SmootherConfig:
     robust: bool = True
     huber_stereo: float = math.sqrt(7.815)
     huber_mono: float = math.sqrt(5.991)
-    robust_pose_k: float = 1.0
+    robust_pose_k: float = math.sqrt(12.592)
     gate_sigmas: float = 100.0
     max_disparity_ratio: float = 1.7
     min_depth_m: float = 0.05

@@ -1,0 +1,294 @@
+"""Removal by id: nothing else may change, nothing may be left underconstrained."""
+
+import numpy as np
+import pytest
+from synthetic_room import CAMERA, Room, make_room
+
+from graph.geometry import inverse, se3_exp, se3_log
+from graph.keys import keyframe_keys, landmark_keys
+from graph.smoother import Smoother
+from graph.updates import (
+    GraphEstimate,
+    GraphUpdate,
+    Observations,
+    PosePrior,
+    RefusalReason,
+    RelativePose,
+)
+
+ROOM = make_room(keyframes=8, points=80, noise_px=0.3)
+
+
+def filled(room: Room = ROOM) -> Smoother:
+    smoother = Smoother(CAMERA)
+    for update in room.updates():
+        smoother.update(update)
+    return smoother
+
+
+def from_scratch(smoother: Smoother) -> GraphEstimate:
+    """The optimum of a new graph that is given what this one holds, from the room's truth."""
+    shadow = smoother._shadow
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    factors = [f.factor for f in shadow.pose_factors.values()]
+    fresh = Smoother(CAMERA)
+    fresh.update(
+        GraphUpdate(
+            shadow.keyframes.ids,
+            ROOM.poses_world_camera[shadow.keyframes.ids],
+            shadow.landmarks.ids,
+            ROOM.points_world[shadow.landmarks.ids],
+            seen,
+            priors=tuple(f for f in factors if isinstance(f, PosePrior)),
+            relative_poses=tuple(f for f in factors if isinstance(f, RelativePose)),
+        )
+    )
+    return fresh.optimise_batch()
+
+
+def assert_isam_matches_shadow(smoother: Smoother) -> None:
+    """Every slot holds just the factor that the shadow believes to be there."""
+    shadow, isam = smoother._shadow, smoother._solver._isam
+    graph = isam.getFactorsUnsafe()
+    rows = shadow.observations.all_rows()
+    seen = shadow.observations.select(rows)
+    expected = dict(
+        zip(
+            shadow.observations.slots(rows).tolist(),
+            zip(keyframe_keys(seen.keyframe_ids), landmark_keys(seen.landmark_ids), strict=True),
+            strict=True,
+        )
+    )
+    for factor in shadow.pose_factors.values():
+        expected[factor.slot] = tuple(keyframe_keys(np.array(factor.keyframes)))
+    held = {i: tuple(graph.at(i).keys()) for i in range(graph.size()) if graph.exists(i)}
+    assert held == expected
+    assert len(expected) == len(rows) + len(shadow.pose_factors)
+
+
+def assert_same_optimum(smoother: Smoother) -> None:
+    expected, found = from_scratch(smoother), smoother.optimise_batch()
+    difference = se3_log(inverse(found.poses_world_camera) @ expected.poses_world_camera)
+    assert np.abs(difference).max() < 1e-5
+    np.testing.assert_allclose(found.points_world, expected.points_world, atol=1e-4)
+
+
+def test_a_landmark_goes_with_all_its_factors() -> None:
+    smoother = filled()
+    before = smoother.estimate()
+    victims = before.landmark_ids[[3, 10]]
+    views = np.isin(ROOM.observations.landmark_ids, victims).sum()
+    after = smoother.update(GraphUpdate(remove_landmarks=victims))
+    assert after.factors == before.factors - views
+    np.testing.assert_array_equal(after.landmark_ids, np.setdiff1d(before.landmark_ids, victims))
+    assert not after.rebuilt
+    assert_isam_matches_shadow(smoother)
+    assert_same_optimum(smoother)
+
+
+def test_a_keyframe_goes_with_all_its_factors() -> None:
+    smoother = filled()
+    before = smoother.estimate()
+    after = smoother.update(GraphUpdate(remove_keyframes=np.array([4])))
+    assert after.keyframe_ids.tolist() == [0, 1, 2, 3, 5, 6, 7]
+    assert after.factors == before.factors - (ROOM.observations.keyframe_ids == 4).sum()
+    assert not after.rebuilt
+    assert_isam_matches_shadow(smoother)
+    assert_same_optimum(smoother)
+
+
+def test_an_observation_goes_and_comes_again() -> None:
+    smoother = filled()
+    before = smoother.estimate()
+    row = int(np.flatnonzero(seen_often(ROOM))[40])
+    seen = ROOM.observations.select(np.array([row]))
+    pair = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+    after = smoother.update(GraphUpdate(remove_observations=pair))
+    assert after.factors == before.factors - 1
+    assert_isam_matches_shadow(smoother)
+    again = smoother.update(GraphUpdate(observations=seen))
+    assert again.factors == before.factors
+    assert len(again.refused) == 0
+    twice = smoother.update(GraphUpdate(observations=seen))
+    assert twice.refused.count(RefusalReason.DUPLICATE) == 1
+    assert_isam_matches_shadow(smoother)
+    assert_same_optimum(smoother)
+
+
+@pytest.mark.parametrize("in_one_update", [False, True])
+def test_an_id_is_used_again(in_one_update: bool) -> None:
+    """Landmark 5 becomes another point, keyframe 7 is made anew."""
+    smoother = filled()
+    seen = ROOM.observations
+    rows = (seen.landmark_ids == 5) | (seen.keyframe_ids == 7)
+    assert rows.sum() > 20
+    removal = {"remove_landmarks": np.array([5]), "remove_keyframes": np.array([7])}
+    if not in_one_update:
+        smoother.update(GraphUpdate(**removal))
+        removal = {}
+    estimate = smoother.update(
+        GraphUpdate(
+            np.array([7]),
+            ROOM.initial_poses[[7]],
+            np.array([5]),
+            ROOM.points_world[[5]] + 0.05,
+            seen.select(rows),
+            **removal,
+        )
+    )
+    assert not estimate.rebuilt
+    assert len(estimate.refused) == 0
+    assert {5} <= set(estimate.landmark_ids.tolist())
+    assert_isam_matches_shadow(smoother)
+    assert_same_optimum(smoother)
+
+
+def test_many_random_removals_and_returns() -> None:
+    """Slots are used again and again and always hold what the shadow says."""
+    rng = np.random.default_rng(5)
+    smoother = filled()
+    seen = ROOM.observations
+    pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+    for _ in range(15):
+        estimate = smoother.update(
+            GraphUpdate(
+                remove_landmarks=rng.choice(80, 3, replace=False),
+                remove_keyframes=rng.choice(np.arange(1, 8), rng.integers(0, 2)),
+                remove_observations=rng.permutation(pairs)[:20],
+            )
+        )
+        assert not estimate.rebuilt
+        assert_isam_matches_shadow(smoother)
+        keyframes = np.setdiff1d(np.arange(8), estimate.keyframe_ids)
+        landmarks = rng.permutation(np.setdiff1d(np.arange(80), estimate.landmark_ids))[:6]
+        estimate = smoother.update(
+            GraphUpdate(
+                keyframes,
+                ROOM.poses_world_camera[keyframes],
+                landmarks,
+                ROOM.points_world[landmarks],
+                rng_select(rng, seen),
+            )
+        )
+        assert not estimate.rebuilt
+        assert_isam_matches_shadow(smoother)
+    assert_same_optimum(smoother)
+
+
+def rng_select(rng: np.random.Generator, seen: Observations) -> Observations:
+    return seen.select(np.sort(rng.permutation(len(seen))[: len(seen) // 2]))
+
+
+def seen_often(room: Room) -> np.ndarray:
+    """Mask of the observations whose landmark has four views or more."""
+    ids, views = np.unique(room.observations.landmark_ids, return_counts=True)
+    return np.isin(room.observations.landmark_ids, ids[views >= 4])
+
+
+def test_what_is_not_there_is_passed_over() -> None:
+    nothing = GraphUpdate(
+        remove_landmarks=np.array([99999]),
+        remove_keyframes=np.array([77]),
+        remove_observations=np.array([[0, 99999], [77, 1]]),
+        remove_relative_poses=((0, 1, "loop"),),
+    )
+    empty = Smoother(CAMERA).update(nothing)
+    assert len(empty.keyframe_ids) == 0
+    smoother = filled()
+    before = smoother.estimate()
+    assert smoother.update(nothing).factors == before.factors
+
+
+def test_a_landmark_left_with_one_monocular_view_goes_too() -> None:
+    room = make_room(keyframes=8, points=80, noise_px=0.3, mono_share=1.0)
+    stereo = make_room(keyframes=8, points=80, noise_px=0.3)
+    smoother = filled(stereo)
+    new = np.arange(1000, 1080)
+    seen = room.observations
+    seen = Observations(
+        seen.keyframe_ids, 1000 + seen.landmark_ids, seen.measurements, seen.sigmas_px
+    )
+    smoother.update(
+        GraphUpdate(landmark_ids=new, points_world=room.points_world, observations=seen)
+    )
+    before = smoother.estimate()
+    victim = int(before.landmark_ids[before.landmark_ids >= 1000][0])
+    views = seen.keyframe_ids[seen.landmark_ids == victim]
+    assert len(views) >= 3
+    all_but_two = np.stack([views[:-2], np.full(len(views) - 2, victim)], axis=1)
+    kept = smoother.update(GraphUpdate(remove_observations=all_but_two))
+    assert victim in kept.landmark_ids
+    gone = smoother.update(GraphUpdate(remove_observations=np.array([[views[-2], victim]])))
+    assert gone.dropped_landmarks.tolist() == [victim]
+    assert not gone.rebuilt
+    assert_isam_matches_shadow(smoother)
+
+
+def test_a_keyframe_that_loses_its_landmarks_is_held_where_it_was() -> None:
+    smoother = filled()
+    before = smoother.estimate()
+    seen = ROOM.observations
+    mine = seen.landmark_ids[seen.keyframe_ids == 7]
+    pairs = np.stack([np.full(len(mine) - 2, 7), mine[:-2]], axis=1)
+    after = smoother.update(GraphUpdate(remove_observations=pairs))
+    assert not after.rebuilt
+    assert after.bridged_keyframes.tolist() == [7]
+    np.testing.assert_allclose(after.poses_world_camera[7], before.poses_world_camera[7], atol=0.1)
+    assert_isam_matches_shadow(smoother)
+    sigma_m = np.sqrt(np.diag(smoother.marginal_covariance(7))[3:])
+    assert (sigma_m > 0.01).any()  # and it says how badly it is known
+
+
+def test_the_world_stays_when_the_first_keyframe_goes() -> None:
+    smoother = filled()
+    before = smoother.optimise_batch()
+    after = smoother.update(GraphUpdate(remove_keyframes=np.array([0])))
+    assert not after.rebuilt
+    assert after.bridged_keyframes.tolist() == [1]
+    difference = se3_log(inverse(after.poses_world_camera) @ before.poses_world_camera[1:])
+    assert np.abs(difference).max() < 0.01
+    np.testing.assert_allclose(after.poses_world_camera[0], before.poses_world_camera[1], atol=1e-3)
+
+
+def test_everything_goes_and_a_new_graph_starts() -> None:
+    smoother = filled()
+    empty = smoother.update(GraphUpdate(remove_keyframes=np.arange(8)))
+    assert empty.factors == 0
+    assert len(empty.landmark_ids) == 0
+    for update in ROOM.updates():
+        estimate = smoother.update(update)
+    assert not estimate.rebuilt
+    assert estimate.keyframe_ids.tolist() == list(range(8))
+    assert_same_optimum(smoother)
+
+
+@pytest.mark.parametrize(("robust", "wrong_by"), [(None, 0.03), ("cauchy", 0.5), ("dcs", 0.5)])
+def test_a_wrong_loop_goes_by_its_name(robust: str | None, wrong_by: float) -> None:
+    smoother = filled()
+    right = smoother.optimise_batch()
+    covariance = 1e-6 * np.eye(6)
+    T_a_b = inverse(right.poses_world_camera[0]) @ right.poses_world_camera[7]
+    odometry = RelativePose(0, 7, T_a_b, covariance)
+    wrong = RelativePose(
+        0, 7, T_a_b @ se3_exp(np.full(6, wrong_by)), covariance, robust, kind="loop"
+    )
+    smoother.update(GraphUpdate(relative_poses=(wrong, odometry)))
+    bent = smoother.update(GraphUpdate())
+    bend_m = np.linalg.norm(bent.poses_world_camera[7] - right.poses_world_camera[7])
+    assert bend_m > 0.01 if robust is None else bend_m < 0.005
+    removed = smoother.update(GraphUpdate(remove_relative_poses=((0, 7, "loop"),)))
+    assert removed.factors == bent.factors - 1
+    found = smoother.optimise_batch()
+    np.testing.assert_allclose(found.poses_world_camera, right.poses_world_camera, atol=2e-3)
+
+
+def test_removal_in_the_first_update_after_a_restart() -> None:
+    """ISAM2 refuses a removal in its very first update; here it is only a smaller graph."""
+    smoother = filled()
+    smoother.restart()
+    estimate = smoother.update(
+        GraphUpdate(remove_landmarks=np.array([5]), remove_keyframes=np.array([3]))
+    )
+    assert not estimate.rebuilt
+    assert 3 not in estimate.keyframe_ids
+    assert_isam_matches_shadow(smoother)
