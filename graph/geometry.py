@@ -29,6 +29,15 @@ def inverse(T_a_b: Array) -> Array:
     return make_pose(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
 
 
+def orthonormalised(T: Array) -> Array:
+    """The rigid transforms (..., 4, 4) nearest to products that have gathered rounding errors.
+
+    Prediction and update feed each other (``T <- T @ inverse(T_last) @ T``), which doubles a
+    deviation from orthonormality every frame; whoever closes such a loop must call this.
+    """
+    return make_pose(rotation_from_quaternion(quaternion_from_rotation(T[..., :3, :3])), T[..., :3, 3])
+
+
 def transform(T_a_b: Array, points_b: Array) -> Array:
     """Points (..., N, 3) in metres from frame b to frame a."""
     return points_b @ np.swapaxes(T_a_b[..., :3, :3], -1, -2) + T_a_b[..., None, :3, 3]

@@ -1,0 +1,184 @@
+"""BRISK keypoints with bucketing, depth and the pseudo-stereo coordinate, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.camera import Camera
+from graph.geometry import Array
+from slam.frame import Frame
+
+BRISK_BASE_SIZE_PX = 12.0 * 0.7  # OpenCV's keypoint size in the finest layer
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """The front end's parameters; pixels are those of the full image.
+
+    ``octaves`` doubles as BRISK's: each adds a half-scale layer and an intra-octave. The
+    depth noise is Khoshelham's and Nguyen's model of structured light, as in OpenNI sensors:
+    sigma_z = depth_sigma_m + depth_sigma_z2 * z^2.
+    """
+
+    threshold: int = 20
+    octaves: int = 2
+    max_keypoints: int = 1000
+    bucket_px: int = 40
+    pixel_sigma: float = 0.7
+    disparity_sigma_px: float = 0.12
+    depth_window_px: int = 2
+    depth_edge_ratio: float = 0.04
+    min_depth_m: float = 0.3
+    max_depth_m: float = 8.0
+
+
+@dataclass(frozen=True)
+class Features:
+    """N keypoints of one frame.
+
+    Attributes:
+        pixels: (N, 2) undistorted (u, v).
+        image_pixels: (N, 2) as detected in the image, for looking up pixels and masks.
+        descriptors: (N, 8) uint64, the 512 bits of BRISK.
+        scales: (N,) keypoint size relative to the finest layer, >= 1.
+        angles_rad: (N,) BRISK's orientation in the image.
+        depth_m: (N,) z-depth, NaN where missing or ambiguous.
+        disparity_px: (N,) bf / z, NaN where depth is missing.
+        sigmas_px: (N, 3) standard deviation of u, v and disparity.
+        colours: (N, 3) uint8 red first.
+        gray: (H, W) uint8, the image they come from.
+    """
+
+    pixels: Array
+    image_pixels: Array
+    descriptors: NDArray[np.uint64]
+    scales: Array
+    angles_rad: Array
+    depth_m: Array
+    disparity_px: Array
+    sigmas_px: Array
+    colours: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def measurements(self) -> Array:
+        """(N, 3) of u, v and disparity in pixels; disparity NaN where depth is missing."""
+        return np.column_stack([self.pixels, self.disparity_px])
+
+
+class BriskExtractor:
+    """Detects, buckets and describes; holds OpenCV's detector, so one per thread."""
+
+    def __init__(self, camera: Camera, config: FeatureConfig):
+        self.camera = camera
+        self.config = config
+        self._brisk = cv2.BRISK_create(config.threshold, config.octaves)
+
+    def extract(self, frame: Frame) -> Features:
+        """The features of a frame. Pure: the same frame gives the same arrays."""
+        gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        keypoints = self._brisk.detect(gray, None)
+        kept = self._strongest_spread(keypoints, gray.shape)
+        keypoints, descriptors = self._brisk.compute(gray, kept)
+        if descriptors is None:
+            keypoints, descriptors = (), np.zeros((0, 64), np.uint8)
+        table = np.array(
+            [(*k.pt, k.size, k.angle) for k in keypoints], dtype=float
+        ).reshape(-1, 4)
+        return self._assemble(frame, gray, table, np.ascontiguousarray(descriptors))
+
+    def _strongest_spread(self, keypoints: tuple, shape: tuple[int, int]) -> list:
+        """At most ``max_keypoints``: every bucket's strongest first, then the second, and so on."""
+        if len(keypoints) <= self.config.max_keypoints:
+            return list(keypoints)
+        size = self.config.bucket_px
+        columns = -(-shape[1] // size)
+        pixels = cv2.KeyPoint_convert(keypoints)
+        response = np.array([k.response for k in keypoints])
+        bucket = (pixels[:, 1] // size).astype(int) * columns + (pixels[:, 0] // size).astype(int)
+        keep = spread_order(bucket, response)[: self.config.max_keypoints]
+        return [keypoints[i] for i in np.sort(keep)]
+
+    def _assemble(
+        self, frame: Frame, gray: NDArray[np.uint8], table: Array, descriptors: NDArray[np.uint8]
+    ) -> Features:
+        raw, scales = table[:, :2], np.maximum(table[:, 2] / BRISK_BASE_SIZE_PX, 1.0)
+        depth_m, spread_m = sample_depth(frame.depth_m, raw, self.config)
+        disparity = self.camera.stereo_bf_px_m / depth_m
+        sigmas = np.empty((len(raw), 3))
+        sigmas[:, :2] = (self.config.pixel_sigma * np.sqrt(scales))[:, None]
+        depth_to_disparity = self.camera.stereo_bf_px_m / depth_m**2
+        sigmas[:, 2] = np.hypot(self.config.disparity_sigma_px, depth_to_disparity * spread_m)
+        rows, columns = np.rint(raw[:, 1]).astype(int), np.rint(raw[:, 0]).astype(int)
+        return Features(
+            pixels=undistort(self.camera, raw),
+            image_pixels=raw,
+            descriptors=descriptors.view(np.uint64).reshape(-1, 8),
+            scales=scales,
+            angles_rad=np.deg2rad(table[:, 3]),
+            depth_m=depth_m,
+            disparity_px=disparity,
+            sigmas_px=sigmas,
+            colours=frame.rgb[rows, columns],
+            gray=gray,
+        )
+
+
+def spread_order(bucket: NDArray[np.int64], score: Array) -> NDArray[np.int64]:
+    """Indices ordered by their rank inside their bucket, then by score, best first.
+
+    A prefix of any length is spread over the buckets as evenly as they allow.
+    """
+    order = np.lexsort((-score, bucket))
+    sorted_bucket = bucket[order]
+    starts = np.flatnonzero(np.r_[True, sorted_bucket[1:] != sorted_bucket[:-1]])
+    run_lengths = np.diff(np.r_[starts, len(order)])
+    rank = np.arange(len(order)) - np.repeat(starts, run_lengths)
+    return order[np.lexsort((-score[order], rank))]
+
+
+def sample_depth(
+    depth_m: NDArray[np.float32], pixels: Array, config: FeatureConfig
+) -> tuple[Array, Array]:
+    """Depth (N,) at keypoints and its local spread (N,) in metres.
+
+    The depth is the median of the valid pixels in a small window; the spread is their median
+    absolute deviation, so that slanted and rough surfaces are trusted less. Where the window
+    straddles a depth edge (a range above ``depth_edge_ratio`` z) colour and depth disagree about
+    which side the keypoint is on, and the depth is NaN.
+    """
+    radius = config.depth_window_px
+    height, width = depth_m.shape
+    offsets = np.arange(-radius, radius + 1)
+    rows = np.clip(np.rint(pixels[:, 1]).astype(int)[:, None] + offsets, 0, height - 1)
+    columns = np.clip(np.rint(pixels[:, 0]).astype(int)[:, None] + offsets, 0, width - 1)
+    window = depth_m[rows[:, :, None], columns[:, None, :]].reshape(len(pixels), offsets.size**2)
+    window = np.sort(window.astype(float), axis=1)  # NaN sorts last
+    count = np.isfinite(window).sum(axis=1)
+    index = np.arange(len(pixels))
+    last = np.maximum(count - 1, 0)
+    median = window[index, last // 2]
+    spread = (window[index, (3 * last) // 4] - window[index, last // 4]) / 2
+    extent = window[index, last] - window[:, 0]
+    good = (
+        (count * 2 > offsets.size**2)
+        & (median > config.min_depth_m)
+        & (median < config.max_depth_m)
+        & (extent < config.depth_edge_ratio * median)
+    )
+    return np.where(good, median, np.nan), np.where(good, spread, np.nan)
+
+
+def undistort(camera: Camera, pixels: Array) -> Array:
+    """Undistorted pixels (N, 2) of detected ones (N, 2), in the same camera matrix."""
+    if not any(camera.distortion) or len(pixels) == 0:
+        return pixels.copy()
+    distortion = np.array(camera.distortion)
+    return cv2.undistortPoints(pixels[:, None], camera.K, distortion, P=camera.K)[:, 0]

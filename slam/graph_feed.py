@@ -1,0 +1,144 @@
+"""Which of the map's observations enter the factor graph, and how its answer is read back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph.geometry import Array
+from graph.updates import GraphEstimate, GraphUpdate, IntArray, Observations
+from slam.features import Features, spread_order
+from slam.landmarks import Ints
+from slam.world_map import Keyframe, WorldMap
+
+
+@dataclass(frozen=True)
+class GraphFeedConfig:
+    """The graph's size decides its cost: measurements are capped per keyframe.
+
+    A landmark enters when ``min_views`` keyframes see it, with all its observations so far.
+    """
+
+    max_observations: int = 200
+    min_views: int = 2
+    bucket_px: int = 60
+
+
+class GraphFeed:
+    """Turns changes of the map into updates of the graph and estimates back into the map."""
+
+    def __init__(self, config: GraphFeedConfig):
+        self.config = config
+        self._removed: list[Ints] = []
+        self._removed_keyframes: list[int] = []
+
+    def forget_landmarks(self, ids: Ints) -> None:
+        """These landmarks were culled or fused: their factors go with the next update."""
+        self._removed.append(ids)
+
+    def forget_keyframe(self, keyframe_id: int) -> None:
+        """This keyframe was culled: its factors go with the next update."""
+        self._removed_keyframes.append(keyframe_id)
+
+    def keyframe_update(self, world: WorldMap, keyframe: Keyframe) -> GraphUpdate:
+        """The update that adds one keyframe, its landmarks and all that was removed since the last."""
+        keypoints, ids = world.observed(keyframe)
+        inside = world.landmarks.in_graph[ids]
+        new_ids = self._promoted(world, keyframe, keypoints[~inside], ids[~inside], inside.sum())
+        world.landmarks.in_graph[new_ids] = True
+        observed = self._unsent_observations(world, keyframe, new_ids)
+        removed = np.concatenate([np.zeros(0, np.int64), *self._removed])
+        gone = self._removed_keyframes
+        self._removed, self._removed_keyframes = [], []
+        return GraphUpdate(
+            keyframe_ids=np.array([keyframe.id]),
+            poses_world_camera=keyframe.T_world_camera[None],
+            landmark_ids=new_ids,
+            points_world=world.landmarks.points_world[new_ids],
+            observations=observed,
+            remove_landmarks=removed,
+            remove_keyframes=np.array(gone, np.int64),
+        )
+
+    def _promoted(
+        self, world: WorldMap, keyframe: Keyframe, keypoints: Ints, ids: Ints, already: int
+    ) -> Ints:
+        """Landmarks of the keyframe that enter the graph now: well spread, most seen first."""
+        views = world.landmarks.observations[ids]
+        enough = views >= self.config.min_views
+        keypoints, ids, views = keypoints[enough], ids[enough], views[enough]
+        room = max(self.config.max_observations - int(already), 0)
+        pixels = keyframe.features.image_pixels[keypoints] // self.config.bucket_px
+        bucket = (pixels[:, 1] * 1000 + pixels[:, 0]).astype(np.int64)
+        return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
+
+    def _unsent_observations(
+        self, world: WorldMap, keyframe: Keyframe, new_ids: Ints
+    ) -> Observations:
+        """All observations of the new landmarks, and this keyframe's of the ones in the graph."""
+        is_new = np.zeros(len(world.landmarks), bool)
+        is_new[new_ids] = True
+        parts = []
+        oldest = world.landmarks.host[new_ids].min() if len(new_ids) else keyframe.id
+        for other in world.keyframes.values():
+            if other.id < oldest and other is not keyframe:
+                continue
+            keypoints, ids = world.observed(other)
+            wanted = world.landmarks.in_graph[ids] if other is keyframe else is_new[ids]
+            if wanted.any():
+                parts.append(observations_of(other, keypoints[wanted], ids[wanted]))
+        return concatenate(parts)
+
+
+def observations_of(keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> Observations:
+    """The graph's observations of some keypoints of a keyframe."""
+    features = keyframe.features
+    return Observations(
+        keyframe_ids=np.full(len(keypoints), keyframe.id),
+        landmark_ids=landmark_ids,
+        measurements=stereo_measurements(features, keypoints),
+        sigmas_px=features.sigmas_px[keypoints],
+    )
+
+
+def stereo_measurements(features: Features, keypoints: Ints) -> Array:
+    """(N, 3) of u_left, v, u_right = u_left - disparity; u_right NaN without depth."""
+    pixels = features.pixels[keypoints]
+    return np.column_stack([pixels, pixels[:, 0] - features.disparity_px[keypoints]])
+
+
+def concatenate(parts: list[Observations]) -> Observations:
+    """One table of several."""
+    if not parts:
+        return Observations()
+    return Observations(
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("keyframe_ids", "landmark_ids", "measurements", "sigmas_px")
+        )
+    )
+
+
+def read_back(world: WorldMap, estimate: GraphEstimate) -> IntArray:
+    """Write the graph's poses and points into the map; returns the landmarks the graph dropped.
+
+    Landmarks outside the graph move rigidly with the keyframe that made them.
+    """
+    landmarks = world.landmarks
+    landmarks.in_graph[estimate.dropped_landmarks] = False
+    known = np.array([i in world.keyframes for i in estimate.keyframe_ids], bool)
+    ids, T_new = estimate.keyframe_ids[known], estimate.poses_world_camera[known]
+    T_old = np.array([world.keyframes[i].T_world_camera for i in ids]).reshape(-1, 4, 4)
+    moved = np.abs(T_new - T_old).max(axis=(1, 2)) > 1e-9
+    outside = np.flatnonzero(landmarks.alive & ~landmarks.in_graph)
+    if moved.any():
+        landmarks.move_with_hosts(outside, ids[moved], T_old[moved], T_new[moved])
+    for i, T in zip(ids, T_new, strict=True):
+        world.keyframes[i].T_world_camera = T
+    inside = estimate.landmark_ids[landmarks.alive[estimate.landmark_ids]]
+    position = np.searchsorted(estimate.landmark_ids, inside)
+    landmarks.points_world[inside] = estimate.points_world[position]
+    landmarks.in_graph[:] = False
+    landmarks.in_graph[inside] = True
+    return estimate.dropped_landmarks

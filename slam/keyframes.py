@@ -1,0 +1,78 @@
+"""When a frame becomes a keyframe, and why (Algorithm 2 of the paper and its origin)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """The rule's numbers; ``rule`` is "orb" (default) or "paper".
+
+    "orb" (ORB-SLAM, section V.E, with ORB-SLAM2's extra rule): mapping is idle or more than
+    ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and fewer than
+    ``max_shared`` of the reference keyframe's points are; or the close points run out: fewer
+    than ``min_close_tracked`` are tracked while ``min_close_new`` could be made.
+    "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
+    mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
+    """
+
+    rule: str = "orb"
+    min_interval_frames: int = 3
+    max_interval_frames: int = 20
+    min_tracked: int = 50
+    max_shared: float = 0.7
+    min_close_tracked: int = 100
+    min_close_new: int = 70
+    paper_interval_frames: int = 30
+    paper_shared: float = 0.9
+    paper_min_matches: int = 100
+
+
+@dataclass(frozen=True)
+class KeyframeEvidence:
+    """What the rule looks at.
+
+    Attributes:
+        frames_since: frames since the last keyframe was made.
+        mapping_idle: the back end waits for work; True in an offline run, so that runs repeat.
+        tracked: landmarks tracked in this frame.
+        shared: tracked points of the reference keyframe over all its points, 0 to 1.
+        close_tracked: tracked landmarks at close range.
+        close_new: keypoints at close range that are not tracked.
+    """
+
+    frames_since: int
+    mapping_idle: bool
+    tracked: int
+    shared: float
+    close_tracked: int
+    close_new: int
+
+
+def keyframe_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:
+    """Why this frame should become a keyframe, or "" if it should not."""
+    if config.rule == "paper":
+        return _paper_reason(evidence, config)
+    if evidence.frames_since < config.min_interval_frames:
+        return ""
+    starving = (
+        evidence.close_tracked < config.min_close_tracked
+        and evidence.close_new > config.min_close_new
+    )
+    if starving:
+        return "close points run out"
+    ready = evidence.mapping_idle or evidence.frames_since > config.max_interval_frames
+    if ready and evidence.tracked >= config.min_tracked and evidence.shared < config.max_shared:
+        return "new view"
+    return ""
+
+
+def _paper_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:
+    due = (
+        evidence.frames_since >= config.paper_interval_frames
+        and evidence.mapping_idle
+        and evidence.shared < config.paper_shared
+        and evidence.tracked >= config.paper_min_matches
+    )
+    return "Algorithm 2" if due else ""

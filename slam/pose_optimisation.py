@@ -1,0 +1,144 @@
+"""Motion-only bundle adjustment: one camera pose from matched landmarks, vectorised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.camera import Camera
+from graph.geometry import Array, inverse, orthonormalised, se3_exp, skew, transform
+
+CHI2_3DOF = 7.815  # 95 %
+CHI2_2DOF = 5.991
+
+
+@dataclass(frozen=True)
+class PoseOptimisationConfig:
+    """Kernel widths in units of the chi-square gate, widest first, then the final rounds.
+
+    Cauchy weights on ALL points with a narrowing kernel (graduated non-convexity) find the
+    consensus from a prediction many sigmas away; the final rounds use the inliers alone.
+    """
+
+    kernel_widths: tuple[float, ...] = (64.0, 16.0, 4.0, 1.0)
+    kernel_iterations: int = 3
+    final_rounds: int = 2
+    final_iterations: int = 5
+    step_tolerance: float = 1e-5
+    min_points: int = 6
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A pose from N matches.
+
+    Attributes:
+        T_world_camera: (4, 4).
+        inliers: (N,) bool: within the chi-square gate, taken without the robust kernel.
+        information: (6, 6) in the camera's own tangent [rotation rad, translation m].
+        ok: False where too few points were left or the system was singular; the pose is
+            then that of the last good step and must not be used.
+    """
+
+    T_world_camera: Array
+    inliers: NDArray[np.bool_]
+    information: Array
+    ok: bool
+
+
+def residuals(
+    T_world_camera: Array, points_world: Array, measurements: Array, camera: Camera
+) -> tuple[Array, Array]:
+    """Residuals (N, 3) of u, v, disparity in pixels (predicted - measured) and points_camera (N, 3)."""
+    points_camera = transform(inverse(T_world_camera), points_world)
+    z = points_camera[:, 2]
+    safe_z = np.where(z > 1e-3, z, 1e-3)
+    predicted = np.stack(
+        [
+            camera.fx * points_camera[:, 0] / safe_z + camera.cx,
+            camera.fy * points_camera[:, 1] / safe_z + camera.cy,
+            camera.stereo_bf_px_m / safe_z,
+        ],
+        axis=1,
+    )
+    return predicted - measurements, points_camera
+
+
+def jacobian(points_camera: Array, camera: Camera) -> Array:
+    """d(u, v, disparity)/d(xi) (N, 3, 6) for ``T_world_camera <- T_world_camera @ se3_exp(xi)``.
+
+    Chain rule: d(pixel)/d(point_camera) @ d(point_camera)/d(xi), and the latter is
+    [skew(p), -I] since p <- exp(-xi) p.
+    """
+    x, y, z = points_camera.T
+    inv_z = 1.0 / np.where(z > 1e-3, z, 1e-3)
+    dr_dp = np.zeros((len(x), 3, 3))
+    dr_dp[:, 0, 0] = camera.fx * inv_z
+    dr_dp[:, 0, 2] = -camera.fx * x * inv_z**2
+    dr_dp[:, 1, 1] = camera.fy * inv_z
+    dr_dp[:, 1, 2] = -camera.fy * y * inv_z**2
+    dr_dp[:, 2, 2] = -camera.stereo_bf_px_m * inv_z**2
+    return np.concatenate([dr_dp @ skew(points_camera), -dr_dp], axis=2)
+
+
+def optimise_pose(
+    T_world_camera: Array,
+    points_world: Array,
+    measurements: Array,
+    sigmas_px: Array,
+    camera: Camera,
+    config: PoseOptimisationConfig | None = None,
+) -> PoseEstimate:
+    """The pose that minimises the robustly weighted reprojection and disparity errors.
+
+    Args:
+        T_world_camera: (4, 4) initial pose.
+        points_world: (N, 3) landmarks.
+        measurements: (N, 3) u, v, disparity in undistorted pixels; disparity NaN: monocular.
+        sigmas_px: (N, 3) their standard deviations.
+
+    Inliers are chosen by the chi-square gate of 95 % for 3 or 2 degrees of freedom, taken without
+    the robust kernel.
+    """
+    config = config or PoseOptimisationConfig()
+    stereo = np.isfinite(measurements[:, 2])
+    measured = np.where(np.isfinite(measurements), measurements, 0.0)
+    weight = np.where(np.isfinite(measurements), 1.0 / sigmas_px**2, 0.0)
+    gate = np.where(stereo, CHI2_3DOF, CHI2_2DOF)
+    T, inliers, H = T_world_camera, np.ones(len(stereo), bool), np.zeros((6, 6))
+    stages = [(width, config.kernel_iterations) for width in config.kernel_widths]
+    stages += [(None, config.final_iterations)] * config.final_rounds
+    for width, iterations in stages:
+        if width is None:
+            r, p = residuals(T, points_world, measured, camera)
+            inliers = (np.einsum("ij,ij,ij->i", r, r, weight) < gate) & (p[:, 2] > 0.05)
+        if inliers.sum() < config.min_points:
+            return PoseEstimate(T, inliers, H, False)
+        for _ in range(iterations):
+            r, p = residuals(T, points_world[inliers], measured[inliers], camera)
+            kernel = None if width is None else width * gate
+            H, g = _normal_equations(r, p, weight[inliers], kernel, camera)
+            if np.linalg.cond(H) > 1e14:
+                return PoseEstimate(T, inliers, H, False)
+            step = -np.linalg.solve(H, g)
+            T = orthonormalised(T @ se3_exp(step))
+            if np.abs(step).max() < config.step_tolerance:
+                break
+    r, p = residuals(T, points_world, measured, camera)
+    inliers = (np.einsum("ij,ij,ij->i", r, r, weight) < gate) & (p[:, 2] > 0.05)
+    return PoseEstimate(T, inliers, H, int(inliers.sum()) >= config.min_points)
+
+
+def _normal_equations(
+    r: Array, points_camera: Array, weight: Array, kernel: Array | None, camera: Camera
+) -> tuple[Array, Array]:
+    """H (6, 6) and gradient (6,) of the weighted squares; Cauchy's weights where a kernel is given."""
+    w = weight
+    if kernel is not None:
+        chi2 = np.einsum("ij,ij,ij->i", r, r, weight)
+        w = weight * (kernel / (kernel + chi2))[:, None]
+    J = jacobian(points_camera, camera).reshape(-1, 6)
+    weighted = J * w.reshape(-1, 1)
+    return weighted.T @ J, weighted.T @ r.reshape(-1)

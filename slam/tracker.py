@@ -1,0 +1,188 @@
+"""Frame tracking: predict, match the local map by projection, optimise the pose, judge it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.geometry import Array, inverse, transform
+from slam.features import Features
+from slam.landmarks import Ints, LandmarkTable
+from slam.matching import MatchConfig, Matches, WindowIndex, match_pairs
+from slam.pose_optimisation import PoseEstimate, PoseOptimisationConfig, optimise_pose
+from slam.results import TrackingStatus
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Search windows in pixels and the numbers of inliers that make a status.
+
+    The first search looks only for the landmarks of the last frame around their predicted
+    places, ``wide_radius_px`` where that fails; the second looks for the whole local map.
+    """
+
+    search_radius_px: float = 20.0
+    wide_radius_px: float = 60.0
+    local_radius_px: float = 6.0
+    min_inliers: int = 30
+    weak_inliers: int = 15
+    max_view_angle_deg: float = 60.0
+    match: MatchConfig = field(default_factory=MatchConfig)
+    pose: PoseOptimisationConfig = field(default_factory=PoseOptimisationConfig)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame against the map.
+
+    Attributes:
+        status: LOST means that the pose must not be used.
+        T_world_camera: (4, 4).
+        keypoints, landmark_ids: (M,) inlier matches.
+        matches: number of matches before the robust estimate.
+        visible_ids: landmarks that should be in view.
+        information: (6, 6) of the pose.
+    """
+
+    status: TrackingStatus
+    T_world_camera: Array
+    keypoints: Ints
+    landmark_ids: Ints
+    matches: int
+    visible_ids: Ints
+    information: Array
+
+
+class Tracker:
+    """Holds the camera and the gates; the map is the caller's."""
+
+    def __init__(self, camera: Camera, config: TrackingConfig):
+        self.camera = camera
+        self.config = config
+
+    def track(
+        self,
+        features: Features,
+        T_predicted: Array,
+        recent_ids: Ints,
+        local_ids: Ints,
+        landmarks: LandmarkTable,
+    ) -> Tracked:
+        """The frame's pose from landmarks seen a moment ago, then from the whole local map."""
+        index = WindowIndex(features.pixels)
+        estimate = self._first_estimate(features, index, T_predicted, recent_ids, landmarks)
+        if estimate is None:
+            return lost(T_predicted)
+        return self.refine(features, index, estimate.T_world_camera, local_ids, landmarks)
+
+    def refine(
+        self,
+        features: Features,
+        index: WindowIndex,
+        T_world_camera: Array,
+        local_ids: Ints,
+        landmarks: LandmarkTable,
+    ) -> Tracked:
+        """The pose from all landmarks of the local map, given a good first one."""
+        radius = self.config.local_radius_px
+        visible, matches = self.search(features, index, T_world_camera, local_ids, radius, landmarks)
+        estimate = self._optimise(features, matches, visible, T_world_camera, landmarks)
+        inliers = int(estimate.inliers.sum())
+        good = estimate.ok and inliers >= self.config.weak_inliers
+        if not good:
+            return lost(T_world_camera, len(matches))
+        status = TrackingStatus.OK if inliers >= self.config.min_inliers else TrackingStatus.WEAK
+        kept = matches[estimate.inliers]
+        return Tracked(
+            status=status,
+            T_world_camera=estimate.T_world_camera,
+            keypoints=kept.train,
+            landmark_ids=visible[kept.query],
+            matches=len(matches),
+            visible_ids=visible,
+            information=estimate.information,
+        )
+
+    def search(
+        self,
+        features: Features,
+        index: WindowIndex,
+        T_world_camera: Array,
+        ids: Ints,
+        radius_px: float,
+        landmarks: LandmarkTable,
+    ) -> tuple[Ints, Matches]:
+        """Landmarks in view and their matches (query: position among those, train: keypoint).
+
+        A landmark is in view if it projects into the image, and is seen from within
+        ``max_view_angle_deg`` of the direction it was last seen from. The window grows with the
+        keypoint's scale; a keypoint of another scale than predicted is no candidate.
+        """
+        camera = self.camera
+        points_camera = transform(inverse(T_world_camera), landmarks.points_world[ids])
+        front = points_camera[:, 2] > 0.1
+        ids, points_camera = ids[front], points_camera[front]
+        pixels = camera.project(points_camera)
+        towards = T_world_camera[:3, 3] - landmarks.points_world[ids]
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        cosine = np.einsum("ij,ij->i", towards, landmarks.directions[ids])
+        inside = (
+            (pixels[:, 0] > 0)
+            & (pixels[:, 0] < camera.width - 1)
+            & (pixels[:, 1] > 0)
+            & (pixels[:, 1] < camera.height - 1)
+            & (cosine > np.cos(np.deg2rad(self.config.max_view_angle_deg)))
+        )
+        ids, pixels = ids[inside], pixels[inside]
+        scale = np.maximum(landmarks.extent[ids] / points_camera[inside, 2], 1.0)
+        query, train = index.pairs(pixels, radius_px * np.minimum(np.sqrt(scale), 3.0))
+        ratio = features.scales[train] / scale[query]
+        limit = self.config.match.max_scale_ratio
+        fits = (ratio < limit) & (ratio > 1 / limit)
+        pairs = (query[fits], train[fits])
+        tables = (landmarks.descriptors[ids], features.descriptors)
+        return ids, match_pairs(pairs, tables, self.config.match)
+
+    def _first_estimate(
+        self,
+        features: Features,
+        index: WindowIndex,
+        T_predicted: Array,
+        recent_ids: Ints,
+        landmarks: LandmarkTable,
+    ) -> PoseEstimate | None:
+        for radius in (self.config.search_radius_px, self.config.wide_radius_px):
+            visible, matches = self.search(
+                features, index, T_predicted, recent_ids, radius, landmarks
+            )
+            estimate = self._optimise(features, matches, visible, T_predicted, landmarks)
+            if estimate.ok and estimate.inliers.sum() >= self.config.weak_inliers:
+                return estimate
+        return None
+
+    def _optimise(
+        self,
+        features: Features,
+        matches: Matches,
+        ids: Ints,
+        T_world_camera: Array,
+        landmarks: LandmarkTable,
+    ) -> PoseEstimate:
+        return optimise_pose(
+            T_world_camera,
+            landmarks.points_world[ids[matches.query]],
+            features.measurements[matches.train],
+            features.sigmas_px[matches.train],
+            self.camera,
+            self.config.pose,
+        )
+
+
+def lost(T_world_camera: Array, matches: int = 0) -> Tracked:
+    """The outcome of a frame without a pose."""
+    none = np.zeros(0, np.int64)
+    return Tracked(
+        TrackingStatus.LOST, T_world_camera, none, none, matches, none, np.zeros((6, 6))
+    )

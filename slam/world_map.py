@@ -1,0 +1,113 @@
+"""The map that the front end tracks against: keyframes, landmarks and who sees what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graph.geometry import Array
+from slam.features import Features
+from slam.landmarks import Ints, LandmarkTable
+
+
+@dataclass
+class Keyframe:
+    """A frame that stays in the map.
+
+    Attributes:
+        id: position among all keyframes ever made, from 0.
+        frame_index, timestamp_s: of the frame it was.
+        segment: map segment it belongs to.
+        T_world_camera: (4, 4), replaced whenever the graph was optimised.
+        features: its keypoints.
+        landmark_ids: (N,) landmark of every keypoint, -1 for none.
+    """
+
+    id: int
+    frame_index: int
+    timestamp_s: float
+    segment: int
+    T_world_camera: Array
+    features: Features
+    landmark_ids: Ints
+
+
+@dataclass
+class WorldMap:
+    """Keyframes by id, in the order they were made, and the landmark table."""
+
+    keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    landmarks: LandmarkTable = field(default_factory=LandmarkTable)
+    next_keyframe_id: int = 0
+
+    def observed(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
+        """Keypoint indices and ids of the living landmarks that a keyframe observes."""
+        keypoints = np.flatnonzero(keyframe.landmark_ids >= 0)
+        keypoints = keypoints[self.landmarks.alive[keyframe.landmark_ids[keypoints]]]
+        return keypoints, keyframe.landmark_ids[keypoints]
+
+    def attach(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:
+        """Record that keypoints (N,) of a keyframe observe landmarks (N,), and refresh these."""
+        landmarks, features = self.landmarks, keyframe.features
+        keyframe.landmark_ids[keypoints] = landmark_ids
+        landmarks.observations[landmark_ids] += 1
+        newest = landmarks.last_keyframe[landmark_ids] <= keyframe.id
+        ids, rows = landmark_ids[newest], keypoints[newest]
+        landmarks.last_keyframe[ids] = keyframe.id
+        landmarks.descriptors[ids] = features.descriptors[rows]
+        towards = keyframe.T_world_camera[:3, 3] - landmarks.points_world[ids]
+        landmarks.directions[ids] = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+        z = -towards @ keyframe.T_world_camera[:3, 2]
+        landmarks.extent[ids] = features.scales[rows] * np.maximum(z, 0.05)
+
+    def remove_keyframe(self, keyframe: Keyframe, heir: Keyframe) -> None:
+        """Take a keyframe out of the map; the landmarks it made follow the heir from now on."""
+        _, ids = self.observed(keyframe)
+        self.landmarks.observations[ids] -= 1
+        self.landmarks.host[self.landmarks.host == keyframe.id] = heir.id
+        del self.keyframes[keyframe.id]
+
+    def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
+        """(shared landmarks, keyframe), most shared first, of keyframes that share at least so many."""
+        seen = np.zeros(len(self.landmarks) + 1, bool)  # the last entry answers for id -1
+        seen[landmark_ids] = True
+        shared = [
+            (int(np.count_nonzero(seen[k.landmark_ids])), k) for k in self.keyframes.values()
+        ]
+        strong = [pair for pair in shared if pair[0] >= minimum]
+        return sorted(strong, key=lambda pair: (-pair[0], -pair[1].id))
+
+    def replace_landmarks(self, old_ids: Ints, new_ids: Ints) -> Ints:
+        """Fuse duplicates: every observation of old_ids[k] becomes one of new_ids[k].
+
+        Returns the ids that were removed. A keyframe that observes both keeps the new one's
+        keypoint, since one landmark has one place in an image.
+        """
+        remap = np.arange(len(self.landmarks) + 1)
+        remap[-1] = -1
+        remap[old_ids] = new_ids
+        involved = np.zeros(len(self.landmarks) + 1, bool)
+        involved[old_ids] = True
+        for keyframe in self.keyframes.values():
+            rows = np.flatnonzero(involved[keyframe.landmark_ids])
+            if len(rows) == 0:
+                continue
+            targets = remap[keyframe.landmark_ids[rows]]
+            taken = np.isin(targets, keyframe.landmark_ids)
+            _, first = np.unique(targets, return_index=True)
+            repeated = np.ones(len(targets), bool)
+            repeated[first] = False
+            keep = ~(taken | repeated)
+            keyframe.landmark_ids[rows[~keep]] = -1
+            self.attach(keyframe, rows[keep], targets[keep])
+        self.landmarks.found[new_ids] += self.landmarks.found[old_ids]
+        self.landmarks.visible[new_ids] += self.landmarks.visible[old_ids]
+        self.landmarks.remove(old_ids)
+        return old_ids
+
+    def poses(self) -> tuple[Ints, Array]:
+        """Ids (K,) and poses T_world_camera (K, 4, 4) of all keyframes, by id."""
+        ids = np.array(sorted(self.keyframes), np.int64)
+        poses = [self.keyframes[i].T_world_camera for i in ids]
+        return ids, np.array(poses).reshape(-1, 4, 4)
