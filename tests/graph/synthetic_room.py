@@ -72,7 +72,10 @@ def make_room(
         poses,
         points_world,
         Observations(
-            keyframe_ids, landmark_ids, measurements, np.full((len(measurements), 3), noise_px or 1)
+            keyframe_ids,
+            landmark_ids,
+            measurements,
+            np.full((len(measurements), 3), noise_px or 1.0),
         ),
         spoiled,
         points_world + rng.normal(0, 0.01, points_world.shape),
