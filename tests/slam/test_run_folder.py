@@ -1,0 +1,102 @@
+"""The run folder: what it refuses, what it leaves, and that files appear whole."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from graph.errors import InputError
+from slam.results import FrameResult, TrackingStatus
+from slam.run_folder import FILES, RunFolder, free_run_path
+
+RESULT = FrameResult(3, 0.1, TrackingStatus.OK, None, stage_ms={"tracking": 1.5})
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_folder_that_holds_a_run_is_refused_untouched(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("earlier")
+    with pytest.raises(InputError, match=f"already holds a run .{name}.; .* add --overwrite"):
+        RunFolder(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "earlier"
+
+
+def test_overwrite_removes_the_run_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "graph").mkdir()
+    (tmp_path / "graph/values").write_text("earlier")
+    (tmp_path / "metrics.json").write_text("earlier")
+    (tmp_path / "notes.txt").write_text("mine")
+    with RunFolder(tmp_path, overwrite=True):
+        pass
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["frames.csv", "log.txt", "notes.txt"]
+
+
+def test_a_file_in_the_way(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file: is a file; choose another folder with --out"):
+        RunFolder(tmp_path / "file")
+    with pytest.raises(InputError, match=r"run: cannot be written \(Not a directory\); choose"):
+        RunFolder(tmp_path / "file/run")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(InputError, match=r"cannot be written \(Permission denied\)"):
+        RunFolder(tmp_path / "run")
+
+
+def test_a_place_where_nobody_may_write() -> None:
+    with pytest.raises(InputError, match=r"/proc/run: cannot be written"):
+        RunFolder(Path("/proc/run"))
+
+
+def test_frames_are_on_disk_at_once(tmp_path: Path) -> None:
+    with RunFolder(tmp_path) as folder:
+        folder.write_frame(RESULT)
+        header, row = (tmp_path / "frames.csv").read_text().splitlines()
+        assert dict(zip(header.split(","), row.split(","), strict=True))["tracking_ms"] == "1.500"
+
+
+def test_an_unknown_stage_is_a_bug(tmp_path: Path) -> None:
+    result = FrameResult(3, 0.1, TrackingStatus.OK, None, stage_ms={"tea": 1.5})
+    with RunFolder(tmp_path) as folder, pytest.raises(ValueError, match="tea_ms"):
+        folder.write_frame(result)
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    with RunFolder(tmp_path) as folder:
+        folder.write_text("metrics.json", "old")
+        with pytest.raises(ZeroDivisionError), folder.replacing("metrics.json") as temporary:
+            temporary.write_text("half")
+            raise ZeroDivisionError
+        assert (tmp_path / "metrics.json").read_text() == "old"
+        for content in ("a", "b"):
+            with folder.replacing("graph") as temporary:
+                temporary.mkdir()
+                (temporary / content).write_text("")
+        assert [p.name for p in (tmp_path / "graph").iterdir()] == ["b"]
+    assert [p.name for p in tmp_path.glob(".*")] == []
+
+
+def test_an_input_error_after_frames_keeps_them(tmp_path: Path) -> None:
+    with pytest.raises(InputError), RunFolder(tmp_path / "run") as folder:
+        folder.write_frame(RESULT)
+        raise InputError("broken")
+    assert "stopped: broken" in (tmp_path / "run/log.txt").read_text()
+
+
+def test_an_input_error_before_frames_keeps_foreign_files(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError), RunFolder(tmp_path):
+        raise InputError("broken")
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_free_paths_are_numbered(tmp_path: Path) -> None:
+    assert free_run_path("a", tmp_path) == tmp_path / "a"
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a-2").write_text("")
+    assert free_run_path("a", tmp_path) == tmp_path / "a-3"
