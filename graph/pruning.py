@@ -21,7 +21,7 @@ from graph.geometry import inverse
 from graph.shadow import NO_SLOT, Shadow, ids_array
 from graph.smoother_config import SmootherConfig
 from graph.support import constrained_landmarks, diagonal_covariance
-from graph.updates import GraphUpdate, IntArray, PosePrior, RelativePose
+from graph.updates import GraphUpdate, IntArray, Observations, PosePrior, RelativePose
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,15 @@ def remove(update: GraphUpdate, shadow: Shadow, config: SmootherConfig) -> Remov
     dropped = _left_underconstrained(rows, landmarks, shadow, config)
     rows = np.union1d(rows, shadow.observations.rows_of_landmarks(dropped.tolist()))
     touched = _touched_keyframes(rows, numbers, shadow) - keyframes
-    neighbours = {k: _best_neighbour(k, keyframes, shadow) for k in sorted(touched)}
+    gone = shadow.observations.select(rows)
+    edges = [shadow.pose_factors[number].keyframes for number in numbers]
     slots = _take_out(rows, numbers, shadow)
     shadow.landmarks.remove(ids_array([*landmarks, *dropped.tolist()]))
     shadow.keyframes.remove(ids_array(keyframes))
-    added = _bridge(neighbours, shadow, config)
+    loose = [k for k in sorted(touched) if not _is_supported(k, shadow, config)]
+    bridges = [_bridge_to_best(k, gone, edges, shadow, config) for k in loose]
+    added = shadow.add_pose_factors([edge for edge in bridges if edge is not None])
+    added += anchor_components(shadow, config)
     return Removal(slots, dropped, added, keyframes_held_by(added, shadow))
 
 
@@ -147,20 +151,28 @@ def _touched_keyframes(rows: IntArray, numbers: list[int], shadow: Shadow) -> se
     return touched
 
 
-def _best_neighbour(keyframe: int, leaving: set[int], shadow: Shadow) -> int | None:
-    """The staying keyframe that shares most with this one, the nearest id among equals."""
-    shared: Counter[int] = Counter()
-    for landmark in shadow.observations.of_keyframe.get(keyframe, {}):
-        shared.update(shadow.observations.of_landmark[landmark].keys())
-    for number in shadow.numbers_of_keyframes([keyframe]):
-        shared.update(shadow.pose_factors[number].keyframes)
-    candidates = [k for k in shared if k != keyframe and k not in leaving]
-    if not candidates:
-        staying = shadow.keyframes.ids.tolist()
-        candidates = [k for k in staying if k != keyframe and k not in leaving]
-    if not candidates:
+def _bridge_to_best(
+    keyframe: int,
+    gone: Observations,
+    edges: list[tuple[int, ...]],
+    shadow: Shadow,
+    config: SmootherConfig,
+) -> RelativePose | None:
+    """A bridge to the keyframe that shared most with this one before the removal.
+
+    ``gone`` and ``edges`` are what the removal took. Without any, the nearest id is taken.
+    """
+    shared: Counter[int] = Counter(k for edge in edges if keyframe in edge for k in edge)
+    lost = gone.landmark_ids[gone.keyframe_ids == keyframe]
+    kept = shadow.observations.of_keyframe.get(keyframe, {})
+    for landmark in {*lost.tolist(), *kept}:
+        shared.update(shadow.observations.of_landmark.get(landmark, {}).keys())
+    shared.update(gone.keyframe_ids[np.isin(gone.landmark_ids, lost)].tolist())
+    others = [k for k in shadow.keyframes.ids.tolist() if k != keyframe]
+    if not others:
         return None
-    return min(candidates, key=lambda k: (-shared[k], abs(k - keyframe), k))
+    best = min(others, key=lambda k: (-shared[k], abs(k - keyframe), k))
+    return bridge(best, keyframe, shadow, config)
 
 
 def _take_out(rows: IntArray, numbers: list[int], shadow: Shadow) -> list[int]:
@@ -171,24 +183,15 @@ def _take_out(rows: IntArray, numbers: list[int], shadow: Shadow) -> list[int]:
     return sorted(slot for slot in slots if slot != NO_SLOT)
 
 
-def _bridge(neighbours: dict[int, int | None], shadow: Shadow, config: SmootherConfig) -> list[int]:
-    """Tie the touched keyframes that lack support, then fix parts without a prior."""
-    bridges = [
-        bridge(neighbour, keyframe, shadow, config)
-        for keyframe, neighbour in neighbours.items()
-        if neighbour is not None and not _is_supported(keyframe, shadow, config)
-    ]
-    added = shadow.add_pose_factors(bridges)
-    return added + anchor_components(shadow, config)
-
-
 def _is_supported(keyframe: int, shadow: Shadow, config: SmootherConfig) -> bool:
     if shadow.pose_factors_of.get(keyframe):
         return True
-    table = shadow.observations
-    seen = table.of_keyframe.get(keyframe, {})
-    shared = sum(len(table.of_landmark[landmark]) > 1 for landmark in seen)
-    return shared >= config.min_shared_observations
+    table, shared = shadow.observations, 0
+    for landmark in table.of_keyframe.get(keyframe, {}):
+        shared += len(table.of_landmark[landmark]) > 1
+        if shared >= config.min_shared_observations:
+            return True
+    return False
 
 
 def keyframes_held_by(numbers: list[int], shadow: Shadow) -> IntArray:
@@ -199,7 +202,7 @@ def keyframes_held_by(numbers: list[int], shadow: Shadow) -> IntArray:
 def _component_labels(shadow: Shadow) -> IntArray:
     """The number (K,) of the connected part that each keyframe is in."""
     ids, landmark_ids = shadow.keyframes.ids, shadow.landmarks.ids
-    seen = shadow.observations.select(shadow.observations.all_rows())
+    seen = shadow.observations.select(shadow.observations.used_rows())
     edges = [f.keyframes for f in shadow.pose_factors.values() if not f.is_prior]
     pairs = np.array(edges, np.int64).reshape(-1, 2)
     starts = np.concatenate([seen.keyframe_ids, pairs[:, 0]])

@@ -127,11 +127,15 @@ class ObservationTable:
         """Remember the places of these rows' factors in ISAM2."""
         self._slots[rows] = slots
 
-    def all_rows(self) -> IntArray:
-        """Every row in use, ordered by keyframe, then landmark: the same for equal contents."""
+    def used_rows(self) -> IntArray:
+        """Every row in use, in no order that means anything."""
         used = np.ones(self._used, bool)
         used[self._free] = False
-        rows = np.flatnonzero(used)
+        return np.flatnonzero(used)
+
+    def all_rows(self) -> IntArray:
+        """Every row in use, ordered by keyframe, then landmark: the same for equal contents."""
+        rows = self.used_rows()
         columns = self._columns.select(rows)
         return rows[np.lexsort((columns.landmark_ids, columns.keyframe_ids))]
 
