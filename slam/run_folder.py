@@ -19,10 +19,12 @@ and renamed, so that a killed run leaves whole files.
 from __future__ import annotations
 
 import csv
+import errno
 import itertools
 import logging
 import os
 import shutil
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -44,6 +46,7 @@ FILES = (
     "trajectory.png",
     "log.txt",
 )
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("graph", "semantics", "mapping", "slam")
 COLUMNS = (
     *("index", "timestamp", "status", "segment", "matches", "inliers"),
@@ -56,6 +59,14 @@ def free_run_path(stem: str, root: Path = Path("runs")) -> Path:
     """``root/stem``, or with -2, -3, ... the first that does not exist yet."""
     names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
     return next(root / name for name in names if not os.path.lexists(root / name))
+
+
+class _LogFile(logging.FileHandler):
+    """A log whose own failure is quiet: a full disk is met, and told, by whoever writes data."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handleError(record)
 
 
 class RunFolder:
@@ -79,7 +90,7 @@ class RunFolder:
             )
         try:
             _remove(path, held)
-            self._log = logging.FileHandler(path / "log.txt", mode="x", encoding="utf-8")
+            self._log = _LogFile(path / "log.txt", mode="x", encoding="utf-8")
             self._frames = (path / "frames.csv").open("x", encoding="utf-8", newline="")
         except OSError as error:
             _remove_empty(self._made)
@@ -120,6 +131,10 @@ class RunFolder:
         if isinstance(error, InputError) and not self._written:
             _remove(self.path, FILES)
             _remove_empty(self._made)
+        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+            raise InputError(
+                f"{self.path}: {error.strerror}; free some space, what was written before is kept"
+            ) from error
 
     def write_frame(self, result: FrameResult) -> None:
         """Append a frame to frames.csv, at once on disk.

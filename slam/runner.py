@@ -179,7 +179,12 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
     packages = ("gtsam", "numpy", "opencv-python-headless")
     versions = ", ".join(f"{package} {version(package)}" for package in packages)
     logger.info("%s, Python %s, %s", platform.platform(), platform.python_version(), versions)
-    logger.info("camera %s: %s", sequence.camera_source, sequence.camera)
+    logger.info("camera from %s: %s", sequence.camera_source, sequence.camera)
+    pairs = sequence.pairs
+    unpaired = f"{pairs.unpaired_rgb} colour and {pairs.unpaired_depth} depth images"
+    logger.info("%d frames; %s without a partner", len(sequence), unpaired)
+    for index, reason in sequence.skipped:  # found while opening, before there was a log
+        logger.info("frame %d is broken: %s", index, reason)
 
 
 def track(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import logging
 import os
@@ -134,6 +135,17 @@ def test_a_broken_frame_is_skipped_and_counts_as_untracked(sequence: Path, out: 
     assert "frame 4 skipped" in (out / "log.txt").read_text()
 
 
+def test_what_was_found_while_opening_is_in_the_log(sequence: Path, out: Path) -> None:
+    (sequence / "rgb/4.png").unlink()
+    with (sequence / "rgb.txt").open("a") as file:
+        file.write("77.0 rgb/1.png\n")
+    fake_run(sequence, out)
+    log = (out / "log.txt").read_text()
+    assert "frame 4 is broken" in log
+    assert "1 colour and 0 depth images without a partner" in log
+    assert "camera.yaml: Camera(width=32" in log
+
+
 def test_another_reference(sequence: Path, out: Path, tmp_path: Path) -> None:
     truth = true_trajectory(20)
     poses = truth.poses_world_camera.copy()
@@ -240,6 +252,16 @@ def test_a_bug_is_in_the_log_with_its_traceback(sequence: Path, out: Path) -> No
     assert "Traceback" in (out / "log.txt").read_text()
     assert logging.getLogger("slam").level == level
     assert logging.getLogger("slam").handlers == []
+
+
+def test_a_full_disk_is_said_and_keeps_what_was_written(sequence: Path, out: Path) -> None:
+    class Full(FakeSystem):
+        def save_graph(self, folder: Path) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(InputError, match=r"out: No space left on device; free some space"):
+        run(RunOptions(sequence, out=out, quiet=True), Full)
+    assert len(read_tum(out / "trajectory.txt")) == 18
 
 
 def test_run_folders_are_numbered(sequence: Path, tmp_path: Path, monkeypatch) -> None:
