@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -109,18 +111,31 @@ class Smoother:
         try:
             self._solver.update(self._shadow, change)
         except SolverError as failure:
-            self._recover(failure, admitted, change, report)
+            ids = admitted.keyframe_ids
+            if not self._recover(failure, ids, report, self._solver.rebuild):
+                self._retract(admitted, change, report)
         return self._estimate(report, started_s)
 
     def optimise_batch(self, max_iterations: int = 100) -> GraphEstimate:
         """Full bundle adjustment (Levenberg-Marquardt, with the kernels) of the whole graph.
 
-        ISAM2 is thrown away and made anew from the result if another update comes.
+        ISAM2 is thrown away and made anew from the result if another update comes. A failure
+        is repaired as in an update; if it cannot be, the values stay and the costs are NaN.
         """
         started_s = time.perf_counter()
         self._solver.elapsed_s = 0.0
-        before, after = self._solver.optimise_batch(self._shadow, max_iterations)
-        estimate = self._estimate(_Report(), started_s)
+        report, costs = _Report(), [(math.nan, math.nan)]
+
+        def solve(shadow: Shadow) -> None:
+            costs.append(self._solver.optimise_batch(shadow, max_iterations))
+
+        try:
+            solve(self._shadow)
+        except SolverError as failure:
+            if not self._recover(failure, ids_array([]), report, solve):
+                logger.error("batch optimisation failed; the values stay as they were")
+        before, after = costs[-1]
+        estimate = self._estimate(report, started_s)
         return dataclasses.replace(estimate, cost_before=before, cost_after=after)
 
     def estimate(self) -> GraphEstimate:
@@ -205,32 +220,31 @@ class Smoother:
         )
 
     def _recover(
-        self, failure: SolverError, admitted: Admitted, change: Change, report: _Report
-    ) -> None:
-        """Repair the shadow and rebuild until ISAM2 solves; else give the update up.
+        self,
+        failure: SolverError,
+        new_keyframes: IntArray,
+        report: _Report,
+        solve: Callable[[Shadow], None],
+    ) -> bool:
+        """Repair the shadow and solve anew until it works; whether it did.
 
         The first attempt drops only what is visibly loose, later ones the named variable too.
         """
         report.rebuilt = True
         for attempt in range(self._config.max_recoveries):
             report.failed = failure.variable or report.failed
-            logger.warning("ISAM2 failed near %s; rebuilding", report.failed_variable)
-            done = repair(
-                failure.variable if attempt else None,
-                admitted.keyframe_ids,
-                self._shadow,
-                self._camera,
-                self._config,
-            )
+            logger.warning("GTSAM failed near %s (%s)", report.failed_variable or "?", failure)
+            named = failure.variable if attempt else None
+            done = repair(named, new_keyframes, self._shadow, self._camera, self._config)
             report.add_repair(done)
             try:
-                self._solver.rebuild(self._shadow)
-                return
+                solve(self._shadow)
+                return True
             except SolverError as again:
                 failure = again
                 if attempt and not done.changed:
                     break
-        self._retract(admitted, change, report)
+        return False
 
     def _retract(self, admitted: Admitted, change: Change, report: _Report) -> None:
         """Take the whole update out again, refused as SOLVER_FAILED."""

@@ -99,6 +99,8 @@ class Solver:
             after = graph.error(values)
         except RuntimeError as error:
             raise self._failure(error) from error
+        if not np.isfinite(after):
+            raise SolverError(f"the cost is {after}", None)
         poses, points = read_values(values)
         self.elapsed_s += time.perf_counter() - started_s
         self._check_finite(shadow, poses, points)
@@ -174,7 +176,8 @@ class Solver:
 
     def _failure(self, error: RuntimeError) -> SolverError:
         self._isam = None
-        return SolverError(str(error).strip(), variable_named_in(str(error)))
+        first_line = str(error).strip().split("\n\n")[0].replace("\n", " ")
+        return SolverError(first_line, variable_named_in(str(error)))
 
     def _check_finite(self, shadow: Shadow, poses: Array, points: Array) -> None:
         for name, ids, values in (

@@ -3,6 +3,8 @@
 import json
 import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -151,3 +153,11 @@ def test_updates_and_estimates_cross_a_process_border() -> None:
     smoother = Smoother(CAMERA)
     estimate = smoother.update(ROOM.update_of(0))
     assert pickle.loads(pickle.dumps(estimate)).factors == estimate.factors
+
+
+def test_what_the_front_end_needs_imports_without_gtsam() -> None:
+    """Updates are made, checked and saved in numpy; another process need not load GTSAM."""
+    modules = "updates, shadow, gates, admission, support, pruning, storage, smoother_config"
+    code = f"import sys; from graph import {modules}; sys.exit('gtsam' in sys.modules)"
+    root = Path(__file__).resolve().parents[2]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0

@@ -14,6 +14,7 @@ from graph.geometry import Array, inverse, se3_exp, se3_log, transform
 from graph.recovery import Repair
 from graph.shadow import Shadow
 from graph.smoother import Smoother, SmootherConfig
+from graph.solver import SolverError
 from graph.updates import (
     GraphEstimate,
     GraphUpdate,
@@ -181,3 +182,30 @@ def test_an_update_that_cannot_be_repaired_is_taken_out_whole(
     np.testing.assert_array_equal(estimate.keyframe_ids, before.keyframe_ids)
     np.testing.assert_array_equal(estimate.landmark_ids, before.landmark_ids)
     assert_goes_on(smoother, estimate)
+
+
+def test_a_batch_optimisation_is_repaired_too(smoother: Smoother) -> None:
+    expected = smoother.optimise_batch()
+    row = 40
+    seen = smoother._shadow.observations.select(np.array([row]))
+    seen.measurements[0, 0] = np.nan
+    smoother._shadow.observations.remove(np.array([row]))
+    smoother._shadow.observations.add(seen)
+    found = smoother.optimise_batch()
+    assert found.rebuilt
+    assert found.factors == expected.factors - 1
+    assert np.isfinite(found.cost_after)
+    np.testing.assert_allclose(found.poses_world_camera, expected.poses_world_camera, atol=2e-3)
+
+
+def test_a_batch_optimisation_that_fails_leaves_the_values(
+    smoother: Smoother, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise SolverError("planted", None)
+
+    before = smoother.estimate()
+    monkeypatch.setattr(smoother._solver, "optimise_batch", fail)
+    after = smoother.optimise_batch()
+    assert np.isnan(after.cost_after)
+    np.testing.assert_array_equal(after.points_world, before.points_world)
