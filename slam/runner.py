@@ -13,51 +13,28 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
+from typing import Any
 
 from graph.camera import Camera
 from graph.errors import InputError
-from graph.ply import write_ply
 from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps, read_tum
 from slam import __version__
 from slam.configuration import dump
-from slam.evaluation import Row, evaluate_trajectory, format_json
-from slam.evaluation.plot import plot_trajectory
+from slam.evaluation import Row
 from slam.frame import Frame
-from slam.memory import peak_rss_mb
 from slam.progress import Progress
-from slam.results import FrameResult, TrackingStatus
 from slam.run_folder import RunFolder, free_run_path
+from slam.run_results import Tally, measure, save
 from slam.sequences import Sequence, open_sequence
 from slam.stop import StopRequest
-from slam.system import LandmarkCloud, SlamSystem, SystemConfig
+from slam.system import SlamSystem, SystemConfig
+from slam.system_interface import System
 
 logger = logging.getLogger(__name__)
 
 SNAPSHOT_FRAMES = 30
 SNAPSHOT_GROWTH = 1.05
-EVALUATION_ROWS = (
-    "ate_rmse",
-    "rpe_trans_rmse_frame",
-    "rpe_trans_rmse_second",
-    "rpe_rot_rmse_second",
-)
 MIN_REFERENCE_POSES = 3
-
-
-class System(Protocol):
-    """What a run asks of a SLAM system; ``slam.system.SlamSystem`` is the real one."""
-
-    def prepare(self, frame: Frame) -> Any: ...
-    def process(self, frame: Frame, features: Any = None) -> FrameResult: ...
-    def finish(self) -> None: ...
-    def trajectory(self) -> Trajectory: ...
-    def keyframe_trajectory(self) -> Trajectory: ...
-    def landmarks(self) -> LandmarkCloud: ...
-    def save_graph(self, folder: Path) -> None: ...
-    def statistics(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)
@@ -111,16 +88,6 @@ class RunSummary:
     frames: int
     skipped: int
     stopped_by: signal.Signals | None = None
-
-
-@dataclass
-class Tally:
-    """What is counted while frames go by."""
-
-    tracking_ms: list[float] = field(default_factory=list)
-    lost: int = 0
-    next_index: int = 0
-    wall_s: float = 0.0
 
 
 def run(
@@ -206,7 +173,7 @@ def track(
             result = system.process(frame, features)
             result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
             folder.write_frame(result)
-            _count(tally, result)
+            tally.count(result)
             bar.update(result)
             snapshot(len(tally.tracking_ms))
             if stop.signal is not None:
@@ -250,66 +217,3 @@ def _timed(prepare: Callable[[Frame], Any]) -> Callable[[Frame], tuple[Any, floa
         return features, 1e3 * (time.perf_counter() - start_s)
 
     return timed
-
-
-def _count(tally: Tally, result: FrameResult) -> None:
-    stages = result.stage_ms
-    tally.tracking_ms.append(stages["features"] + stages.get("tracking", 0.0))
-    tally.lost += result.status is TrackingStatus.LOST
-    tally.next_index = result.index + 1
-
-
-def measure(system: System, reference: Trajectory | None, tally: Tally, stride: int) -> list[Row]:
-    """The rows of metrics.json; errors only where there is a reference that covers the run."""
-    trajectory, statistics = system.trajectory(), system.statistics()
-    given = len(range(0, tally.next_index, stride))
-    rows = [_row("tracked_share", len(trajectory) / max(given, 1), "1")]
-    if reference is not None:
-        try:
-            errors = evaluate_trajectory(trajectory, reference).rows
-            rows += [row for row in errors if row["name"] in EVALUATION_ROWS]
-        except InputError as error:
-            logger.warning("no comparison with the reference: %s", error)
-    rows += _percentiles("tracking_ms", tally.tracking_ms)
-    rows.append(_row("frames_per_second", len(tally.tracking_ms) / tally.wall_s, "Hz"))
-    rows.append(_row("keyframes", int(statistics["keyframes"]), "keyframes"))
-    rows.append(_row("landmarks", int(statistics["landmarks"]), "landmarks"))
-    rows += _percentiles("isam2_update_ms", statistics["isam2_update_ms"])
-    rows.append(_row("peak_rss_mb", peak_rss_mb(), "MB"))
-    return rows
-
-
-def _row(name: str, value: float, unit: str) -> Row:
-    return {"name": name, "value": value, "unit": unit}
-
-
-def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
-    """Median and 95th percentile; nothing of nothing."""
-    if not values_ms:
-        return []
-    median, high = np.percentile(values_ms, (50, 95))
-    return [_row(f"{name}_median", float(median), "ms"), _row(f"{name}_p95", float(high), "ms")]
-
-
-def save(
-    system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
-) -> None:
-    """Write everything that is known only at the end."""
-    trajectory = system.trajectory()
-    folder.write_trajectory(trajectory)
-    folder.write_trajectory(system.keyframe_trajectory(), "keyframes.txt")
-    write_landmarks(folder.path / "landmarks.ply", system.landmarks())
-    with folder.replacing("graph") as graph:
-        system.save_graph(graph)
-    folder.write_text("metrics.json", format_json(rows))
-    plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title)
-
-
-def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:
-    """Landmarks as PLY: position in the world in metres, colour, number of keyframes, id."""
-    x, y, z = cloud.points_world.T.astype(np.float32)
-    red, green, blue = cloud.colours.T.astype(np.uint8)
-    columns = {"x": x, "y": y, "z": z, "red": red, "green": green, "blue": blue}
-    columns["observations"] = cloud.observations.astype(np.int32)
-    columns["id"] = cloud.ids.astype(np.int32)
-    write_ply(path, columns, "bmask-slam landmarks, world frame, metres")

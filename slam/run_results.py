@@ -1,0 +1,105 @@
+"""What is known at the end of a run: its metrics and the files of the result."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from graph.errors import InputError
+from graph.ply import write_ply
+from graph.trajectory import Trajectory
+from slam.evaluation import Row, evaluate_trajectory, format_json
+from slam.evaluation.plot import plot_trajectory
+from slam.memory import peak_rss_mb
+from slam.run_folder import RunFolder
+from slam.system import LandmarkCloud
+from slam.system_interface import System
+
+logger = logging.getLogger(__name__)
+
+EVALUATION_ROWS = (
+    "ate_rmse",
+    "rpe_trans_rmse_frame",
+    "rpe_trans_rmse_second",
+    "rpe_rot_rmse_second",
+)
+
+
+@dataclass
+class Tally:
+    """What is counted while frames go by.
+
+    Attributes:
+        tracking_ms: of each frame, features and tracking; what a keyframe adds is not in it.
+        next_index: the first index of the sequence that was not reached.
+        wall_s: time of the whole loop.
+    """
+
+    tracking_ms: list[float] = field(default_factory=list)
+    next_index: int = 0
+    wall_s: float = 0.0
+
+    def count(self, result: FrameResult) -> None:
+        """Count a frame."""
+        stages = result.stage_ms
+        self.tracking_ms.append(stages["features"] + stages.get("tracking", 0.0))
+        self.next_index = result.index + 1
+
+
+def measure(system: System, reference: Trajectory | None, tally: Tally, stride: int) -> list[Row]:
+    """The rows of metrics.json; errors only where there is a reference that covers the run."""
+    trajectory, statistics = system.trajectory(), system.statistics()
+    given = len(range(0, tally.next_index, stride))
+    rows = [_row("tracked_share", len(trajectory) / max(given, 1), "1")]
+    if reference is not None:
+        try:
+            errors = evaluate_trajectory(trajectory, reference).rows
+            rows += [row for row in errors if row["name"] in EVALUATION_ROWS]
+        except InputError as error:
+            logger.warning("no comparison with the reference: %s", error)
+    rows += _percentiles("tracking_ms", tally.tracking_ms)
+    rows.append(_row("frames_per_second", len(tally.tracking_ms) / tally.wall_s, "Hz"))
+    rows.append(_row("keyframes", int(statistics["keyframes"]), "keyframes"))
+    rows.append(_row("landmarks", int(statistics["landmarks"]), "landmarks"))
+    rows += _percentiles("isam2_update_ms", statistics["isam2_update_ms"])
+    rows.append(_row("peak_rss_mb", peak_rss_mb(), "MB"))
+    return rows
+
+
+def _row(name: str, value: float, unit: str) -> Row:
+    return {"name": name, "value": value, "unit": unit}
+
+
+def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
+    """Median and 95th percentile; nothing of nothing."""
+    if not values_ms:
+        return []
+    median, high = np.percentile(values_ms, (50, 95))
+    return [_row(f"{name}_median", float(median), "ms"), _row(f"{name}_p95", float(high), "ms")]
+
+
+def save(
+    system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
+) -> None:
+    """Write everything that is known only at the end."""
+    trajectory = system.trajectory()
+    folder.write_trajectory(trajectory)
+    folder.write_trajectory(system.keyframe_trajectory(), "keyframes.txt")
+    write_landmarks(folder.path / "landmarks.ply", system.landmarks())
+    with folder.replacing("graph") as graph:
+        system.save_graph(graph)
+    folder.write_text("metrics.json", format_json(rows))
+    plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title)
+
+
+def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:
+    """Landmarks as PLY: position in the world in metres, colour, number of keyframes, id."""
+    x, y, z = cloud.points_world.T.astype(np.float32)
+    red, green, blue = cloud.colours.T.astype(np.uint8)
+    columns = {"x": x, "y": y, "z": z, "red": red, "green": green, "blue": blue}
+    columns["observations"] = cloud.observations.astype(np.int32)
+    columns["id"] = cloud.ids.astype(np.int32)
+    write_ply(path, columns, "bmask-slam landmarks, world frame, metres")
