@@ -14,6 +14,7 @@ from graph.trajectory import Trajectory
 from slam.evaluation import Row, evaluate_trajectory, format_json
 from slam.evaluation.plot import plot_trajectory
 from slam.memory import peak_rss_mb
+from slam.results import FrameResult
 from slam.run_folder import RunFolder
 from slam.system import LandmarkCloud
 from slam.system_interface import System
