@@ -86,6 +86,23 @@ def test_a_landmark_behind_the_camera_is_dropped(smoother: Smoother) -> None:
     assert_goes_on(smoother, estimate)
 
 
+def test_many_bad_landmarks_go_at_once(smoother: Smoother) -> None:
+    """More than could be dropped one by one as GTSAM names them."""
+    count = 3 * SmootherConfig().max_recoveries
+    behind = np.column_stack([np.linspace(-1, 1, count), np.zeros(count), np.full(count, -2.0)])
+    ids = np.arange(900, 900 + count)
+    z = np.tile([330.0, 240.0, 315.0], (count, 1))
+    estimate = smoother.update(
+        GraphUpdate(
+            landmark_ids=ids,
+            points_world=transform(smoother.estimate().poses_world_camera[4], behind),
+            observations=observe(4, ids.tolist(), z),
+        )
+    )
+    assert estimate.dropped_landmarks.tolist() == ids.tolist()
+    assert_goes_on(smoother, estimate)
+
+
 def test_a_landmark_with_one_monocular_view_is_dropped(smoother: Smoother) -> None:
     point = transform(smoother.estimate().poses_world_camera[4], np.array([[0.1, 0.1, 2.0]]))
     estimate = smoother.update(
