@@ -60,7 +60,7 @@ def _mip_levels(texture: Image) -> list[Image]:
     for _ in range(_LEVELS - 1):
         h, w = ((n + 1) // 2 for n in levels[-1].shape[:2])
         smaller = cv2.resize(levels[-1], (w, h), interpolation=cv2.INTER_AREA)
-        levels.append(smaller)
+        levels.append(np.asarray(smaller, np.uint8))
     return levels
 
 
@@ -75,5 +75,5 @@ def sample(atlas: Atlas, texture: NDArray[np.integer], uv: Floats, level: Floats
     n = len(where)
     lanes = np.zeros((-(-n // _LANE), _LANE, 2), np.float32)
     lanes.reshape(-1, 2)[:n] = where
-    colours = cv2.remap(atlas.image, lanes, None, cv2.INTER_LINEAR)
+    colours = cv2.remap(atlas.image, lanes[..., 0], lanes[..., 1], cv2.INTER_LINEAR)
     return colours.reshape(-1, 3)[:n].astype(np.float32)

@@ -42,7 +42,9 @@ class SceneBuilder:
     Instance ids count from 1 in order of creation; ``categories[id - 1]`` is the class name.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, detail: float = 1.0) -> None:
+        """``detail`` scales the number of texels per metre of everything."""
+        self._detail = detail
         self.rng = np.random.default_rng(seed)
         self.parts: list[Part] = []
         self.categories: list[str] = []
@@ -51,7 +53,7 @@ class SceneBuilder:
 
     @contextmanager
     def at(self, T_object: Array, category: str | None = None) -> Iterator[None]:
-        """Add things in a frame relative to the current one, as a new instance if it has a class."""
+        """Add things in a frame relative to the current one; with a class, as a new instance."""
         before = self._T_world_object, self._instance
         self._T_world_object = self._T_world_object @ T_object
         if category is not None:
@@ -119,10 +121,12 @@ class SceneBuilder:
     def solid(
         self, shape: Shape, painter: Painter, size_m: tuple[float, float], px_per_m: float
     ) -> None:
+        """Add any other shape, given the width and height in metres that its texture covers."""
         texture = self._paint(painter, size_m[0], size_m[1], px_per_m)
         shape = shape.moved(self._T_world_object)
         self.parts.append(Part(shape, texture, self._instance, flat=False, shines=False))
 
     def _paint(self, painter: Painter, width_m: float, height_m: float, px_per_m: float) -> Image:
+        px_per_m *= self._detail
         rows, columns = (max(4, round(m * px_per_m)) for m in (height_m, width_m))
         return painter(rows, columns, px_per_m, np.random.default_rng(self.rng.integers(2**63)))

@@ -13,12 +13,15 @@ from slam.rendering import objects as o
 from slam.rendering.builder import Painter, SceneBuilder
 from slam.rendering.lighting import Lamp, Lighting
 from slam.rendering.meshes import pose, tilt
+from slam.rendering.paper import notice_board
 from slam.rendering.path import CameraPath
 from slam.rendering.people import Role
-from slam.rendering.prints import notice_board, painting, poster, whiteboard, window
+from slam.rendering.prints import painting, poster, whiteboard, window
 from slam.rendering.surfaces import bricks, carpet, planks, plaster, tiles, wallpaper
 
 _X, _Y, _HEIGHT, _WALK = 10.6, 8.8, 2.5, 2.0
+_BEND = 0.75
+_Point = tuple[float, float, float]
 
 LIGHTING = Lighting(
     tuple(
@@ -46,63 +49,34 @@ ROLES = (
 """Who may be there, in the order in which they come; walkers go clockwise, along the block."""
 
 
-def _centre_line(distance_m: Array) -> Array:
-    """Points (N, 3) on the rounded middle line, counter-clockwise from the middle of y = 1."""
-    r, half_x, half_y = 0.75, (_X - _WALK) / 2, (_Y - _WALK) / 2
-    straight_x, straight_y, bend = half_x - r, half_y - r, 0.5 * np.pi * r
-    total = 4 * (straight_x + straight_y + bend)
-    points = []
-    for s in np.mod(distance_m, total):
-        quarter_turns = 0
-        lengths = [
-            straight_x,
-            bend,
-            2 * straight_y,
-            bend,
-            2 * straight_x,
-            bend,
-            2 * straight_y,
-            bend,
-            straight_x,
-        ]
-        centres = [
-            (straight_x, -straight_y),
-            (straight_x, straight_y),
-            (-straight_x, straight_y),
-            (-straight_x, -straight_y),
-        ]
-        starts = [
-            (0, -half_y),
-            (half_x, -straight_y),
-            (straight_x, half_y),
-            (-half_x, straight_y),
-            (-straight_x, -half_y),
-        ]
-        for k, length in enumerate(lengths):
-            if s <= length or k == 8:
-                break
-            s -= length
-            quarter_turns = (k + 1) // 2
-        angle = quarter_turns * np.pi / 2
-        if k % 2 == 0:
-            p = np.array(starts[k // 2]) + s * np.array([np.cos(angle), np.sin(angle)])
-        else:
-            a = angle - np.pi / 2 + s / r
-            p = np.array(centres[k // 2]) + r * np.array([np.cos(a), np.sin(a)])
-        points.append([p[0] + _X / 2, p[1] + _Y / 2, 0.0])
-    return np.array(points)
+def _ring() -> Array:
+    """The middle line (N, 3), closed, corners rounded, counter-clockwise from (5.3, 1)."""
+    half_x, half_y = (_X - _WALK) / 2 - _BEND, (_Y - _WALK) / 2 - _BEND
+    points = [np.array([0.0, -half_y - _BEND])]
+    for quarter, (x, y) in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1))):
+        angle = np.linspace(quarter - 1, quarter, 33) * np.pi / 2
+        arc = _BEND * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        points.extend(arc + np.array([x * half_x, y * half_y]))
+    flat = np.array([*points, points[0]]) + np.array([_X / 2, _Y / 2])
+    return np.c_[flat, np.zeros(len(flat))]
 
 
 def _path() -> CameraPath:
     """Once around and 0.6 m on, weaving a little and glancing at the walls."""
-    length = 4 * ((_X - _WALK) / 2 - 0.75 + (_Y - _WALK) / 2 - 0.75 + 0.375 * np.pi)
-    s = np.linspace(0, length + 0.6, 75)
-    turns = 2 * np.pi * s / length
-    eyes, ahead = _centre_line(s), _centre_line(s + 0.3)
-    left = np.cross([0, 0, 1.0], ahead - eyes) / 0.3
+    ring = _ring()
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))]
+
+    def at(distance_m: Array) -> Array:
+        wrapped = np.mod(distance_m, along[-1])
+        return np.stack([np.interp(wrapped, along, column) for column in ring.T], axis=-1)
+
+    s = np.linspace(0, along[-1] + 0.6, 75)
+    turns = 2 * np.pi * s / along[-1]
+    eyes = at(s)
+    left = np.cross([0, 0, 1.0], at(s + 0.3) - eyes) / 0.3
     eyes = eyes + 0.12 * np.sin(5 * turns)[:, None] * left
     eyes[:, 2] = 1.42 + 0.04 * np.sin(7 * turns)
-    targets = _centre_line(s + 1.7) + 0.45 * np.sin(6 * turns)[:, None] * left
+    targets = at(s + 1.7) + 0.45 * np.sin(6 * turns)[:, None] * left
     targets[:, 2] = 1.22 + 0.1 * np.sin(4 * turns)
     return CameraPath(eyes, targets, speed_m_s=0.5, turn_deg_s=30)
 
@@ -126,7 +100,7 @@ def furnish(b: SceneBuilder) -> None:
     _inner(b)
 
 
-def _floor(b: SceneBuilder, origin: tuple, right: tuple, near: tuple, painter: Painter) -> None:
+def _floor(b: SceneBuilder, origin: _Point, right: _Point, near: _Point, painter: Painter) -> None:
     b.quad(origin, right, near, painter, 400)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from slam.rendering.builder import Painter, SceneBuilder
 from slam.rendering.meshes import pose, tilt
-from slam.rendering.prints import book_cover, book_spine, pages, sign
+from slam.rendering.paper import book_cover, book_spine, pages
+from slam.rendering.prints import sign
 from slam.rendering.surfaces import Colour, fabric, leaf, plain, wood
 
 OAK: Colour = (176, 130, 82)
@@ -74,8 +75,8 @@ def sofa(b: SceneBuilder, colour: Colour, second: Colour) -> None:
     cloth = fabric(colour)
     b.box((2.0, 0.85, 0.4), cloth, (0, 0, 0.04))
     b.box((2.0, 0.22, 0.45), cloth, (0, 0.33, 0.42))
-    for x in (-1, 1):
-        b.box((0.2, 0.85, 0.6), cloth, (x * 1.0, 0, 0.04))
+    for side in (-1, 1):
+        b.box((0.2, 0.85, 0.6), cloth, (side * 1.0, 0, 0.04))
     for x in (-0.53, 0, 0.53):
         b.box((0.51, 0.6, 0.1), fabric(tuple(1.12 * np.array(colour))), (x, -0.1, 0.44))
     for x, yaw in ((-0.65, 20), (0.62, -15)):
@@ -85,7 +86,8 @@ def sofa(b: SceneBuilder, colour: Colour, second: Colour) -> None:
 
 def books(b: SceneBuilder, width: float, depth: float, room: float) -> None:
     """A row of standing books from x = 0 to ``width``, backs toward -y at y = 0."""
-    rng, x = b.rng, 0.0
+    rng = b.rng
+    x = 0.0
     while x < width - 0.06:
         if rng.random() < 0.12:
             x += rng.uniform(0.04, 0.12)
@@ -171,8 +173,9 @@ def blade(b: SceneBuilder, length: float, width: float) -> None:
 
 def flower_pot(b: SceneBuilder, radius: float = 0.16, height: float = 0.3) -> None:
     """A clay pot with earth in it."""
-    profile = [(0, 0), (0.68 * radius, 0), (0.9 * radius, 0.8 * height), (radius, 0.82 * height),
-               (radius, height), (0.88 * radius, height), (0.86 * radius, 0.9 * height)]  # fmt: skip
+    r = radius
+    profile = [(0, 0), (0.68 * r, 0), (0.9 * r, 0.8 * height), (r, 0.82 * height), (r, height),
+               (0.88 * r, height), (0.86 * r, 0.9 * height)]  # fmt: skip
     b.lathe(profile, plain((176, 92, 58), 11))
     b.lathe([(0.87 * radius, 0.9 * height), (0, 0.93 * height)], plain((58, 42, 30), 14))
 

@@ -62,7 +62,9 @@ def bake(parts: list[Part], lighting: Lighting, seed: int) -> tuple[list[Image],
     points = np.concatenate([g[0] for g in grids])
     normals = np.concatenate([g[1] for g in grids])
     light = _gather(scene, lighting, points, normals, np.random.default_rng(seed))
-    textures, corners, first = [], [], 0
+    textures: list[Image] = []
+    corners: list[Array] = []
+    first = 0
     for part, (points_part, _, shape) in zip(parts, grids, strict=True):
         own = light[first : first + len(points_part)].reshape(shape)
         first += len(points_part)

@@ -45,7 +45,7 @@ ROLES = (
     Role("stand", ((0.9, 3.6),), 50, "cup"),
     Role("sit", ((5.93, 2.6),), -95),
     Role(
-        "walk", ((1.0, 3.2), (1.3, 4.4), (2.8, 4.5), (2.0, 3.9)), carries="umbrella", speed_m_s=0.6
+        "walk", ((1.7, 3.4), (1.7, 4.3), (2.8, 4.4), (2.5, 3.6)), carries="umbrella", speed_m_s=0.6
     ),
 )
 """Who may be there, in the order in which they come."""

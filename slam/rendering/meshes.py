@@ -88,7 +88,8 @@ def lathe(profile: Array, segments: int = 20, squash: tuple[float, float] = (1.0
     normals[..., 1] = step[:, None, 1] * np.sin(angle) / squash[1]
     normals[..., 2] = -step[:, None, 0]
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-12
-    length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))]
+    steps = np.diff(profile, axis=0) * [np.mean(squash), 1.0]
+    length = np.r_[0, np.cumsum(np.linalg.norm(steps, axis=1))]
     uvs = np.empty((*points.shape[:2], 2))
     uvs[..., 0] = np.linspace(0, 1, segments + 1)
     uvs[..., 1] = 1 - (length / length[-1])[:, None]

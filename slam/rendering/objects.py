@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from slam.rendering.builder import Painter, SceneBuilder
+from slam.rendering.displays import broadcast, desktop, keys
+from slam.rendering.drawing import random_colour
 from slam.rendering.meshes import pose, tilt
-from slam.rendering.prints import broadcast, desktop, keys, label, random_colour, sign
+from slam.rendering.prints import label, sign
 from slam.rendering.surfaces import Colour, fabric, plain
 
 _BLACK: Colour = (30, 30, 34)
@@ -55,7 +59,7 @@ def cup(b: SceneBuilder, colour: Colour) -> None:
     b.lathe([(0.037, 0.078), (0, 0.078)], plain((58, 34, 20)))
     turn = np.linspace(-1.25, 1.25, 7)
     loop = [(0.034 + 0.033 * np.cos(a), 0, 0.05 + 0.03 * np.sin(a)) for a in turn]
-    for p, q in zip(loop, loop[1:], strict=False):
+    for p, q in pairwise(loop):
         b.rod(p, q, 0.006, plain(colour))
 
 
@@ -89,7 +93,7 @@ def trophy(b: SceneBuilder) -> None:
     for side in (-1, 1):
         turn = np.linspace(-1.3, 1.3, 6)
         loop = [(side * (0.07 + 0.045 * np.cos(a)), 0, 0.26 + 0.05 * np.sin(a)) for a in turn]
-        for p, q in zip(loop, loop[1:], strict=False):
+        for p, q in pairwise(loop):
             b.rod(p, q, 0.007, plain(_GOLD))
 
 
@@ -119,7 +123,7 @@ def umbrella(b: SceneBuilder, colour: Colour, opened: bool = False) -> None:
     b.rod((0, 0, 0), (0, 0, length - 0.05), 0.008, plain((60, 60, 64)))
     turn = np.linspace(0, np.pi, 7)
     hook = [(0.035 - 0.035 * np.cos(a), 0, length - 0.05 + 0.04 * np.sin(a)) for a in turn]
-    for p, q in zip(hook, hook[1:], strict=False):
+    for p, q in pairwise(hook):
         b.rod(p, q, 0.012, plain((120, 76, 40)))
     second = random_colour(b.rng, 120, 240)
     if opened:
@@ -182,12 +186,12 @@ def drone(b: SceneBuilder) -> None:
         for y in (-1, 1):
             end = np.array([0.19 * x, 0.19 * y, 0.07])
             b.rod((0.05 * x, 0.06 * y, 0.07), end, 0.012, plain((190, 60, 40)))
-            b.rod(end, end + [0, 0, 0.035], 0.018, plain((40, 40, 44)))
+            b.rod(end, end + np.array([0, 0, 0.035]), 0.018, plain((40, 40, 44)))
             b.rod(end - [0, 0, 0.07], end, 0.006, plain((40, 40, 44)))
             b.lathe(
                 [(0, 0), (0.11, 0), (0.11, 0.003), (0, 0.003)],
                 plain((120, 124, 130)),
-                end + [0, 0, 0.036],
+                end + np.array([0, 0, 0.036]),
             )
 
 

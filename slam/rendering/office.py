@@ -9,9 +9,10 @@ from slam.rendering import objects as o
 from slam.rendering.builder import SceneBuilder
 from slam.rendering.lighting import Lamp, Lighting
 from slam.rendering.meshes import pose, tilt
+from slam.rendering.paper import notice_board, sheet
 from slam.rendering.path import CameraPath
 from slam.rendering.people import Role
-from slam.rendering.prints import notice_board, painting, poster, sheet, whiteboard, window
+from slam.rendering.prints import painting, poster, whiteboard, window
 from slam.rendering.room import Room, shell
 from slam.rendering.surfaces import bricks, carpet, plaster
 
@@ -21,18 +22,20 @@ LIGHTING = Lighting(tuple(Lamp((x, y, 2.6)) for x in (1.5, 4.5) for y in (1.4, 3
 
 PATH = CameraPath(
     eyes_world=np.array([
-        [3.0, 2.0, 1.45], [2.5, 2.2, 1.4], [2.1, 2.6, 1.35], [2.4, 3.1, 1.4], [3.0, 3.1, 1.45], [3.6, 2.9, 1.4],
+        [3.0, 2.0, 1.45], [2.5, 2.2, 1.4], [2.1, 2.6, 1.35], [2.4, 3.1, 1.4], [3.0, 3.1, 1.45],
+        [3.6, 2.9, 1.4],
         [4.0, 2.5, 1.4], [3.8, 2.0, 1.45], [3.3, 1.8, 1.5], [2.8, 1.9, 1.5], [3.0, 2.0, 1.45],
     ]),
     targets_world=np.array([
-        [2.6, 4.7, 0.95], [1.4, 4.6, 0.9], [0.4, 3.6, 0.95], [0.4, 2.2, 1.0], [2.2, 0.4, 1.15], [4.0, 0.3, 1.15],
+        [2.6, 4.7, 0.95], [1.4, 4.6, 0.9], [0.4, 3.6, 0.95], [0.4, 2.2, 1.0], [2.2, 0.4, 1.15],
+        [4.0, 0.3, 1.15],
         [5.6, 1.4, 1.1], [5.7, 2.8, 1.1], [4.9, 4.5, 1.0], [3.6, 4.7, 0.95], [2.6, 4.7, 0.95],
     ]),
 )  # fmt: skip
 
 ROLES = (
-    Role("walk", ((1.1, 1.1), (2.6, 1.15), (4.2, 1.25), (5.0, 1.3), (4.6, 1.75), (3.0, 1.45), (1.4, 1.5)),
-         carries="suitcase"),
+    Role("walk", ((1.1, 1.1), (2.6, 1.15), (4.2, 1.25), (5.0, 1.3), (4.6, 1.75), (3.0, 1.45),
+                  (1.4, 1.5)), carries="suitcase"),
     Role("sit", ((1.4, 3.92),), 180),
     Role("stand", ((4.3, 3.75),), -40, "cup"),
     Role("walk", ((1.3, 1.6), (1.2, 2.6), (1.5, 3.3), (1.7, 2.5)), carries="book", speed_m_s=0.6),
@@ -46,8 +49,9 @@ def furnish(b: SceneBuilder) -> None:
     """Build the room: x to the right, y away, door side at y = 0."""
     room = Room(_WIDTH, _DEPTH, _HEIGHT)
     cream = plaster((196, 190, 172))
-    shell(b, room, carpet((96, 104, 116), (170, 150, 120)), {"north": cream, "east": plaster((150, 172, 180)),
-                                                             "south": cream, "west": bricks((150, 84, 62))})  # fmt: skip
+    blue, brick = plaster((150, 172, 180)), bricks((150, 84, 62))
+    walls = {"north": cream, "east": blue, "south": cream, "west": brick}
+    shell(b, room, carpet((96, 104, 116), (170, 150, 120)), walls)
     _north(b)
     _west(b)
     _south(b)

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from graph.errors import InputError
 from graph.geometry import Array
 from slam.rendering import objects as o
 from slam.rendering import skeleton as sk
@@ -125,13 +124,7 @@ class Cast:
 
 
 def hire(b: SceneBuilder, roles: tuple[Role, ...], lighting: Lighting, count: int) -> Cast:
-    """Dress ``count`` people for the first roles of a scene; each is an instance of the builder.
-
-    Raises:
-        InputError: the scene has fewer roles.
-    """
-    if count > len(roles):
-        raise InputError(f"people={count}: this scene has room for {len(roles)}; ask for fewer")
+    """Dress the people for the first ``count`` roles; each is an instance of the builder."""
     people, parts, owners = [], [], []
     for who, role in enumerate(roles[:count]):
         person = Person(role, b.rng.random(), b.rng.uniform(0.94, 1.06))
@@ -232,7 +225,7 @@ def _features(picture: Floats, hair: Colour, tone: Colour) -> None:
     middle, level, w = columns // 2, round(0.47 * rows), max(1, columns // 40)
     for sign in (-1, 1):
         x = middle + sign * round(0.062 * columns)
-        white, iris = (w, max(1, w // 3)), (max(1, w // 3), max(1, w // 3))
+        white, iris = (w, max(1, w // 3)), (max(1, w // 2), max(1, w // 3))
         cv2.ellipse(picture, (x, level), white, 0, 0, 360, (238, 238, 236), -1, cv2.LINE_AA)
         cv2.ellipse(picture, (x, level), iris, 0, 0, 360, (46, 34, 28), -1, cv2.LINE_AA)
         brow = level - round(0.055 * rows)
@@ -241,12 +234,12 @@ def _features(picture: Floats, hair: Colour, tone: Colour) -> None:
     cv2.line(picture, (middle, level), tip, tone, max(1, w // 3), cv2.LINE_AA)
     lips = (round(1.3 * w), max(1, w // 4))
     cv2.ellipse(
-        picture, (middle, round(0.66 * rows)), lips, 0, 0, 360, (160, 74, 70), -1, cv2.LINE_AA
+        picture, (middle, round(0.68 * rows)), lips, 0, 0, 360, (160, 74, 70), -1, cv2.LINE_AA
     )
 
 
 def _load(b: SceneBuilder, carries: str) -> list[tuple[str, Part]]:
-    """What the right hand carries, in the frame of its grip: origin there, z up, -y to the front."""
+    """What the right hand carries, in the frame of its grip: z up, -y to the front."""
     if not carries:
         return []
 

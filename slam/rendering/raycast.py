@@ -115,7 +115,9 @@ class Renderer:
     def _supersample(
         self, layers: list[Geometry], tables: _Tables, pixels: Floats, T_world_camera: Array
     ) -> Floats:
-        offsets = np.float32([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
+        if len(pixels) == 0:
+            return np.zeros((0, 3), np.float32)
+        offsets = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32) / np.float32(4)
         many = (pixels[None] + offsets[:, None]).reshape(-1, 2)
         hits = self._cast(layers, many, T_world_camera)
         colour, _ = self._shade(tables, hits, T_world_camera)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,7 @@ _STEPS_PER_PX = 8.0
 _SHADOW_PX = 0.75
 
 
-def depth_sigma_m(depth_m: Array) -> Array:
+def depth_sigma_m(depth_m: NDArray[Any]) -> NDArray[Any]:
     """Standard deviation of a Kinect's depth in metres (Nguyen et al. 2012, axial noise)."""
     return 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
 
@@ -31,8 +33,8 @@ def measure_depth(
     """The depth a Kinect reports, (H, W) float32 with NaN where it reports none.
 
     Disparity bf/z is read at a place that is off by a fraction of a pixel, disturbed by a noise
-    that is alike in neighbouring pixels, and rounded to an eighth of a pixel. Missing: out of range, grazing, in
-    the projector's shadow, and a ragged rim along edges.
+    that is alike in neighbouring pixels, and rounded to an eighth of a pixel. Missing: out of
+    range, grazing, in the projector's shadow, and a ragged rim along edges.
     """
     h, w = depth_m.shape
     missing = ~((depth_m >= RANGE_M[0]) & (depth_m <= RANGE_M[1]))
@@ -134,4 +136,4 @@ def blur(rgb: Floats, flow_px: Floats, samples: int = 7) -> Floats:
             rgb, u + s * flow_px[..., 0], v + s * flow_px[..., 1],
             cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE,
         )  # fmt: skip
-    return total / samples
+    return (total / samples).astype(np.float32)

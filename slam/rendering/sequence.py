@@ -143,8 +143,12 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
             f"frames={config.frames}: the path of {config.name!r} has {len(poses)} frames at "
             f"{config.fps:g} Hz; ask for at most as many"
         )
+    if config.people > len(plan.ROLES):
+        raise InputError(
+            f"people={config.people}: {config.name!r} has room for {len(plan.ROLES)}; ask for fewer"
+        )
     poses = poses[: config.frames]
-    builder = SceneBuilder(config.seed)
+    builder = SceneBuilder(config.seed, detail=float(np.clip(config.width / 640, 0.25, 1.0)))
     plan.furnish(builder)
     cast = hire(builder, plan.ROLES, plan.LIGHTING, config.people)
     scene = build_scene(builder, plan.LIGHTING, cast.parts, config.seed)

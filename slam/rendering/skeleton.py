@@ -105,14 +105,16 @@ def bones(posture: Posture) -> dict[str, Array]:
     result["head"] = head
     for k, (side, sign) in enumerate((("right", -1), ("left", 1))):
         hip, knee, ankle, toe = (hips + joint for joint in legs[side])
-        result |= {f"{side} thigh": _frame(hip, knee), f"{side} shin": _frame(knee, ankle),
-                   f"{side} foot": _frame(ankle, toe)}  # fmt: skip
+        result[f"{side} thigh"] = _frame(hip, knee)
+        result[f"{side} shin"] = _frame(knee, ankle)
+        result[f"{side} foot"] = _frame(ankle, toe)
         shoulder = hips + (TORSO_M - 0.05) * up + np.array([sign * 0.185, 0, 0])
         out = np.array([sign * posture.spread, 0, 0])
         elbow = shoulder + UPPER_ARM_M * _unit(_swing(posture.shoulders[k]) + out)
         wrist = elbow + FOREARM_M * _unit(_swing(posture.shoulders[k] + posture.elbows[k]) - out)
-        result |= {f"{side} upper arm": _frame(shoulder, elbow), f"{side} forearm": _frame(elbow, wrist),
-                   f"{side} hand": _frame(wrist, 2 * wrist - elbow)}  # fmt: skip
+        result[f"{side} upper arm"] = _frame(shoulder, elbow)
+        result[f"{side} forearm"] = _frame(elbow, wrist)
+        result[f"{side} hand"] = _frame(wrist, 2 * wrist - elbow)
         grip = np.eye(4)
         grip[:3, 3] = wrist + 0.09 * _unit(wrist - elbow)
         result[f"{side} grip"] = grip

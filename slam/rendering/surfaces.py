@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 from slam.rendering.builder import Image, Painter
 
 Field = NDArray[np.float32]
-Colour = tuple[float, float, float]
+Colour = tuple[float, ...]
+"""Red, green, blue in [0, 255]."""
 
 
 def field(rows: int, columns: int, cell: tuple[float, float], rng: np.random.Generator) -> Field:
-    """A smooth random field (rows, columns) of unit variance, roughly ``cell`` (v, u) texels wide."""
+    """A smooth random field (rows, columns), about normal, ``cell`` (v, u) texels a wave."""
     coarse = [
         max(2, round(n / max(c, 1.0)) + 1) for n, c in zip((rows, columns), cell, strict=True)
     ]
     values = rng.standard_normal(coarse, dtype=np.float32)
     if (coarse[0], coarse[1]) == (rows + 1, columns + 1):
         return values[:rows, :columns]
-    return cv2.resize(values, (columns, rows), interpolation=cv2.INTER_CUBIC)
+    smooth = cv2.resize(values, (columns, rows), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(smooth, np.float32)
 
 
 def octaves(rows: int, columns: int, cells_px: list[float], rng: np.random.Generator) -> Field:
@@ -35,7 +37,7 @@ def octaves(rows: int, columns: int, cells_px: list[float], rng: np.random.Gener
 
 def flat(rows: int, columns: int, colour: Colour) -> Field:
     """A float32 picture of one colour."""
-    return np.broadcast_to(np.float32(colour), (rows, columns, 3)).copy()
+    return np.broadcast_to(np.asarray(colour, np.float32), (rows, columns, 3)).copy()
 
 
 def as_image(picture: NDArray[np.floating]) -> Image:
@@ -159,9 +161,10 @@ def bricks(colour: Colour, mortar: Colour = (188, 182, 170)) -> Painter:
                 -(course % 2) * length // 2 - int(rng.integers(gap + 1)), columns, length
             ):
                 tone = np.float32(np.array(colour) * rng.uniform(0.6, 1.25) + rng.normal(0, 8, 3))
-                jitter = rng.integers(0, gap + 1, 4)
-                area = np.s_[v + jitter[0] : v + height - gap + jitter[1] // 2,
-                             max(u + jitter[2], 0) : max(u + length - gap + jitter[3] // 2, 0)]  # fmt: skip
+                top, bottom, left, right = rng.integers(0, gap + 1, 4) // (1, 2, 1, 2)
+                rows_of = slice(v + top, v + height - gap + bottom)
+                columns_of = slice(max(u + left, 0), max(u + length - gap + right, 0))
+                area = rows_of, columns_of
                 picture[area] = tone + 14 * noise[area][..., None]
         chips = field(rows, columns, (0.012 * px_per_m, 0.012 * px_per_m), rng) > 2.2
         picture[chips] *= 0.65
@@ -199,7 +202,7 @@ def fabric(colour: Colour, second: Colour | None = None) -> Painter:
             for axis, n in ((0, rows), (1, columns)):
                 stripes = np.clip(field(1, n, (1, 0.02 * px_per_m), rng)[0] * 0.8, 0, 0.8)
                 share = stripes[:, None, None] if axis == 0 else stripes[None, :, None]
-                picture = picture + share * (np.float32(second) - picture)
+                picture = picture + share * (np.asarray(second, np.float32) - picture)
         weave = field(rows, columns, (1, 5), rng) + field(rows, columns, (5, 1), rng)
         lint = field(rows, columns, (0.01 * px_per_m, 0.01 * px_per_m), rng)
         shade = 5 * weave + 6 * octaves(rows, columns, [0.03 * px_per_m, 0.12 * px_per_m], rng)
