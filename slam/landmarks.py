@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph.geometry import Array, inverse, transform
+from slam.subpixel import PATCH_PX
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -18,6 +19,8 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type, float]] = {
     "colours": ((3,), np.uint8, 0),
     "host": ((), np.int64, -1),
     "last_keyframe": ((), np.int64, -1),
+    "patches": ((PATCH_PX, PATCH_PX), np.uint8, 0),
+    "patch_views": ((3,), np.float64, np.nan),
     "observations": ((), np.int64, 0),
     "visible": ((), np.int64, 0),
     "found": ((), np.int64, 0),
@@ -37,6 +40,8 @@ class LandmarkTable:
         colours: (N, 3) uint8.
         host: (N,) keyframe that made it; it moves the landmark while it is not in the graph.
         last_keyframe: (N,) newest keyframe that observes it.
+        patches: (N, 11, 11) uint8 image patch that sub-pixel registration aligns with.
+        patch_views: (N, 3) metres, from the point to the camera that took the patch.
         observations: (N,) keyframes that observe it.
         visible, found: (N,) frames in which it should have been, and was, matched.
         alive, in_graph: (N,) bool.
@@ -49,6 +54,8 @@ class LandmarkTable:
     colours: NDArray[np.uint8]
     host: Ints
     last_keyframe: Ints
+    patches: NDArray[np.uint8]
+    patch_views: Array
     observations: Ints
     visible: Ints
     found: Ints

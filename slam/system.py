@@ -33,7 +33,7 @@ from slam.local_mapping import (
     redundant_keyframe,
 )
 from slam.results import FrameResult, TrackingStatus
-from slam.tracker import Tracked, Tracker, TrackingConfig, lost
+from slam.tracker import Tracked, Tracker, TrackingConfig
 from slam.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ class SlamSystem:
             tracked = self._track(features)
         with clock.stage("keyframe"):
             reason = self._keyframe_reason(tracked, features)
-            keyframe = self._insert_keyframe(frame, features, tracked) if reason else None
+            keyframe = self._insert_keyframe(frame, tracked) if reason else None
         with clock.stage("graph"):
             if keyframe is not None:
                 self._optimise(keyframe)
@@ -150,15 +150,15 @@ class SlamSystem:
         if self._reference is None:
             none = np.zeros(0, np.int64)
             return Tracked(
-                TrackingStatus.OK, np.eye(4), none, none, 0, none, np.zeros((6, 6))
+                TrackingStatus.OK, np.eye(4), features, none, none, 0, none, np.zeros((6, 6))
             )
         T_predicted = orthonormalised(self._T_last @ self._velocity)
         landmarks = self.world.landmarks
         tracked = self.tracker.track(
-            features, T_predicted, landmarks.living(self._recent_ids), self._local_ids, landmarks
+            features, T_predicted, self._recent_ids, self._local_ids, self.world
         )
         if tracked.status is TrackingStatus.LOST:
-            return lost(T_predicted, tracked.matches)
+            return tracked
         landmarks.visible[tracked.visible_ids] += 1
         landmarks.found[tracked.landmark_ids] += 1
         return tracked
@@ -183,7 +183,7 @@ class SlamSystem:
         )
         return keyframe_reason(evidence, self.config.keyframes)
 
-    def _insert_keyframe(self, frame: Frame, features: Features, tracked: Tracked) -> Keyframe:
+    def _insert_keyframe(self, frame: Frame, tracked: Tracked) -> Keyframe:
         world = self.world
         keyframe = Keyframe(
             id=world.next_keyframe_id,
@@ -191,14 +191,15 @@ class SlamSystem:
             timestamp_s=frame.timestamp_s,
             segment=self.segment,
             T_world_camera=tracked.T_world_camera,
-            features=features,
-            landmark_ids=np.full(len(features), -1, np.int64),
+            features=tracked.features,
+            landmark_ids=np.full(len(tracked.features), -1, np.int64),
         )
         world.next_keyframe_id += 1
         world.keyframes[keyframe.id] = keyframe
         world.attach(keyframe, tracked.keypoints, tracked.landmark_ids)
         new_ids = create_landmarks(world, keyframe, self.camera)
         fused = fuse_into_neighbours(world, keyframe, new_ids, self.tracker, self.config.mapping)
+        world.renew_patches(keyframe, self.config.tracking.subpixel)
         self.feed.forget_landmarks(fused)
         self.feed.forget_landmarks(cull_landmarks(world, self._local_ids, self.config.mapping))
         return keyframe

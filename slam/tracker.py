@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
-from slam.features import Features
+from slam.features import Features, undistort
 from slam.landmarks import Ints, LandmarkTable
 from slam.matching import MatchConfig, Matches, WindowIndex, match_pairs
 from slam.pose_optimisation import PoseEstimate, PoseOptimisationConfig, optimise_pose
 from slam.results import TrackingStatus
+from slam.subpixel import SubpixelConfig, register_patches
+from slam.world_map import WorldMap
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class TrackingConfig:
     max_view_angle_deg: float = 60.0
     match: MatchConfig = field(default_factory=MatchConfig)
     pose: PoseOptimisationConfig = field(default_factory=PoseOptimisationConfig)
+    subpixel: SubpixelConfig = field(default_factory=SubpixelConfig)
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Tracked:
     Attributes:
         status: LOST means that the pose must not be used.
         T_world_camera: (4, 4).
+        features: the frame's, with the registered pixels of the matches.
         keypoints, landmark_ids: (M,) inlier matches.
         matches: number of matches before the robust estimate.
         visible_ids: landmarks that should be in view.
@@ -48,6 +52,7 @@ class Tracked:
 
     status: TrackingStatus
     T_world_camera: Array
+    features: Features
     keypoints: Ints
     landmark_ids: Ints
     matches: int
@@ -68,14 +73,15 @@ class Tracker:
         T_predicted: Array,
         recent_ids: Ints,
         local_ids: Ints,
-        landmarks: LandmarkTable,
+        world: WorldMap,
     ) -> Tracked:
         """The frame's pose from landmarks seen a moment ago, then from the whole local map."""
         index = WindowIndex(features.pixels)
-        estimate = self._first_estimate(features, index, T_predicted, recent_ids, landmarks)
+        recent_ids = world.landmarks.living(recent_ids)
+        estimate = self._first_estimate(features, index, T_predicted, recent_ids, world.landmarks)
         if estimate is None:
-            return lost(T_predicted)
-        return self.refine(features, index, estimate.T_world_camera, local_ids, landmarks)
+            return lost(T_predicted, features)
+        return self.refine(features, index, estimate.T_world_camera, local_ids, world)
 
     def refine(
         self,
@@ -83,27 +89,49 @@ class Tracker:
         index: WindowIndex,
         T_world_camera: Array,
         local_ids: Ints,
-        landmarks: LandmarkTable,
+        world: WorldMap,
     ) -> Tracked:
         """The pose from all landmarks of the local map, given a good first one."""
-        radius = self.config.local_radius_px
+        radius, landmarks = self.config.local_radius_px, world.landmarks
         visible, matches = self.search(features, index, T_world_camera, local_ids, radius, landmarks)
+        if self.config.subpixel.enabled:
+            features = self._registered(features, matches.train, visible[matches.query], world)
         estimate = self._optimise(features, matches, visible, T_world_camera, landmarks)
         inliers = int(estimate.inliers.sum())
-        good = estimate.ok and inliers >= self.config.weak_inliers
-        if not good:
-            return lost(T_world_camera, len(matches))
+        if not estimate.ok or inliers < self.config.weak_inliers:
+            return lost(T_world_camera, features, len(matches))
         status = TrackingStatus.OK if inliers >= self.config.min_inliers else TrackingStatus.WEAK
         kept = matches[estimate.inliers]
         return Tracked(
             status=status,
             T_world_camera=estimate.T_world_camera,
+            features=features,
             keypoints=kept.train,
             landmark_ids=visible[kept.query],
             matches=len(matches),
             visible_ids=visible,
             information=estimate.information,
         )
+
+    def _registered(
+        self, features: Features, keypoints: Ints, ids: Ints, world: WorldMap
+    ) -> Features:
+        """The features with the matched keypoints moved to where their landmarks' patches lie."""
+        config = self.config.subpixel
+        start = features.image_pixels[keypoints]
+        refined, correlation = register_patches(
+            features.gray, start, world.landmarks.patches[ids], config.iterations
+        )
+        shift = np.linalg.norm(refined - start, axis=1)
+        limit = config.max_shift_px * np.sqrt(features.scales[keypoints])
+        good = (correlation > config.min_correlation) & (shift < limit)
+        rows = keypoints[good]
+        image_pixels, pixels = features.image_pixels.copy(), features.pixels.copy()
+        sigmas = features.sigmas_px.copy()
+        image_pixels[rows] = refined[good]
+        pixels[rows] = undistort(self.camera, refined[good])
+        sigmas[rows, :2] = config.sigma_px
+        return replace(features, image_pixels=image_pixels, pixels=pixels, sigmas_px=sigmas)
 
     def search(
         self,
@@ -180,9 +208,9 @@ class Tracker:
         )
 
 
-def lost(T_world_camera: Array, matches: int = 0) -> Tracked:
+def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked:
     """The outcome of a frame without a pose."""
     none = np.zeros(0, np.int64)
-    return Tracked(
-        TrackingStatus.LOST, T_world_camera, none, none, matches, none, np.zeros((6, 6))
-    )
+    information = np.zeros((6, 6))
+    status = TrackingStatus.LOST
+    return Tracked(status, T_world_camera, features, none, none, matches, none, information)

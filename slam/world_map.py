@@ -9,6 +9,7 @@ import numpy as np
 from graph.geometry import Array
 from slam.features import Features
 from slam.landmarks import Ints, LandmarkTable
+from slam.subpixel import SubpixelConfig, cut_patches
 
 
 @dataclass
@@ -67,6 +68,24 @@ class WorldMap:
         self.landmarks.observations[ids] -= 1
         self.landmarks.host[self.landmarks.host == keyframe.id] = heir.id
         del self.keyframes[keyframe.id]
+
+    def renew_patches(self, keyframe: Keyframe, config: SubpixelConfig) -> None:
+        """Give landmarks the patch of a keyframe that sees them too differently from their own.
+
+        A patch is kept as long as it serves: every change moves the landmark's image a little.
+        """
+        landmarks = self.landmarks
+        rows, ids = self.observed(keyframe)
+        here = keyframe.T_world_camera[:3, 3] - landmarks.points_world[ids]
+        there = landmarks.patch_views[ids]
+        distance_here, distance_there = (np.linalg.norm(v, axis=1) for v in (here, there))
+        cosine = np.einsum("ij,ij->i", here, there) / (distance_here * distance_there)
+        zoom = np.maximum(distance_here / distance_there, distance_there / distance_here)
+        serves = (cosine > np.cos(np.deg2rad(config.max_angle_deg))) & (zoom < config.max_zoom)
+        rows, ids = rows[~serves], ids[~serves]  # a new landmark's view is NaN and never serves
+        features = keyframe.features
+        landmarks.patches[ids] = cut_patches(features.gray, features.image_pixels[rows])
+        landmarks.patch_views[ids] = here[~serves]
 
     def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
         """(shared landmarks, keyframe), most shared first, of keyframes that share at least so many."""

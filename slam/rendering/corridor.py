@@ -17,6 +17,7 @@ from slam.rendering.paper import notice_board
 from slam.rendering.path import CameraPath
 from slam.rendering.people import Role
 from slam.rendering.prints import painting, poster, whiteboard, window
+from slam.rendering.room import ceiling_lamps
 from slam.rendering.surfaces import bricks, carpet, planks, plaster, tiles, wallpaper
 
 _X, _Y, _HEIGHT, _WALK = 10.6, 8.8, 2.5, 2.0
@@ -25,7 +26,7 @@ _Point = tuple[float, float, float]
 
 LIGHTING = Lighting(
     tuple(
-        Lamp((x, y, 2.4), 1.5, (0.4, 0.4, 0.0))
+        Lamp((x, y, 2.4), 1.5, (0.4, 0.4))
         for x, y in (
             (1.0, 1.0), (3.9, 1.0), (6.7, 1.0), (9.6, 1.0), (9.6, 4.4), (9.6, 7.8),
             (6.7, 7.8), (3.9, 7.8), (1.0, 7.8), (1.0, 4.4),
@@ -96,6 +97,7 @@ def furnish(b: SceneBuilder) -> None:
         ((0, y1, _HEIGHT), (_X, 0, 0), (0, w, 0)), ((0, w, _HEIGHT), (w, 0, 0), (0, y1 - w, 0)),
     ):  # fmt: skip
         b.quad(origin, right, away, tiles((206, 206, 200), 0.6, 0.3), 250)
+    ceiling_lamps(b, LIGHTING, _HEIGHT)
     _outer(b)
     _inner(b)
 

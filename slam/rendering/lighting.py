@@ -25,11 +25,14 @@ _SKY_REACH_M = 0.9
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp: centre in metres, power (1 lights a surface at 1 m fully), half size in metres."""
+    """A lamp: centre in metres, power, half size along x and y in metres.
+
+    At distance d it gives power / (0.5 + d^2) to a surface that faces it.
+    """
 
     centre: tuple[float, float, float]
     power: float = 1.6
-    half_size: tuple[float, float, float] = (0.5, 0.15, 0.0)
+    half_size: tuple[float, float] = (0.5, 0.15)
 
 
 @dataclass(frozen=True)

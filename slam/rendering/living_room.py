@@ -12,7 +12,7 @@ from slam.rendering.meshes import pose, tilt
 from slam.rendering.path import CameraPath
 from slam.rendering.people import Role
 from slam.rendering.prints import painting, poster, rug, window
-from slam.rendering.room import Room, shell
+from slam.rendering.room import Room, ceiling_lamps, shell
 from slam.rendering.surfaces import planks, plaster, wallpaper, wood
 
 _WIDTH, _DEPTH, _HEIGHT = 6.4, 5.4, 2.6
@@ -60,6 +60,7 @@ def furnish(b: SceneBuilder) -> None:
         "west": plaster((208, 188, 158)),
     }
     shell(b, Room(_WIDTH, _DEPTH, _HEIGHT), planks((158, 106, 62)), walls)
+    ceiling_lamps(b, LIGHTING, _HEIGHT)
     _seats(b)
     _television(b)
     _dining(b)

@@ -55,17 +55,12 @@ def mouse(b: SceneBuilder) -> None:
 def cup(b: SceneBuilder, colour: Colour) -> None:
     """A mug with a handle, and coffee in it."""
     b.lathe([(0, 0), (0.036, 0), (0.04, 0.01), (0.041, 0.095), (0.037, 0.096), (0.036, 0.08)],
-            _printed(colour), px_per_m=1100)  # fmt: skip
+            label(colour), px_per_m=1100)  # fmt: skip
     b.lathe([(0.037, 0.078), (0, 0.078)], plain((58, 34, 20)))
     turn = np.linspace(-1.25, 1.25, 7)
     loop = [(0.034 + 0.033 * np.cos(a), 0, 0.05 + 0.03 * np.sin(a)) for a in turn]
     for p, q in pairwise(loop):
         b.rod(p, q, 0.006, plain(colour))
-
-
-def _printed(colour: Colour) -> Painter:
-    del colour
-    return label()
 
 
 def bottle(b: SceneBuilder, colour: Colour = (40, 110, 70)) -> None:

@@ -13,7 +13,7 @@ from slam.rendering.paper import notice_board, sheet
 from slam.rendering.path import CameraPath
 from slam.rendering.people import Role
 from slam.rendering.prints import painting, poster, whiteboard, window
-from slam.rendering.room import Room, shell
+from slam.rendering.room import Room, ceiling_lamps, shell
 from slam.rendering.surfaces import bricks, carpet, plaster
 
 _WIDTH, _DEPTH, _HEIGHT = 6.0, 5.0, 2.7
@@ -52,6 +52,7 @@ def furnish(b: SceneBuilder) -> None:
     blue, brick = plaster((150, 172, 180)), bricks((150, 84, 62))
     walls = {"north": cream, "east": blue, "south": cream, "west": brick}
     shell(b, room, carpet((96, 104, 116), (170, 150, 120)), walls)
+    ceiling_lamps(b, LIGHTING, _HEIGHT)
     _north(b)
     _west(b)
     _south(b)

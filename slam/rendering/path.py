@@ -39,7 +39,7 @@ def look_at(eyes: Array, targets: Array) -> Array:
 
 def camera_poses(path: CameraPath, fps: float, seed: int) -> Array:
     """All poses T_world_camera (F, 4, 4) along the path, with the tremor of a hand."""
-    fine = _sampled(path, 4000)
+    fine = _at(path, np.linspace(0, 1, 4000))
     step_m = np.linalg.norm(np.diff(fine[:, :3, 3], axis=0), axis=1)
     relative = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
     step_deg = np.rad2deg(np.linalg.norm(so3_log(relative), axis=1))
@@ -59,11 +59,8 @@ def _eased(stamps: Array, total_s: float) -> Array:
     return np.minimum(start, total_s)
 
 
-def _sampled(path: CameraPath, count: int) -> Array:
-    return _at(path, np.linspace(0, 1, count))
-
-
 def _at(path: CameraPath, share: Array) -> Array:
+    """Poses (N, 4, 4) at shares (N,) in [0, 1] of the curve."""
     chord = np.linalg.norm(np.diff(path.eyes_world, axis=0), axis=1) + 0.35 * np.linalg.norm(
         np.diff(path.targets_world, axis=0), axis=1
     )

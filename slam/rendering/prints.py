@@ -151,12 +151,11 @@ def sign(text: str, colour: Colour = (240, 240, 236), ink: Colour = (30, 40, 60)
     return paint
 
 
-def label() -> Painter:
-    """A wrap-around label of a bottle or tin."""
+def label(colour: Colour | None = None) -> Painter:
+    """A print around a bottle or a mug."""
 
     def paint(rows: int, columns: int, px_per_m: float, rng: np.random.Generator) -> Image:
-        base = random_colour(rng, 60, 235)
-        picture = canvas(rows, columns, base, rng)
+        picture = canvas(rows, columns, colour or random_colour(rng, 60, 235), rng)
         for share in (0.08, 0.55):
             write(
                 picture,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam.rendering.builder import Painter, SceneBuilder
+from slam.rendering.lighting import Lighting
 from slam.rendering.surfaces import plain, tiles
 
 
@@ -30,7 +31,9 @@ def shell(
     b.quad((w, d, h), (0, -d, 0), (0, 0, -h), walls["east"], px_per_m)
 
 
-def ceiling_lamp(b: SceneBuilder, x: float, y: float, height: float) -> None:
-    """A flat luminous panel below the ceiling."""
+def ceiling_lamps(b: SceneBuilder, lighting: Lighting, height: float) -> None:
+    """Luminous panels on the ceiling, where the light comes from."""
     white = plain((250, 250, 244), 2)
-    b.quad((x - 0.5, y - 0.15, height - 0.02), (1.0, 0, 0), (0, 0.3, 0), white, 200, shines=True)
+    for lamp in lighting.lamps:
+        (x, y, _), (a, c) = lamp.centre, lamp.half_size
+        b.quad((x - a, y - c, height - 0.02), (2 * a, 0, 0), (0, 2 * c, 0), white, 200, shines=True)
