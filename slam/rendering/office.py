@@ -38,7 +38,7 @@ ROLES = (
                   (1.4, 1.5)), carries="suitcase"),
     Role("sit", ((1.4, 3.92),), 180),
     Role("stand", ((4.3, 3.75),), -40, "cup"),
-    Role("walk", ((1.3, 1.6), (1.2, 2.6), (1.5, 3.3), (1.7, 2.5)), carries="book", speed_m_s=0.6),
+    Role("walk", ((1.25, 2.0), (1.2, 2.7), (1.45, 3.3), (1.7, 2.6)), carries="book", speed_m_s=0.6),
     Role("sit", ((4.92, 2.25),), 90),
     Role("stand", ((2.4, 0.7),), 190, "cell phone"),
 )  # fmt: skip
