@@ -41,7 +41,7 @@ class FactorMaker:
 
     def _stereo(self, observations: Observations) -> list[gtsam.NonlinearFactor]:
         huber_k = self._config.huber_stereo if self._config.robust else None
-        noises = pixel_noises(observations.sigmas_px[:, _GTSAM_STEREO_ORDER], huber_k)
+        noises = pixel_noises(observations.sigmas_px, huber_k)
         K = self._K_stereo
         columns = zip(
             observations.measurements[:, _GTSAM_STEREO_ORDER].tolist(),

@@ -167,6 +167,7 @@ def reprojection(
     points_camera += T_camera_world[:, :3, 3]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         residual = camera.project_stereo(points_camera) - observations.measurements
+        residual[:, 2] = residual[:, 0] - residual[:, 2]  # of the disparity
         whitened = residual / observations.sigmas_px
     mono = ~np.isfinite(observations.measurements[:, 2])
     whitened[mono, 2] = 0.0

@@ -35,7 +35,7 @@ class SmootherConfig:
         max_recoveries: attempts to rebuild after failures before the update is given up.
     """
 
-    relinearize_threshold: float = 0.01
+    relinearize_threshold: float = 0.003
     relinearize_skip: int = 1
     extra_iterations: int = 0
     robust: bool = True

@@ -57,8 +57,9 @@ class Observations:
         landmark_ids: (M,) int64.
         measurements: (M, 3) ``(u_left, v, u_right)`` in undistorted pixels, the order of
             ``Camera.project_stereo``; u_right NaN where there is no depth (monocular).
-        sigmas_px: (M, 3) standard deviations of the same three, in pixels; the third is not
-            read where u_right is NaN.
+        sigmas_px: (M, 3) standard deviations in pixels of u_left, v and the DISPARITY
+            u_left - u_right, which err independently; the third is not read where u_right is
+            NaN.
     """
 
     keyframe_ids: IntArray = field(default_factory=_no_ids)

@@ -98,8 +98,13 @@ def observations_of(keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> 
         keyframe_ids=np.full(len(keypoints), keyframe.id),
         landmark_ids=landmark_ids,
         measurements=stereo_measurements(features, keypoints),
-        sigmas_px=features.sigmas_px[keypoints],
+        sigmas_px=quantised(features.sigmas_px[keypoints]),
     )
+
+
+def quantised(sigmas_px: Array) -> Array:
+    """Sigmas rounded to powers of 2^(1/3), so that factors can share noise models."""
+    return np.exp2(np.round(3 * np.log2(sigmas_px)) / 3)
 
 
 def stereo_measurements(features: Features, keypoints: Ints) -> Array:
