@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -278,3 +279,15 @@ def test_impossible_options(option: str, value: int) -> None:
     name = option.replace("_", "-")
     with pytest.raises(InputError, match=f"--{name} {value}: must be a whole number"):
         RunOptions(Path("x"), **{option: value})
+
+
+def test_real_frames_twice_give_the_same_bytes(tmp_path: Path) -> None:
+    kitchen = Path(__file__).resolve().parents[2] / "../shared/data/redkitchen"
+    if not kitchen.is_dir():
+        pytest.skip("no ../shared/data/redkitchen here")
+    options = RunOptions(kitchen, max_frames=20, quiet=True)
+    summaries = [run(replace(options, out=tmp_path / name)) for name in "ab"]
+    for name in ("trajectory.txt", "keyframes.txt", "landmarks.ply", "graph"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert values(summaries[0])["tracked_share"] == 1
+    assert values(summaries[0])["ate_rmse"] < 0.02
