@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph.camera import Camera
-from graph.geometry import Array, inverse, orthonormalised, se3_exp, skew, transform
+from graph.geometry import Array, inverse, orthonormalised, se3_exp, transform
 
 CHI2_3DOF = 7.815  # 95 %
 CHI2_2DOF = 5.991
@@ -26,7 +26,7 @@ class PoseOptimisationConfig:
     kernel_iterations: int = 3
     final_rounds: int = 2
     final_iterations: int = 5
-    step_tolerance: float = 1e-5
+    step_tolerance: float = 3e-5
     min_points: int = 6
 
 
@@ -69,18 +69,19 @@ def residuals(
 def jacobian(points_camera: Array, camera: Camera) -> Array:
     """d(u, v, disparity)/d(xi) (N, 3, 6) for ``T_world_camera <- T_world_camera @ se3_exp(xi)``.
 
-    Chain rule: d(pixel)/d(point_camera) @ d(point_camera)/d(xi), and the latter is
-    [skew(p), -I] since p <- exp(-xi) p.
+    Chain rule, multiplied out: d(pixel)/d(point_camera) @ d(point_camera)/d(xi), and the latter
+    is [skew(p), -I] since p <- exp(-xi) p.
     """
     x, y, z = points_camera.T
     inv_z = 1.0 / np.where(z > 1e-3, z, 1e-3)
-    dr_dp = np.zeros((len(x), 3, 3))
-    dr_dp[:, 0, 0] = camera.fx * inv_z
-    dr_dp[:, 0, 2] = -camera.fx * x * inv_z**2
-    dr_dp[:, 1, 1] = camera.fy * inv_z
-    dr_dp[:, 1, 2] = -camera.fy * y * inv_z**2
-    dr_dp[:, 2, 2] = -camera.stereo_bf_px_m * inv_z**2
-    return np.concatenate([dr_dp @ skew(points_camera), -dr_dp], axis=2)
+    xn, yn, bf = x * inv_z, y * inv_z, camera.stereo_bf_px_m
+    J = np.zeros((len(x), 3, 6))
+    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2] = camera.fx * xn * yn, -camera.fx * (1 + xn**2), camera.fx * yn
+    J[:, 0, 3], J[:, 0, 5] = -camera.fx * inv_z, camera.fx * xn * inv_z
+    J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = camera.fy * (1 + yn**2), -camera.fy * xn * yn, -camera.fy * xn
+    J[:, 1, 4], J[:, 1, 5] = -camera.fy * inv_z, camera.fy * yn * inv_z
+    J[:, 2, 0], J[:, 2, 1], J[:, 2, 5] = bf * yn * inv_z, -bf * xn * inv_z, bf * inv_z**2
+    return J
 
 
 def optimise_pose(
@@ -112,29 +113,49 @@ def optimise_pose(
     stages += [(None, config.final_iterations)] * config.final_rounds
     for width, iterations in stages:
         if width is None:
-            r, p = residuals(T, points_world, measured, camera)
-            inliers = (np.einsum("ij,ij,ij->i", r, r, weight) < gate) & (p[:, 2] > 0.05)
+            inliers = _inliers(T, points_world, measured, weight, gate, camera)
         if inliers.sum() < config.min_points:
-            return PoseEstimate(T, inliers, H, False)
+            return PoseEstimate(orthonormalised(T), inliers, H, False)
+        chosen = (points_world[inliers], measured[inliers], weight[inliers])
+        kernel = None if width is None else width * gate
         for _ in range(iterations):
-            r, p = residuals(T, points_world[inliers], measured[inliers], camera)
-            kernel = None if width is None else width * gate
-            H, g = _normal_equations(r, p, weight[inliers], kernel, camera)
-            if np.linalg.cond(H) > 1e14:
-                return PoseEstimate(T, inliers, H, False)
+            H, g = _normal_equations(T, *chosen, kernel, camera)
+            if not _well_conditioned(H):
+                return PoseEstimate(orthonormalised(T), inliers, H, False)
             step = -np.linalg.solve(H, g)
-            T = orthonormalised(T @ se3_exp(step))
+            T = T @ se3_exp(step)
             if np.abs(step).max() < config.step_tolerance:
                 break
+    inliers = _inliers(T, points_world, measured, weight, gate, camera)
+    return PoseEstimate(orthonormalised(T), inliers, H, int(inliers.sum()) >= config.min_points)
+
+
+def _inliers(
+    T: Array, points_world: Array, measured: Array, weight: Array, gate: Array, camera: Camera
+) -> NDArray[np.bool_]:
+    """Points (N,) in front of the camera and within the chi-square gate, without any kernel."""
     r, p = residuals(T, points_world, measured, camera)
-    inliers = (np.einsum("ij,ij,ij->i", r, r, weight) < gate) & (p[:, 2] > 0.05)
-    return PoseEstimate(T, inliers, H, int(inliers.sum()) >= config.min_points)
+    return (np.einsum("ij,ij,ij->i", r, r, weight) < gate) & (p[:, 2] > 0.05)
+
+
+def _well_conditioned(H: Array) -> bool:
+    """Whether the six directions are all observed, judged by H scaled to a unit diagonal."""
+    scale = np.sqrt(np.diagonal(H))
+    if not (np.isfinite(scale).all() and (scale > 0).all()):
+        return False
+    return bool(np.linalg.eigvalsh(H / np.outer(scale, scale))[0] > 1e-10)
 
 
 def _normal_equations(
-    r: Array, points_camera: Array, weight: Array, kernel: Array | None, camera: Camera
+    T: Array,
+    points_world: Array,
+    measured: Array,
+    weight: Array,
+    kernel: Array | None,
+    camera: Camera,
 ) -> tuple[Array, Array]:
     """H (6, 6) and gradient (6,) of the weighted squares; Cauchy's weights where a kernel is given."""
+    r, points_camera = residuals(T, points_world, measured, camera)
     w = weight
     if kernel is not None:
         chi2 = np.einsum("ij,ij,ij->i", r, r, weight)
