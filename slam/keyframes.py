@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,7 @@ class KeyframeConfig:
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """
 
-    rule: str = "orb"
+    rule: Literal["orb", "paper"] = "orb"
     min_interval_frames: int = 3
     max_interval_frames: int = 20
     min_tracked: int = 50

@@ -1,0 +1,1 @@
+"""Rendered indoor sequences with exact poses, depth, instances and labels."""
