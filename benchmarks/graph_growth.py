@@ -60,7 +60,7 @@ class Feeder:
         is_old = np.isin(ids, self.known)
         chosen = np.concatenate([self.rng.permutation(ids[is_old]), ids[~is_old]])
         chosen = np.sort(chosen[: self.per_keyframe])
-        z = z[chosen] + self.rng.normal(0, NOISE_PX, (len(chosen), 3))
+        z = self._noisy(z[chosen])
         new = ~np.isin(chosen, self.known)
         depth_m = CAMERA.stereo_bf_px_m / np.maximum(z[new, 0] - z[new, 2], 4.0)
         points_world = transform(T, CAMERA.backproject(z[new, :2], depth_m))
@@ -79,6 +79,12 @@ class Feeder:
             observations.select(keep),
             remove_landmarks=culled,
         )
+
+    def _noisy(self, z: Array) -> Array:
+        """Noise of u, v and disparity; u_right = u_left - disparity carries two of them."""
+        noise = self.rng.normal(0, NOISE_PX, z.shape)
+        noise[:, 2] = noise[:, 0] - noise[:, 2]
+        return z + noise
 
     def _initial_pose(self, k: int, estimate: GraphEstimate | None) -> Array:
         if estimate is None:

@@ -42,7 +42,7 @@ class Camera:
         return self.stereo_bf_px_m / self.fx
 
     def project(self, points_camera: Array) -> Array:
-        """Undistorted pixels (..., 2) of points (..., 3) in the camera frame; z must be positive."""
+        """Undistorted pixels (..., 2) of camera-frame points (..., 3); z must be positive."""
         x, y, z = np.moveaxis(points_camera, -1, 0)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
 
@@ -53,7 +53,7 @@ class Camera:
         return np.concatenate([uv, u_right[..., None]], axis=-1)
 
     def backproject(self, pixels: Array, depth_m: Array) -> Array:
-        """Camera-frame points (..., 3) of undistorted pixels (..., 2) at z-depth (...) in metres."""
+        """Camera-frame points (..., 3) of undistorted pixels (..., 2) at z-depth (...) in m."""
         x = (pixels[..., 0] - self.cx) / self.fx * depth_m
         y = (pixels[..., 1] - self.cy) / self.fy * depth_m
         return np.stack([x, y, np.broadcast_to(depth_m, x.shape)], axis=-1)

@@ -35,7 +35,9 @@ def orthonormalised(T: Array) -> Array:
     Prediction and update feed each other (``T <- T @ inverse(T_last) @ T``), which doubles a
     deviation from orthonormality every frame; whoever closes such a loop must call this.
     """
-    return make_pose(rotation_from_quaternion(quaternion_from_rotation(T[..., :3, :3])), T[..., :3, 3])
+    return make_pose(
+        rotation_from_quaternion(quaternion_from_rotation(T[..., :3, :3])), T[..., :3, 3]
+    )
 
 
 def transform(T_a_b: Array, points_b: Array) -> Array:

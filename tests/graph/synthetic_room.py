@@ -58,13 +58,20 @@ def make_room(
     noise_px: float = 0.0,
     mono_share: float = 0.0,
     seed: int = 0,
+    disparity_noise_px: float | None = None,
 ) -> Room:
-    """A room with this pixel noise in all three coordinates; sigmas 1 px where it is zero."""
+    """A room with this pixel noise in u, v and disparity; sigmas 1 px where it is zero.
+
+    ``disparity_noise_px`` gives the disparity a noise of its own.
+    """
+    sigmas_px = np.array([noise_px, noise_px, noise_px])
+    if disparity_noise_px is not None:
+        sigmas_px[2] = disparity_noise_px
     rng = np.random.default_rng(seed)
     poses = _circle(keyframes)
     points_world = rng.uniform([-2.0, -1.2, -2.0], [2.0, 1.2, 2.0], (points, 3))
     keyframe_ids, landmark_ids, measurements = _measure(poses, points_world)
-    measurements = measurements + rng.normal(0, 1, measurements.shape) * noise_px
+    measurements = noisy(measurements, rng.normal(0, 1, measurements.shape) * sigmas_px)
     measurements[rng.random(len(measurements)) < mono_share, 2] = np.nan
     spoiled = poses @ se3_exp(rng.normal(0, [0.001] * 3 + [0.005] * 3, (keyframes, 6)))
     spoiled[0] = poses[0]
@@ -75,11 +82,22 @@ def make_room(
             keyframe_ids,
             landmark_ids,
             measurements,
-            np.full((len(measurements), 3), noise_px or 1.0),
+            np.tile(np.where(sigmas_px > 0, sigmas_px, 1.0), (len(measurements), 1)),
         ),
         spoiled,
         points_world + rng.normal(0, 0.01, points_world.shape),
     )
+
+
+def noisy(measurements: Array, noise_px: Array) -> Array:
+    """Measurements (M, 3) ``(u_left, v, u_right)`` with noise (M, 3) of u, v and disparity.
+
+    The right image is not seen: u_right = u_left_noisy - (disparity + disparity noise).
+    """
+    u_left, v, u_right = measurements.T
+    u_noisy = u_left + noise_px[:, 0]
+    disparity = (u_left - u_right) + noise_px[:, 2]
+    return np.stack([u_noisy, v + noise_px[:, 1], u_noisy - disparity], axis=1)
 
 
 def _circle(count: int) -> Array:

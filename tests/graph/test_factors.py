@@ -3,9 +3,10 @@
 import gtsam
 import numpy as np
 import pytest
-from synthetic_room import CAMERA, make_room
+from synthetic_room import CAMERA, make_room, noisy
 
 from graph.factors import FactorMaker, make_graph, make_values, read_values
+from graph.gates import reprojection
 from graph.geometry import inverse, se3_exp, se3_log, transform
 from graph.keys import keyframe_keys, landmark_keys, variable_named_in
 from graph.smoother_config import SmootherConfig
@@ -15,7 +16,16 @@ RNG = np.random.default_rng(3)
 T_WORLD_CAMERA = se3_exp(np.array([0.3, -0.2, 0.5, 1.0, -2.0, 0.7]))
 POINT_WORLD = transform(T_WORLD_CAMERA, np.array([[0.4, -0.3, 2.5]]))[0]
 OFFSET_PX = np.array([1.5, -2.5, 0.8])
-SIGMAS_PX = np.array([0.5, 1.0, 2.0])
+SIGMAS_PX = np.array([0.5, 1.0, 2.0])  # of u, v and disparity
+SIGMA_RIGHT_PX = np.hypot(0.5, 2.0)  # u_right = u_left - disparity carries both errors
+COVARIANCE_PX2 = np.array([[0.25, 0.0, 0.25], [0.0, 1.0, 0.0], [0.25, 0.0, SIGMA_RIGHT_PX**2]])
+
+
+def chi2_of_offset(mono: bool) -> float:
+    """Squared Mahalanobis length of OFFSET_PX under the covariance of (u_left, v, u_right)."""
+    rows = slice(0, 2 if mono else 3)
+    offset = OFFSET_PX[rows]
+    return float(offset @ np.linalg.solve(COVARIANCE_PX2[rows, rows], offset))
 
 
 def one_observation(mono: bool) -> Observations:
@@ -34,26 +44,45 @@ def test_error_is_half_of_whitened_projection_minus_measurement(mono: bool) -> N
     (factor,) = FactorMaker(CAMERA, SmootherConfig(robust=False)).observations(
         one_observation(mono)
     )
-    whitened = (OFFSET_PX / SIGMAS_PX)[: 2 if mono else 3]
     error = factor.error(values_at(T_WORLD_CAMERA, POINT_WORLD))
-    assert error == pytest.approx(0.5 * np.sum(whitened**2), rel=1e-9)
+    assert error == pytest.approx(0.5 * chi2_of_offset(mono), rel=1e-9)
+
+
+def test_stereo_error_is_that_of_independent_pixel_and_disparity() -> None:
+    """The same chi-square as three independent residuals u, v and u_left - u_right."""
+    disparity_offset = OFFSET_PX[0] - OFFSET_PX[2]
+    independent = np.array([OFFSET_PX[0], OFFSET_PX[1], disparity_offset]) / SIGMAS_PX
+    assert chi2_of_offset(mono=False) == pytest.approx(np.sum(independent**2), rel=1e-12)
+    _, chi2 = reprojection(one_observation(False), T_WORLD_CAMERA[None], POINT_WORLD[None], CAMERA)
+    assert chi2[0] == pytest.approx(chi2_of_offset(mono=False), rel=1e-9)
+    _, chi2 = reprojection(one_observation(True), T_WORLD_CAMERA[None], POINT_WORLD[None], CAMERA)
+    assert chi2[0] == pytest.approx(chi2_of_offset(mono=True), rel=1e-9)
+
+
+def test_covariance_is_that_of_simulated_measurements() -> None:
+    noise = RNG.normal(size=(100_000, 3)) * SIGMAS_PX
+    z = noisy(np.tile([300.0, 200.0, 280.0], (len(noise), 1)), noise)
+    np.testing.assert_allclose(np.cov(z.T), COVARIANCE_PX2, atol=0.05)
 
 
 @pytest.mark.parametrize("mono", [False, True])
 def test_jacobians_agree_with_finite_differences_of_our_camera(mono: bool) -> None:
-    """GTSAM's linear factor against central differences of Camera.project_stereo."""
+    """GTSAM's linear factor against central differences of Camera.project_stereo.
+
+    Jacobian and error are compared through J^T J, J^T b and b^T b, which any square root of
+    the information matrix gives alike.
+    """
     maker = FactorMaker(CAMERA, SmootherConfig(robust=False))
     (factor,) = maker.observations(one_observation(mono))
     linear = factor.linearize(values_at(T_WORLD_CAMERA, POINT_WORLD))
     J, b = linear.jacobian()
-    rows = [0, 1] if mono else [0, 2, 1]  # GTSAM's order of a stereo measurement
+    rows = slice(0, 2 if mono else 3)
+    square_root = np.linalg.cholesky(np.linalg.inv(COVARIANCE_PX2[rows, rows])).T
 
     def whitened(T: np.ndarray, p: np.ndarray) -> np.ndarray:
         camera_point = transform(inverse(T), p[None])[0]
-        r = (
-            CAMERA.project_stereo(camera_point) - one_observation(False).measurements[0]
-        ) / SIGMAS_PX
-        return r[rows]
+        r = CAMERA.project_stereo(camera_point) - one_observation(False).measurements[0]
+        return square_root @ r[rows]
 
     h = 1e-6
     d_pose = [
@@ -73,15 +102,16 @@ def test_jacobians_agree_with_finite_differences_of_our_camera(mono: bool) -> No
         for e in np.eye(3)
     ]
     assert list(linear.keys()) == keyframe_keys(np.array([7])) + landmark_keys(np.array([9]))
-    np.testing.assert_allclose(J, np.array(d_pose + d_point).T, rtol=1e-5, atol=1e-4)
-    np.testing.assert_allclose(-b, whitened(T_WORLD_CAMERA, POINT_WORLD), rtol=1e-9)
+    ours = np.column_stack([*d_pose, *d_point, -whitened(T_WORLD_CAMERA, POINT_WORLD)])
+    theirs = np.column_stack([J, b])
+    np.testing.assert_allclose(theirs.T @ theirs, ours.T @ ours, rtol=1e-5, atol=1e-2)
 
 
 def test_huber_starts_at_the_chi_square_bound() -> None:
     config = SmootherConfig(huber_stereo=2.0)
     z = one_observation(False)
     (factor,) = FactorMaker(CAMERA, config).observations(z)
-    distance = np.linalg.norm(OFFSET_PX / SIGMAS_PX)
+    distance = np.sqrt(chi2_of_offset(mono=False))
     expected = 2.0 * (distance - 1.0)  # Huber's loss beyond k = 2
     assert distance > 2.0
     error = factor.error(values_at(T_WORLD_CAMERA, POINT_WORLD))

@@ -108,11 +108,12 @@ def test_huber_bounds_the_harm_of_outliers() -> None:
     assert harm_m[False] > 0.005
 
 
-def test_pose_covariance_is_consistent() -> None:
+@pytest.mark.parametrize(("noise_px", "disparity_noise_px"), [(1.0, 1.0), (0.7, 0.15), (0.2, 1.0)])
+def test_pose_covariance_is_consistent(noise_px: float, disparity_noise_px: float) -> None:
     """NEES: the squared error in units of the covariance is chi-square, 6 a pose."""
     nees = []
     for seed in range(20):
-        room = make_room(keyframes=6, points=60, noise_px=1.0, seed=seed)
+        room = make_room(6, 60, noise_px, seed=seed, disparity_noise_px=disparity_noise_px)
         smoother, _ = run(room, SmootherConfig(robust=False, gate_sigmas=1e3))
         xi = pose_errors(smoother.optimise_batch(), room)[5]
         nees.append(xi @ np.linalg.solve(smoother.marginal_covariance(5), xi))
