@@ -19,13 +19,17 @@ BRISK_BASE_SIZE_PX = 12.0 * 0.7  # OpenCV's keypoint size in the finest layer
 class FeatureConfig:
     """The front end's parameters; pixels are those of the full image.
 
-    ``octaves`` doubles as BRISK's: each adds a half-scale layer and an intra-octave. The
-    depth noise is Khoshelham's and Nguyen's model of structured light, as in OpenNI sensors:
-    sigma_z = depth_sigma_m + depth_sigma_z2 * z^2.
+    The corner threshold is the highest of ``thresholds`` at which FAST, a fortieth of BRISK's cost,
+    finds ``max_keypoints`` in the finest layer; so a blurred frame gets its keypoints and a rich one
+    costs no more. ``octaves`` is BRISK's: each adds a half-scale layer and an intra-octave.
+    ``pixel_sigma`` is that of a BRISK keypoint at scale 1. ``disparity_sigma_px`` is the depth
+    sensor's: for structured light a constant in disparity, sigma_z = z^2 / bf * sigma_d, with 0.07 px
+    the laboratory value (Nguyen 2012) at bf = 40 px m. ``depth_window_px`` and
+    ``depth_edge_ratio``: see sample_depth.
     """
 
-    threshold: int = 20
-    octaves: int = 2
+    thresholds: tuple[int, ...] = (50, 35, 25, 18, 13)
+    octaves: int = 0
     max_keypoints: int = 1000
     bucket_px: int = 40
     pixel_sigma: float = 0.7
@@ -79,20 +83,27 @@ class BriskExtractor:
     def __init__(self, camera: Camera, config: FeatureConfig):
         self.camera = camera
         self.config = config
-        self._brisk = cv2.BRISK_create(config.threshold, config.octaves)
+        self._brisk = {t: cv2.BRISK_create(t, config.octaves) for t in config.thresholds}
+        self._fast = {t: cv2.FastFeatureDetector_create(t) for t in config.thresholds}
 
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        keypoints = self._brisk.detect(gray, None)
-        kept = self._strongest_spread(keypoints, gray.shape)
-        keypoints, descriptors = self._brisk.compute(gray, kept)
+        brisk = self._brisk[self._threshold(gray)]
+        kept = self._strongest_spread(brisk.detect(gray, None), gray.shape)
+        keypoints, descriptors = brisk.compute(gray, kept)
         if descriptors is None:
             keypoints, descriptors = (), np.zeros((0, 64), np.uint8)
         table = np.array(
             [(*k.pt, k.size, k.angle) for k in keypoints], dtype=float
         ).reshape(-1, 4)
         return self._assemble(frame, gray, table, np.ascontiguousarray(descriptors))
+
+    def _threshold(self, gray: NDArray[np.uint8]) -> int:
+        for threshold in self.config.thresholds:
+            if len(self._fast[threshold].detect(gray)) >= self.config.max_keypoints:
+                return threshold
+        return self.config.thresholds[-1]
 
     def _strongest_spread(self, keypoints: tuple, shape: tuple[int, int]) -> list:
         """At most ``max_keypoints``: every bucket's strongest first, then the second, and so on."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph.geometry import Array
-from graph.updates import GraphEstimate, GraphUpdate, IntArray, Observations
+from graph.updates import GraphEstimate, GraphUpdate, IntArray, Observations, PosePrior
 from slam.features import Features, spread_order
 from slam.landmarks import Ints
 from slam.world_map import Keyframe, WorldMap
@@ -50,6 +50,7 @@ class GraphFeed:
         observed = self._unsent_observations(world, keyframe, new_ids)
         removed = np.concatenate([np.zeros(0, np.int64), *self._removed])
         gone = self._removed_keyframes
+        begins = world.in_segment(keyframe.segment) == [keyframe]
         self._removed, self._removed_keyframes = [], []
         return GraphUpdate(
             keyframe_ids=np.array([keyframe.id]),
@@ -57,8 +58,31 @@ class GraphFeed:
             landmark_ids=new_ids,
             points_world=world.landmarks.points_world[new_ids],
             observations=observed,
+            priors=(segment_prior(keyframe),) if begins else (),
             remove_landmarks=removed,
             remove_keyframes=np.array(gone, np.int64),
+        )
+
+    def whole_update(self, world: WorldMap) -> GraphUpdate:
+        """The update that fills an empty graph with the whole map, one prior a segment."""
+        self._removed, self._removed_keyframes = [], []
+        keyframes = list(world.keyframes.values())
+        landmarks = world.landmarks
+        landmarks.in_graph &= landmarks.alive
+        first = {k.segment: k for k in reversed(keyframes)}
+        parts = []
+        for keyframe in keyframes:
+            keypoints, ids = world.observed(keyframe)
+            inside = landmarks.in_graph[ids]
+            parts.append(observations_of(keyframe, keypoints[inside], ids[inside]))
+        ids = np.flatnonzero(landmarks.in_graph)
+        return GraphUpdate(
+            keyframe_ids=np.array([k.id for k in keyframes]),
+            poses_world_camera=np.array([k.T_world_camera for k in keyframes]),
+            landmark_ids=ids,
+            points_world=landmarks.points_world[ids],
+            observations=concatenate(parts),
+            priors=tuple(segment_prior(first[s]) for s in sorted(first)),
         )
 
     def _promoted(
@@ -89,6 +113,11 @@ class GraphFeed:
             if wanted.any():
                 parts.append(observations_of(other, keypoints[wanted], ids[wanted]))
         return concatenate(parts)
+
+
+def segment_prior(keyframe: Keyframe) -> PosePrior:
+    """The first keyframe of a segment fixes the segment's frame."""
+    return PosePrior(keyframe.id, keyframe.T_world_camera, np.eye(6) * 1e-8)
 
 
 def observations_of(keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> Observations:

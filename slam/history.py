@@ -36,16 +36,19 @@ class FrameHistory:
         """A keyframe leaves the map: its frames follow the parent from now on."""
         self._parent[keyframe_id] = (parent_id, T_parent_keyframe)
 
-    def trajectory(self, world: WorldMap, segment: int) -> Trajectory:
-        """Every tracked frame of one map segment, from the keyframes' current poses."""
-        stamps, poses = [], []
+    def trajectories(self, world: WorldMap) -> dict[int, Trajectory]:
+        """Every tracked frame, by map segment, from the keyframes' current poses."""
+        stamps: dict[int, list[float]] = {}
+        poses: dict[int, list[Array]] = {}
         for entry in self._entries:
             keyframe_id, T = self._resolve(entry.keyframe_id, entry.T_keyframe_camera)
             keyframe = world.keyframes[keyframe_id]
-            if keyframe.segment == segment:
-                stamps.append(entry.timestamp_s)
-                poses.append(keyframe.T_world_camera @ T)
-        return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4))
+            stamps.setdefault(keyframe.segment, []).append(entry.timestamp_s)
+            poses.setdefault(keyframe.segment, []).append(keyframe.T_world_camera @ T)
+        return {
+            segment: Trajectory(np.array(stamps[segment]), np.array(poses[segment]))
+            for segment in sorted(stamps)
+        }
 
     def _resolve(self, keyframe_id: int, T: Array) -> tuple[int, Array]:
         while keyframe_id in self._parent:

@@ -11,9 +11,11 @@ class KeyframeConfig:
     """The rule's numbers; ``rule`` is "orb" (default) or "paper".
 
     "orb" (ORB-SLAM, section V.E, with ORB-SLAM2's extra rule): mapping is idle or more than
-    ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and fewer than
-    ``max_shared`` of the reference keyframe's points are; or the close points run out: fewer
-    than ``min_close_tracked`` are tracked while ``min_close_new`` could be made.
+    ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and the shared view
+    is below ``max_shared``; or the close points run out: fewer than ``min_close_tracked`` are
+    tracked while ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three
+    keyframes see; here all points of the reference keyframe count, of which BRISK finds about 60 %
+    again in the next frame, so that half is the equal of it.
     "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """
@@ -22,7 +24,7 @@ class KeyframeConfig:
     min_interval_frames: int = 3
     max_interval_frames: int = 20
     min_tracked: int = 50
-    max_shared: float = 0.7
+    max_shared: float = 0.5
     min_close_tracked: int = 100
     min_close_new: int = 70
     paper_interval_frames: int = 30
@@ -38,7 +40,7 @@ class KeyframeEvidence:
         frames_since: frames since the last keyframe was made.
         mapping_idle: the back end waits for work; True in an offline run, so that runs repeat.
         tracked: landmarks tracked in this frame.
-        shared: tracked points of the reference keyframe over all its points, 0 to 1.
+        shared: tracked points over the points of the reference keyframe.
         close_tracked: tracked landmarks at close range.
         close_new: keypoints at close range that are not tracked.
     """

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from graph.camera import Camera
-from graph.geometry import Array, transform
+from graph.geometry import transform
 from slam.landmarks import Ints
 from slam.matching import Matches, WindowIndex
 from slam.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from slam.tracker import Tracker
+from slam.triangulation import TriangulationConfig
 from slam.world_map import Keyframe, WorldMap
 
 
@@ -35,6 +36,7 @@ class MappingConfig:
     min_observations: int = 2
     redundant_share: float = 0.9
     redundant_views: int = 3
+    triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
 
 
 def local_landmarks(world: WorldMap, seen_ids: Ints, config: MappingConfig) -> Ints:
@@ -51,20 +53,7 @@ def create_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> Int
     features = keyframe.features
     free = np.flatnonzero((keyframe.landmark_ids < 0) & np.isfinite(features.depth_m))
     points = camera.backproject(features.pixels[free], features.depth_m[free])
-    return add_landmarks(world, keyframe, free, transform(keyframe.T_world_camera, points))
-
-
-def add_landmarks(world: WorldMap, keyframe: Keyframe, keypoints: Ints, points_world: Array) -> Ints:
-    """Landmarks at points (N, 3), made and observed by the keypoints (N,) of a keyframe."""
-    ids = world.landmarks.add(
-        {
-            "points_world": points_world,
-            "colours": keyframe.features.colours[keypoints],
-            "host": np.full(len(keypoints), keyframe.id),
-        }
-    )
-    world.attach(keyframe, keypoints, ids)
-    return ids
+    return world.make_landmarks(keyframe, free, transform(keyframe.T_world_camera, points))
 
 
 def fuse_into_neighbours(

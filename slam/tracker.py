@@ -214,3 +214,10 @@ def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked
     information = np.zeros((6, 6))
     status = TrackingStatus.LOST
     return Tracked(status, T_world_camera, features, none, none, matches, none, information)
+
+
+def untracked(T_world_camera: Array, features: Features) -> Tracked:
+    """The outcome of a frame that begins a map at a given pose."""
+    none = np.zeros(0, np.int64)
+    information = np.zeros((6, 6))
+    return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information)

@@ -42,11 +42,38 @@ class WorldMap:
     landmarks: LandmarkTable = field(default_factory=LandmarkTable)
     next_keyframe_id: int = 0
 
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        """Take a keyframe in; its id must be ``next_keyframe_id``."""
+        self.keyframes[keyframe.id] = keyframe
+        self.next_keyframe_id = keyframe.id + 1
+
+    def in_segment(self, segment: int) -> list[Keyframe]:
+        """The keyframes of one map segment, oldest first."""
+        return [k for k in self.keyframes.values() if k.segment == segment]
+
+    def segment_of(self, landmark_ids: Ints) -> int:
+        """The segment whose keyframes made most of these landmarks."""
+        hosts = self.landmarks.host[landmark_ids]
+        segments = [self.keyframes[h].segment for h in hosts if h in self.keyframes]
+        return int(np.bincount(segments).argmax())
+
     def observed(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
         """Keypoint indices and ids of the living landmarks that a keyframe observes."""
         keypoints = np.flatnonzero(keyframe.landmark_ids >= 0)
         keypoints = keypoints[self.landmarks.alive[keyframe.landmark_ids[keypoints]]]
         return keypoints, keyframe.landmark_ids[keypoints]
+
+    def make_landmarks(self, keyframe: Keyframe, keypoints: Ints, points_world: Array) -> Ints:
+        """Landmarks at points (N, 3), made and observed by keypoints (N,); returns their ids."""
+        ids = self.landmarks.add(
+            {
+                "points_world": points_world,
+                "colours": keyframe.features.colours[keypoints],
+                "host": np.full(len(keypoints), keyframe.id),
+            }
+        )
+        self.attach(keyframe, keypoints, ids)
+        return ids
 
     def attach(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:
         """Record that keypoints (N,) of a keyframe observe landmarks (N,), and refresh these."""
@@ -124,9 +151,3 @@ class WorldMap:
         self.landmarks.visible[new_ids] += self.landmarks.visible[old_ids]
         self.landmarks.remove(old_ids)
         return old_ids
-
-    def poses(self) -> tuple[Ints, Array]:
-        """Ids (K,) and poses T_world_camera (K, 4, 4) of all keyframes, by id."""
-        ids = np.array(sorted(self.keyframes), np.int64)
-        poses = [self.keyframes[i].T_world_camera for i in ids]
-        return ids, np.array(poses).reshape(-1, 4, 4)

@@ -1,0 +1,79 @@
+"""Where the camera is, frame by frame: the motion model, tracking, and what to do when lost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graph.geometry import Array, inverse, orthonormalised
+from slam.features import Features
+from slam.landmarks import Ints
+from slam.local_mapping import MappingConfig, local_landmarks
+from slam.relocalisation import RelocalisationConfig, relocalise
+from slam.results import TrackingStatus
+from slam.tracker import Tracked, Tracker
+from slam.world_map import Keyframe, WorldMap
+
+
+class Localiser:
+    """Keeps what one frame hands to the next; the map belongs to the caller.
+
+    ``lost_frames`` counts the frames since the last pose, 0 while tracking.
+    """
+
+    def __init__(
+        self, tracker: Tracker, relocalisation: RelocalisationConfig, mapping: MappingConfig
+    ):
+        self.tracker = tracker
+        self.lost_frames = 0
+        self._relocalisation = relocalisation
+        self._mapping = mapping
+        self._T_world_last = np.eye(4)
+        self._T_last_next = np.eye(4)
+        self._recent_ids: Ints = np.zeros(0, np.int64)
+        self._local_ids: Ints = np.zeros(0, np.int64)
+
+    @property
+    def local_ids(self) -> Ints:
+        """Landmarks of the local map that the next frame will be tracked against."""
+        return self._local_ids
+
+    def track(self, features: Features, world: WorldMap, reference: Keyframe) -> Tracked:
+        """The frame's pose by constant velocity and the local map; when lost, by all keyframes."""
+        T_predicted = orthonormalised(self._T_world_last @ self._T_last_next)
+        tracked = self.tracker.track(
+            features, T_predicted, self._recent_ids, self._local_ids, world
+        )
+        if tracked.status is TrackingStatus.LOST:
+            found = self.find(features, world.in_segment(reference.segment), world)
+            tracked = found or tracked
+        if tracked.status is TrackingStatus.LOST:
+            self.lost_frames += 1
+            self._T_last_next = np.eye(4)
+            return tracked
+        world.landmarks.visible[tracked.visible_ids] += 1
+        world.landmarks.found[tracked.landmark_ids] += 1
+        return tracked
+
+    def find(
+        self, features: Features, keyframes: list[Keyframe], world: WorldMap
+    ) -> Tracked | None:
+        """The frame's pose against some keyframes, without a prior; None if it is not there."""
+        rules = (self._relocalisation, self._mapping)
+        return relocalise(features, keyframes, world, self.tracker, rules)
+
+    def moved_on(self, T_world_tracked: Array, T_world_camera: Array, seen_ids: Ints) -> None:
+        """A frame is done: T_world_tracked is its pose as tracked, T_world_camera as optimised."""
+        steady = self.lost_frames == 0
+        self._T_last_next = inverse(self._T_world_last) @ T_world_tracked if steady else np.eye(4)
+        self._T_world_last = T_world_camera
+        self._recent_ids = seen_ids
+        self.lost_frames = 0
+
+    def new_local_map(self, world: WorldMap, keyframe: Keyframe) -> None:
+        """Track against the surroundings of this keyframe from now on."""
+        _, seen = world.observed(keyframe)
+        self._local_ids = local_landmarks(world, seen, self._mapping)
+
+    def restart(self, T_world_camera: Array) -> None:
+        """Begin anew at a pose, without speed: a new segment, or a map that was moved."""
+        self._T_world_last, self._T_last_next = T_world_camera, np.eye(4)

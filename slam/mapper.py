@@ -1,0 +1,120 @@
+"""The map's owner: keyframes go in, the graph is optimised, segments are joined."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.geometry import inverse
+from graph.smoother import Smoother
+from graph.smoother_config import SmootherConfig
+from graph.updates import GraphEstimate
+from slam.features import Features
+from slam.frame import Frame
+from slam.graph_feed import GraphFeed, GraphFeedConfig, read_back
+from slam.history import FrameHistory
+from slam.landmarks import Ints
+from slam.local_mapping import (
+    MappingConfig,
+    create_landmarks,
+    cull_landmarks,
+    fuse_into_neighbours,
+    redundant_keyframe,
+)
+from slam.segments import join_segment
+from slam.tracker import Tracked, Tracker
+from slam.triangulation import triangulate_landmarks
+from slam.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
+
+
+class Mapper:
+    """Holds map, graph and frame history, and keeps the three consistent."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        tracker: Tracker,
+        config: tuple[MappingConfig, GraphFeedConfig, SmootherConfig],
+    ):
+        self.camera = camera
+        self.world = WorldMap()
+        self.history = FrameHistory()
+        self.smoother = Smoother(camera, config[2])
+        self.update_ms: list[float] = []
+        self._tracker = tracker
+        self._mapping, self._graph_config = config[0], config[2]
+        self._feed = GraphFeed(config[1])
+
+    def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
+        """Make a tracked frame a keyframe: landmarks are made, fused and culled."""
+        world = self.world
+        keyframe = Keyframe(
+            id=world.next_keyframe_id,
+            frame_index=frame.index,
+            timestamp_s=frame.timestamp_s,
+            segment=segment,
+            T_world_camera=tracked.T_world_camera,
+            features=tracked.features,
+            landmark_ids=np.full(len(tracked.features), -1, np.int64),
+        )
+        world.add_keyframe(keyframe)
+        world.attach(keyframe, tracked.keypoints, tracked.landmark_ids)
+        new_ids = create_landmarks(world, keyframe, self.camera)
+        fused = fuse_into_neighbours(world, keyframe, new_ids, self._tracker, self._mapping)
+        triangulate_landmarks(world, keyframe, self.camera, self._mapping.triangulation)
+        world.renew_patches(keyframe, self._tracker.config.subpixel)
+        keyframe.features = without_image(keyframe.features)
+        self._feed.forget_landmarks(fused)
+        self._feed.forget_landmarks(cull_landmarks(world, local_ids, self._mapping))
+        return keyframe
+
+    def optimise(self, keyframe: Keyframe) -> None:
+        """Put a keyframe into the graph, read all poses and points back, cull a redundant one."""
+        self._apply(self.smoother.update(self._feed.keyframe_update(self.world, keyframe)))
+        self._cull_keyframe(keyframe)
+
+    def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
+        """A frame of one segment was recognised in another: move the segment there, as one map.
+
+        Returns the frame as it is seen in the joined map.
+        """
+        joined = join_segment(self.world, segment, tracked, recognised)
+        self.smoother = Smoother(self.camera, self._graph_config)
+        self._apply(self.smoother.update(self._feed.whole_update(self.world)))
+        return joined
+
+    def finish(self) -> None:
+        """Full bundle adjustment of the graph; the map is then final."""
+        if self.world.keyframes:
+            self._apply(self.smoother.optimise_batch(), timed=False)
+
+    def _apply(self, estimate: GraphEstimate, timed: bool = True) -> None:
+        if timed:
+            self.update_ms.append(estimate.update_ms)
+        if estimate.rebuilt:
+            logger.warning("graph rebuilt after a failure at %s", estimate.failed_variable)
+        read_back(self.world, estimate)
+
+    def _cull_keyframe(self, newest: Keyframe) -> None:
+        _, seen = self.world.observed(newest)
+        strong = self.world.covisible(seen, 15)
+        old = [k for _, k in strong if k.id != 0 and k.id < newest.id - 2]
+        redundant = redundant_keyframe(self.world, old, self._mapping)
+        if redundant is None:
+            return
+        _, ids = self.world.observed(redundant)
+        heir = next(k for _, k in self.world.covisible(ids, 0) if k is not redundant)
+        T_heir_keyframe = inverse(heir.T_world_camera) @ redundant.T_world_camera
+        self.history.hand_over(redundant.id, heir.id, T_heir_keyframe)
+        self.world.remove_keyframe(redundant, heir)
+        self._feed.forget_keyframe(redundant.id)
+
+
+def without_image(features: Features) -> Features:
+    """The features without their picture, which a keyframe needs no more once patches are cut."""
+    return replace(features, gray=np.zeros((0, 0), np.uint8))

@@ -1,0 +1,99 @@
+"""Finding the camera in the map without a prior: after tracking was lost, or to join segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from graph.geometry import Array, make_pose
+from slam.features import Features
+from slam.local_mapping import MappingConfig, local_landmarks
+from slam.matching import MatchConfig, WindowIndex, match_brute_force
+from slam.results import TrackingStatus
+from slam.tracker import Tracked, Tracker
+from slam.world_map import Keyframe, WorldMap
+
+
+@dataclass(frozen=True)
+class RelocalisationConfig:
+    """``candidates`` keyframes with the most votes are tried; a pose needs ``min_inliers``.
+
+    Every frame casts votes with ``query_keypoints`` of its descriptors. After ``patience_frames``
+    lost frames a new map segment is begun, if the frame has ``min_new_points`` with depth.
+    """
+
+    query_keypoints: int = 200
+    candidates: int = 4
+    min_matches: int = 15
+    min_inliers: int = 30
+    reprojection_px: float = 4.0
+    patience_frames: int = 10
+    min_new_points: int = 100
+    match: MatchConfig = field(default_factory=lambda: MatchConfig(max_distance=110, ratio=0.85))
+
+
+def relocalise(
+    features: Features,
+    keyframes: list[Keyframe],
+    world: WorldMap,
+    tracker: Tracker,
+    config: tuple[RelocalisationConfig, MappingConfig],
+) -> Tracked | None:
+    """The frame against the most similar of some keyframes, or None if none of them fits.
+
+    Descriptors are matched without a prior, the pose is found by P3P in RANSAC (OpenCV, whose
+    random numbers are seeded, so that runs repeat), then refined on that keyframe's local map.
+    """
+    rules, mapping = config
+    for keyframe in similar_keyframes(features, keyframes, rules):
+        T_world_camera = _pose_from(keyframe, features, world, tracker, rules)
+        if T_world_camera is None:
+            continue
+        _, seen = world.observed(keyframe)
+        local_ids = local_landmarks(world, seen, mapping)
+        index = WindowIndex(features.pixels)
+        tracked = tracker.refine(features, index, T_world_camera, local_ids, world)
+        enough = len(tracked.landmark_ids) >= rules.min_inliers
+        if tracked.status is not TrackingStatus.LOST and enough:
+            return tracked
+    return None
+
+
+def similar_keyframes(
+    features: Features, keyframes: list[Keyframe], config: RelocalisationConfig
+) -> list[Keyframe]:
+    """The keyframes that most of a frame's descriptors find a near, unambiguous partner in."""
+    step = max(len(features) // config.query_keypoints, 1)
+    query = np.ascontiguousarray(features.descriptors[::step])
+    votes = [len(match_brute_force(query, k.features.descriptors, config.match)) for k in keyframes]
+    order = np.argsort(-np.array(votes, dtype=int), kind="stable")[: config.candidates]
+    return [keyframes[i] for i in order if votes[i] >= config.min_matches // 3]
+
+
+def _pose_from(
+    keyframe: Keyframe,
+    features: Features,
+    world: WorldMap,
+    tracker: Tracker,
+    config: RelocalisationConfig,
+) -> Array | None:
+    keypoints, ids = world.observed(keyframe)
+    known = np.ascontiguousarray(keyframe.features.descriptors[keypoints])
+    matches = match_brute_force(features.descriptors, known, config.match)
+    if len(matches) < config.min_matches:
+        return None
+    found, rotation, t, inliers = cv2.solvePnPRansac(
+        world.landmarks.points_world[ids[matches.train]],
+        features.pixels[matches.query],
+        tracker.camera.K,
+        None,
+        reprojectionError=config.reprojection_px,
+        iterationsCount=200,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or inliers is None or len(inliers) < config.min_matches:
+        return None
+    R_camera_world = cv2.Rodrigues(rotation)[0]
+    return make_pose(R_camera_world.T, -R_camera_world.T @ t[:, 0])
