@@ -12,7 +12,7 @@ from graph.camera import Camera
 from graph.geometry import Array
 from slam.frame import Frame
 
-BRISK_BASE_SIZE_PX = 12.0 * 0.7  # OpenCV's keypoint size in the finest layer
+FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
 
 
 @dataclass(frozen=True)
@@ -89,38 +89,46 @@ class BriskExtractor:
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        brisk = self._brisk[self._threshold(gray)]
-        kept = self._strongest_spread(brisk.detect(gray, None), gray.shape)
-        keypoints, descriptors = brisk.compute(gray, kept)
+        keypoints, threshold = self._detect(gray)
+        kept = self._strongest_spread(keypoints, gray.shape)
+        keypoints, descriptors = self._brisk[threshold].compute(gray, kept)
         if descriptors is None:
             keypoints, descriptors = (), np.zeros((0, 64), np.uint8)
-        table = np.array(
-            [(*k.pt, k.size, k.angle) for k in keypoints], dtype=float
-        ).reshape(-1, 4)
-        return self._assemble(frame, gray, table, np.ascontiguousarray(descriptors))
+        table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=float)
+        return self._assemble(frame, gray, table.reshape(-1, 4), np.ascontiguousarray(descriptors))
 
-    def _threshold(self, gray: NDArray[np.uint8]) -> int:
+    def _detect(self, gray: NDArray[np.uint8]) -> tuple[list, int]:
+        """Keypoints at the highest threshold that gives enough of them, and that threshold.
+
+        Without octaves BRISK's detector is FAST with non-maximum suppression, and its sub-pixel
+        step is not needed, since matches are registered to patches later.
+        """
         for threshold in self.config.thresholds:
-            if len(self._fast[threshold].detect(gray)) >= self.config.max_keypoints:
-                return threshold
-        return self.config.thresholds[-1]
+            keypoints = self._fast[threshold].detect(gray)
+            if len(keypoints) >= self.config.max_keypoints:
+                break
+        if self.config.octaves > 0:
+            keypoints = self._brisk[threshold].detect(gray, None)
+        return list(keypoints), threshold
 
-    def _strongest_spread(self, keypoints: tuple, shape: tuple[int, int]) -> list:
+    def _strongest_spread(self, keypoints: list, shape: tuple[int, int]) -> list:
         """At most ``max_keypoints``: every bucket's strongest first, then the second, and so on."""
-        if len(keypoints) <= self.config.max_keypoints:
-            return list(keypoints)
+        if not keypoints:
+            return []
         size = self.config.bucket_px
         columns = -(-shape[1] // size)
         pixels = cv2.KeyPoint_convert(keypoints)
         response = np.array([k.response for k in keypoints])
         bucket = (pixels[:, 1] // size).astype(int) * columns + (pixels[:, 0] // size).astype(int)
-        keep = spread_order(bucket, response)[: self.config.max_keypoints]
-        return [keypoints[i] for i in np.sort(keep)]
+        keep = np.sort(spread_order(bucket, response)[: self.config.max_keypoints])
+        if self.config.octaves > 0:
+            return [keypoints[i] for i in keep]
+        return list(cv2.KeyPoint_convert(pixels[keep], FINEST_SIZE_PX))
 
     def _assemble(
         self, frame: Frame, gray: NDArray[np.uint8], table: Array, descriptors: NDArray[np.uint8]
     ) -> Features:
-        raw, scales = table[:, :2], np.maximum(table[:, 2] / BRISK_BASE_SIZE_PX, 1.0)
+        raw, scales = table[:, :2], np.maximum(table[:, 2] / FINEST_SIZE_PX, 1.0)
         depth_m, spread_m = sample_depth(frame.depth_m, raw, self.config)
         disparity = self.camera.stereo_bf_px_m / depth_m
         sigmas = np.empty((len(raw), 3))
