@@ -1,0 +1,185 @@
+"""Measure everything and write docs/benchmarks.md; ``make bench`` calls it.
+
+    python benchmarks/run.py                  all sequences; also the table in README.md
+    python benchmarks/run.py --quick          the first frames of two sequences, in a minute or two
+    python benchmarks/run.py --sequence DIR   a sequence of your own instead
+
+Every run is a process of its own. Rendered sequences are made once, in runs/bench/, and the red
+kitchen is measured where ../shared holds it. Only a run over everything touches docs/ and
+README.md; the others write their report into runs/bench/, or where --report says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from figures import growth_rows, plot_growth, read_growth
+from machine import brisk_ms, describe_commit, describe_machine, load_average, now
+from measure import (
+    ROOT,
+    SHARED,
+    Job,
+    Measurement,
+    call,
+    identical,
+    measure,
+    published_trajectories,
+    render,
+    shown,
+)
+from report import insert_results, write_report
+
+logger = logging.getLogger("benchmarks")
+
+WRITTEN = ("docs/benchmarks.md", "docs/images", "README.md")
+RENDERED = {
+    "office": ("office-300", ("--frames", "300", "--true-depth")),
+    "living_room": ("living_room", ()),
+    "corridor": ("corridor", ()),
+}
+KITCHEN = SHARED / "redkitchen"
+WITHOUT_SUBPIXEL = ("--set", "tracking.subpixel.enabled=false")
+GROWING = ("redkitchen", "corridor")
+QUICK_FRAMES = 150
+
+
+def plan(folders: dict[str, Path], quick: bool) -> list[Job]:
+    """What is run: all as it comes, again, at 10 Hz, and without sub-pixel registration."""
+    if quick:
+        options = ("--max-frames", str(QUICK_FRAMES))
+        return [Job(name, folder, "default", options) for name, folder in folders.items()]
+    jobs = [Job(name, folder) for name, folder in folders.items()]
+    first = next(iter(folders))
+    jobs.append(Job(first, folders[first], "repeated"))
+    if KITCHEN in folders.values():
+        jobs.append(Job("redkitchen", KITCHEN, "every 3rd frame", ("--stride", "3")))
+    for name, folder in folders.items():
+        jobs.append(Job(name, folder, "without sub-pixel registration", WITHOUT_SUBPIXEL))
+    return jobs
+
+
+def find_sequences(arguments: argparse.Namespace) -> tuple[dict[str, Path], list[str]]:
+    """Folders by name, rendered where they were missing, and the commands that make them."""
+    if arguments.sequence:
+        return {folder.resolve().name: folder for folder in arguments.sequence}, []
+    folders = {"redkitchen": KITCHEN} if KITCHEN.is_dir() else {}
+    commands = []
+    for name, (folder_name, options) in RENDERED.items():
+        if arguments.quick and name != "office":
+            continue
+        folders[name] = arguments.work / folder_name
+        commands.append(render(folders[name], name, options))
+    return folders, commands
+
+
+def recorded(name: str, folder: Path, work: Path, frames: int) -> Any:
+    """A run that writes down how the graph grows."""
+    out = work / "results" / f"{name}-recorded"
+    logger.info("running %s, recorded", name)
+    call(["benchmarks/recorded_run.py", str(folder), "--out", str(out)])
+    return read_growth(out / "growth.csv", name, frames)
+
+
+def measure_all(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Everything that the report needs, as plain data."""
+    load = [load_average()]
+    folders, commands = find_sequences(arguments)
+    yardstick = next(iter(folders.values()))
+    brisk = [brisk_ms(yardstick)]
+    measurements = [measure(job, arguments.work) for job in plan(folders, arguments.quick)]
+    brisk.append(brisk_ms(yardstick))
+    load.append(load_average())
+    growing = [name for name in folders if name in GROWING or arguments.sequence]
+    frames = {m.sequence: m.frames for m in measurements if m.variant == "default"}
+    grown = [
+        recorded(name, folders[name], arguments.work, frames[name])
+        for name in growing
+        if not arguments.quick
+    ]
+    if grown:
+        plot_growth(grown, image_path(arguments))
+    noise = {}
+    if "office" in folders and (folders["office"] / "depth_true").is_dir():
+        command = ["benchmarks/keypoint_noise.py", str(folders["office"]), "--json"]
+        noise = json.loads(call(command))
+    return {
+        "machine": describe_machine(),
+        "commit": describe_commit(ROOT, WRITTEN),
+        "date": now(),
+        "command": command_line(arguments),
+        "render_commands": commands,
+        "load": load,
+        "brisk_ms": brisk,
+        "brisk_sequence": shown(yardstick),
+        "runs": [asdict(m) for m in measurements],
+        "identical": repeats(measurements),
+        "growth": {growth.sequence: growth_rows(growth) for growth in grown},
+        "noise": noise,
+        "trajectories": published_trajectories(),
+    }
+
+
+def repeats(measurements: list[Measurement]) -> dict[str, bool]:
+    """For each sequence that was run twice, whether both trajectories have the same bytes."""
+    first = {m.sequence: m for m in measurements if m.variant == "default"}
+    again = [m for m in measurements if m.variant == "repeated"]
+    return {m.sequence: identical(first[m.sequence], m) for m in again}
+
+
+def image_path(arguments: argparse.Namespace) -> Path:
+    """The growth figure lies beside the report."""
+    path: Path = arguments.report.parent / "images" / "graph_growth.png"
+    return path
+
+
+def command_line(arguments: argparse.Namespace) -> str:
+    """The command that repeats this report."""
+    flags = ["--quick"] * arguments.quick
+    for folder in arguments.sequence:
+        flags += ["--sequence", shown(folder)]
+    return f'make bench BENCH="{" ".join(flags)}"' if flags else "make bench"
+
+
+def parse() -> argparse.Namespace:
+    """The command line, with the report's place filled in."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a few frames of two sequences")
+    parser.add_argument(
+        "--sequence", type=Path, action="append", default=[], help="instead; may be repeated"
+    )
+    parser.add_argument("--work", type=Path, default=ROOT / "runs" / "bench", help="for runs")
+    parser.add_argument("--report", type=Path, help="file to write (default: see above)")
+    parser.add_argument(
+        "--report-only", action="store_true", help="write the report of the last run again"
+    )
+    arguments = parser.parse_args()
+    arguments.whole = not (arguments.quick or arguments.sequence or arguments.report)
+    if arguments.report is None:
+        folder = ROOT / "docs" if arguments.whole else arguments.work
+        arguments.report = folder / "benchmarks.md"
+    return arguments
+
+
+def main() -> None:
+    """Measure, write the report, and the README's table if everything was measured."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    logging.getLogger("slam").setLevel(logging.WARNING)
+    arguments = parse()
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    store = arguments.work / "results.json"
+    if not arguments.report_only:
+        store.write_text(json.dumps(measure_all(arguments), indent=1), encoding="utf-8")
+    results = json.loads(store.read_text(encoding="utf-8"))
+    write_report(results, arguments.report)
+    if arguments.whole:
+        insert_results(results, ROOT / "README.md")
+    print(arguments.report)
+
+
+if __name__ == "__main__":
+    main()
