@@ -120,14 +120,16 @@ def optimise_pose(
         kernel = None if width is None else width * gate
         for _ in range(iterations):
             H, g = _normal_equations(T, *chosen, kernel, camera)
-            if not _well_conditioned(H):
+            if not (np.isfinite(H).all() and np.isfinite(g).all()):
                 return PoseEstimate(orthonormalised(T), inliers, H, False)
+            H[np.diag_indices(6)] += 1e-9  # a singular system makes no step, and fails the check below
             step = -np.linalg.solve(H, g)
             T = T @ se3_exp(step)
             if np.abs(step).max() < config.step_tolerance:
                 break
     inliers = _inliers(T, points_world, measured, weight, gate, camera)
-    return PoseEstimate(orthonormalised(T), inliers, H, int(inliers.sum()) >= config.min_points)
+    ok = int(inliers.sum()) >= config.min_points and _well_conditioned(H)
+    return PoseEstimate(orthonormalised(T), inliers, H, ok)
 
 
 def _inliers(

@@ -18,6 +18,7 @@ from graph.geometry import Array
 
 PATCH_PX = 11  # side of a stored patch; the outermost ring only serves the gradients
 _RADIUS = PATCH_PX // 2
+_INNER = (PATCH_PX - 2) ** 2  # pixels without that ring
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class SubpixelConfig:
     """
 
     enabled: bool = True
-    iterations: int = 6
+    iterations: int = 4
     sigma_px: float = 0.25
     max_shift_px: float = 2.0
     min_correlation: float = 0.8
@@ -55,23 +56,23 @@ def register_patches(
     template = patches.astype(np.float32)
     gradient = np.stack(
         [
-            (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]).reshape(len(template), -1) / 2,
-            (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]).reshape(len(template), -1) / 2,
+            (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]).reshape(-1, _INNER) / 2,
+            (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]).reshape(-1, _INNER) / 2,
         ],
         axis=1,
     )
     gradient -= gradient.mean(axis=2, keepdims=True)
-    inner, contrast = _normalised(template[:, 1:-1, 1:-1].reshape(len(template), -1))
+    inner, contrast = _normalised(template[:, 1:-1, 1:-1].reshape(-1, _INNER))
     hessian = np.einsum("mik,mjk->mij", gradient, gradient).astype(float)
     hessian += 1e-3 * np.eye(2)
     inverse_hessian = np.linalg.inv(hessian)
     moved = pixels.astype(float).copy()
     for _ in range(iterations):
-        image = _normalised(_sample(gray, moved, _RADIUS - 1).reshape(len(moved), -1))[0]
+        image = _normalised(_sample(gray, moved, _RADIUS - 1).reshape(-1, _INNER))[0]
         error = (image - inner) * contrast[:, None]
         steepest = np.einsum("mik,mk->mi", gradient, error)
         moved -= np.clip(np.einsum("mij,mj->mi", inverse_hessian, steepest), -1.0, 1.0)
-    image = _normalised(_sample(gray, moved, _RADIUS - 1).reshape(len(moved), -1))[0]
+    image = _normalised(_sample(gray, moved, _RADIUS - 1).reshape(-1, _INNER))[0]
     return moved, np.einsum("mk,mk->m", image, inner).astype(float)
 
 

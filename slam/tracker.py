@@ -66,6 +66,7 @@ class Tracker:
     def __init__(self, camera: Camera, config: TrackingConfig):
         self.camera = camera
         self.config = config
+        self._narrow = replace(config.pose, kernel_widths=config.pose.kernel_widths[-2:])
 
     def track(
         self,
@@ -96,7 +97,9 @@ class Tracker:
         visible, matches = self.search(features, index, T_world_camera, local_ids, radius, landmarks)
         if self.config.subpixel.enabled:
             features = self._registered(features, matches.train, visible[matches.query], world)
-        estimate = self._optimise(features, matches, visible, T_world_camera, landmarks)
+        estimate = self._optimise(
+            features, matches, visible, T_world_camera, landmarks, self._narrow
+        )
         inliers = int(estimate.inliers.sum())
         if not estimate.ok or inliers < self.config.weak_inliers:
             return lost(T_world_camera, features, len(matches))
@@ -185,7 +188,9 @@ class Tracker:
             visible, matches = self.search(
                 features, index, T_predicted, recent_ids, radius, landmarks
             )
-            estimate = self._optimise(features, matches, visible, T_predicted, landmarks)
+            estimate = self._optimise(
+                features, matches, visible, T_predicted, landmarks, self.config.pose
+            )
             if estimate.ok and estimate.inliers.sum() >= self.config.weak_inliers:
                 return estimate
         return None
@@ -197,6 +202,7 @@ class Tracker:
         ids: Ints,
         T_world_camera: Array,
         landmarks: LandmarkTable,
+        config: PoseOptimisationConfig,
     ) -> PoseEstimate:
         return optimise_pose(
             T_world_camera,
@@ -204,7 +210,7 @@ class Tracker:
             features.measurements[matches.train],
             features.sigmas_px[matches.train],
             self.camera,
-            self.config.pose,
+            config,
         )
 
 
