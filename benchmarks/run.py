@@ -46,6 +46,7 @@ KITCHEN = SHARED / "redkitchen"
 WITHOUT_SUBPIXEL = ("--set", "tracking.subpixel.enabled=false")
 GROWING = ("redkitchen", "corridor")
 QUICK_FRAMES = 150
+OVERVIEW_FRAME = 60
 
 
 def plan(folders: dict[str, Path], quick: bool) -> list[Job]:
@@ -103,6 +104,8 @@ def measure_all(arguments: argparse.Namespace) -> dict[str, Any]:
     ]
     if grown:
         plot_growth(grown, image_path(arguments))
+    if "living_room" in folders:
+        draw_overview(folders["living_room"], arguments)
     noise = {}
     if "office" in folders and (folders["office"] / "depth_true").is_dir():
         command = ["benchmarks/keypoint_noise.py", str(folders["office"]), "--json"]
@@ -129,6 +132,14 @@ def repeats(measurements: list[Measurement]) -> dict[str, bool]:
     first = {m.sequence: m for m in measurements if m.variant == "default"}
     again = [m for m in measurements if m.variant == "repeated"]
     return {m.sequence: identical(first[m.sequence], m) for m in again}
+
+
+def draw_overview(folder: Path, arguments: argparse.Namespace) -> None:
+    """The picture at the top of README.md, from the living room's run."""
+    run = arguments.work / "results" / "living_room-default"
+    out = image_path(arguments).with_name("overview.png")
+    command = ["benchmarks/picture.py", str(run), str(folder), "--out", str(out)]
+    call([*command, "--frame", str(OVERVIEW_FRAME)])
 
 
 def image_path(arguments: argparse.Namespace) -> Path:
