@@ -19,12 +19,12 @@ FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
 class FeatureConfig:
     """The front end's parameters; pixels are those of the full image.
 
-    The corner threshold is the highest of ``thresholds`` at which FAST, a fortieth of BRISK's cost,
-    finds ``max_keypoints`` in the finest layer; so a blurred frame gets its keypoints and a rich one
-    costs no more. ``octaves`` is BRISK's: each adds a half-scale layer and an intra-octave.
+    The corner threshold is the highest of ``thresholds`` at which FAST, a fortieth of BRISK's
+    cost, finds ``max_keypoints`` in the finest layer; so a blurred frame gets its keypoints and
+    a rich one costs no more. ``octaves`` is BRISK's: each adds a half-scale layer and an intra-octave.
     ``pixel_sigma`` is that of a BRISK keypoint at scale 1. ``disparity_sigma_px`` is the depth
-    sensor's: for structured light a constant in disparity, sigma_z = z^2 / bf * sigma_d, with 0.07 px
-    the laboratory value (Nguyen 2012) at bf = 40 px m. ``depth_window_px`` and
+    sensor's: for structured light a constant in disparity, sigma_z = z^2 / bf * sigma_d, with
+    0.07 px the laboratory value (Nguyen 2012) at bf = 40 px m. ``depth_window_px`` and
     ``depth_edge_ratio``: see sample_depth.
     """
 
@@ -93,7 +93,7 @@ class BriskExtractor:
         kept = self._strongest_spread(keypoints, gray.shape)
         keypoints, descriptors = self._brisk[threshold].compute(gray, kept)
         if descriptors is None:
-            keypoints, descriptors = (), np.zeros((0, 64), np.uint8)
+            return self._assemble(frame, gray, np.zeros((0, 4)), np.zeros((0, 64), np.uint8))
         table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=float)
         return self._assemble(frame, gray, table.reshape(-1, 4), np.ascontiguousarray(descriptors))
 

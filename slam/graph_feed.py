@@ -42,7 +42,7 @@ class GraphFeed:
         self._removed_keyframes.append(keyframe_id)
 
     def keyframe_update(self, world: WorldMap, keyframe: Keyframe) -> GraphUpdate:
-        """The update that adds one keyframe, its landmarks and all that was removed since the last."""
+        """The update that adds one keyframe and its landmarks, and removes what was forgotten."""
         keypoints, ids = world.observed(keyframe)
         inside = world.landmarks.in_graph[ids]
         new_ids = self._promoted(world, keyframe, keypoints[~inside], ids[~inside], inside.sum())

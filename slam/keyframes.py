@@ -11,8 +11,8 @@ class KeyframeConfig:
     """The rule's numbers; ``rule`` is "orb" (default) or "paper".
 
     "orb" (ORB-SLAM, section V.E, with ORB-SLAM2's extra rule): mapping is idle or more than
-    ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and the shared view
-    is below ``max_shared``; or the close points run out: fewer than ``min_close_tracked`` are
+    ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and the shared
+    view is below ``max_shared``; or the close points run out: fewer than ``min_close_tracked`` are
     tracked while ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three
     keyframes see; here all points of the reference keyframe count, of which BRISK finds about 60 %
     again in the next frame, so that half is the equal of it.

@@ -64,7 +64,7 @@ class LandmarkTable:
 
     def __init__(self) -> None:
         self._size = 0
-        self._store = {
+        self._store: dict[str, NDArray] = {
             name: np.full((1024, *shape), fill, dtype)
             for name, (shape, dtype, fill) in _COLUMNS.items()
         }
@@ -109,7 +109,7 @@ class LandmarkTable:
 
     def _grow(self, capacity: int) -> None:
         for name, (shape, dtype, fill) in _COLUMNS.items():
-            bigger = np.full((capacity, *shape), fill, dtype)
+            bigger: NDArray = np.full((capacity, *shape), fill, dtype)
             old = self._store[name]
             bigger[: len(old)] = old
             self._store[name] = bigger

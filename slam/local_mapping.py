@@ -78,9 +78,7 @@ def fuse_into_neighbours(
         duplicates = ids[matches.query[old]]
         different = duplicates != there[old]
         if different.any():
-            removed.append(
-                world.replace_landmarks(duplicates[different], there[old][different])
-            )
+            removed.append(world.replace_landmarks(duplicates[different], there[old][different]))
     return np.concatenate(removed)
 
 
@@ -126,5 +124,3 @@ def redundant_keyframe(
         if often.mean() > config.redundant_share:
             return keyframe
     return None
-
-

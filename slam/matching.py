@@ -115,13 +115,16 @@ def unique_train(matches: Matches) -> Matches:
 
 
 def match_brute_force(query: Bits, train: Bits, config: MatchConfig) -> Matches:
-    """The best matches of query descriptors (M, 8) among train descriptors (N, 8), without a prior."""
+    """The best matches of descriptors (M, 8) among train descriptors (N, 8), without a prior."""
     empty = np.zeros(0, np.int64)
     if len(query) < 1 or len(train) < 2:
         return Matches(empty, empty, empty)
     distance, index = cv2.batchDistance(
-        query.view(np.uint8), train.view(np.uint8), dtype=cv2.CV_32S,
-        normType=cv2.NORM_HAMMING, K=2,
+        query.view(np.uint8),
+        train.view(np.uint8),
+        dtype=cv2.CV_32S,
+        normType=cv2.NORM_HAMMING,
+        K=2,
     )
     clear = distance[:, 0] <= config.ratio * distance[:, 1]
     keep = np.flatnonzero(clear & (distance[:, 0] <= config.max_distance))

@@ -51,7 +51,7 @@ class PoseEstimate:
 def residuals(
     T_world_camera: Array, points_world: Array, measurements: Array, camera: Camera
 ) -> tuple[Array, Array]:
-    """Residuals (N, 3) of u, v, disparity in pixels (predicted - measured) and points_camera (N, 3)."""
+    """Residuals (N, 3) px of u, v, disparity (predicted - measured), and points_camera (N, 3)."""
     points_camera = transform(inverse(T_world_camera), points_world)
     z = points_camera[:, 2]
     safe_z = np.where(z > 1e-3, z, 1e-3)
@@ -76,9 +76,17 @@ def jacobian(points_camera: Array, camera: Camera) -> Array:
     inv_z = 1.0 / np.where(z > 1e-3, z, 1e-3)
     xn, yn, bf = x * inv_z, y * inv_z, camera.stereo_bf_px_m
     J = np.zeros((len(x), 3, 6))
-    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2] = camera.fx * xn * yn, -camera.fx * (1 + xn**2), camera.fx * yn
+    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2] = (
+        camera.fx * xn * yn,
+        -camera.fx * (1 + xn**2),
+        camera.fx * yn,
+    )
     J[:, 0, 3], J[:, 0, 5] = -camera.fx * inv_z, camera.fx * xn * inv_z
-    J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = camera.fy * (1 + yn**2), -camera.fy * xn * yn, -camera.fy * xn
+    J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = (
+        camera.fy * (1 + yn**2),
+        -camera.fy * xn * yn,
+        -camera.fy * xn,
+    )
     J[:, 1, 4], J[:, 1, 5] = -camera.fy * inv_z, camera.fy * yn * inv_z
     J[:, 2, 0], J[:, 2, 1], J[:, 2, 5] = bf * yn * inv_z, -bf * xn * inv_z, bf * inv_z**2
     return J
@@ -109,7 +117,8 @@ def optimise_pose(
     weight = np.where(np.isfinite(measurements), 1.0 / sigmas_px**2, 0.0)
     gate = np.where(stereo, CHI2_3DOF, CHI2_2DOF)
     T, inliers, H = T_world_camera, np.ones(len(stereo), bool), np.zeros((6, 6))
-    stages = [(width, config.kernel_iterations) for width in config.kernel_widths]
+    stages: list[tuple[float | None, int]] = []
+    stages += [(width, config.kernel_iterations) for width in config.kernel_widths]
     stages += [(None, config.final_iterations)] * config.final_rounds
     for width, iterations in stages:
         if width is None:
@@ -122,8 +131,10 @@ def optimise_pose(
             H, g = _normal_equations(T, *chosen, kernel, camera)
             if not (np.isfinite(H).all() and np.isfinite(g).all()):
                 return PoseEstimate(orthonormalised(T), inliers, H, False)
-            H[np.diag_indices(6)] += 1e-9  # a singular system makes no step, and fails the check below
-            step = -np.linalg.solve(H, g)
+            H[np.diag_indices(6)] += (
+                1e-9  # a singular system makes no step, and fails the check below
+            )
+            step = np.asarray(-np.linalg.solve(H, g), dtype=np.float64)
             T = T @ se3_exp(step)
             if np.abs(step).max() < config.step_tolerance:
                 break
@@ -156,7 +167,7 @@ def _normal_equations(
     kernel: Array | None,
     camera: Camera,
 ) -> tuple[Array, Array]:
-    """H (6, 6) and gradient (6,) of the weighted squares; Cauchy's weights where a kernel is given."""
+    """H (6, 6) and gradient (6,) of the weighted squares; with a kernel, Cauchy's weights."""
     r, points_camera = residuals(T, points_world, measured, camera)
     w = weight
     if kernel is not None:

@@ -11,9 +11,7 @@ from slam.tracker import Tracked
 from slam.world_map import WorldMap
 
 
-def join_segment(
-    world: WorldMap, segment: int, tracked: Tracked, recognised: Tracked
-) -> Tracked:
+def join_segment(world: WorldMap, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
     """Move a segment into the frame of another where one of its frames was recognised.
 
     ``tracked`` is the frame in the moving segment, ``recognised`` the same frame in the other.

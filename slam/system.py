@@ -148,19 +148,18 @@ class SlamSystem:
         }
 
     def _track(self, features: Features) -> Tracked:
-        """Against the map; where there is none, or it is lost for long, the frame begins a new one."""
+        """Against the map; where there is none, or it is long lost, the frame begins a new one."""
         rules = self.config.relocalisation
         can_begin = np.isfinite(features.depth_m).sum() >= rules.min_new_points
         if self._reference is None:
             return untracked(np.eye(4), features) if can_begin else lost(np.eye(4), features)
         tracked = self.localiser.track(features, self.mapper.world, self._reference)
-        if tracked.status is TrackingStatus.LOST and can_begin:
-            if self.localiser.lost_frames > rules.patience_frames:
-                self._segment = 1 + max(k.segment for k in self.mapper.world.keyframes.values())
-                self._reference = None
-                self.localiser.restart(np.eye(4))
-                return untracked(np.eye(4), features)
-        return tracked
+        if self.localiser.lost_frames <= rules.patience_frames or not can_begin:
+            return tracked
+        self._segment = 1 + max(k.segment for k in self.mapper.world.keyframes.values())
+        self._reference = None
+        self.localiser.restart(np.eye(4))
+        return untracked(np.eye(4), features)
 
     def _keyframe_reason(self, tracked: Tracked) -> str:
         if tracked.status is TrackingStatus.LOST:

@@ -22,7 +22,8 @@ class TrackingConfig:
     """Search windows in pixels and the numbers of inliers that make a status.
 
     The first search looks only for the landmarks of the last frame around their predicted
-    places, ``wide_radius_px`` where that fails; the second looks for the whole local map.
+    places; where that fails, for the whole local map, at last in windows of ``wide_radius_px``. The
+    second looks for the whole local map in windows of ``local_radius_px``.
     """
 
     search_radius_px: float = 20.0
@@ -79,7 +80,9 @@ class Tracker:
         """The frame's pose from landmarks seen a moment ago, then from the whole local map."""
         index = WindowIndex(features.pixels)
         recent_ids = world.landmarks.living(recent_ids)
-        estimate = self._first_estimate(features, index, T_predicted, recent_ids, world.landmarks)
+        estimate = self._first_estimate(
+            features, index, T_predicted, recent_ids, local_ids, world.landmarks
+        )
         if estimate is None:
             return lost(T_predicted, features)
         return self.refine(features, index, estimate.T_world_camera, local_ids, world)
@@ -94,7 +97,9 @@ class Tracker:
     ) -> Tracked:
         """The pose from all landmarks of the local map, given a good first one."""
         radius, landmarks = self.config.local_radius_px, world.landmarks
-        visible, matches = self.search(features, index, T_world_camera, local_ids, radius, landmarks)
+        visible, matches = self.search(
+            features, index, T_world_camera, local_ids, radius, landmarks
+        )
         if self.config.subpixel.enabled:
             features = self._registered(features, matches.train, visible[matches.query], world)
         estimate = self._optimise(
@@ -182,12 +187,13 @@ class Tracker:
         index: WindowIndex,
         T_predicted: Array,
         recent_ids: Ints,
+        local_ids: Ints,
         landmarks: LandmarkTable,
     ) -> PoseEstimate | None:
-        for radius in (self.config.search_radius_px, self.config.wide_radius_px):
-            visible, matches = self.search(
-                features, index, T_predicted, recent_ids, radius, landmarks
-            )
+        """A pose near the prediction, from the last frame's landmarks or from the local map."""
+        near, wide = self.config.search_radius_px, self.config.wide_radius_px
+        for ids, radius in ((recent_ids, near), (local_ids, near), (local_ids, wide)):
+            visible, matches = self.search(features, index, T_predicted, ids, radius, landmarks)
             estimate = self._optimise(
                 features, matches, visible, T_predicted, landmarks, self.config.pose
             )

@@ -17,7 +17,7 @@ from slam.world_map import Keyframe, WorldMap
 
 @dataclass(frozen=True)
 class TriangulationConfig:
-    """``neighbours`` covisible keyframes are searched; the angle between two rays is bounded below."""
+    """``neighbours`` covisible keyframes are searched; their rays must cross at some angle."""
 
     neighbours: int = 3
     min_parallax_deg: float = 1.5
@@ -82,6 +82,4 @@ def triangulate(
 
 
 def _free_without_depth(keyframe: Keyframe) -> Ints:
-    return np.flatnonzero(
-        (keyframe.landmark_ids < 0) & ~np.isfinite(keyframe.features.depth_m)
-    )
+    return np.flatnonzero((keyframe.landmark_ids < 0) & ~np.isfinite(keyframe.features.depth_m))

@@ -115,12 +115,10 @@ class WorldMap:
         landmarks.patch_views[ids] = here[~serves]
 
     def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
-        """(shared landmarks, keyframe), most shared first, of keyframes that share at least so many."""
+        """(shared landmarks, keyframe) of all that share at least a minimum, most shared first."""
         seen = np.zeros(len(self.landmarks) + 1, bool)  # the last entry answers for id -1
         seen[landmark_ids] = True
-        shared = [
-            (int(np.count_nonzero(seen[k.landmark_ids])), k) for k in self.keyframes.values()
-        ]
+        shared = [(int(np.count_nonzero(seen[k.landmark_ids])), k) for k in self.keyframes.values()]
         strong = [pair for pair in shared if pair[0] >= minimum]
         return sorted(strong, key=lambda pair: (-pair[0], -pair[1].id))
 
