@@ -1,0 +1,93 @@
+"""Synthetic views with exact truth: a textured plane rendered to frames, and bare keypoints."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from graph.camera import Camera
+from graph.geometry import Array, inverse, se3_exp, transform
+from slam.features import Features
+from slam.frame import Frame
+from slam.world_map import Keyframe, WorldMap
+
+CAMERA = Camera(640, 480, fx=525.0, fy=520.0, cx=318.5, cy=241.5)
+T_NEW_OLD = se3_exp(np.array([0.4, -1.1, 0.7, 3.0, -5.0, 2.0]))
+PLANE_Z_M = 2.0
+_TEXELS_PER_M = 250.0
+_TEXTURE_HALF_M = 3.0
+
+
+def _texture() -> Array:
+    rng = np.random.default_rng(11)
+    side = int(2 * _TEXTURE_HALF_M * _TEXELS_PER_M)
+    texture = np.zeros((side, side), np.float32)
+    for sigma, weight in ((2.0, 1.0), (5.0, 2.0), (15.0, 3.0)):
+        noise = cv2.GaussianBlur(rng.normal(size=(side, side)).astype(np.float32), (0, 0), sigma)
+        texture += weight * noise / noise.std()
+    return np.clip(128 + 22 * texture, 0, 255)
+
+
+TEXTURE = _texture()
+
+
+def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
+    """What a camera sees of the plane z_world = 2 m; depth is exact."""
+    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    pixels = np.stack([columns, rows], axis=-1)
+    rays_camera = CAMERA.backproject(pixels, np.array(1.0))
+    rays_world = rays_camera @ T_world_camera[:3, :3].T
+    z_m = (PLANE_Z_M - T_world_camera[2, 3]) / rays_world[..., 2]
+    hits = T_world_camera[:3, 3] + z_m[..., None] * rays_world
+    texel = ((hits[..., :2] + _TEXTURE_HALF_M) * _TEXELS_PER_M).astype(np.float32)
+    image = cv2.remap(TEXTURE, texel[..., 0], texel[..., 1], cv2.INTER_LINEAR)
+    gray = np.rint(image).astype(np.uint8)
+    return Frame(index, index / 30.0, np.repeat(gray[..., None], 3, axis=2), z_m.astype(np.float32))
+
+
+def make_features(
+    T_world_camera: Array, points_world: Array, descriptors: Array, noise_px: Array | None = None
+) -> Features:
+    """Keypoints that see these points, in their order; sigmas 0.7, 0.7 and 0.12 px."""
+    points_camera = transform(inverse(T_world_camera), points_world)
+    count = len(points_camera)
+    noise_px = np.zeros((count, 3)) if noise_px is None else noise_px
+    pixels = CAMERA.project(points_camera) + noise_px[:, :2]
+    disparity = CAMERA.stereo_bf_px_m / points_camera[:, 2] + noise_px[:, 2]
+    return Features(
+        pixels=pixels,
+        image_pixels=pixels.copy(),
+        descriptors=descriptors,
+        scales=np.ones(count),
+        angles_rad=np.zeros(count),
+        depth_m=CAMERA.stereo_bf_px_m / disparity,
+        disparity_px=disparity,
+        sigmas_px=np.tile([0.7, 0.7, 0.12], (count, 1)),
+        colours=np.full((count, 3), 100, np.uint8),
+        gray=np.zeros((480, 640), np.uint8),
+    )
+
+
+def random_descriptors(count: int, rng: np.random.Generator) -> Array:
+    """(N, 8) uint64: two random ones are about 256 bits apart."""
+    return rng.integers(0, 2**64, (count, 8), dtype=np.uint64)
+
+
+def points_before(T_world_camera: Array, count: int, rng: np.random.Generator) -> Array:
+    """Points (N, 3) in the world inside the view, 1 to 4 m away."""
+    z = rng.uniform(1.0, 4.0, count)
+    pixels = rng.uniform([60.0, 60.0], [580.0, 420.0], (count, 2))
+    return transform(T_world_camera, CAMERA.backproject(pixels, z))
+
+
+def add_keyframe(
+    world: WorldMap, T_world_camera: Array, features: Features, segment: int = 0
+) -> Keyframe:
+    """A new keyframe without landmarks, taken into the map."""
+    keyframe_id = world.next_keyframe_id
+    none = np.full(len(features), -1, np.int64)
+    keyframe = Keyframe(
+        keyframe_id, 10 * keyframe_id, keyframe_id / 3.0, segment, T_world_camera, features, none
+    )
+    world.add_keyframe(keyframe)
+    return keyframe

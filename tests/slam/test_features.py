@@ -1,0 +1,270 @@
+"""Keypoints of a rendered plane: bucketing, depth, undistortion, sigmas, empty images."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, PLANE_Z_M, render_plane
+
+from graph.camera import Camera
+from graph.geometry import make_pose, se3_exp, so3_exp
+from slam.features import (
+    BriskExtractor,
+    FeatureConfig,
+    Features,
+    sample_depth,
+    spread_order,
+    undistort,
+)
+from slam.frame import Frame
+
+RNG = np.random.default_rng(4)
+CONFIG = FeatureConfig()
+FRONTAL = render_plane(np.eye(4))
+FREIBURG1 = Camera(
+    640,
+    480,
+    fx=517.306408,
+    fy=516.469215,
+    cx=318.643040,
+    cy=255.313989,
+    distortion=(0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+)
+
+
+def extract(frame: Frame, config: FeatureConfig = CONFIG, camera: Camera = CAMERA) -> Features:
+    return BriskExtractor(camera, config).extract(frame)
+
+
+def arrays(features: Features) -> dict[str, np.ndarray]:
+    return {f.name: getattr(features, f.name) for f in dataclasses.fields(features)}
+
+
+def test_columns_agree_in_shape_and_type() -> None:
+    features = extract(FRONTAL)
+    n = len(features)
+    assert n > 300
+    assert features.descriptors.shape == (n, 8)
+    assert features.descriptors.dtype == np.uint64
+    assert features.pixels.shape == features.image_pixels.shape == (n, 2)
+    assert features.sigmas_px.shape == features.measurements.shape == (n, 3)
+    assert features.colours.shape == (n, 3)
+    assert features.gray.shape == (480, 640)
+    assert (features.scales >= 1).all()
+    assert np.isfinite(features.pixels).all()
+
+
+def test_the_same_frame_gives_the_same_arrays() -> None:
+    extractor = BriskExtractor(CAMERA, CONFIG)
+    first = extractor.extract(FRONTAL)
+    extractor.extract(render_plane(se3_exp(np.array([0.1, 0, 0, 0, 0, 0.3]))))
+    for other in (extractor.extract(FRONTAL), extract(FRONTAL)):
+        for name, values in arrays(first).items():
+            np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
+
+
+def test_descriptors_are_those_of_opencv_at_these_keypoints() -> None:
+    """Rows belong together: each descriptor is that of its own pixel, size and angle."""
+    features = extract(FRONTAL)
+    keypoints = [
+        cv2.KeyPoint(float(u), float(v), float(12.0 * s), float(np.rad2deg(a)))
+        for (u, v), s, a in zip(
+            features.image_pixels, features.scales, features.angles_rad, strict=True
+        )
+    ]
+    kept, expected = cv2.BRISK_create().compute(features.gray, keypoints)
+    assert len(kept) == len(features)
+    np.testing.assert_array_equal(features.descriptors.view(np.uint8), expected)
+
+
+@pytest.mark.parametrize("cap", [50, 200])
+def test_keypoints_are_capped_and_spread(cap: int) -> None:
+    few = extract(FRONTAL, dataclasses.replace(CONFIG, max_keypoints=cap))
+    assert 0.75 * cap <= len(few) <= cap  # BRISK cannot describe some at the border
+    quarter = (few.image_pixels > [320, 240]) @ [1, 2]
+    assert np.bincount(quarter, minlength=4).min() > cap / 8
+
+
+def test_one_rich_corner_does_not_take_all_keypoints() -> None:
+    """Strong texture in one quarter, weak elsewhere: the weak ones are still chosen."""
+    weak = np.rint(128 + 0.6 * (FRONTAL.rgb.astype(float) - 128)).astype(np.uint8)
+    weak[:240, :320] = FRONTAL.rgb[:240, :320]
+    config = dataclasses.replace(CONFIG, thresholds=(15,), max_keypoints=190)
+    features = extract(dataclasses.replace(FRONTAL, rgb=weak), config)
+    rich = (features.image_pixels < [320, 240]).all(axis=1)
+    assert rich.mean() < 0.35
+
+
+def slow_spread_order(bucket: list[int], score: list[float]) -> list[int]:
+    """Round by round the best that every bucket has left; within a round by score."""
+    left = sorted(range(len(bucket)), key=lambda i: -score[i])
+    order = []
+    while left:
+        served: set[int] = set()
+        for i in list(left):
+            if bucket[i] not in served:
+                served.add(bucket[i])
+                order.append(i)
+                left.remove(i)
+    return order
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 60])
+def test_spread_order_serves_the_buckets_in_rounds(count: int) -> None:
+    bucket, score = RNG.integers(0, 9, count), RNG.permutation(count).astype(float)
+    order = spread_order(bucket, score)
+    assert order.tolist() == slow_spread_order(bucket.tolist(), score.tolist())
+
+
+def test_depth_and_disparity_of_a_plane() -> None:
+    features = extract(FRONTAL)
+    np.testing.assert_allclose(features.depth_m, PLANE_Z_M, rtol=1e-6)
+    np.testing.assert_allclose(features.disparity_px, CAMERA.stereo_bf_px_m / PLANE_Z_M, rtol=1e-6)
+    stereo = CAMERA.project_stereo(CAMERA.backproject(features.pixels, features.depth_m))
+    np.testing.assert_allclose(features.measurements[:, :2], stereo[:, :2], atol=1e-9)
+    np.testing.assert_allclose(features.measurements[:, 2], stereo[:, 0] - stereo[:, 2], atol=1e-9)
+
+
+def test_sigmas_are_the_sensors_and_grow_with_scale_and_slant() -> None:
+    frontal = extract(FRONTAL, dataclasses.replace(CONFIG, octaves=2))
+    np.testing.assert_allclose(frontal.sigmas_px[:, 2], CONFIG.disparity_sigma_px, rtol=1e-3)
+    np.testing.assert_array_equal(frontal.sigmas_px[:, 0], frontal.sigmas_px[:, 1])
+    order = np.argsort(frontal.scales)
+    assert (np.diff(frontal.sigmas_px[order, 0]) >= 0).all()
+    assert frontal.scales.max() > 1.5
+    assert frontal.sigmas_px[:, 0].min() == pytest.approx(CONFIG.pixel_sigma)
+
+
+def test_disparity_sigma_of_a_slanted_plane_has_the_depth_change_of_a_pixel() -> None:
+    """The quartiles of a 5 by 5 window lie one column either side of its middle."""
+    turned = so3_exp(np.array([0, np.deg2rad(50), 0]))
+    frame = render_plane(make_pose(turned, np.array([-1.0, 0.0, 1.2])))
+    features = extract(frame)
+    finite = np.isfinite(features.depth_m)
+    assert finite.sum() > 50
+    columns, rows = np.rint(features.image_pixels[finite]).astype(int).T
+    slope_m = (frame.depth_m[rows, columns + 1] - frame.depth_m[rows, columns - 1]) / 2
+    change_px = CAMERA.stereo_bf_px_m / features.depth_m[finite] ** 2 * slope_m
+    expected = np.hypot(CONFIG.disparity_sigma_px, change_px)
+    assert expected.max() > 1.05 * CONFIG.disparity_sigma_px
+    np.testing.assert_allclose(features.sigmas_px[finite, 2], expected, rtol=0.01)
+
+
+def test_image_pixels_are_where_the_colour_is_taken() -> None:
+    coloured = FRONTAL.rgb.copy()
+    coloured[..., 1] = np.clip(coloured[..., 1].astype(int) + 7, 0, 255)
+    features = extract(dataclasses.replace(FRONTAL, rgb=coloured))
+    for (u, v), colour in zip(features.image_pixels[:50], features.colours[:50], strict=True):
+        assert colour.tolist() == coloured[round(v), round(u)].tolist()
+
+
+def test_no_keypoint_without_a_valid_pixel() -> None:
+    for features in (extract(FRONTAL), extract(FRONTAL, camera=FREIBURG1)):
+        assert (features.image_pixels > 0).all()
+        assert (features.image_pixels < [639, 479]).all()
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_an_empty_image_has_no_features(value: int) -> None:
+    frame = dataclasses.replace(FRONTAL, rgb=np.full((480, 640, 3), value, np.uint8))
+    for camera in (CAMERA, FREIBURG1):
+        features = extract(frame, camera=camera)
+        assert len(features) == 0
+        assert features.descriptors.shape == (0, 8)
+        assert features.measurements.shape == features.sigmas_px.shape == (0, 3)
+        assert features.colours.shape == (0, 3)
+
+
+def test_without_depth_features_are_monocular() -> None:
+    frame = dataclasses.replace(FRONTAL, depth_m=np.full((480, 640), np.nan, np.float32))
+    features = extract(frame)
+    assert len(features) > 300
+    assert np.isnan(features.depth_m).all()
+    assert np.isnan(features.measurements[:, 2]).all()
+    assert np.isfinite(features.sigmas_px[:, :2]).all()
+
+
+def depth_at(depth: np.ndarray, u: float, v: float) -> tuple[float, float]:
+    depth_m, spread_m = sample_depth(depth.astype(np.float32), np.array([[u, v]]), CONFIG)
+    return float(depth_m[0]), float(spread_m[0])
+
+
+def test_depth_is_looked_up_at_row_v_column_u() -> None:
+    depth = np.full((480, 640), 1.0)
+    depth[90:111, 190:211] = 2.0
+    assert depth_at(depth, 200.4, 99.6)[0] == 2.0
+    assert depth_at(depth, 99.6, 200.4)[0] == 1.0
+
+
+def test_depth_is_rejected_at_an_edge_and_kept_beside_it() -> None:
+    depth = np.full((480, 640), 1.0)
+    depth[:, 300:] = 1.5
+    reach = CONFIG.depth_window_px
+    for u in range(290, 311):
+        straddles = u - reach < 300 <= u + reach
+        assert np.isnan(depth_at(depth, u, 100)[0]) == straddles, u
+
+
+def test_depth_tolerates_a_small_step_in_proportion_to_depth() -> None:
+    for z, step, good in ((1.0, 0.035, True), (1.0, 0.045, False), (3.0, 0.1, True)):
+        depth = np.full((480, 640), z)
+        depth[:, 300:] = z + step
+        assert np.isfinite(depth_at(depth, 300, 100)[0]) == good
+
+
+def test_depth_needs_half_of_the_window() -> None:
+    side = 2 * CONFIG.depth_window_px + 1
+    for missing, good in ((side**2 // 2, True), (side**2 // 2 + 1, False), (side**2, False)):
+        depth = np.full((480, 640), 1.25)
+        window = np.full(side**2, 1.25)
+        window[RNG.permutation(side**2)[:missing]] = np.nan
+        reach = CONFIG.depth_window_px
+        depth[100 - reach : 101 + reach, 200 - reach : 201 + reach] = window.reshape(side, side)
+        assert np.isfinite(depth_at(depth, 200, 100)[0]) == good, missing
+
+
+def test_depth_is_the_median_and_the_spread_of_the_valid() -> None:
+    depth = 1.0 + 0.01 * RNG.random((480, 640))
+    depth[100, 201] = np.nan
+    reach = CONFIG.depth_window_px
+    window = depth[100 - reach : 101 + reach, 200 - reach : 201 + reach]
+    depth_m, spread_m = depth_at(depth, 200, 100)
+    assert depth_m == pytest.approx(np.nanmedian(window), abs=1e-3)
+    low, high = np.nanpercentile(window, [25, 75])
+    assert spread_m == pytest.approx((high - low) / 2, rel=0.35)
+
+
+@pytest.mark.parametrize(("z", "good"), [(0.2, False), (0.31, True), (7.9, True), (8.1, False)])
+def test_depth_has_a_range(z: float, good: bool) -> None:
+    assert np.isfinite(depth_at(np.full((480, 640), z), 200, 100)[0]) == good
+
+
+def test_depth_at_the_images_corners_and_of_nothing() -> None:
+    depth = np.full((480, 640), 1.0, np.float32)
+    corners = np.array([[0.0, 0.0], [639.0, 479.0], [639.0, 0.0]])
+    np.testing.assert_array_equal(sample_depth(depth, corners, CONFIG)[0], 1.0)
+    assert len(sample_depth(depth, np.zeros((0, 2)), CONFIG)[0]) == 0
+
+
+def test_undistortion_undoes_opencvs_distortion() -> None:
+    """Points projected WITH distortion by OpenCV come back to the pinhole's pixels."""
+    grid = np.stack(np.meshgrid(np.linspace(30, 610, 15), np.linspace(30, 450, 12)), -1)
+    points = FREIBURG1.backproject(grid.reshape(-1, 2), np.array(2.0))
+    none = np.zeros(3)
+    distorted, _ = cv2.projectPoints(
+        points, none, none, FREIBURG1.K, np.array(FREIBURG1.distortion)
+    )
+    distorted = distorted[:, 0]
+    assert np.abs(distorted - FREIBURG1.project(points)).max() > 5.0
+    back = undistort(FREIBURG1, distorted)
+    np.testing.assert_allclose(back, FREIBURG1.project(points), atol=0.05)
+
+
+def test_without_distortion_pixels_are_copied() -> None:
+    pixels = RNG.uniform(0, 400, (5, 2))
+    same = undistort(CAMERA, pixels)
+    np.testing.assert_array_equal(same, pixels)
+    same[0] = -1
+    assert (pixels >= 0).all()
+    assert undistort(FREIBURG1, np.zeros((0, 2))).shape == (0, 2)

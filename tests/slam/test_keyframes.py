@@ -1,0 +1,76 @@
+"""The keyframe rules as tables: ORB-SLAM's, and the paper's Algorithm 2 as printed."""
+
+from dataclasses import replace
+
+import pytest
+
+from slam.keyframes import KeyframeConfig, KeyframeEvidence, keyframe_reason
+
+# Numbers of their own, so that the tables do not follow the defaults about.
+ORB = KeyframeConfig(
+    rule="orb",
+    min_interval_frames=3,
+    max_interval_frames=20,
+    min_tracked=50,
+    max_shared=0.7,
+    min_close_tracked=100,
+    min_close_new=70,
+)
+DUE = KeyframeEvidence(
+    frames_since=10, mapping_idle=True, tracked=200, shared=0.5, close_tracked=150, close_new=500
+)
+PAPER = KeyframeConfig(rule="paper")
+PAPER_DUE = KeyframeEvidence(
+    frames_since=30, mapping_idle=True, tracked=100, shared=0.89, close_tracked=0, close_new=999
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({}, "new view"),
+        ({"frames_since": 3}, "new view"),
+        ({"frames_since": 2}, ""),
+        ({"tracked": 50}, "new view"),
+        ({"tracked": 49}, ""),
+        ({"shared": 0.69}, "new view"),
+        ({"shared": 0.7}, ""),
+        ({"mapping_idle": False}, ""),
+        ({"mapping_idle": False, "frames_since": 20}, ""),
+        ({"mapping_idle": False, "frames_since": 21}, "new view"),
+        # ORB-SLAM2's extra rule: starving of close points while new ones can be made
+        ({"close_tracked": 99, "close_new": 71, "shared": 1.0}, "close points run out"),
+        ({"close_tracked": 100, "close_new": 71, "shared": 1.0}, ""),
+        ({"close_tracked": 99, "close_new": 70, "shared": 1.0}, ""),
+        ({"close_tracked": 0, "tracked": 20, "mapping_idle": False}, "close points run out"),
+        ({"close_tracked": 0, "frames_since": 2}, ""),
+    ],
+)
+def test_orb_rule(change: dict[str, float], reason: str) -> None:
+    assert keyframe_reason(replace(DUE, **change), ORB) == reason
+
+
+@pytest.mark.parametrize(
+    ("change", "is_due"),
+    [
+        ({}, True),
+        ({"frames_since": 29}, False),
+        ({"frames_since": 500}, True),
+        ({"mapping_idle": False}, False),
+        ({"mapping_idle": False, "frames_since": 500}, False),  # a strict AND, as printed
+        ({"shared": 0.9}, False),
+        ({"tracked": 99}, False),
+        ({"frames_since": 29, "shared": 0.1}, False),
+    ],
+)
+def test_the_papers_rule_with_the_printed_numbers(change: dict[str, float], is_due: bool) -> None:
+    """At least 30 frames AND idle AND shared view < 90 % AND >= 100 matches; nothing else."""
+    reason = keyframe_reason(replace(PAPER_DUE, **change), PAPER)
+    assert reason == ("Algorithm 2" if is_due else "")
+
+
+def test_the_default_rule_is_orb_slams() -> None:
+    assert KeyframeConfig().rule == "orb"
+    assert keyframe_reason(DUE, ORB) == keyframe_reason(
+        DUE, replace(KeyframeConfig(), max_shared=0.7)
+    )
