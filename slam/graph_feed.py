@@ -101,12 +101,11 @@ class GraphFeed:
         self, world: WorldMap, keyframe: Keyframe, new_ids: Ints
     ) -> Observations:
         """All observations of the new landmarks, and this keyframe's of the ones in the graph."""
-        is_new = np.zeros(len(world.landmarks), bool)
+        is_new = np.zeros(len(world.landmarks) + 1, bool)  # the last entry answers for id -1
         is_new[new_ids] = True
         parts = []
-        oldest = world.landmarks.host[new_ids].min() if len(new_ids) else keyframe.id
         for other in world.keyframes.values():
-            if other.id < oldest and other is not keyframe:
+            if other is not keyframe and not is_new[other.landmark_ids].any():
                 continue
             keypoints, ids = world.observed(other)
             wanted = world.landmarks.in_graph[ids] if other is keyframe else is_new[ids]
@@ -160,7 +159,9 @@ def read_back(world: WorldMap, estimate: GraphEstimate) -> IntArray:
     Landmarks outside the graph move rigidly with the keyframe that made them.
     """
     landmarks = world.landmarks
-    landmarks.in_graph[estimate.dropped_landmarks] = False
+    inside = estimate.landmark_ids[landmarks.alive[estimate.landmark_ids]]
+    landmarks.in_graph[:] = False  # not those either that were sent and refused
+    landmarks.in_graph[inside] = True
     known = np.array([i in world.keyframes for i in estimate.keyframe_ids], bool)
     ids, T_new = estimate.keyframe_ids[known], estimate.poses_world_camera[known]
     T_old = np.array([world.keyframes[i].T_world_camera for i in ids]).reshape(-1, 4, 4)
@@ -170,9 +171,6 @@ def read_back(world: WorldMap, estimate: GraphEstimate) -> IntArray:
         landmarks.move_with_hosts(outside, ids[moved], T_old[moved], T_new[moved])
     for i, T in zip(ids, T_new, strict=True):
         world.keyframes[i].T_world_camera = T
-    inside = estimate.landmark_ids[landmarks.alive[estimate.landmark_ids]]
     position = np.searchsorted(estimate.landmark_ids, inside)
     landmarks.points_world[inside] = estimate.points_world[position]
-    landmarks.in_graph[:] = False
-    landmarks.in_graph[inside] = True
     return estimate.dropped_landmarks

@@ -145,7 +145,7 @@ class WorldMap:
             keep = ~(taken | repeated)
             keyframe.landmark_ids[rows[~keep]] = -1
             self.attach(keyframe, rows[keep], targets[keep])
-        self.landmarks.found[new_ids] += self.landmarks.found[old_ids]
-        self.landmarks.visible[new_ids] += self.landmarks.visible[old_ids]
+        np.add.at(self.landmarks.found, new_ids, self.landmarks.found[old_ids])
+        np.add.at(self.landmarks.visible, new_ids, self.landmarks.visible[old_ids])
         self.landmarks.remove(old_ids)
         return old_ids

@@ -135,7 +135,9 @@ def test_two_duplicates_fused_into_one_keep_one_observation() -> None:
     heir = make(world, 0, [0])
     twins = make(world, 1, [2, 3])
     attach(world, 2, [2], twins[:1])
+    world.landmarks.found[twins] = [4, 7]
     world.replace_landmarks(twins, np.repeat(heir, 2))
+    assert world.landmarks.found[heir].tolist() == [12]
     assert world.landmarks.observations[heir].tolist() == [3]
     assert np.count_nonzero(world.keyframes[1].landmark_ids == heir[0]) == 1
     assert_counts_are_true(world)
