@@ -23,6 +23,7 @@ from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
 from graph.trajectory import associate_stamps
 from slam.features import BriskExtractor, FeatureConfig, Features
+from slam.landmarks import Ints
 from slam.matching import MatchConfig, WindowIndex, match_pairs
 from slam.sequences import Sequence, open_sequence
 from slam.subpixel import SubpixelConfig, cut_patches, register_patches
@@ -30,7 +31,7 @@ from slam.subpixel import SubpixelConfig, cut_patches, register_patches
 GAPS = (1, 5, 15)
 STEP = 10
 WINDOW_PX = 6.0
-DEPTH_BANDS_M = ((0.5, 1.5), (1.5, 2.5), (2.5, 5.0))
+DEPTH_BANDS_M = ((0.5, 2.0), (2.0, 3.0), (3.0, 5.0))
 FLAT_SHARE = 0.01
 
 
@@ -90,7 +91,7 @@ def true_depth_at(depth_m: Array, pixels: Array) -> Array:
     return np.where(inside & smooth, depth, np.nan)
 
 
-def true_pixels(first: _View, second: _View, camera: Camera) -> tuple[Array, Array]:
+def true_pixels(first: _View, second: _View, camera: Camera) -> tuple[Ints, Array]:
     """Indices of the first view's keypoints that the second one sees, and where (N, 2).
 
     A point counts as seen if the second view's noise-free depth there agrees with it.

@@ -16,7 +16,7 @@ import numpy as np
 
 from graph.geometry import Array, inverse
 from graph.trajectory import associate, read_tum
-from slam.evaluation import evaluate
+from slam.evaluation import Row, evaluate
 from slam.run_folder import STAGES
 
 logger = logging.getLogger(__name__)
@@ -48,6 +48,7 @@ class Measurement:
         sequence, variant: of the job.
         command: as one would type it.
         metrics: of metrics.json, by name.
+        printed: the rows of metrics.json as they are, for what the command line prints of them.
         stages: (median ms, 95 % ms, number of frames that took this stage) by name.
         frames, weak, lost: of frames.csv.
         path_m: length of the reference's path during the run, 0 without a reference.
@@ -58,6 +59,7 @@ class Measurement:
     variant: str
     command: str
     metrics: dict[str, float]
+    printed: list[Row]
     stages: dict[str, tuple[float, float, int]]
     frames: int
     weak: int
@@ -122,6 +124,7 @@ def read_run(out: Path, job: Job, command: str) -> Measurement:
         variant=job.variant,
         command=command,
         metrics={row["name"]: row["value"] for row in rows},
+        printed=rows,
         stages={stage: stage_times(frames, stage) for stage in STAGES},
         frames=len(frames),
         weak=status.count("WEAK"),

@@ -31,7 +31,7 @@ class RecordingSystem(SlamSystem):
         """A frame as ever; then look at the graph."""
         result = super().process(frame, features)
         if result.keyframe_id is not None:
-            graph, map_now = self.smoother.estimate(), self.statistics()
+            graph, map_now = self.mapper.smoother.estimate(), self.statistics()
             update_ms = map_now["isam2_update_ms"]
             assert isinstance(update_ms, list)
             self.rows.append(

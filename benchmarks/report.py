@@ -9,9 +9,13 @@ from typing import Any
 from anchors import KITCHEN, PUBLISHED_ATE_CM
 from targets import target_rows
 
+from slam.evaluation import format_table
+
 Results = dict[str, Any]
 BEGIN = "<!-- results: written by benchmarks/run.py -->"
 END = "<!-- end of results -->"
+EXAMPLE_BEGIN = "<!-- example: written by benchmarks/run.py -->"
+EXAMPLE_END = "<!-- end of example -->"
 BUSY_LOAD = 1.0
 ESTIMATED_REFERENCE = ("redkitchen",)
 TITLES = {
@@ -38,9 +42,10 @@ def results_block(results: Results) -> str:
     header = ("sequence", "frames tracked", "ATE", "RPE a second", "end drift",
               "ms a frame: median, 95 %", "frames/s", "keyframes", "memory")  # fmt: skip
     rows = [_result_row(run) for run in results["runs"] if run["variant"] == "default"]
-    machine = results["machine"]
+    machine, (commit, *changes) = results["machine"], results["commit"].split(" with ")
     where = (
-        f"{machine['processor']}, {machine['cores']} cores, no GPU; commit {results['commit']}; "
+        f"{machine['processor']}, {machine['cores']} cores, no GPU used; "
+        f"commit {commit}{' and uncommitted changes' if changes else ''}; "
         f"{results['date']}; by `{results['command']}`."
     )
     return "\n".join([BEGIN, table(header, rows), "", where, END])
@@ -74,14 +79,24 @@ def _drift(run: dict[str, Any]) -> str:
     return f"{100 * run['drift_m'] / max(run['path_m'], 1e-9):.2f} % of {run['path_m']:.1f} m"
 
 
-def insert_results(results: Results, path: Path) -> None:
-    """Replace what stands between the markers in a file."""
+def example_block(results: Results) -> str:
+    """What the command line prints of the office's run, between its markers."""
+    run = next(run for run in results["runs"] if run["sequence"] == "office")
+    printed = format_table(run["printed"])
+    return f"{EXAMPLE_BEGIN}\n```\n$ {run['command']}\n{printed}\n```\n{EXAMPLE_END}"
+
+
+def fill_readme(results: Results, path: Path) -> None:
+    """Replace what stands between the markers in README.md."""
     text = path.read_text(encoding="utf-8")
-    before, found, rest = text.partition(BEGIN)
-    _, closed, after = rest.partition(END)
-    if not (found and closed):
-        raise SystemExit(f"error: {path}: lacks the lines '{BEGIN}' and '{END}'")
-    path.write_text(before + results_block(results) + after, encoding="utf-8")
+    for block in (results_block(results), example_block(results)):
+        begin, end = block.partition("\n")[0], block.rpartition("\n")[2]
+        before, found, rest = text.partition(begin)
+        _, closed, after = rest.partition(end)
+        if not (found and closed):
+            raise SystemExit(f"error: {path}: lacks the lines '{begin}' and '{end}'")
+        text = before + block + after
+    path.write_text(text, encoding="utf-8")
 
 
 def write_report(results: Results, path: Path) -> None:
@@ -147,7 +162,8 @@ def _targets(results: Results) -> str:
 
 
 def _kitchen(results: Results) -> str:
-    runs = [r for r in results["runs"] if r["sequence"] == "redkitchen" and _is_whole(r)]
+    whole = [r for r in results["runs"] if "--max-frames" not in r["command"]]
+    runs = [r for r in whole if r["sequence"] == "redkitchen" and r["variant"] != "repeated"]
     if not runs:
         return ""
     rows = []
@@ -167,10 +183,6 @@ def _kitchen(results: Results) -> str:
         "scale 2 % larger takes ORB-SLAM2 from 4.8 to 4.0 cm. Differences below a centimetre prove "
         "nothing here; the rendered sequences, whose truth is exact, decide."
     )
-
-
-def _is_whole(run: dict[str, Any]) -> bool:
-    return "ate_rmse" in run["metrics"] and "--max-frames" not in run["command"]
 
 
 def _stages(results: Results) -> str:
@@ -272,8 +284,8 @@ def _trajectories(results: Results) -> str:
     ]  # fmt: skip
     header = ("trajectory", "ATE, our evaluation", "RPE a second", "poses", "published, cm")
     return (
-        "## The evaluation itself\n\nPublished trajectories of other systems through "
-        "`bmask-slam evaluate` (SE(3), all poses); the tests hold it against `evo` to 1e-6 m.\n\n"
+        "## The evaluation itself\n\nPublished trajectories of other systems through our "
+        "evaluation (SE(3), all poses); the tests hold it against `evo` to 1e-6 m.\n\n"
         + table(header, rows)
     )
 

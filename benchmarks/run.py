@@ -32,7 +32,7 @@ from measure import (
     render,
     shown,
 )
-from report import insert_results, write_report
+from report import fill_readme, write_report
 
 logger = logging.getLogger("benchmarks")
 
@@ -188,7 +188,7 @@ def main() -> None:
     results = json.loads(store.read_text(encoding="utf-8"))
     write_report(results, arguments.report)
     if arguments.whole:
-        insert_results(results, ROOT / "README.md")
+        fill_readme(results, ROOT / "README.md")
     print(arguments.report)
 
 

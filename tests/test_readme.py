@@ -1,0 +1,142 @@
+"""README.md and docs/ say what is so: paths exist, commands parse, tables are the benchmark's."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from slam.cli import make_parser
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+MAX_LINES = 150
+MAKE_TARGET = re.compile(r"\bmake ([a-z]+)\b")
+LINK = re.compile(r"\]\(([^)]+)\)")
+CODE = re.compile(r"```.*?\n(.*?)```|`([^`\n]+)`", re.DOTALL)
+REPOSITORY_PATH = re.compile(
+    r"^(?:slam|graph|semantics|mapping|data|tests|benchmarks|docs)/[\w./]*$|^[\w]+\.(?:md|toml)$"
+)
+
+
+def commands() -> argparse._SubParsersAction:
+    (action,) = (a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    return action
+
+
+def code_lines(text: str) -> list[str]:
+    """Every line of code in a page, from blocks and from within sentences, without comments."""
+    pieces = [block or inline for block, inline in CODE.findall(text)]
+    return [line.split("#")[0].strip() for piece in pieces for line in piece.splitlines()]
+
+
+def command_lines(text: str) -> list[list[str]]:
+    """The arguments of every ``bmask-slam COMMAND ...`` in code."""
+    lines = [line.removeprefix("$ ") for line in code_lines(text)]
+    split = [shlex.split(line) for line in lines if line.startswith("bmask-slam ")]
+    return [words[1:] for words in split]
+
+
+def test_the_readme_is_short():
+    assert len(README.splitlines()) <= MAX_LINES
+
+
+def anchors(page: Path) -> set[str]:
+    """What can follow # in a link to a page: its headings, as GitHub writes them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for link in LINK.findall(page.read_text(encoding="utf-8")):
+        if link.startswith("http"):
+            continue
+        target, _, anchor = link.partition("#")
+        file = page.parent / target if target else page
+        assert file.exists(), link
+        assert not anchor or anchor in anchors(file), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_paths_in_code_exist(page):
+    words = [w for line in code_lines(page.read_text(encoding="utf-8")) for w in line.split()]
+    paths = {word for word in words if REPOSITORY_PATH.match(word)}
+    missing = [path for path in sorted(paths) if not (ROOT / path).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_parse(page):
+    """Whole command lines go through the real parser; --help and --version end it with 0."""
+    lines = command_lines(page.read_text(encoding="utf-8"))
+    for words in lines:
+        try:
+            make_parser().parse_args(words)
+        except SystemExit as end:
+            assert end.code == 0, f"bmask-slam {shlex.join(words)}"
+
+
+def test_the_readme_shows_every_command():
+    shown = {words[0] for words in command_lines(README)}
+    assert shown == set(commands().choices)
+
+
+def test_options_in_the_table_belong_to_their_command():
+    rows = re.findall(r"^\| `bmask-slam (\w+)[^`]*` \| (.*) \|$", README, re.MULTILINE)
+    assert len(rows) == len(commands().choices)
+    for name, cell in rows:
+        known = commands().choices[name]._option_string_actions
+        for option in re.findall(r"`(--[\w-]+)", cell):
+            assert option in known, f"{name} {option}"
+
+
+def test_make_targets_exist():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    named = {name for line in code_lines(README) for name in MAKE_TARGET.findall(line)}
+    assert {"demo", "test", "bench", "check"} <= named
+    for name in named:
+        assert re.search(rf"^{name}:", makefile, re.MULTILINE), name
+
+
+def test_configuration_keys_exist():
+    from slam.configuration import resolve
+    from slam.system import SystemConfig
+
+    given = [
+        words[i + 1]
+        for page in PAGES
+        for words in command_lines(page.read_text(encoding="utf-8"))
+        for i, word in enumerate(words)
+        if word == "--set"
+    ]
+    given += re.findall(r"`--set ([\w.]+=[\w.]+)`", README)
+    assert given
+    for setting in given:
+        resolve(SystemConfig, None, [setting])
+
+
+def block(text: str) -> str:
+    """What stands between the markers of the results table."""
+    begin, end = "<!-- results: written by benchmarks/run.py -->", "<!-- end of results -->"
+    assert text.count(begin) == text.count(end) == 1
+    return text.partition(begin)[2].partition(end)[0]
+
+
+def test_the_results_are_those_of_the_benchmark():
+    report = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    results = block(README)
+    assert results == block(report)
+    rows = [line for line in results.splitlines() if line.startswith("| ")]
+    assert len(rows) > 2, "no sequence was measured"
+
+
+def test_figures_of_results_stand_nowhere_else_in_the_readme():
+    """Nothing measured is typed by hand: units of results appear in written blocks only."""
+    example = README.partition("<!-- example:")[2].partition("<!-- end of example -->")[0]
+    rest = README.replace(block(README), "").replace(example, "")
+    assert not re.search(r"\d+(?:\.\d+)? ?(?:mm|cm|ms|MB|fps|Hz|°)\b", rest)
