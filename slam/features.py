@@ -21,8 +21,8 @@ class FeatureConfig:
 
     The corner threshold is the highest of ``thresholds`` at which FAST, a fortieth of BRISK's
     cost, finds ``max_keypoints`` in the finest layer; so a blurred frame gets its keypoints and
-    a rich one costs no more. ``octaves`` is BRISK's: each adds a half-scale layer and an intra-octave.
-    ``pixel_sigma`` is that of a BRISK keypoint at scale 1. ``disparity_sigma_px`` is the depth
+    a rich one costs no more. ``octaves`` is BRISK's: each adds a half-scale layer and an
+    intra-octave. ``pixel_sigma`` is that of a BRISK keypoint at scale 1. ``disparity_sigma_px`` is the depth
     sensor's: for structured light a constant in disparity, sigma_z = z^2 / bf * sigma_d, with
     0.07 px the laboratory value (Nguyen 2012) at bf = 40 px m. ``depth_window_px`` and
     ``depth_edge_ratio``: see sample_depth.
@@ -33,7 +33,7 @@ class FeatureConfig:
     max_keypoints: int = 1000
     bucket_px: int = 40
     pixel_sigma: float = 0.7
-    disparity_sigma_px: float = 0.12
+    disparity_sigma_px: float = 0.08
     depth_window_px: int = 2
     depth_edge_ratio: float = 0.04
     min_depth_m: float = 0.3

@@ -16,6 +16,7 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type, float]] = {
     "descriptors": ((8,), np.uint64, 0),
     "directions": ((3,), np.float64, 0.0),
     "extent": ((), np.float64, 0.0),
+    "angles_rad": ((), np.float64, 0.0),
     "colours": ((3,), np.uint8, 0),
     "host": ((), np.int64, -1),
     "last_keyframe": ((), np.int64, -1),
@@ -37,6 +38,7 @@ class LandmarkTable:
         descriptors: (N, 8) uint64, BRISK's bits in the keyframe that saw it last.
         directions: (N, 3) unit vector from the point towards that keyframe's camera.
         extent: (N,) keypoint scale times z there, so that scale at depth z is extent / z.
+        angles_rad: (N,) the keypoint's orientation there.
         colours: (N, 3) uint8.
         host: (N,) keyframe that made it; it moves the landmark while it is not in the graph.
         last_keyframe: (N,) newest keyframe that observes it.
@@ -51,6 +53,7 @@ class LandmarkTable:
     descriptors: NDArray[np.uint64]
     directions: Array
     extent: Array
+    angles_rad: Array
     colours: NDArray[np.uint8]
     host: Ints
     last_keyframe: Ints

@@ -10,7 +10,7 @@ import numpy as np
 from graph.geometry import Array, make_pose
 from slam.features import Features
 from slam.local_mapping import MappingConfig, local_landmarks
-from slam.matching import MatchConfig, WindowIndex, match_brute_force
+from slam.matching import MatchConfig, WindowIndex, consistent_rotation, match_brute_force
 from slam.results import TrackingStatus
 from slam.tracker import Tracked, Tracker
 from slam.world_map import Keyframe, WorldMap
@@ -31,7 +31,9 @@ class RelocalisationConfig:
     reprojection_px: float = 4.0
     patience_frames: int = 10
     min_new_points: int = 100
-    match: MatchConfig = field(default_factory=lambda: MatchConfig(max_distance=110, ratio=0.85))
+    match: MatchConfig = field(
+        default_factory=lambda: MatchConfig(max_distance=110, ratio=0.85, max_angle_rad=0.5)
+    )
 
 
 def relocalise(
@@ -82,6 +84,12 @@ def _pose_from(
     keypoints, ids = world.observed(keyframe)
     known = np.ascontiguousarray(keyframe.features.descriptors[keypoints])
     matches = match_brute_force(features.descriptors, known, config.match)
+    if config.match.max_angle_rad is not None:
+        turn = (
+            features.angles_rad[matches.query]
+            - keyframe.features.angles_rad[keypoints[matches.train]]
+        )
+        matches = consistent_rotation(matches, turn, config.match.max_angle_rad)
     if len(matches) < config.min_matches:
         return None
     found, rotation, t, inliers = cv2.solvePnPRansac(

@@ -89,6 +89,9 @@ def save(
     trajectory = system.trajectory()
     folder.write_trajectory(trajectory)
     folder.write_trajectory(system.keyframe_trajectory(), "keyframes.txt")
+    for number, segment in system.segments().items():
+        if segment.timestamps_s[0] not in trajectory.timestamps_s:
+            folder.write_trajectory(segment, f"trajectory_segment_{number}.txt")
     write_landmarks(folder.path / "landmarks.ply", system.landmarks())
     with folder.replacing("graph") as graph:
         system.save_graph(graph)

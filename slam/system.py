@@ -110,10 +110,8 @@ class SlamSystem:
 
     def trajectory(self) -> Trajectory:
         """Every frame with a pose in the largest segment, from the keyframes as they are now."""
-        segments = self.segments()
-        if not segments:
-            return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-        return segments[max(segments, key=lambda s: (len(segments[s]), -s))]
+        nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+        return self.segments().get(self._largest_segment(), nothing)
 
     def segments(self) -> dict[int, Trajectory]:
         """The frames of every map segment that was not joined, each in a frame of its own."""
@@ -121,16 +119,15 @@ class SlamSystem:
 
     def keyframe_trajectory(self) -> Trajectory:
         """The keyframes of the largest segment."""
-        wanted = self.trajectory().timestamps_s
-        keyframes = self.mapper.world.keyframes.values()
-        chosen = [k for k in keyframes if np.isin(k.timestamp_s, wanted)]
+        chosen = self.mapper.world.in_segment(self._largest_segment())
         stamps = np.array([k.timestamp_s for k in chosen])
         return Trajectory(stamps, np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4))
 
     def landmarks(self) -> LandmarkCloud:
-        """The living landmarks with their colours."""
+        """The living landmarks of the largest segment, with their colours."""
         table = self.mapper.world.landmarks
-        ids = np.flatnonzero(table.alive)
+        hosts = [k.id for k in self.mapper.world.in_segment(self._largest_segment())]
+        ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
         return LandmarkCloud(
             ids, table.points_world[ids], table.colours[ids], table.observations[ids]
         )
@@ -146,6 +143,10 @@ class SlamSystem:
             "landmarks": int(self.mapper.world.landmarks.alive.sum()),
             "isam2_update_ms": list(self.mapper.update_ms),
         }
+
+    def _largest_segment(self) -> int:
+        segments = self.segments()
+        return max(segments, key=lambda s: (len(segments[s]), -s), default=0)
 
     def _track(self, features: Features) -> Tracked:
         """Against the map; where there is none, or it is long lost, the frame begins a new one."""

@@ -10,7 +10,7 @@ from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
 from slam.features import Features, undistort
 from slam.landmarks import Ints, LandmarkTable
-from slam.matching import MatchConfig, Matches, WindowIndex, match_pairs
+from slam.matching import MatchConfig, Matches, WindowIndex, consistent_rotation, match_pairs
 from slam.pose_optimisation import PoseEstimate, PoseOptimisationConfig, optimise_pose
 from slam.results import TrackingStatus
 from slam.subpixel import SubpixelConfig, register_patches
@@ -179,7 +179,12 @@ class Tracker:
         fits = (ratio < limit) & (ratio > 1 / limit)
         pairs = (query[fits], train[fits])
         tables = (landmarks.descriptors[ids], features.descriptors)
-        return ids, match_pairs(pairs, tables, self.config.match)
+        matches = match_pairs(pairs, tables, self.config.match)
+        tolerance = self.config.match.max_angle_rad
+        if tolerance is None:
+            return ids, matches
+        turn = features.angles_rad[matches.train] - landmarks.angles_rad[ids[matches.query]]
+        return ids, consistent_rotation(matches, turn, tolerance)
 
     def _first_estimate(
         self,

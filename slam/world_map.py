@@ -87,6 +87,7 @@ class WorldMap:
         towards = keyframe.T_world_camera[:3, 3] - landmarks.points_world[ids]
         landmarks.directions[ids] = towards / np.linalg.norm(towards, axis=1, keepdims=True)
         z = -towards @ keyframe.T_world_camera[:3, 2]
+        landmarks.angles_rad[ids] = features.angles_rad[rows]
         landmarks.extent[ids] = features.scales[rows] * np.maximum(z, 0.05)
 
     def remove_keyframe(self, keyframe: Keyframe, heir: Keyframe) -> None:

@@ -1,0 +1,147 @@
+"""The whole system on a textured plane with exact truth, and on real frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane
+
+from graph.geometry import Array, inverse, se3_exp, se3_log
+from slam.frame import Frame
+from slam.results import FrameResult, TrackingStatus
+from slam.sequences import open_sequence
+from slam.system import SlamSystem
+
+KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/redkitchen"
+
+
+def path(count: int, start_x_m: float = -0.6) -> list[Array]:
+    """Camera poses sideways along the plane, 2 cm a frame, turning a little."""
+    steps = np.arange(count)
+    return [
+        se3_exp(np.array([0.02 * np.sin(0.3 * i), 0.03 * np.sin(0.2 * i), 0.01 * i, 0, 0, 0]))
+        @ se3_exp(np.array([0, 0, 0, start_x_m + 0.02 * i, 0.05 * np.sin(0.4 * i), 0.0]))
+        for i in steps
+    ]
+
+
+def feed(system: SlamSystem, poses: list[Array | None], first: int = 0) -> list[FrameResult]:
+    """Run the system along poses; None is a black frame without depth."""
+    return [system.process(view(pose, first + i)) for i, pose in enumerate(poses)]
+
+
+def view(pose: Array | None, index: int) -> Frame:
+    if pose is not None:
+        return render_plane(pose, index)
+    black = np.zeros((480, 640, 3), np.uint8)
+    return Frame(index, index / 30.0, black, np.full((480, 640), np.nan, np.float32))
+
+
+def largest_error_m(system: SlamSystem, poses: list[Array | None]) -> float:
+    """Largest distance of a frame from the truth, both relative to the first frame."""
+    trajectory = system.trajectory()
+    index = np.rint(trajectory.timestamps_s * 30).astype(int)
+    truth = [inverse(poses[index[0]]) @ poses[i] for i in index]
+    start = inverse(trajectory.poses_world_camera[0])
+    offsets = [
+        se3_log(inverse(T_true) @ start @ T)
+        for T_true, T in zip(truth, trajectory.poses_world_camera, strict=True)
+    ]
+    return float(np.linalg.norm(np.array(offsets)[:, 3:], axis=1).max())
+
+
+def test_pose_agrees_with_the_truth_in_frame_unit_and_sign() -> None:
+    system, poses = SlamSystem(CAMERA), path(25)
+    results = feed(system, poses)
+    assert all(r.status is TrackingStatus.OK for r in results)
+    system.finish()
+    assert len(system.trajectory()) == 25
+    assert largest_error_m(system, poses) < 0.003
+    T_first_last = inverse(poses[0]) @ poses[-1]
+    assert np.allclose(results[-1].T_world_camera, T_first_last, atol=0.004)
+
+
+def test_lost_frames_get_no_pose_and_tracking_comes_back() -> None:
+    system = SlamSystem(CAMERA)
+    there = path(15)
+    poses = [*there, *[None] * 5, *there[5:10]]
+    results = feed(system, poses)
+    assert [r.status for r in results[15:20]] == [TrackingStatus.LOST] * 5
+    assert all(r.T_world_camera is None for r in results[15:20])
+    assert all(r.status is not TrackingStatus.LOST for r in results[20:])
+    assert len(system.trajectory()) == 20
+    assert {r.segment for r in results} == {0}
+    assert largest_error_m(system, poses) < 0.003
+
+
+def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
+    system = SlamSystem(CAMERA)
+    here, elsewhere = path(12), path(50, start_x_m=0.9)
+    back = [path(1, start_x_m=x)[0] for x in np.arange(0.9, -0.61, -0.03)]
+    poses = [*here, *[None] * 11, *elsewhere[:14]]
+    results = feed(system, poses)
+    assert results[-1].segment == 1
+    apart = system.segments()
+    assert [len(apart[0]), len(apart[1])] == [12, sum(r.segment == 1 for r in results)]
+    poses += [*elsewhere[13::-1], *back]
+    results += feed(system, poses[len(results) :], first=len(results))
+    assert results[-1].segment == 0
+    joined = system.segments()
+    assert list(joined) == [0]
+    assert len(joined[0]) == sum(r.T_world_camera is not None for r in results)
+    assert largest_error_m(system, poses) < 0.01
+
+
+def test_black_frames_before_the_first_keyframe_are_lost_not_fatal() -> None:
+    results = feed(SlamSystem(CAMERA), [None, None, *path(3)])
+    expected = [TrackingStatus.LOST] * 2 + [TrackingStatus.OK] * 3
+    assert [r.status for r in results] == expected
+    assert results[2].keyframe_reason == "first frame"
+
+
+def test_a_frame_without_depth_is_tracked_from_the_map() -> None:
+    system, poses = SlamSystem(CAMERA), path(6)
+    feed(system, poses[:5])
+    frame = render_plane(poses[5], 5)
+    blind = Frame(5, frame.timestamp_s, frame.rgb, np.full((480, 640), np.nan, np.float32))
+    result = system.process(blind)
+    assert result.status is TrackingStatus.OK
+    assert np.allclose(result.T_world_camera, inverse(poses[0]) @ poses[5], atol=0.01)
+
+
+def test_features_prepared_ahead_change_nothing_and_runs_repeat() -> None:
+    runs = []
+    for ahead in (False, True):
+        system = SlamSystem(CAMERA)
+        for index, pose in enumerate(path(10)):
+            frame = render_plane(pose, index)
+            system.process(frame, system.prepare(frame) if ahead else None)
+        system.finish()
+        runs.append(system.trajectory().poses_world_camera.tobytes())
+    assert runs[0] == runs[1]
+
+
+def test_graph_is_saved_with_every_keyframe(tmp_path: Path) -> None:
+    from graph.smoother import Smoother
+
+    system = SlamSystem(CAMERA)
+    feed(system, path(15))
+    system.save_graph(tmp_path / "graph")
+    estimate = Smoother.load(tmp_path / "graph").estimate()
+    keyframes = system.keyframe_trajectory().poses_world_camera
+    assert np.allclose(estimate.poses_world_camera, keyframes)
+    assert len(estimate.landmark_ids) > 50
+
+
+@pytest.mark.skipif(not KITCHEN.exists(), reason="needs ../shared/data/redkitchen")
+def test_real_kitchen_start_is_tracked() -> None:
+    from slam.evaluation import evaluate_trajectory
+
+    sequence = open_sequence(KITCHEN)
+    system = SlamSystem(sequence.camera)
+    results = [system.process(frame) for frame in sequence.frames(stop=120, stride=3)]
+    assert all(r.status is not TrackingStatus.LOST for r in results)
+    errors = evaluate_trajectory(system.trajectory(), sequence.groundtruth)
+    assert errors.value("ate_rmse") < 0.03
