@@ -126,12 +126,12 @@ def test_depth_and_disparity_of_a_plane() -> None:
     np.testing.assert_allclose(features.measurements[:, 2], stereo[:, 0] - stereo[:, 2], atol=1e-9)
 
 
-def test_sigmas_are_the_sensors_and_grow_with_scale_and_slant() -> None:
+def test_sigmas_are_the_sensors_and_grow_with_the_root_of_scale() -> None:
     frontal = extract(FRONTAL, dataclasses.replace(CONFIG, octaves=2))
     np.testing.assert_allclose(frontal.sigmas_px[:, 2], CONFIG.disparity_sigma_px, rtol=1e-3)
     np.testing.assert_array_equal(frontal.sigmas_px[:, 0], frontal.sigmas_px[:, 1])
-    order = np.argsort(frontal.scales)
-    assert (np.diff(frontal.sigmas_px[order, 0]) >= 0).all()
+    expected = CONFIG.pixel_sigma * np.sqrt(frontal.scales)
+    np.testing.assert_allclose(frontal.sigmas_px[:, 0], expected, rtol=1e-12)
     assert frontal.scales.max() > 1.5
     assert frontal.sigmas_px[:, 0].min() == pytest.approx(CONFIG.pixel_sigma)
 

@@ -86,6 +86,13 @@ def test_window_pairs_are_those_of_the_double_loop(radius_px: float) -> None:
     assert set(found) == slow
 
 
+def test_the_windows_edge_belongs_to_it() -> None:
+    """Corners of FAST lie on whole pixels, so that distances hit the radius exactly."""
+    pixels = np.array([[105.0, 50.0], [95.0, 50.0], [100.0, 55.0], [100.0, 45.0], [103.0, 54.0]])
+    _, train = WindowIndex(pixels).pairs(np.array([[100.0, 50.0]]), np.array([5.0]))
+    assert sorted(train.tolist()) == [0, 1, 2, 3, 4]
+
+
 def test_window_of_nothing_is_empty() -> None:
     none = np.zeros((0, 2))
     for pixels, centres in ((none, RNG.uniform(0, 99, (4, 2))), (RNG.uniform(0, 99, (4, 2)), none)):

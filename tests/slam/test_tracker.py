@@ -162,10 +162,12 @@ def test_search_looks_where_a_plain_loop_looks() -> None:
     """From afar and aside, so that some landmarks leave the image, some lie behind, some turn."""
     rng = np.random.default_rng(6)
     world, _ = make_map(300, rng)
-    world.landmarks.points_world[:40, 2] *= -1.0
     random = rng.normal(size=(60, 3))
     world.landmarks.directions[40:100] = random / np.linalg.norm(random, axis=1, keepdims=True)
     T = se3_exp(np.array([0.05, 0.25, 0.3, 0.3, 0.1, -0.4]))
+    world.landmarks.points_world[:40, 2] *= -1.0  # behind, and seen from there before
+    towards = T[:3, 3] - world.landmarks.points_world[:40]
+    world.landmarks.directions[:40] = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     features = see(world, rng)
     ids = rng.permutation(300)[:250]
     tracker = Tracker(CAMERA, PLAIN)
