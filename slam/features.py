@@ -22,7 +22,8 @@ class FeatureConfig:
     The corner threshold is the highest of ``thresholds`` at which FAST, a fortieth of BRISK's
     cost, finds ``max_keypoints`` in the finest layer; so a blurred frame gets its keypoints and
     a rich one costs no more. ``octaves`` is BRISK's: each adds a half-scale layer and an
-    intra-octave. ``pixel_sigma`` is that of a BRISK keypoint at scale 1. ``disparity_sigma_px`` is the depth
+    intra-octave. Nearer to the border than ``border_px`` BRISK has no descriptor.
+    ``pixel_sigma`` is that of a BRISK keypoint at scale 1. ``disparity_sigma_px`` is the depth
     sensor's: for structured light a constant in disparity, sigma_z = z^2 / bf * sigma_d, with
     0.07 px the laboratory value (Nguyen 2012) at bf = 40 px m. ``depth_window_px`` and
     ``depth_edge_ratio``: see sample_depth.
@@ -30,8 +31,9 @@ class FeatureConfig:
 
     thresholds: tuple[int, ...] = (50, 35, 25, 18, 13)
     octaves: int = 0
-    max_keypoints: int = 1000
+    max_keypoints: int = 850
     bucket_px: int = 40
+    border_px: int = 20
     pixel_sigma: float = 0.7
     disparity_sigma_px: float = 0.08
     depth_window_px: int = 2
@@ -103,12 +105,15 @@ class BriskExtractor:
         Without octaves BRISK's detector is FAST with non-maximum suppression, and its sub-pixel
         step is not needed, since matches are registered to patches later.
         """
+        border = self.config.border_px
+        inside = np.zeros_like(gray)
+        inside[border:-border, border:-border] = 255
         for threshold in self.config.thresholds:
-            keypoints = self._fast[threshold].detect(gray)
+            keypoints = self._fast[threshold].detect(gray, inside)
             if len(keypoints) >= self.config.max_keypoints:
                 break
         if self.config.octaves > 0:
-            keypoints = self._brisk[threshold].detect(gray, None)
+            keypoints = self._brisk[threshold].detect(gray, inside)
         return list(keypoints), threshold
 
     def _strongest_spread(self, keypoints: list, shape: tuple[int, int]) -> list:
@@ -168,8 +173,8 @@ def sample_depth(
 ) -> tuple[Array, Array]:
     """Depth (N,) at keypoints and its local spread (N,) in metres.
 
-    The depth is the median of the valid pixels in a small window; the spread is their median
-    absolute deviation, so that slanted and rough surfaces are trusted less. Where the window
+    The depth is the median of the valid pixels in a small window; the spread is half
+    their interquartile range, so that slanted and rough surfaces are trusted less. Where the window
     straddles a depth edge (a range above ``depth_edge_ratio`` z) colour and depth disagree about
     which side the keypoint is on, and the depth is NaN.
     """

@@ -47,7 +47,7 @@ class GraphFeed:
         inside = world.landmarks.in_graph[ids]
         new_ids = self._promoted(world, keyframe, keypoints[~inside], ids[~inside], inside.sum())
         world.landmarks.in_graph[new_ids] = True
-        observed = self._unsent_observations(world, keyframe, new_ids)
+        observed = self._unsent_observations(world)
         removed = np.concatenate([np.zeros(0, np.int64), *self._removed])
         gone = self._removed_keyframes
         begins = world.in_segment(keyframe.segment) == [keyframe]
@@ -70,18 +70,15 @@ class GraphFeed:
         landmarks = world.landmarks
         landmarks.in_graph &= landmarks.alive
         first = {k.segment: k for k in reversed(keyframes)}
-        parts = []
         for keyframe in keyframes:
-            keypoints, ids = world.observed(keyframe)
-            inside = landmarks.in_graph[ids]
-            parts.append(observations_of(keyframe, keypoints[inside], ids[inside]))
+            keyframe.sent_ids[:] = -1
         ids = np.flatnonzero(landmarks.in_graph)
         return GraphUpdate(
             keyframe_ids=np.array([k.id for k in keyframes]),
             poses_world_camera=np.array([k.T_world_camera for k in keyframes]),
             landmark_ids=ids,
             points_world=landmarks.points_world[ids],
-            observations=concatenate(parts),
+            observations=self._unsent_observations(world),
             priors=tuple(segment_prior(first[s]) for s in sorted(first)),
         )
 
@@ -97,20 +94,19 @@ class GraphFeed:
         bucket = (pixels[:, 1] * 1000 + pixels[:, 0]).astype(np.int64)
         return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
 
-    def _unsent_observations(
-        self, world: WorldMap, keyframe: Keyframe, new_ids: Ints
-    ) -> Observations:
-        """All observations of the new landmarks, and this keyframe's of the ones in the graph."""
-        is_new = np.zeros(len(world.landmarks) + 1, bool)  # the last entry answers for id -1
-        is_new[new_ids] = True
+    def _unsent_observations(self, world: WorldMap) -> Observations:
+        """Every observation of a landmark in the graph that was not sent yet, in all keyframes.
+
+        Observations that older keyframes gained by fusion are among them.
+        """
+        in_graph = np.append(world.landmarks.in_graph, False)  # the last entry answers for id -1
         parts = []
-        for other in world.keyframes.values():
-            if other is not keyframe and not is_new[other.landmark_ids].any():
-                continue
-            keypoints, ids = world.observed(other)
-            wanted = world.landmarks.in_graph[ids] if other is keyframe else is_new[ids]
-            if wanted.any():
-                parts.append(observations_of(other, keypoints[wanted], ids[wanted]))
+        for keyframe in world.keyframes.values():
+            ids = keyframe.landmark_ids
+            rows = np.flatnonzero(in_graph[ids] & (keyframe.sent_ids != ids))
+            if len(rows):
+                parts.append(observations_of(keyframe, rows, ids[rows]))
+                keyframe.sent_ids[rows] = ids[rows]
         return concatenate(parts)
 
 
@@ -159,9 +155,14 @@ def read_back(world: WorldMap, estimate: GraphEstimate) -> IntArray:
     Landmarks outside the graph move rigidly with the keyframe that made them.
     """
     landmarks = world.landmarks
+    before = landmarks.in_graph.copy()
     inside = estimate.landmark_ids[landmarks.alive[estimate.landmark_ids]]
     landmarks.in_graph[:] = False  # not those either that were sent and refused
     landmarks.in_graph[inside] = True
+    left_out = np.append(before & ~landmarks.in_graph, False)
+    if left_out.any():  # their observations may be sent again later
+        for keyframe in world.keyframes.values():
+            keyframe.sent_ids[left_out[keyframe.sent_ids]] = -1
     known = np.array([i in world.keyframes for i in estimate.keyframe_ids], bool)
     ids, T_new = estimate.keyframe_ids[known], estimate.poses_world_camera[known]
     T_old = np.array([world.keyframes[i].T_world_camera for i in ids]).reshape(-1, 4, 4)

@@ -40,6 +40,7 @@ class Localiser:
     def track(self, features: Features, world: WorldMap, reference: Keyframe) -> Tracked:
         """The frame's pose by constant velocity and the local map; when lost, by all keyframes."""
         T_predicted = orthonormalised(self._T_world_last @ self._T_last_next)
+        self._local_ids = world.landmarks.living(self._local_ids)
         tracked = self.tracker.track(
             features, T_predicted, self._recent_ids, self._local_ids, world
         )

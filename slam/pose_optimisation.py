@@ -12,6 +12,7 @@ from graph.geometry import Array, inverse, orthonormalised, se3_exp, transform
 
 CHI2_3DOF = 7.815  # 95 %
 CHI2_2DOF = 5.991
+STEP_TOLERANCE = 3e-5  # rad and m: a fiftieth of a pixel
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class PoseOptimisationConfig:
     kernel_iterations: int = 3
     final_rounds: int = 2
     final_iterations: int = 5
-    step_tolerance: float = 3e-5
+    max_noise_scale: float = 4.0
     min_points: int = 6
 
 
@@ -37,14 +38,16 @@ class PoseEstimate:
     Attributes:
         T_world_camera: (4, 4).
         inliers: (N,) bool: within the chi-square gate, taken without the robust kernel.
+        noise_scale: factor on the pixel sigmas that the residuals ask for, at least 1.
         information: (6, 6) in the camera's own tangent [rotation rad, translation m].
-        ok: False where too few points were left or the system was singular; the pose is
-            then that of the last good step and must not be used.
+        ok: False where too few points were left or a direction of motion is not observed; the
+            rest is then that of the start and must not be used.
     """
 
     T_world_camera: Array
     inliers: NDArray[np.bool_]
     information: Array
+    noise_scale: float
     ok: bool
 
 
@@ -109,38 +112,53 @@ def optimise_pose(
         sigmas_px: (N, 3) their standard deviations.
 
     Inliers are chosen by the chi-square gate of 95 % for 3 or 2 degrees of freedom, taken without
-    the robust kernel.
+    the robust kernel, and with the pixel sigmas raised to what the frame's residuals ask for: a
+    blurred or rolling-shutter image has more noise than any constant says.
     """
     config = config or PoseOptimisationConfig()
     stereo = np.isfinite(measurements[:, 2])
     measured = np.where(np.isfinite(measurements), measurements, 0.0)
     weight = np.where(np.isfinite(measurements), 1.0 / sigmas_px**2, 0.0)
     gate = np.where(stereo, CHI2_3DOF, CHI2_2DOF)
-    T, inliers, H = T_world_camera, np.ones(len(stereo), bool), np.zeros((6, 6))
-    stages: list[tuple[float | None, int]] = []
-    stages += [(width, config.kernel_iterations) for width in config.kernel_widths]
-    stages += [(None, config.final_iterations)] * config.final_rounds
-    for width, iterations in stages:
-        if width is None:
-            inliers = _inliers(T, points_world, measured, weight, gate, camera)
+    T, inliers = T_world_camera, np.ones(len(stereo), bool)
+    failed = PoseEstimate(T_world_camera, inliers & False, np.zeros((6, 6)), 1.0, False)
+    if len(stereo) < config.min_points:
+        return failed
+    for width in config.kernel_widths:
+        matches = (points_world, measured, weight)
+        T, H = _descend(T, matches, width * gate, camera, config.kernel_iterations)
+    scale = _noise_scale(T, points_world, measured, weight, gate, camera)
+    scale = min(scale, config.max_noise_scale)
+    weight = weight * np.array([scale**-2, scale**-2, 1.0])
+    for _ in range(config.final_rounds):
+        inliers = _inliers(T, points_world, measured, weight, gate, camera)
         if inliers.sum() < config.min_points:
-            return PoseEstimate(orthonormalised(T), inliers, H, False)
-        chosen = (points_world[inliers], measured[inliers], weight[inliers])
-        kernel = None if width is None else width * gate
-        for _ in range(iterations):
-            H, g = _normal_equations(T, *chosen, kernel, camera)
-            if not (np.isfinite(H).all() and np.isfinite(g).all()):
-                return PoseEstimate(orthonormalised(T), inliers, H, False)
-            H[np.diag_indices(6)] += (
-                1e-9  # a singular system makes no step, and fails the check below
-            )
-            step = np.asarray(-np.linalg.solve(H, g), dtype=np.float64)
-            T = T @ se3_exp(step)
-            if np.abs(step).max() < config.step_tolerance:
-                break
+            return failed
+        matches = (points_world[inliers], measured[inliers], weight[inliers])
+        T, H = _descend(T, matches, None, camera, config.final_iterations)
     inliers = _inliers(T, points_world, measured, weight, gate, camera)
     ok = int(inliers.sum()) >= config.min_points and _well_conditioned(H)
-    return PoseEstimate(orthonormalised(T), inliers, H, ok)
+    return PoseEstimate(orthonormalised(T), inliers, H, scale, ok) if ok else failed
+
+
+def _descend(
+    T: Array,
+    matches: tuple[Array, Array, Array],
+    kernel: Array | None,
+    camera: Camera,
+    iterations: int,
+) -> tuple[Array, Array]:
+    """Gauss-Newton steps from a pose on (points, measurements, weights); its pose and H (6, 6).
+
+    A direction that nothing observes is left alone, and shows in H.
+    """
+    for _ in range(iterations):
+        H, g = _normal_equations(T, *matches, kernel, camera)
+        step = np.asarray(-np.linalg.solve(H + 1e-9 * np.eye(6), g), dtype=np.float64)
+        T = T @ se3_exp(step)
+        if np.abs(step).max() < STEP_TOLERANCE:
+            break
+    return T, H
 
 
 def _inliers(
@@ -149,6 +167,21 @@ def _inliers(
     """Points (N,) in front of the camera and within the chi-square gate, without any kernel."""
     r, p = residuals(T, points_world, measured, camera)
     return (np.einsum("ij,ij,ij->i", r, r, weight) < gate) & (p[:, 2] > 0.05)
+
+
+def _noise_scale(
+    T: Array, points_world: Array, measured: Array, weight: Array, gate: Array, camera: Camera
+) -> float:
+    """How many times larger the pixel residuals are than their sigmas say, at least 1.
+
+    The median of chi-square with 2 degrees of freedom is 1.386; gross outliers do not count.
+    """
+    r, p = residuals(T, points_world, measured, camera)
+    chi2 = np.einsum("ij,ij,ij->i", r[:, :2], r[:, :2], weight[:, :2])
+    plausible = (chi2 < 16 * gate) & (p[:, 2] > 0.05)
+    if not plausible.any():
+        return 1.0
+    return max(1.0, float(np.sqrt(np.median(chi2[plausible]) / 1.386)))
 
 
 def _well_conditioned(H: Array) -> bool:

@@ -33,7 +33,7 @@ class SubpixelConfig:
 
     enabled: bool = True
     iterations: int = 4
-    sigma_px: float = 0.25
+    sigma_px: float = 0.2
     max_shift_px: float = 2.0
     min_correlation: float = 0.8
     max_angle_deg: float = 20.0

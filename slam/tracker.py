@@ -44,7 +44,8 @@ class Tracked:
     Attributes:
         status: LOST means that the pose must not be used.
         T_world_camera: (4, 4).
-        features: the frame's, with the registered pixels of the matches.
+        features: the frame's, with the registered pixels of the matches, and pixel sigmas that
+            agree with the frame's residuals.
         keypoints, landmark_ids: (M,) inlier matches.
         matches: number of matches before the robust estimate.
         visible_ids: landmarks that should be in view.
@@ -110,6 +111,8 @@ class Tracker:
             return lost(T_world_camera, features, len(matches))
         status = TrackingStatus.OK if inliers >= self.config.min_inliers else TrackingStatus.WEAK
         kept = matches[estimate.inliers]
+        noise = np.array([estimate.noise_scale, estimate.noise_scale, 1.0])
+        features = replace(features, sigmas_px=features.sigmas_px * noise)
         return Tracked(
             status=status,
             T_world_camera=estimate.T_world_camera,

@@ -23,6 +23,7 @@ class Keyframe:
         T_world_camera: (4, 4), replaced whenever the graph was optimised.
         features: its keypoints.
         landmark_ids: (N,) landmark of every keypoint, -1 for none.
+        sent_ids: (N,) the landmark for which a keypoint's observation was sent to the graph, or -1.
     """
 
     id: int
@@ -32,6 +33,10 @@ class Keyframe:
     T_world_camera: Array
     features: Features
     landmark_ids: Ints
+    sent_ids: Ints = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.sent_ids = np.full(len(self.landmark_ids), -1, np.int64)
 
 
 @dataclass

@@ -90,6 +90,9 @@ class FakeSystem:
     def finish(self) -> None:
         self.finished = True
 
+    def segments(self) -> dict[int, Trajectory]:
+        return {0: self.trajectory()} if len(self.trajectory()) else {}
+
     def trajectory(self) -> Trajectory:
         poses = np.array([true_pose(k) for k in self.numbers]).reshape(-1, 4, 4)
         poses[1::2, 2, 3] += self.z_error_m

@@ -78,14 +78,14 @@ def test_lost_frames_get_no_pose_and_tracking_comes_back() -> None:
 
 def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
     system = SlamSystem(CAMERA)
-    here, elsewhere = path(12), path(50, start_x_m=0.9)
-    back = [path(1, start_x_m=x)[0] for x in np.arange(0.9, -0.61, -0.03)]
-    poses = [*here, *[None] * 11, *elsewhere[:14]]
+    here, elsewhere = path(12, start_x_m=-1.6), path(14, start_x_m=1.4)
+    back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.03)]
+    poses = [*here, *[None] * 11, *elsewhere]
     results = feed(system, poses)
     assert results[-1].segment == 1
     apart = system.segments()
     assert [len(apart[0]), len(apart[1])] == [12, sum(r.segment == 1 for r in results)]
-    poses += [*elsewhere[13::-1], *back]
+    poses += [*elsewhere[::-1], *back]
     results += feed(system, poses[len(results) :], first=len(results))
     assert results[-1].segment == 0
     joined = system.segments()
