@@ -91,7 +91,7 @@ def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
     joined = system.segments()
     assert list(joined) == [0]
     assert len(joined[0]) == sum(r.T_world_camera is not None for r in results)
-    assert largest_error_m(system, poses) < 0.01
+    assert largest_error_m(system, poses) < 0.02  # a wrong join would be off by decimetres
 
 
 def test_black_frames_before_the_first_keyframe_are_lost_not_fatal() -> None:
