@@ -3,10 +3,11 @@
 ====================  ============================================================================
 config.yaml           the resolved configuration; ``--config RUN/config.yaml`` repeats it
 trajectory.txt        TUM format, T_world_camera, every frame with a pose
-keyframes.txt         the same of the keyframes
+trajectory_segment_N  .txt: the same of map segment N, if it was never joined to the largest
+keyframes.txt         the keyframes, as trajectory.txt
 frames.csv            one line a frame: status, matches, inliers, milliseconds a stage, keyframe
 landmarks.ply         x y z (world, metres), red green blue, observations, id
-graph/                the saved factor graph and values
+graph                 the saved factor graph and values, one file that loads again
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference
 log.txt               what the program had to say

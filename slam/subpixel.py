@@ -1,9 +1,9 @@
 """Sub-pixel registration of matched keypoints to the image patch that made their landmark.
 
-BRISK places a keypoint to a third of a pixel at best, and anew in every image. The pose error that
-this causes is why dense alignment beats plain features. Aligning the patch around each match with
-the landmark's own patch (Lucas-Kanade, inverse compositional: Baker and Matthews 2004) leaves
-about 0.13 px on rendered scenes, where the truth is known (docs/benchmarks.md).
+A corner is found to half a pixel at best, and anew in every image. The pose error that this causes
+is why dense alignment beats plain features. Aligning the patch around each match with the
+landmark's own patch (Lucas-Kanade, inverse compositional: Baker and Matthews 2004) leaves a
+fraction of that; benchmarks/keypoint_noise.py measures it where the truth is exact.
 """
 
 from __future__ import annotations
