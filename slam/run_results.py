@@ -46,7 +46,7 @@ class Tally:
     def count(self, result: FrameResult) -> None:
         """Count a frame."""
         stages = result.stage_ms
-        self.tracking_ms.append(stages.get("features", 0.0) + stages.get("tracking", 0.0))
+        self.tracking_ms.append(stages["features"] + stages.get("tracking", 0.0))
         self.next_index = result.index + 1
 
 

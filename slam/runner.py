@@ -10,9 +10,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from graph.camera import Camera
 from graph.errors import InputError
@@ -20,6 +21,7 @@ from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from slam import __version__
 from slam.configuration import dump
 from slam.evaluation import Row
+from slam.frame import Frame
 from slam.progress import Progress
 from slam.run_folder import RunFolder, free_run_path
 from slam.run_results import Tally, measure, save
@@ -155,15 +157,11 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
 def track(
     system: System, sequence: Sequence, folder: RunFolder, options: RunOptions, stop: StopRequest
 ) -> Tally:
-    """Process frames until the end, ``max_frames`` or a stop request, recording each.
-
-    Images are decoded ahead in a thread; features are not, since Python's lock makes the two
-    stages slow each other down by more than the second core brings (docs/benchmarks.md).
-    """
+    """Process frames until the end, ``max_frames`` or a stop request, recording each."""
     end = len(sequence)
     if options.max_frames is not None:
         end = min(end, options.max_frames * options.stride)
-    frames = sequence.frames(0, end, options.stride)
+    frames = sequence.frames(0, end, options.stride, prepare=_timed(system.prepare))
     tally, total = Tally(), len(range(0, end, options.stride))
     start_s = time.perf_counter()
     with (
@@ -171,8 +169,9 @@ def track(
         Progress(total, options.quiet) as bar,
         _snapshots(system, folder) as snapshot,
     ):
-        for frame in frames:
-            result = system.process(frame)
+        for frame, (features, features_ms) in frames:
+            result = system.process(frame, features)
+            result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
             folder.write_frame(result)
             tally.count(result)
             bar.update(result)
@@ -207,3 +206,14 @@ def _snapshots(system: System, folder: RunFolder) -> Iterator[Callable[[int], No
     finally:
         if frames:
             folder.write_trajectory(system.trajectory())
+
+
+def _timed(prepare: Callable[[Frame], Any]) -> Callable[[Frame], tuple[Any, float]]:
+    """The function with the milliseconds it took."""
+
+    def timed(frame: Frame) -> tuple[Any, float]:
+        start_s = time.perf_counter()
+        features = prepare(frame)
+        return features, 1e3 * (time.perf_counter() - start_s)
+
+    return timed

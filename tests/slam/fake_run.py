@@ -66,11 +66,11 @@ class FakeSystem:
         self.numbers: list[int] = []
         self.finished = False
 
-    def number(self, frame: Frame) -> int:
+    def prepare(self, frame: Frame) -> int:
         return int(frame.rgb[0, 0, 0])
 
-    def process(self, frame: Frame) -> FrameResult:
-        k = self.number(frame)
+    def process(self, frame: Frame, features: int | None = None) -> FrameResult:
+        k = self.prepare(frame) if features is None else features
         self.on_frame(k)
         lost = k % 7 == 6
         if not lost:
@@ -84,7 +84,7 @@ class FakeSystem:
             inliers=90 + k,
             keyframe_id=k // 5 if k % 5 == 0 else None,
             keyframe_reason="new view" if k % 5 == 0 else "",
-            stage_ms={"features": 0.5, "tracking": 1000.0 + k, "keyframe": 5e6, "graph": 7e6},
+            stage_ms={"tracking": 1000.0 + k, "keyframe": 5e6, "graph": 7e6},
         )
 
     def finish(self) -> None:
