@@ -85,22 +85,21 @@ class BriskExtractor:
     def __init__(self, camera: Camera, config: FeatureConfig):
         self.camera = camera
         self.config = config
-        self._brisk = {t: cv2.BRISK_create(t, config.octaves) for t in config.thresholds}
+        self._describer = cv2.BRISK_create(config.thresholds[0], config.octaves)
         self._fast = {t: cv2.FastFeatureDetector_create(t) for t in config.thresholds}
 
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        keypoints, threshold = self._detect(gray)
-        kept = self._strongest_spread(keypoints, gray.shape)
-        keypoints, descriptors = self._brisk[threshold].compute(gray, kept)
+        kept = self._strongest_spread(self._detect(gray), gray.shape)
+        keypoints, descriptors = self._describer.compute(gray, kept)
         if descriptors is None:
             return self._assemble(frame, gray, np.zeros((0, 4)), np.zeros((0, 64), np.uint8))
         table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=float)
         return self._assemble(frame, gray, table.reshape(-1, 4), np.ascontiguousarray(descriptors))
 
-    def _detect(self, gray: NDArray[np.uint8]) -> tuple[list, int]:
-        """Keypoints at the highest threshold that gives enough of them, and that threshold.
+    def _detect(self, gray: NDArray[np.uint8]) -> list:
+        """Keypoints at the highest threshold that gives enough of them.
 
         Without octaves BRISK's detector is FAST with non-maximum suppression, and its sub-pixel
         step is not needed, since matches are registered to patches later.
@@ -113,8 +112,8 @@ class BriskExtractor:
             if len(keypoints) >= self.config.max_keypoints:
                 break
         if self.config.octaves > 0:
-            keypoints = self._brisk[threshold].detect(gray, inside)
-        return list(keypoints), threshold
+            keypoints = cv2.BRISK_create(threshold, self.config.octaves).detect(gray, inside)
+        return list(keypoints)
 
     def _strongest_spread(self, keypoints: list, shape: tuple[int, int]) -> list:
         """At most ``max_keypoints``: every bucket's strongest first, then the second, and so on."""
