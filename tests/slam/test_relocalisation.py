@@ -1,0 +1,64 @@
+"""Finding the camera without a prior on a textured plane."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane
+
+from graph.geometry import Array, inverse, se3_exp, se3_log
+from slam.features import BriskExtractor, FeatureConfig
+from slam.local_mapping import MappingConfig, create_landmarks
+from slam.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
+from slam.tracker import Tracked, Tracker, TrackingConfig
+from slam.world_map import Keyframe, WorldMap
+
+EXTRACTOR = BriskExtractor(CAMERA, FeatureConfig())
+TRACKER = Tracker(CAMERA, TrackingConfig())
+RULES = (RelocalisationConfig(), MappingConfig())
+
+
+def at(x_m: float, turn_rad: float = 0.0) -> Array:
+    return se3_exp(np.array([0, 0, 0, x_m, 0, 0])) @ se3_exp(np.array([0, 0, turn_rad, 0, 0, 0]))
+
+
+@pytest.fixture(scope="module")
+def world() -> WorldMap:
+    """Two keyframes 2.4 m apart, with landmarks."""
+    world = WorldMap()
+    for x_m in (-1.2, 1.2):
+        features = EXTRACTOR.extract(render_plane(at(x_m)))
+        number = world.next_keyframe_id
+        ids = np.full(len(features), -1, np.int64)
+        keyframe = Keyframe(number, number, float(number), 0, at(x_m), features, ids)
+        world.add_keyframe(keyframe)
+        create_landmarks(world, keyframe, CAMERA)
+        world.renew_patches(keyframe, TRACKER.config.subpixel)
+    return world
+
+
+def find(world: WorldMap, T_world_camera: Array) -> Tracked | None:
+    features = EXTRACTOR.extract(render_plane(T_world_camera))
+    return relocalise(features, list(world.keyframes.values()), world, TRACKER, RULES)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.5])
+@pytest.mark.parametrize("x_m", [-1.0, 1.3])
+def test_a_known_place_is_found(world: WorldMap, x_m: float, turn_rad: float) -> None:
+    T_world_camera = at(x_m, turn_rad)
+    tracked = find(world, T_world_camera)
+    assert tracked is not None
+    error = se3_log(inverse(T_world_camera) @ tracked.T_world_camera)
+    assert np.abs(error[:3]).max() < 0.003
+    assert np.abs(error[3:]).max() < 0.005
+
+
+def test_an_unknown_place_is_not_found(world: WorldMap) -> None:
+    elsewhere = se3_exp(np.array([0, 0, 0, 0.0, 2.2, 0.5]))
+    assert find(world, elsewhere) is None
+
+
+def test_the_most_similar_keyframe_comes_first(world: WorldMap) -> None:
+    features = EXTRACTOR.extract(render_plane(at(1.0)))
+    keyframes = list(world.keyframes.values())
+    assert similar_keyframes(features, keyframes, RULES[0])[0].id == 1

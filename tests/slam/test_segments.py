@@ -1,0 +1,74 @@
+"""Joining two map segments that were made in different frames."""
+
+from __future__ import annotations
+
+import numpy as np
+from synthetic_view import T_NEW_OLD, add_keyframe, make_features, points_before, random_descriptors
+
+from graph.geometry import inverse, se3_exp, transform
+from slam.features import Features
+from slam.results import TrackingStatus
+from slam.segments import join_segment
+from slam.tracker import Tracked
+from slam.world_map import WorldMap
+
+T_WORLD_FIRST = se3_exp(np.array([0.1, 0.2, -0.1, 0.3, 0.0, 0.2]))
+T_WORLD_SECOND = T_WORLD_FIRST @ se3_exp(np.array([0.02, -0.03, 0.01, 0.1, 0.0, 0.05]))
+T_SEGMENT_WORLD = T_NEW_OLD
+
+
+def tracked(T: np.ndarray, features: Features, keypoints: np.ndarray, ids: np.ndarray) -> Tracked:
+    nothing = np.zeros(0, np.int64)
+    return Tracked(
+        TrackingStatus.OK, T, features, keypoints, ids, len(ids), nothing, np.zeros((6, 6))
+    )
+
+
+def two_segments() -> tuple[WorldMap, np.ndarray, Features]:
+    """Segment 0 in the world's frame, segment 1 in its own, of the same 40 points."""
+    rng = np.random.default_rng(8)
+    points_world = points_before(T_WORLD_FIRST, 40, rng)
+    descriptors = random_descriptors(40, rng)
+    world = WorldMap()
+    first = make_features(T_WORLD_FIRST, points_world, descriptors)
+    second = make_features(T_WORLD_SECOND, points_world, descriptors)
+    a = add_keyframe(world, T_WORLD_FIRST, first)
+    world.make_landmarks(a, np.arange(30), points_world[:30])
+    b = add_keyframe(world, T_SEGMENT_WORLD @ T_WORLD_SECOND, second, segment=1)
+    world.make_landmarks(b, np.arange(10, 40), transform(T_SEGMENT_WORLD, points_world[10:]))
+    return world, points_world, second
+
+
+def joined_map() -> tuple[WorldMap, np.ndarray, Tracked]:
+    world, points_world, features = two_segments()
+    in_segment = tracked(
+        T_SEGMENT_WORLD @ T_WORLD_SECOND, features, np.arange(10, 40), np.arange(30, 60)
+    )
+    recognised = tracked(T_WORLD_SECOND, features, np.arange(30), np.arange(30))
+    return world, points_world, join_segment(world, 1, in_segment, recognised)
+
+
+def test_keyframes_and_landmarks_move_to_where_they_belong() -> None:
+    world, points_world, _ = joined_map()
+    assert [k.segment for k in world.keyframes.values()] == [0, 0]
+    assert np.allclose(world.keyframes[1].T_world_camera, T_WORLD_SECOND)
+    alive = np.flatnonzero(world.landmarks.alive)
+    number = np.where(alive < 30, alive, alive - 20)
+    assert np.allclose(world.landmarks.points_world[alive], points_world[number])
+
+
+def test_directions_turn_with_the_segment() -> None:
+    world, points_world, _ = joined_map()
+    towards = T_WORLD_SECOND[:3, 3] - points_world[30:]
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    assert np.allclose(world.landmarks.directions[50:60], towards)
+
+
+def test_landmarks_at_one_keypoint_become_one() -> None:
+    world, _, joined = joined_map()
+    assert world.landmarks.alive.sum() == 40
+    assert (world.landmarks.observations[10:30] == 2).all()
+    assert sorted(joined.keypoints) == list(range(40))
+    by_keypoint = dict(zip(joined.keypoints.tolist(), joined.landmark_ids.tolist(), strict=True))
+    assert [by_keypoint[k] for k in (5, 15, 35)] == [5, 15, 55]
+    assert np.allclose(joined.T_world_camera @ inverse(T_WORLD_SECOND), np.eye(4))
