@@ -9,10 +9,11 @@ import pytest
 from synthetic_view import CAMERA, render_plane
 
 from graph.geometry import Array, inverse, se3_exp, se3_log
+from slam.configuration import resolve
 from slam.frame import Frame
 from slam.results import FrameResult, TrackingStatus
 from slam.sequences import open_sequence
-from slam.system import SlamSystem
+from slam.system import SlamSystem, SystemConfig
 
 KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/redkitchen"
 
@@ -121,6 +122,28 @@ def test_features_prepared_ahead_change_nothing_and_runs_repeat() -> None:
         system.finish()
         runs.append(system.trajectory().poses_world_camera.tobytes())
     assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "features.octaves=2",
+        "tracking.match.mutual=false",
+        "tracking.match.max_angle_rad=0.4",
+        "tracking.match.ratio=1.0",
+        "tracking.subpixel.enabled=false",
+        "keyframes.rule=paper",
+        "graph.robust=false",
+        "final_adjustment=false",
+    ],
+)
+def test_every_option_still_tracks(override: str) -> None:
+    poses = path(8)
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, [override]))
+    results = feed(system, poses)
+    system.finish()
+    assert all(r.status is TrackingStatus.OK for r in results)
+    assert largest_error_m(system, poses) < 0.006
 
 
 def test_graph_is_saved_with_every_keyframe(tmp_path: Path) -> None:
