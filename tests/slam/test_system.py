@@ -124,6 +124,15 @@ def test_features_prepared_ahead_change_nothing_and_runs_repeat() -> None:
     assert runs[0] == runs[1]
 
 
+def test_frames_of_culled_keyframes_keep_their_poses() -> None:
+    every_frame = ["keyframes.max_shared=9.0", "keyframes.min_interval_frames=1"]
+    system, poses = SlamSystem(CAMERA, resolve(SystemConfig, None, every_frame)), path(16)
+    results = feed(system, poses)
+    assert len(system.mapper.world.keyframes) < sum(r.keyframe_id is not None for r in results)
+    assert len(system.trajectory()) == 16
+    assert largest_error_m(system, poses) < 0.003
+
+
 @pytest.mark.parametrize(
     "override",
     [

@@ -1,0 +1,67 @@
+"""The motion model between frames."""
+
+from __future__ import annotations
+
+import numpy as np
+from synthetic_view import T_NEW_OLD, add_keyframe, make_features
+
+from graph.geometry import Array, se3_exp
+from slam.features import Features
+from slam.local_mapping import MappingConfig
+from slam.localiser import Localiser
+from slam.relocalisation import RelocalisationConfig
+from slam.results import TrackingStatus
+from slam.tracker import Tracked, lost, untracked
+from slam.world_map import WorldMap
+
+STEP = se3_exp(np.array([0.05, -0.1, 0.2, 0.3, 0.1, -0.2]))
+NO_IDS = np.zeros(0, np.int64)
+
+
+class RecordingTracker:
+    """Stands for the tracker: notes the prediction, and tracks there or is lost."""
+
+    def __init__(self) -> None:
+        self.predictions: list[Array] = []
+        self.is_lost = False
+
+    def track(self, features: Features, T_predicted: Array, *_: object) -> Tracked:
+        self.predictions.append(T_predicted)
+        return (lost if self.is_lost else untracked)(T_predicted, features)
+
+
+def scene() -> tuple[Localiser, RecordingTracker, WorldMap, Features]:
+    features = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
+    world, tracker = WorldMap(), RecordingTracker()
+    add_keyframe(world, np.eye(4), features)
+    localiser = Localiser(tracker, RelocalisationConfig(), MappingConfig())  # type: ignore[arg-type]
+    return localiser, tracker, world, features
+
+
+def test_the_camera_is_expected_to_go_on_in_its_own_frame() -> None:
+    localiser, tracker, world, features = scene()
+    localiser.moved_on(T_NEW_OLD, T_NEW_OLD, NO_IDS)
+    localiser.moved_on(T_NEW_OLD @ STEP, T_NEW_OLD @ STEP, NO_IDS)
+    localiser.track(features, world, world.keyframes[0])
+    assert np.allclose(tracker.predictions[-1], T_NEW_OLD @ STEP @ STEP)
+
+
+def test_the_speed_is_of_tracking_the_place_of_the_optimised_keyframe() -> None:
+    localiser, tracker, world, features = scene()
+    correction = se3_exp(np.array([0, 0, 0, 0.01, 0.02, 0.0]))
+    localiser.moved_on(np.eye(4), np.eye(4), NO_IDS)
+    localiser.moved_on(STEP, correction @ STEP, NO_IDS)
+    localiser.track(features, world, world.keyframes[0])
+    assert np.allclose(tracker.predictions[-1], correction @ STEP @ STEP)
+
+
+def test_a_lost_camera_is_expected_where_it_was_last_seen() -> None:
+    localiser, tracker, world, features = scene()
+    localiser.moved_on(np.eye(4), np.eye(4), NO_IDS)
+    localiser.moved_on(STEP, STEP, NO_IDS)
+    tracker.is_lost = True
+    for number in (1, 2):
+        tracked = localiser.track(features, world, world.keyframes[0])
+        assert tracked.status is TrackingStatus.LOST
+        assert localiser.lost_frames == number
+    assert np.allclose(tracker.predictions[-1], STEP)
