@@ -1,0 +1,121 @@
+"""Trajectories in the formats of KITTI and EuRoC (TUM's is in ``graph.trajectory``)."""
+
+from __future__ import annotations
+
+import os
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from graph.errors import InputError
+from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
+from graph.trajectory import Trajectory
+
+EUROC_HEADER = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+)
+EUROC_COLUMNS = (8, 17)  # 17 in the data sets' own ground truth: velocity and biases follow
+MAX_SKEWNESS = 1e-3
+
+
+def write_kitti(path: Path, poses_world_camera: Array) -> None:
+    """Write (N, 4, 4) poses: the upper three rows of T_world_camera, row by row, a pose a line.
+
+    The format has no stamps; the k-th line belongs to the k-th frame.
+    """
+    rows = poses_world_camera[:, :3].reshape(-1, 12)
+    _write(path, [" ".join(f"{value:.12g}" for value in row) for row in rows.tolist()])
+
+
+def read_kitti(path: Path) -> Array:
+    """Poses T_world_camera (N, 4, 4) in metres, a line each.
+
+    Raises:
+        InputError: no file, no pose, another number of columns than 12, a value that is no finite
+            number, or a matrix that is no rotation.
+    """
+    rows = [_numbers(line.split(), where, (12,)) for where, line in _lines(path)]
+    if not rows:
+        raise InputError(f"{path}: no pose in the file; expected 12 numbers a line")
+    top = np.array(rows).reshape(-1, 3, 4)
+    R = top[:, :, :3]
+    skewness = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    bad = (skewness > MAX_SKEWNESS) | (np.linalg.det(R) < 0)
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise InputError(f"{path}: pose {k + 1} holds no rotation; correct or remove it")
+    return make_pose(R, top[:, :, 3])
+
+
+def write_euroc(path: Path, trajectory: Trajectory) -> None:
+    """Write a EuRoC csv: nanoseconds, position in metres, quaternion w x y z with w >= 0."""
+    quaternions = quaternion_from_rotation(trajectory.poses_world_camera[:, :3, :3])
+    numbers = np.hstack([trajectory.positions_world, np.roll(quaternions, 1, axis=1)])
+    stamps_ns = [round(Fraction(stamp) * 10**9) for stamp in trajectory.timestamps_s.tolist()]
+    rows = [
+        f"{stamp}," + ",".join(f"{value:.12g}" for value in row)
+        for stamp, row in zip(stamps_ns, numbers.tolist(), strict=True)
+    ]
+    _write(path, [EUROC_HEADER, *rows])
+
+
+def read_euroc(path: Path) -> Trajectory:
+    """Read ``ns,px,py,pz,qw,qx,qy,qz`` lines; columns that follow are passed over.
+
+    Stamps become seconds in float64, which keeps them to a quarter of a microsecond today.
+
+    Raises:
+        InputError: no file, no pose, a wrong number of columns, a value that is no finite number,
+            stamps that are not whole or not each there once, or a zero quaternion.
+    """
+    stamps_s, rows = [], []
+    for where, line in _lines(path):
+        words = [word.strip() for word in line.split(",")]
+        if not words[0].isdigit():
+            raise InputError(f"{where}: {words[0][:40]!r} is no stamp in whole nanoseconds")
+        row = _numbers(words, where, EUROC_COLUMNS)[1:8]
+        if sum(q * q for q in row[3:]) < 1e-12:
+            raise InputError(f"{where}: a zero quaternion is no rotation; remove the line")
+        stamps_s.append(int(words[0]) / 10**9)
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: no pose in the file; expected lines of {EUROC_HEADER[1:]}")
+    if len(set(stamps_s)) < len(stamps_s):
+        raise InputError(f"{path}: a stamp is there more than once; each pose needs its own")
+    values = np.array(rows)
+    R = rotation_from_quaternion(np.roll(values[:, 3:], -1, axis=1))
+    return Trajectory(np.array(stamps_s), make_pose(R, values[:, :3]))
+
+
+def _lines(path: Path) -> list[tuple[str, str]]:
+    """Place (file and line number) and text of every line that is neither empty nor a comment."""
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such trajectory file")
+    text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
+    numbered = enumerate(map(str.strip, text.splitlines()), start=1)
+    return [(f"{path}:{k}", line) for k, line in numbered if line and not line.startswith("#")]
+
+
+def _numbers(words: list[str], where: str, counts: tuple[int, ...]) -> list[float]:
+    """The finite numbers of one line."""
+    if len(words) not in counts:
+        raise InputError(f"{where}: {len(words)} columns, expected {' or '.join(map(str, counts))}")
+    numbers = []
+    for word in words:
+        try:
+            number = float(word)
+        except ValueError:
+            number = np.nan
+        if not np.isfinite(number):
+            raise InputError(f"{where}: {word[:40]!r} is not a finite number")
+        numbers.append(number)
+    return numbers
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    """The file appears whole or not at all."""
+    path = Path(path)
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
+    os.replace(temporary, path)

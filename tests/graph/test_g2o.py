@@ -1,0 +1,138 @@
+"""g2o files: orders on the page, GTSAM's reader as a reference, round trips, refusals."""
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from pose_graph_rings import ring
+
+from graph.errors import InputError
+from graph.g2o import read_g2o, write_g2o
+from graph.geometry import make_pose, rotation_from_quaternion
+from graph.pose_graph_factors import pose_graph_cost
+
+EDGE_2D = "EDGE_SE2 3 7 1 2 0.5 11 12 13 22 23 33\n"
+VERTICES_2D = "VERTEX_SE2 7 4 5 -0.5\nVERTEX_SE2 3 1 2 3\n"
+# x y z qx qy qz qw, then rows of the upper triangle: translation first, rotation last
+TRIANGLE = "101 2 3 4 5 6 102 8 9 10 11 103 13 14 15 104 17 18 105 20 106"
+EDGE_3D = f"EDGE_SE3:QUAT 0 1 1 2 3 0 0 0.6 0.8 {TRIANGLE}\n"
+VERTICES_3D = "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 2 3 0.5 0.5 0.5 0.5\n"
+
+
+def read_text(tmp_path: Path, text: str):
+    file = tmp_path / "a.g2o"
+    file.write_text(text)
+    return read_g2o(file)
+
+
+def test_2d_numbers_come_to_their_places(tmp_path: Path) -> None:
+    graph = read_text(tmp_path, "# a comment\n" + VERTICES_2D + "FIX 7\n" + EDGE_2D)
+    assert graph.is_planar
+    assert graph.ids.tolist() == [3, 7]
+    assert graph.fixed.tolist() == [False, True]
+    assert graph.edges.tolist() == [[0, 1]]
+    np.testing.assert_allclose(graph.poses[1, :3, 3], [4, 5, 0])
+    c, s = np.cos(0.5), np.sin(0.5)
+    np.testing.assert_allclose(
+        graph.measurements[0], [[c, -s, 0, 1], [s, c, 0, 2], [0, 0, 1, 0], [0, 0, 0, 1]]
+    )
+    np.testing.assert_array_equal(graph.information[0], [[11, 12, 13], [12, 22, 23], [13, 23, 33]])
+
+
+def test_3d_information_is_turned_to_rotation_first(tmp_path: Path) -> None:
+    graph = read_text(tmp_path, VERTICES_3D + EDGE_3D)
+    assert not graph.is_planar
+    assert np.diagonal(graph.information[0]).tolist() == [104, 105, 106, 101, 102, 103]
+    assert graph.information[0, 0, 3] == graph.information[0, 3, 0] == 4  # x of both kinds
+    assert graph.information[0, 2, 4] == 11  # rotation z, translation y
+    R = rotation_from_quaternion(np.array([0, 0, 0.6, 0.8]))
+    np.testing.assert_allclose(graph.measurements[0], make_pose(R, np.array([1.0, 2, 3])))
+    # a quarter turn of the axes about (1, 1, 1): x goes to y
+    np.testing.assert_allclose(graph.poses[1, :3, 0], [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_gtsam_reads_the_same_graph(tmp_path: Path, planar: bool) -> None:
+    graph = ring(20, planar, seed=3, sigma=0.1)
+    write_g2o(tmp_path / "a.g2o", graph)
+    factors, values = gtsam.readG2o(str(tmp_path / "a.g2o"), not planar)
+    assert factors.size() == len(graph.edges)
+    assert pose_graph_cost(graph) == pytest.approx(factors.error(values), rel=1e-9)
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_everything_is_read_back(tmp_path: Path, planar: bool) -> None:
+    graph = ring(20, planar, seed=4, sigma=0.1)
+    graph.fixed[[2, 5]] = True
+    write_g2o(tmp_path / "a.g2o", graph)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.g2o"]
+    found = read_g2o(tmp_path / "a.g2o")
+    for name in ("ids", "edges", "fixed"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(graph, name))
+    for name in ("poses", "measurements", "information"):
+        np.testing.assert_allclose(getattr(found, name), getattr(graph, name), atol=1e-11)
+
+
+def test_unknown_tags_are_counted_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    text = VERTICES_3D + "VERTEX_XY 1 2 3\nVERTEX_XY 2 2 3\nPARAMS 1\n" + EDGE_3D
+    assert len(read_text(tmp_path, text).ids) == 2
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2
+    assert "2 lines of the unknown type VERTEX_XY" in messages[0]
+
+
+def test_of_separate_parts_the_largest_is_taken(tmp_path: Path, caplog) -> None:
+    def edge(i: int, j: int) -> str:
+        return f"EDGE_SE2 {i} {j} {j - i} 0 0 1 0 0 1 0 1\n"
+
+    vertices = "".join(f"VERTEX_SE2 {i} {i} 0 0\n" for i in range(7))
+    graph = read_text(tmp_path, vertices + edge(0, 1) + edge(2, 4) + edge(4, 5) + edge(5, 2))
+    assert graph.ids.tolist() == [2, 4, 5]
+    assert graph.edges.tolist() == [[0, 1], [1, 2], [2, 0]]
+    assert graph.poses[:, 0, 3].tolist() == [2, 4, 5]
+    assert "4 parts that no edge connects" in caplog.text
+    assert "4 vertices are left out" in caplog.text
+
+
+def test_edges_alone_are_a_graph_without_poses(tmp_path: Path) -> None:
+    graph = read_text(tmp_path, EDGE_2D)
+    assert graph.ids.tolist() == [3, 7]
+    assert not graph.has_poses
+
+
+GOOD_2D = "EDGE_SE2 3 7 1 2 0.5 1 0 0 1 0 1\n"
+BAD = {
+    "6 columns": (
+        VERTICES_2D + "EDGE_SE2 3 7 1 2 0.5 1\n",
+        ":3: 6 values after EDGE_SE2, expected 11",
+    ),
+    "nan": (VERTICES_2D + GOOD_2D.replace("0.5", "nan"), ":3: 'nan' is not a finite number"),
+    "word": ("VERTEX_SE2 3 1 x 3\n", ":1: 'x' is not a finite number"),
+    "id": ("VERTEX_SE2 -3 1 2 3\n", ":1: '-3' is no vertex id"),
+    "huge id": (f"VERTEX_SE2 {2**63} 1 2 3\n", "is no vertex id"),
+    "missing": (VERTICES_2D + GOOD_2D + GOOD_2D.replace("7", "8"), ":4: an edge to vertex 8"),
+    "twice": (VERTICES_2D + "VERTEX_SE2 3 1 2 3\n" + GOOD_2D, ":3: vertex 3 is there twice"),
+    "indefinite": (
+        VERTICES_2D + "\n" + EDGE_2D.replace("33", "1"),
+        ":4: an information matrix that is not positive",
+    ),
+    "self": (GOOD_2D.replace("7", "3"), ":1: an edge from vertex 3 to itself"),
+    "mixed": (VERTICES_2D + GOOD_2D + VERTICES_3D, ":4: 3-D in a file that also has SE2"),
+    "quaternion": ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 0\n", ":1: a zero quaternion"),
+    "fix": (VERTICES_2D + "FIX 4\n" + GOOD_2D, ":3: FIX 4, a vertex that is not there"),
+    "empty": ("", "no EDGE_SE2 or EDGE_SE3:QUAT line"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD.keys())
+def test_broken_files_are_refused_with_their_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError) as error:
+        read_text(tmp_path, text)
+    assert str(error.value).startswith(f"{tmp_path / 'a.g2o'}:")
+    assert message in str(error.value)
+
+
+def test_no_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_g2o(tmp_path / "none.g2o")

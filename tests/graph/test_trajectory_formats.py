@@ -1,0 +1,96 @@
+"""KITTI and EuRoC trajectories: bytes on the page, read back, refusals."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graph.errors import InputError
+from graph.geometry import se3_exp
+from graph.trajectory import Trajectory
+from graph.trajectory_formats import read_euroc, read_kitti, write_euroc, write_kitti
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    rng = np.random.default_rng(0)
+    stamps_s = 1403636579.763555527 + 0.05 * np.arange(50)
+    return Trajectory(stamps_s, se3_exp(2 * rng.normal(size=(50, 6))))
+
+
+def test_kitti_is_read_back(tmp_path: Path, trajectory: Trajectory) -> None:
+    write_kitti(tmp_path / "a.txt", trajectory.poses_world_camera)
+    found = read_kitti(tmp_path / "a.txt")
+    np.testing.assert_allclose(found, trajectory.poses_world_camera, atol=1e-10)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_kitti_rows_are_the_upper_rows_of_the_matrix(tmp_path: Path) -> None:
+    T = np.array([[0.0, -1, 0, 7], [1, 0, 0, 8], [0, 0, 1, 9], [0, 0, 0, 1]])
+    write_kitti(tmp_path / "a.txt", T[None])
+    assert (tmp_path / "a.txt").read_text() == "0 -1 0 7 1 0 0 8 0 0 1 9\n"
+
+
+def test_euroc_is_read_back_to_the_same_stamps(tmp_path: Path, trajectory: Trajectory) -> None:
+    write_euroc(tmp_path / "a.csv", trajectory)
+    found = read_euroc(tmp_path / "a.csv")
+    np.testing.assert_array_equal(found.timestamps_s, trajectory.timestamps_s)
+    np.testing.assert_allclose(found.poses_world_camera, trajectory.poses_world_camera, atol=1e-10)
+
+
+def test_euroc_columns(tmp_path: Path) -> None:
+    """w comes first; a quarter turn about z takes x to y; 17 columns are read as 8."""
+    file = tmp_path / "a.csv"
+    row = "1500000000,1,2,3,0.70710678118654752,0,0,0.70710678118654752"
+    file.write_text(f"#header\n{row}\n")
+    found = read_euroc(file)
+    assert found.timestamps_s.tolist() == [1.5]
+    np.testing.assert_allclose(found.poses_world_camera[0, :3, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_array_equal(found.positions_world, [[1, 2, 3]])
+    file.write_text(row + ",0" * 9)
+    np.testing.assert_array_equal(read_euroc(file).poses_world_camera, found.poses_world_camera)
+    write_euroc(file, found)
+    numbers = [float(word) for word in file.read_text().splitlines()[1].split(",")]
+    np.testing.assert_allclose(numbers, [1.5e9, 1, 2, 3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+
+
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no pose in the file"),
+        (f"{IDENTITY}\n1 2 3\n", ":2: 3 columns, expected 12"),
+        (IDENTITY.replace("1 0 0 0 0", "1 0 0 inf 0"), ":1: 'inf' is not a finite number"),
+        (f"{IDENTITY}\n{IDENTITY.replace('1', '2')}", "pose 2 holds no rotation"),
+        (IDENTITY.replace("1", "-1"), "pose 1 holds no rotation"),
+    ],
+)
+def test_broken_kitti_files(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_kitti(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("#only a header\n", "no pose in the file"),
+        ("1,0,0,0,1,0,0\n", ":1: 7 columns, expected 8 or 17"),
+        ("1,0,0,0,1,0,0,nan\n", ":1: 'nan' is not a finite number"),
+        ("1.5,0,0,0,1,0,0,0\n", ":1: '1.5' is no stamp in whole nanoseconds"),
+        ("1,0,0,0,0,0,0,0\n", ":1: a zero quaternion"),
+        ("1,0,0,0,1,0,0,0\n" * 2, "a stamp is there more than once"),
+    ],
+)
+def test_broken_euroc_files(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_euroc(tmp_path / "a.csv")
+
+
+def test_no_file(tmp_path: Path) -> None:
+    for read in (read_kitti, read_euroc):
+        with pytest.raises(InputError, match="no such trajectory file"):
+            read(tmp_path / "none")
