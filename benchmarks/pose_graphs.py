@@ -102,6 +102,20 @@ def position_rmse_m(poses: Array, reference: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((moved - target) ** 2, axis=1))))
 
 
+def sphere_truth(file: Path) -> Array:
+    """Poses (N, 4, 4) that GTSAM's noise-free EDGE3 lines (x y z roll pitch yaw) chain up to."""
+    rows = [line.split()[1:9] for line in file.read_text().splitlines() if line.startswith("EDGE3")]
+    values = np.array(rows, float)
+    axes = np.eye(3)
+    roll, pitch, yaw = (so3_exp(values[:, 5 + k, None] * axes[k]) for k in range(3))
+    steps = make_pose(yaw @ pitch @ roll, values[:, 2:5])
+    i, j = values[:, :2].astype(int).T
+    poses = np.tile(np.eye(4), (j.max() + 1, 1, 1))
+    for k in np.flatnonzero(j == i + 1):
+        poses[j[k]] = poses[i[k]] @ steps[k]
+    return poses
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--graphs", type=Path, default=FOLDER)
@@ -117,15 +131,15 @@ def main() -> None:
         f"{'graph':16}{'vertices':>9}{'edges':>7}  {'method':8}{'start':9}{'iterations':>10}",
         end="",
     )
-    print(f"{'ms':>9}{'initial cost':>15}{'final cost':>14}{'plain GTSAM':>14}")
+    print(f"{'ms':>9}{'initial cost':>15}{'final cost':>14}{'plain GTSAM':>14}{'outliers':>10}")
     for name, graph in graphs.items():
         plain = plain_cost(graph)
-        for method in ("lm", "dogleg"):
+        for method in ("lm", "dogleg", "gnc"):
             r = optimise_pose_graph(graph, PoseGraphConfig(method=method))
             print(
                 f"{name:16}{len(graph.ids):9}{len(graph.edges):7}  {method:8}{r.start:9}"
                 f"{r.iterations:10}{r.duration_ms:9.0f}{r.initial_cost:15.6g}"
-                f"{r.final_cost:14.7g}{plain:14.7g}",
+                f"{r.final_cost:14.7g}{plain:14.7g}{r.is_outlier.sum():10}",
                 flush=True,
             )
     print(f"\nGNC, {100 * arguments.wrong:g} % of the loop edges wrong, seed {arguments.seed}")
@@ -142,6 +156,11 @@ def wrong_loops(name: str, graph: PoseGraph, arguments: argparse.Namespace) -> N
     disturbed = disturbed.with_poses(graph.poses)
     right = disturbed.with_edges(~wrong)
     reference = optimise_pose_graph(right).graph.poses
+    truth_file = arguments.graphs / "gtsam_sphere2500_groundtruth.txt"
+    truth = sphere_truth(truth_file) if name == "sphere2500" and truth_file.is_file() else None
+    if truth is not None:
+        for text, poses in (("clean", clean), ("right edges alone", reference)):
+            print(f"{name:12}ATE against the truth, {text}: {position_rmse_m(poses, truth):.4f} m")
     for method in ("gnc",) if arguments.gnc_alone else ("gnc", "lm"):
         begin_s = time.perf_counter()
         r = optimise_pose_graph(disturbed, PoseGraphConfig(method=method))
@@ -154,6 +173,9 @@ def wrong_loops(name: str, graph: PoseGraph, arguments: argparse.Namespace) -> N
             f"  cost of right edges {pose_graph_cost(right.with_poses(r.graph.poses)):.6g}",
             flush=True,
         )
+        if truth is not None:
+            ate_m = position_rmse_m(r.graph.poses, truth)
+            print(f"{name:12}ATE against the truth, {method}: {ate_m:.4f} m", flush=True)
 
 
 if __name__ == "__main__":

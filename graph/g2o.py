@@ -77,7 +77,7 @@ def read_g2o(path: Path) -> PoseGraph:
         edges=edge_rows,
         measurements=_poses(numbers[:, :size]),
         information=_information(numbers[:, size:], edges, path),
-        fixed=np.isin(ids, _known_fixed(fixed, ids, path)),
+        fixed=np.isin(ids, _known_fixed(fixed, ids, path, given is not None)),
         has_poses=given is not None,
     )
     return _largest_part(graph, path)
@@ -229,11 +229,14 @@ def _information(triangles: Array, edges: _Rows, path: Path) -> Array:
     return matrices if d == 3 else matrices[:, _ROTATION_FIRST[:, None], _ROTATION_FIRST]
 
 
-def _known_fixed(fixed: dict[int, int], ids: Indices, path: Path) -> list[int]:
+def _known_fixed(fixed: dict[int, int], ids: Indices, path: Path, has_poses: bool) -> list[int]:
     known = set(ids.tolist())
     for name, line in fixed.items():
         if name not in known:
             raise InputError(f"{path}:{line}: FIX {name}, a vertex that is not there; remove it")
+    if len(fixed) > 1 and not has_poses:
+        line = max(fixed.values())
+        raise InputError(f"{path}:{line}: several FIX without vertex lines; add their poses")
     return list(fixed)
 
 

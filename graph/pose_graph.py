@@ -123,11 +123,12 @@ def spanning_tree_poses(graph: PoseGraph) -> Array:
     """Poses (N, 4, 4) of a connected graph by chaining measurements along a tree.
 
     Odometry edges are taken first, so that a graph of consecutive ids gets its odometry path. The
-    first vertex keeps its pose.
+    first fixed vertex (or the first) keeps its pose.
     """
     odometry = graph.with_edges(graph.is_odometry)
     tree = odometry if is_connected(odometry) else graph
-    order, parent = breadth_first_order(_adjacency(tree), 0, directed=False)
+    root = int(np.argmax(graph.fixed))
+    order, parent = breadth_first_order(_adjacency(tree), root, directed=False)
     edge_of = {(i, j): k for k, (i, j) in enumerate(tree.edges.tolist())}
     poses = graph.poses.copy()
     for child in order[1:].tolist():

@@ -194,7 +194,12 @@ class _Solver:
 
 
 def _best_start(graph: PoseGraph, given: dict[str, Array], trusted: Mask) -> tuple[str, Array]:
-    """Name and poses of the cheapest initial value, judged by the trusted edges (M,) alone."""
+    """Name and poses of the cheapest initial value, judged by the trusted edges (M,) alone.
+
+    Where several vertices are fixed, the given poses: the chordal solution knows of one anchor.
+    """
+    if graph.fixed.sum() > 1:
+        return next(iter(given.items()))
     judged = graph.with_edges(trusted)
     candidates = {**given, "chordal": chordal_poses(judged)}
     costs = {name: pose_graph_cost(judged.with_poses(T)) for name, T in candidates.items()}

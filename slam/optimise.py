@@ -44,7 +44,10 @@ def optimise_file(
     _check_outputs(out, plot)
     graph = read_g2o(file)
     with tqdm(unit="step", disable=quiet or not sys.stderr.isatty()) as bar:
-        result = optimise_pose_graph(graph, PoseGraphConfig(method=method), _shown_on(bar))
+        try:
+            result = optimise_pose_graph(graph, PoseGraphConfig(method=method), _shown_on(bar))
+        except InputError as error:
+            raise InputError(f"{file}: {error}") from error
     write_g2o(out, result.graph.with_edges(~result.is_outlier))
     if plot is not None:
         draw_before_after(result, plot)

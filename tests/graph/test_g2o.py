@@ -121,6 +121,7 @@ BAD = {
     "mixed": (VERTICES_2D + GOOD_2D + VERTICES_3D, ":4: 3-D in a file that also has SE2"),
     "quaternion": ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 0\n", ":1: a zero quaternion"),
     "fix": (VERTICES_2D + "FIX 4\n" + GOOD_2D, ":3: FIX 4, a vertex that is not there"),
+    "fix alone": ("FIX 3\nFIX 7\n" + GOOD_2D, ":2: several FIX without vertex lines"),
     "empty": ("", "no EDGE_SE2 or EDGE_SE3:QUAT line"),
 }
 

@@ -114,6 +114,17 @@ def test_fixed_vertices_stay() -> None:
     assert np.abs(result.graph.poses[0] - moved.poses[0]).max() > 1e-3
 
 
+@BOTH
+def test_a_single_fixed_vertex_is_the_anchor_of_a_graph_without_poses(planar: bool) -> None:
+    truth = ring(40, planar)
+    lost = replace(truth.with_poses(np.tile(np.eye(4), (40, 1, 1))), has_poses=False)
+    lost.fixed[25] = True
+    result = optimise_pose_graph(lost)
+    assert (result.given, result.start) in {("odometry", "odometry"), ("odometry", "chordal")}
+    expected = inverse(truth.poses[25]) @ truth.poses
+    np.testing.assert_allclose(result.graph.poses, expected, atol=1e-5)
+
+
 def test_bad_poses_in_the_file_give_way_to_chordal_ones() -> None:
     truth = ring(40, False, sigma=0.01)
     bad = truth.with_poses(se3_exp(np.random.default_rng(0).normal(size=(40, 6)) * 2))
