@@ -36,7 +36,7 @@ from graph.pose_graph_factors import (
 )
 
 Method = Literal["lm", "dogleg", "gnc"]
-WARM_MU = 0.01  # edges with a chi-square beyond 101 times the limit have weight 0 then
+WARM_MU = 0.1  # edges with a chi-square beyond 11 times the limit have weight 0 then
 LEAST_WEIGHT = 1e-6  # where odometry does not connect: what one edge alone holds stays solvable
 
 Progress = Callable[[int, float], None]  # iteration, cost
