@@ -59,7 +59,7 @@ def reference_votes(
 def test_votes_are_those_of_the_definition(config: IndexConfig, rng: np.random.Generator) -> None:
     shared = random_descriptors(60, rng)
     keyframes = {
-        k: np.concatenate([changed(shared[k * 5 :], 20 + 10 * k, rng), random_descriptors(20, rng)])
+        k: np.concatenate([changed(shared[k * 5 :], 20 + 4 * k, rng), random_descriptors(20, rng)])
         for k in range(6)
     }
     index = DescriptorIndex(config)
