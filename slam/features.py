@@ -104,9 +104,9 @@ class BriskExtractor:
         Without octaves BRISK's detector is FAST with non-maximum suppression, and its sub-pixel
         step is not needed, since matches are registered to patches later.
         """
-        border = self.config.border_px
+        border, (height, width) = self.config.border_px, gray.shape
         inside = np.zeros_like(gray)
-        inside[border:-border, border:-border] = 255
+        inside[border : height - border, border : width - border] = 255
         for threshold in self.config.thresholds:
             keypoints = self._fast[threshold].detect(gray, inside)
             if len(keypoints) >= self.config.max_keypoints:
