@@ -1,5 +1,7 @@
 """The one exception that stands for broken input; everything else is a bug or a result."""
 
+import math
+
 
 class InputError(Exception):
     """Broken input from outside: the text names the file, the value and the cure.
@@ -7,3 +9,16 @@ class InputError(Exception):
     The command line prints it as one line and exits with 1. Expected failures of the
     method (tracking lost, a factor refused) are results with a status, never exceptions.
     """
+
+
+def finite_number(text: str, where: str) -> float:
+    """The finite number that a word is; ``where`` is its file and line, for the message."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(
+            f"{where}: {text[:40]!r} is not a finite number; correct or remove the line"
+        )
+    return number

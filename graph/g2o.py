@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.errors import InputError
+from graph.errors import InputError, finite_number
 from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
 from graph.pose_graph import (
     PoseGraph,
@@ -159,25 +159,12 @@ def _row(words: list[str], where: str) -> tuple[list[int], list[float]]:
             f"{where}: {len(words) - 1} values after {tag}, expected {expected}; correct the line"
         )
     names = [_id(word, where) for word in words[1 : 1 + ids]]
-    try:
-        numbers = [float(word) for word in words[1 + ids :]]
-    except ValueError:
-        numbers = [np.nan]
-    if not np.isfinite(numbers).all():
-        bad = next(word for word in words[1 + ids :] if not _is_finite(word))
-        raise InputError(f"{where}: {bad!r} is not a finite number; correct or remove the line")
+    numbers = [finite_number(word, where) for word in words[1 + ids :]]
     if "QUAT" in tag and sum(q * q for q in numbers[3:7]) < 1e-12:
         raise InputError(f"{where}: a zero quaternion is no rotation; correct or remove the line")
     if ids == 2 and names[0] == names[1]:
         raise InputError(f"{where}: an edge from vertex {names[0]} to itself; remove the line")
     return names, numbers
-
-
-def _is_finite(word: str) -> bool:
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False
 
 
 def _id(word: str, where: str) -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.errors import InputError
+from graph.errors import InputError, finite_number
 from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
 
 MAX_TIME_DIFFERENCE_S = 0.02
@@ -180,17 +180,7 @@ def _tum_row(content: str, where: str) -> list[float]:
             f"{where}: {len(columns)} columns in {content[:60]!r}, expected 8: "
             f"timestamp tx ty tz qx qy qz qw{hint}"
         )
-    row = []
-    for column in columns:
-        try:
-            value = float(column)
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value):
-            raise InputError(
-                f"{where}: {column!r} is not a finite number; correct or remove the line"
-            )
-        row.append(value)
+    row = [finite_number(column, where) for column in columns]
     if sum(q * q for q in row[4:]) < 1e-12:
         raise InputError(f"{where}: zero quaternion {columns[4:]}; no rotation, remove the line")
     return row

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.errors import InputError
+from graph.errors import InputError, finite_number
 from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
 from graph.trajectory import Trajectory
 
@@ -101,16 +101,7 @@ def _numbers(words: list[str], where: str, counts: tuple[int, ...]) -> list[floa
     """The finite numbers of one line."""
     if len(words) not in counts:
         raise InputError(f"{where}: {len(words)} columns, expected {' or '.join(map(str, counts))}")
-    numbers = []
-    for word in words:
-        try:
-            number = float(word)
-        except ValueError:
-            number = np.nan
-        if not np.isfinite(number):
-            raise InputError(f"{where}: {word[:40]!r} is not a finite number")
-        numbers.append(number)
-    return numbers
+    return [finite_number(word, where) for word in words]
 
 
 def _write(path: Path, lines: list[str]) -> None:

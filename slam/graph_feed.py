@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph.geometry import Array
-from graph.updates import GraphEstimate, GraphUpdate, IntArray, Observations, PosePrior
+from graph.updates import GraphEstimate, GraphUpdate, Observations, PosePrior
 from slam.features import Features, spread_order
 from slam.landmarks import Ints
 from slam.world_map import Keyframe, WorldMap
@@ -149,8 +149,8 @@ def concatenate(parts: list[Observations]) -> Observations:
     )
 
 
-def read_back(world: WorldMap, estimate: GraphEstimate) -> IntArray:
-    """Write the graph's poses and points into the map; returns the landmarks the graph dropped.
+def read_back(world: WorldMap, estimate: GraphEstimate) -> None:
+    """Write the graph's poses and points into the map.
 
     Landmarks outside the graph move rigidly with the keyframe that made them.
     """
@@ -174,4 +174,3 @@ def read_back(world: WorldMap, estimate: GraphEstimate) -> IntArray:
         world.keyframes[i].T_world_camera = T
     position = np.searchsorted(estimate.landmark_ids, inside)
     landmarks.points_world[inside] = estimate.points_world[position]
-    return estimate.dropped_landmarks

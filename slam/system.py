@@ -111,7 +111,8 @@ class SlamSystem:
     def trajectory(self) -> Trajectory:
         """Every frame with a pose in the largest segment, from the keyframes as they are now."""
         nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-        return self.segments().get(self._largest_segment(), nothing)
+        segments = self.segments()
+        return segments.get(largest(segments), nothing)
 
     def segments(self) -> dict[int, Trajectory]:
         """The frames of every map segment that was not joined, each in a frame of its own."""
@@ -119,14 +120,15 @@ class SlamSystem:
 
     def keyframe_trajectory(self) -> Trajectory:
         """The keyframes of the largest segment."""
-        chosen = self.mapper.world.in_segment(self._largest_segment())
+        chosen = self.mapper.world.in_segment(largest(self.segments()))
         stamps = np.array([k.timestamp_s for k in chosen])
         return Trajectory(stamps, np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4))
 
     def landmarks(self) -> LandmarkCloud:
         """The living landmarks of the largest segment, with their colours."""
         table = self.mapper.world.landmarks
-        hosts = [k.id for k in self.mapper.world.in_segment(self._largest_segment())]
+        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        hosts = [k.id for k in chosen]
         ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
         return LandmarkCloud(
             ids, table.points_world[ids], table.colours[ids], table.observations[ids]
@@ -143,10 +145,6 @@ class SlamSystem:
             "landmarks": int(self.mapper.world.landmarks.alive.sum()),
             "isam2_update_ms": list(self.mapper.update_ms),
         }
-
-    def _largest_segment(self) -> int:
-        segments = self.segments()
-        return max(segments, key=lambda s: (len(segments[s]), -s), default=0)
 
     def _track(self, features: Features) -> Tracked:
         """Against the map; where there is none, or it is long lost, the frame begins a new one."""
@@ -212,6 +210,11 @@ class SlamSystem:
             frame.timestamp_s, reference.id, T_world_reference, T_world_camera
         )
         return T_world_camera
+
+
+def largest(segments: dict[int, Trajectory]) -> int:
+    """The segment with most frames, the older of equal ones; 0 where there is none."""
+    return max(segments, key=lambda s: (len(segments[s]), -s), default=0)
 
 
 class StageClock:

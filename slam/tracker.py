@@ -230,10 +230,8 @@ class Tracker:
 
 def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked:
     """The outcome of a frame without a pose."""
-    none = np.zeros(0, np.int64)
-    information = np.zeros((6, 6))
-    status = TrackingStatus.LOST
-    return Tracked(status, T_world_camera, features, none, none, matches, none, information)
+    begun = untracked(T_world_camera, features)
+    return replace(begun, status=TrackingStatus.LOST, matches=matches)
 
 
 def untracked(T_world_camera: Array, features: Features) -> Tracked:
