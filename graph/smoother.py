@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from graph.admission import Admitted, admit
+from graph.array_file import Arrays
 from graph.camera import Camera
 from graph.gates import describe, reprojection
 from graph.geometry import Array
@@ -21,7 +22,7 @@ from graph.recovery import Repair, repair
 from graph.shadow import Shadow, ids_array
 from graph.smoother_config import SmootherConfig
 from graph.solver import Change, Solver, SolverError, Variable
-from graph.storage import read_graph, write_graph
+from graph.storage import graph_arrays, read_graph, shadow_of, write_graph
 from graph.support import diagonal_covariance
 from graph.updates import (
     NO_LANDMARK,
@@ -180,6 +181,15 @@ class Smoother:
         on exactly like one that is loaded from the file.
         """
         self._solver.reset()
+
+    def state(self) -> Arrays:
+        """Graph, values and ids as named arrays; ISAM2 is not among them, see ``restart``."""
+        return graph_arrays(self._shadow)
+
+    def restore(self, state: Arrays, path: Path) -> None:
+        """Become the smoother of a state that was read from a file. Raises InputError."""
+        self._shadow = shadow_of(state, path)
+        self.restart()
 
     def save(self, path: Path) -> None:
         """Write the graph, its values and ids into one file, atomically."""

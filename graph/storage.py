@@ -1,30 +1,23 @@
-"""A saved graph: one file of numpy arrays that holds every factor, value and id.
+"""A saved graph: every factor, value and id as named arrays, in one file (graph/array_file.py).
 
-ISAM2 itself cannot be saved; from this it is made anew. The file is a zip of .npy arrays
-(``numpy.load`` opens it) with a JSON header, the same bytes for the same graph, and independent
-of GTSAM's version. It is written under a temporary name and renamed, so that a killed run
-leaves the old file or the new one, never half of one.
+ISAM2 itself cannot be saved; from this it is made anew, independent of GTSAM's version. A saved
+map holds the same arrays as a part (slam/map_file.py).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
-import zipfile
-import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from graph.array_file import Arrays, FileKind, Header, read_arrays, write_arrays
 from graph.camera import Camera
 from graph.errors import InputError
 from graph.shadow import Shadow
 from graph.updates import Observations, PosePrior, RelativePose
 
-FORMAT = "bmask-slam graph"
-VERSION = 1
+GRAPH_FILE = FileKind("graph", 1)
 _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "keyframe_ids": ("keyframe", ()),
     "poses_world_camera": ("keyframe", (4, 4)),
@@ -41,50 +34,20 @@ _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "pose_factor_robust": ("pose factor", ()),
 }
 _PRIOR = "prior"
-_UNREADABLE = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError)
-
 
 def write_graph(path: Path, shadow: Shadow, camera: Camera) -> None:
     """Save a shadow and its camera in one file, atomically. Raises InputError if it cannot."""
-    header = {"format": FORMAT, "version": VERSION, "camera": dataclasses.asdict(camera)}
-    arrays = {"header": np.array(json.dumps(header, sort_keys=True)), **_arrays(shadow)}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            np.savez(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(
-            f"{path}: the graph cannot be written ({error.strerror}); choose another folder"
-        ) from error
+    write_arrays(path, GRAPH_FILE, {"camera": dataclasses.asdict(camera)}, graph_arrays(shadow))
 
 
 def read_graph(path: Path) -> tuple[Shadow, Camera]:
     """Load what write_graph saved. Raises InputError for a missing, foreign or broken file."""
-    if not path.is_file():
-        raise InputError(f"{path}: there is no saved graph here; give the graph file of a run")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(str(arrays["header"]))
-        found = header["format"], header["version"]
-    except _UNREADABLE as error:
-        raise InputError(
-            f"{path}: not a saved graph, or a damaged one ({error}); save it again"
-        ) from error
-    if found != (FORMAT, VERSION):
-        raise InputError(
-            f"{path}: holds {found[0]!r} version {found[1]!r}, expected {FORMAT!r} version "
-            f"{VERSION}; save it again with this version of bmask-slam"
-        )
-    _check(path, arrays)
-    return _shadow(arrays), _camera(path, header)
+    header, arrays = read_arrays(path, GRAPH_FILE)
+    return shadow_of(arrays, path), read_camera(header, path)
 
 
-def _arrays(shadow: Shadow) -> dict[str, Any]:
+def graph_arrays(shadow: Shadow) -> Arrays:
+    """Everything a shadow knows, but for the places of its factors in ISAM2."""
     seen = shadow.observations.select(shadow.observations.all_rows())
     factors = [shadow.pose_factors[number].factor for number in sorted(shadow.pose_factors)]
     return {
@@ -118,7 +81,7 @@ def _measured(factor: RelativePose | PosePrior) -> np.ndarray:
     return factor.T_world_camera if isinstance(factor, PosePrior) else factor.T_a_b
 
 
-def _check(path: Path, arrays: dict[str, Any]) -> None:
+def _check(arrays: Arrays, path: Path) -> None:
     """Every array there, of its shape, sorted ids, no factor on a variable that is missing."""
     counts: dict[str, int] = {}
     for name, (what, shape) in _SHAPES.items():
@@ -139,7 +102,13 @@ def _check(path: Path, arrays: dict[str, Any]) -> None:
                 raise InputError(f"{path}: {name} has unknown id {unknown[0]}; save it again")
 
 
-def _shadow(arrays: dict[str, Any]) -> Shadow:
+def shadow_of(arrays: Arrays, path: Path) -> Shadow:
+    """The shadow of ``graph_arrays``, read from a file.
+
+    Raises:
+        InputError: they do not fit together.
+    """
+    _check(arrays, path)
     shadow = Shadow()
     shadow.keyframes.insert(arrays["keyframe_ids"], arrays["poses_world_camera"])
     shadow.landmarks.insert(arrays["landmark_ids"], arrays["points_world"])
@@ -166,7 +135,8 @@ def _shadow(arrays: dict[str, Any]) -> Shadow:
     return shadow
 
 
-def _camera(path: Path, header: dict[str, Any]) -> Camera:
+def read_camera(header: Header, path: Path) -> Camera:
+    """The camera of a file's header. Raises InputError if it is none."""
     try:
         fields = dict(header["camera"])
         fields["distortion"] = tuple(fields["distortion"])

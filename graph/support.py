@@ -17,15 +17,15 @@ def constrained_landmarks(
     """Sorted ids of the landmarks that these observations alone constrain.
 
     ``poses_world_camera`` (M, 4, 4) and ``points_world`` (M, 3) belong to the observations row
-    by row. The parallax is the angle between the ray of a landmark's first row and any other:
-    at least half of the largest angle between any two.
+    by row, in any order. The parallax is the angle between the ray from a landmark's first
+    keyframe and any other: at least half of the largest angle between any two.
     """
     stereo = np.isfinite(observations.measurements[:, 2])
     by_stereo = np.unique(observations.landmark_ids[stereo])
     rows = np.flatnonzero(~np.isin(observations.landmark_ids, by_stereo))
     if not len(rows):
         return by_stereo
-    rows = rows[np.argsort(observations.landmark_ids[rows], kind="stable")]
+    rows = rows[np.lexsort((observations.keyframe_ids[rows], observations.landmark_ids[rows]))]
     ids, first, group = np.unique(
         observations.landmark_ids[rows], return_index=True, return_inverse=True
     )

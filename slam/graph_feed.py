@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graph.array_file import Arrays
 from graph.geometry import Array
 from graph.updates import GraphEstimate, GraphUpdate, Observations, PosePrior
 from slam.features import Features, spread_order
@@ -40,6 +41,18 @@ class GraphFeed:
     def forget_keyframe(self, keyframe_id: int) -> None:
         """This keyframe was culled: its factors go with the next update."""
         self._removed_keyframes.append(keyframe_id)
+
+    def state(self) -> Arrays:
+        """What still has to leave the graph; what entered is known to map and graph."""
+        return {
+            "removed": np.concatenate([np.zeros(0, np.int64), *self._removed]),
+            "removed_keyframes": np.array(self._removed_keyframes, np.int64),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the feed of a state."""
+        self._removed = [state["removed"]]
+        self._removed_keyframes = state["removed_keyframes"].tolist()
 
     def keyframe_update(self, world: WorldMap, keyframe: Keyframe) -> GraphUpdate:
         """The update that adds one keyframe and its landmarks, and removes what was forgotten."""

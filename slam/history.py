@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graph.array_file import Arrays
 from graph.geometry import Array, inverse
 from graph.trajectory import Trajectory
 from slam.world_map import WorldMap
@@ -50,8 +51,32 @@ class FrameHistory:
             for segment in sorted(stamps)
         }
 
+    def state(self) -> Arrays:
+        """All entries, and who inherited whose frames, as arrays."""
+        entries, heirs = self._entries, list(self._parent.values())
+        return {
+            "timestamps_s": np.array([entry.timestamp_s for entry in entries], float),
+            "keyframe_ids": np.array([entry.keyframe_id for entry in entries], np.int64),
+            "T_keyframe_camera": _stacked([entry.T_keyframe_camera for entry in entries]),
+            "culled_ids": np.array(list(self._parent), np.int64),
+            "heir_ids": np.array([heir for heir, _ in heirs], np.int64),
+            "T_heir_culled": _stacked([T for _, T in heirs]),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the history of a state."""
+        columns = [state[name] for name in ("timestamps_s", "keyframe_ids", "T_keyframe_camera")]
+        rows = zip(columns[0].tolist(), columns[1].tolist(), columns[2], strict=True)
+        self._entries = [_Entry(stamp_s, keyframe_id, T) for stamp_s, keyframe_id, T in rows]
+        heirs = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
+        self._parent = dict(zip(state["culled_ids"].tolist(), heirs, strict=True))
+
     def _resolve(self, keyframe_id: int, T: Array) -> tuple[int, Array]:
         while keyframe_id in self._parent:
             keyframe_id, T_parent_keyframe = self._parent[keyframe_id]
             T = T_parent_keyframe @ T
         return keyframe_id, T
+
+
+def _stacked(poses: list[Array]) -> Array:
+    return np.array(poses, float).reshape(-1, 4, 4)

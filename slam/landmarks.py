@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from graph.array_file import Arrays
 from graph.geometry import Array, inverse, transform
 from slam.subpixel import PATCH_PX
 
@@ -109,6 +110,20 @@ class LandmarkTable:
         ids, position = ids[known], position[known]
         T_move = (T_new @ inverse(T_old))[position]
         self.points_world[ids] = transform(T_move, self.points_world[ids][:, None])[:, 0]
+
+    def state(self) -> Arrays:
+        """The living landmarks; of dead ones nothing but their number matters any more."""
+        ids = np.flatnonzero(self.alive)
+        columns = {name: getattr(self, name)[ids] for name in _COLUMNS if name != "alive"}
+        return {"size": np.array(self._size), "ids": ids, **columns}
+
+    def restore(self, state: Arrays) -> None:
+        """Become the table of a state; this one must be new."""
+        self._size = int(state["size"])
+        self._grow(max(len(self._store["alive"]), self._size))
+        self._make_views()
+        for name in _COLUMNS:
+            getattr(self, name)[state["ids"]] = True if name == "alive" else state[name]
 
     def _grow(self, capacity: int) -> None:
         for name, (shape, dtype, fill) in _COLUMNS.items():

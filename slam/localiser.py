@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from graph.array_file import Arrays
 from graph.geometry import Array, inverse, orthonormalised
 from slam.features import Features
 from slam.landmarks import Ints
@@ -31,6 +32,22 @@ class Localiser:
         self._T_last_next = np.eye(4)
         self._recent_ids: Ints = np.zeros(0, np.int64)
         self._local_ids: Ints = np.zeros(0, np.int64)
+
+    def state(self) -> Arrays:
+        """The motion, and the landmarks that the next frame will be tracked against."""
+        return {
+            "lost_frames": np.array(self.lost_frames),
+            "T_world_last": self._T_world_last,
+            "T_last_next": self._T_last_next,
+            "recent_ids": self._recent_ids,
+            "local_ids": self._local_ids,
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the localiser of a state."""
+        self.lost_frames = int(state["lost_frames"])
+        self._T_world_last, self._T_last_next = state["T_world_last"], state["T_last_next"]
+        self._recent_ids, self._local_ids = state["recent_ids"], state["local_ids"]
 
     @property
     def local_ids(self) -> Ints:

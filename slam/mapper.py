@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
 from graph.geometry import inverse
 from graph.smoother import Smoother
@@ -24,6 +26,7 @@ from slam.local_mapping import (
     fuse_into_neighbours,
     redundant_keyframe,
 )
+from slam.map_state import world_of, world_state
 from slam.segments import join_segment
 from slam.tracker import Tracked, Tracker
 from slam.triangulation import triangulate_landmarks
@@ -49,6 +52,30 @@ class Mapper:
         self._tracker = tracker
         self._mapping, self._graph_config = config[0], config[2]
         self._feed = GraphFeed(config[1])
+
+    def state(self) -> Arrays:
+        """Map, history and graph as named arrays."""
+        return {
+            "update_ms": np.array(self.update_ms, float),
+            **nested(
+                world=world_state(self.world),
+                history=self.history.state(),
+                graph=self.smoother.state(),
+                feed=self._feed.state(),
+            ),
+        }
+
+    def restore(self, state: Arrays, path: Path) -> None:
+        """Become the mapper of a state that was read from a file. Raises InputError."""
+        self.update_ms = state["update_ms"].tolist()
+        self.world = world_of(part(state, "world"))
+        self.history.restore(part(state, "history"))
+        self.smoother.restore(part(state, "graph"), path)
+        self._feed.restore(part(state, "feed"))
+
+    def restart(self) -> None:
+        """Build anew, from now on, what a state cannot hold: go on like one that was restored."""
+        self.smoother.restart()
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Make a tracked frame a keyframe: landmarks are made, fused and culled."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from graph.array_file import Arrays, check_like, nested, part
 from graph.camera import Camera
 from graph.geometry import Array
 from graph.smoother_config import SmootherConfig
@@ -68,6 +69,28 @@ class SlamSystem:
         self._segment = 0
         self._reference: Keyframe | None = None
         self._frames_since_keyframe = 0
+
+    def state(self) -> Arrays:
+        """All that the past has left behind, as named arrays (docs: "Checkpoints")."""
+        return {
+            "segment": np.array(self._segment),
+            "reference": np.array(-1 if self._reference is None else self._reference.id),
+            "frames_since_keyframe": np.array(self._frames_since_keyframe),
+            **nested(mapper=self.mapper.state(), localiser=self.localiser.state()),
+        }
+
+    def restore(self, state: Arrays, path: Path) -> None:
+        """Become the system of a state that was read from a file. Raises InputError."""
+        check_like(state, self.state(), path)
+        self.mapper.restore(part(state, "mapper"), path)
+        self.localiser.restore(part(state, "localiser"))
+        self._segment = int(state["segment"])
+        self._reference = self.mapper.world.keyframes.get(int(state["reference"]))
+        self._frames_since_keyframe = int(state["frames_since_keyframe"])
+
+    def restart(self) -> None:
+        """From here on, go on exactly like a system restored from the present state."""
+        self.mapper.restart()
 
     def prepare(self, frame: Frame) -> Features:
         """The frame's features; pure, so that it may run ahead in another thread."""
