@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -23,7 +24,10 @@ from graph.errors import InputError
 Arrays = dict[str, NDArray[Any]]
 Header = dict[str, Any]
 _HEADER = "header"
-_UNREADABLE = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError)
+_UNREADABLE = (  # RuntimeError: a damaged byte may ask for encryption or another compression
+    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError),
+    *(ValueError, KeyError, TypeError, RuntimeError, OverflowError),
+)
 
 
 @dataclass(frozen=True)
@@ -44,11 +48,13 @@ class FileKind:
 
 def write_arrays(path: Path, kind: FileKind, header: Header, arrays: Arrays) -> None:
     """Save arrays and a header of JSON values, atomically. Raises InputError if it cannot."""
-    header = {"format": kind.format, "version": kind.version, **header}
+    names = list(arrays)  # the zip's own directory has no checksum
+    header = {"format": kind.format, "version": kind.version, "arrays": names, **header}
     temporary = path.with_name(path.name + ".tmp")
     try:
         with temporary.open("wb") as file:
-            np.savez(file, **{_HEADER: np.array(json.dumps(header, sort_keys=True))}, **arrays)
+            named = {_HEADER: np.array(json.dumps(header, sort_keys=True)), **arrays}
+            np.savez(file, allow_pickle=False, **named)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -65,10 +71,12 @@ def read_arrays(path: Path, kind: FileKind) -> tuple[Header, Arrays]:
     if not path.is_file():
         raise InputError(f"{path}: there is no saved {kind.noun} here; give a run that has one")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with zipfile.ZipFile(path), np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop(_HEADER)))
         found = header["format"], header["version"]
+        if found == (kind.format, kind.version) and header["arrays"] != list(arrays):
+            raise ValueError("an array is missing")
     except _UNREADABLE as error:
         raise InputError(
             f"{path}: not a saved {kind.noun}, or a damaged one ({error}); save it again"

@@ -17,7 +17,7 @@ from graph.errors import InputError
 from graph.shadow import Shadow
 from graph.updates import Observations, PosePrior, RelativePose
 
-GRAPH_FILE = FileKind("graph", 1)
+GRAPH_FILE = FileKind("graph", 2)
 _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "keyframe_ids": ("keyframe", ()),
     "poses_world_camera": ("keyframe", (4, 4)),
@@ -34,6 +34,7 @@ _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "pose_factor_robust": ("pose factor", ()),
 }
 _PRIOR = "prior"
+
 
 def write_graph(path: Path, shadow: Shadow, camera: Camera) -> None:
     """Save a shadow and its camera in one file, atomically. Raises InputError if it cannot."""

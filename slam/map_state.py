@@ -39,7 +39,7 @@ def world_state(world: WorldMap) -> Arrays:
     """The whole map as named arrays."""
     keyframes = list(world.keyframes.values())
     features = [keyframe.features for keyframe in keyframes]
-    rows = {
+    rows: Arrays = {
         name: np.array([getattr(k, name) for k in keyframes], dtype).reshape(-1, *shape)
         for name, (shape, dtype) in _KEYFRAME.items()
     }

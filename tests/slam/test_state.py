@@ -1,0 +1,145 @@
+"""A system restored from its state is the same in every attribute, and goes on the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane
+
+from graph.array_file import Arrays
+from graph.errors import InputError
+from graph.geometry import Array, se3_exp
+from graph.shadow import Shadow
+from graph.storage import graph_arrays
+from graph.updates import GraphUpdate, RelativePose
+from slam.configuration import resolve
+from slam.frame import Frame
+from slam.landmarks import LandmarkTable
+from slam.system import SlamSystem, SystemConfig
+
+FILE = Path("run/checkpoint")
+SCRATCH = {"elapsed_s"}  # means nothing between two frames
+OPAQUE = ("cv2", "gtsam", "faiss")  # made anew from configuration or state
+SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
+    *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),
+    *("mapping.redundant_share=0.3", "mapping.redundant_views=2"),
+]
+
+
+def poses(count: int) -> list[Array | None]:
+    """Sideways along a plane and back, with two dark frames on the way."""
+    x = np.concatenate([np.arange(count), np.arange(count)[::-1]]) * 0.03
+    turn = [se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a - 0.4, 0, 0])) for a in x]
+    return [None if i in (9, 10) else T for i, T in enumerate(turn)]
+
+
+def view(pose: Array | None, index: int) -> Frame:
+    if pose is not None:
+        return render_plane(pose, index)
+    black = np.zeros((480, 640, 3), np.uint8)
+    return Frame(index, index / 30.0, black, np.full((480, 640), np.nan, np.float32))
+
+
+FRAMES = [view(pose, index) for index, pose in enumerate(poses(14))]
+CONFIG = resolve(SystemConfig, None, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def system() -> SlamSystem:
+    system = at_checkpoint()
+    first, second = list(system.mapper.world.keyframes)[:2]
+    loop = RelativePose(first, second, np.eye(4), np.eye(6), robust="dcs", kind="loop")
+    system.mapper.smoother.update(GraphUpdate(relative_poses=(loop,)))
+    system.mapper.smoother.restart()
+    system.mapper._feed.forget_landmarks(np.array([5, 8]))  # none wait between two frames so far
+    return system
+
+
+def at_checkpoint() -> SlamSystem:
+    """After 20 frames."""
+    system = SlamSystem(CAMERA, CONFIG)
+    for frame in FRAMES[:20]:
+        system.process(frame)
+    system.restart()
+    return system
+
+
+def restored(state: Arrays) -> SlamSystem:
+    system = SlamSystem(CAMERA, CONFIG)
+    system.restore({name: array.copy() for name, array in state.items()}, FILE)
+    return system
+
+
+def differences(a: Any, b: Any, where: str = "system") -> Iterator[str]:
+    """Where two objects differ, down to the last attribute, and in the order of dictionaries."""
+    if type(a) is not type(b):
+        yield f"{where}: {type(a)} and {type(b)}"
+    elif isinstance(a, np.ndarray):
+        if not np.array_equal(a, b, equal_nan=a.dtype.kind == "f"):
+            yield where
+    elif isinstance(a, (int, float, str, Enum, type(None))):
+        if a != b:
+            yield f"{where}: {a} and {b}"
+    elif isinstance(a, (list, tuple, set)):
+        yield from _different_items(sorted(a) if isinstance(a, set) else a, b, where)
+    elif isinstance(a, dict):
+        yield from differences(list(a), list(b), f"{where}.keys")
+        for key in (a.keys() & b.keys()) - SCRATCH:
+            yield from differences(a[key], b[key], f"{where}[{key}]")
+    elif isinstance(a, Shadow):  # rows and slots are its own affair
+        yield from differences(graph_arrays(a), graph_arrays(b), where)
+    elif isinstance(a, LandmarkTable):  # dead landmarks are not kept
+        yield from differences(a.state(), b.state(), where)
+    elif type(a).__module__.partition(".")[0] not in OPAQUE:
+        yield from differences(vars(a), vars(b), where)
+
+
+def _different_items(a: Any, b: Any, where: str) -> Iterator[str]:
+    if all(isinstance(item, np.ndarray) for item in (*a, *b)) and len(a) + len(b):
+        nothing = (a or b)[0][:0]
+        yield from differences(np.concatenate([nothing, *a]), np.concatenate([nothing, *b]), where)
+        return
+    yield from differences(len(a), len(b), f"{where}.length")
+    for i, (x, y) in enumerate(zip(a, sorted(b) if isinstance(b, set) else b, strict=False)):
+        yield from differences(x, y, f"{where}[{i}]")
+
+
+def test_every_attribute_is_restored(system: SlamSystem) -> None:
+    assert list(differences(system, restored(system.state()))) == []
+
+
+def test_every_array_of_the_state_matters(system: SlamSystem) -> None:
+    """Each is filled here, and one that is spoiled is seen or refused: so is a forgotten one."""
+    state = system.state()
+    empty = sorted(name for name, array in state.items() if array.size == 0)
+    assert empty == []
+    for name, array in state.items():
+        spoiled = np.where(array == array.flat[0], array.flat[-1:], array.flat[:1]).astype(
+            array.dtype
+        )
+        if np.array_equal(spoiled, array, equal_nan=array.dtype.kind == "f"):
+            spoiled = np.ones_like(array) if not array.any() else np.zeros_like(array)
+        try:
+            other = restored({**state, name: spoiled})
+        except (InputError, ValueError, IndexError, KeyError):
+            continue
+        assert list(differences(system, other)), name
+
+
+def test_both_go_on_the_same() -> None:
+    """To the last bit: poses, map, graph and final adjustment."""
+    system = at_checkpoint()
+    twin = restored(system.state())
+    for frame in FRAMES[20:]:
+        results = [s.process(frame) for s in (system, twin)]
+        assert list(differences(*[replace(r, stage_ms={}) for r in results])) == []
+    for s in (system, twin):
+        s.finish()
+        s.mapper.update_ms = []  # times are no part of the result
+    assert list(differences(system, twin)) == []
