@@ -7,7 +7,6 @@ inverse(T_world_i) @ T_world_j``.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,6 +18,8 @@ from scipy.stats import chi2
 
 from graph.errors import InputError
 from graph.geometry import Array
+from graph.graduation import first_mu, graduate
+from graph.iteration import Progress, iterate
 from graph.loop_consistency import supported_loops
 from graph.pose_graph import (
     Mask,
@@ -38,8 +39,6 @@ from graph.pose_graph_factors import (
 Method = Literal["lm", "dogleg", "gnc"]
 WARM_MU = 0.1  # edges with a chi-square beyond 11 times the limit have weight 0 then
 LEAST_WEIGHT = 1e-6  # where odometry does not connect: what one edge alone holds stays solvable
-
-Progress = Callable[[int, float], None]  # iteration, cost
 
 
 @dataclass(frozen=True)
@@ -170,15 +169,14 @@ class _Solver:
 
     def run(self, max_iterations: int) -> float:
         """Iterate to convergence or for so many steps; returns the cost of the weighted edges."""
-        optimiser = self._optimiser()
-        cost = float(optimiser.error())
-        for _ in range(max_iterations):
-            optimiser.iterate()
-            self.iterations += 1
-            before, cost = cost, float(optimiser.error())
-            self._progress(self.iterations, cost)
-            if before - cost <= self._config.relative_tolerance * before:
-                break
+        optimiser, done = self._optimiser(), self.iterations
+        cost, steps = iterate(
+            optimiser,
+            max_iterations,
+            self._config.relative_tolerance,
+            lambda step, cost: self._progress(done + step, cost),
+        )
+        self.iterations += steps
         self._values = optimiser.values()
         return cost
 
@@ -231,26 +229,25 @@ def _graduated_non_convexity(
     least = 0.0 if is_connected(graph.with_edges(known)) else LEAST_WEIGHT
     solver.weigh(trusted.astype(float))
     solver.run(config.gnc_inner_iterations)
-    chi_squares = solver.chi_squares()
-    worst = float(chi_squares[~known].max(initial=0.0))
-    if worst <= limit:
+    chi_squares = solver.chi_squares()[~known]
+    if not (chi_squares > limit).any():
         return np.zeros(len(known), bool)
-    mu = max(limit / (2 * worst - limit), 0.0 if trusted.all() else WARM_MU)
-    for _ in range(config.max_iterations):
-        weights = np.where(known, 1.0, truncated_weights(chi_squares, limit, mu))
-        solver.weigh(np.maximum(weights, least))
+    mu = max(first_mu(chi_squares, limit), 0.0 if trusted.all() else WARM_MU)
+
+    def solve(weights: Array) -> Array:
+        all_weights = np.ones(len(known))
+        all_weights[~known] = np.maximum(weights, least)
+        solver.weigh(all_weights)
         solver.run(config.gnc_inner_iterations)
-        chi_squares = solver.chi_squares()
-        if ((weights < 1e-3) | (weights > 1 - 1e-3)).all():
-            break
-        mu *= config.gnc_step
-    return (weights < 0.5) & ~_needed(graph, np.where(weights < 0.5, chi_squares, 1e-3))
+        return solver.chi_squares()[~known]
 
-
-def truncated_weights(chi_squares: Array, limit: float, mu: float) -> Array:
-    """Weights (M,) in [0, 1] of GNC's truncated least squares (Yang et al. 2020, eq. 14)."""
-    middle = np.sqrt(limit * mu * (mu + 1) / np.maximum(chi_squares, 1e-12)) - mu
-    return np.clip(middle, 0.0, 1.0)
+    weights, chi_squares = graduate(
+        chi_squares, limit, mu, config.gnc_step, config.max_iterations, solve
+    )
+    is_outlier, costs = np.zeros(len(known), bool), np.full(len(known), 1e-3)
+    is_outlier[~known] = weights < 0.5
+    costs[is_outlier] = chi_squares[weights < 0.5]
+    return is_outlier & ~_needed(graph, costs)
 
 
 def _needed(graph: PoseGraph, costs: Array) -> Mask:

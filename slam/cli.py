@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from graph.errors import InputError
 from slam import __version__
+from slam.commands.optimise import add_optimise
 
 if TYPE_CHECKING:
     from slam.runner import RunSummary
@@ -72,7 +73,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     _add_render(commands)
     _add_info(commands)
-    _add_optimise(commands)
+    add_optimise(commands)
     return parser
 
 
@@ -220,46 +221,4 @@ def _info(arguments: argparse.Namespace) -> int:
     with console_log():
         info = sequence_info(open_sequence(arguments.sequence))
     print(format_info(info))
-    return 0
-
-
-# --- optimise ------------------------------------------------------------------------------------
-
-
-def _add_optimise(commands: _Commands) -> None:
-    text = "optimise a pose graph offline: a g2o file, 2-D or 3-D"
-    more = "Run folders as input are not supported yet."
-    parser = commands.add_parser("optimise", help=text, description=f"{text}. {more}")
-    parser.set_defaults(handler=_optimise)
-    parser.add_argument("input", type=Path, metavar="INPUT", help="pose graph in g2o format")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="F", help="g2o file to write, without outliers"
-    )
-    parser.add_argument(
-        "--method",
-        choices=("lm", "dogleg", "gnc"),
-        default="lm",
-        help="lm (default), dogleg, or gnc, which finds wrong loops; odometry is taken for right",
-    )
-    parser.add_argument(
-        "--plot", type=Path, metavar="F", help="picture before/after: png, pdf, svg"
-    )
-    parser.add_argument("--quiet", action="store_true", help="print only the output's path")
-
-
-def _optimise(arguments: argparse.Namespace) -> int:
-    from slam.optimise import format_result, optimise_file
-    from slam.progress import console_log
-
-    with console_log():
-        result = optimise_file(
-            arguments.input, arguments.out, arguments.method, arguments.plot, arguments.quiet
-        )
-    if arguments.quiet:
-        print(arguments.out)
-        return 0
-    print(format_result(result))
-    print(f"\nGraph          {arguments.out}")
-    if arguments.plot:
-        print(f"Picture        {arguments.plot}")
     return 0

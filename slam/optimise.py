@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
-from tqdm import tqdm
 
 from graph.errors import InputError
 from graph.g2o import read_g2o, write_g2o
@@ -24,8 +16,9 @@ from graph.pose_graph_optimisation import (
     PoseGraphResult,
     optimise_pose_graph,
 )
-
-PICTURE_TYPES = (".png", ".pdf", ".svg")
+from graph.trajectory import Indices
+from slam.before_after import View, check_picture, draw_before_after
+from slam.progress import iteration_bar
 
 
 def optimise_file(
@@ -34,43 +27,30 @@ def optimise_file(
     """Optimise a g2o file and write the graph, without the edges found wrong, to ``out``.
 
     Raises:
-        InputError: a run folder, an output whose folder is not there, a picture of a type that is
+        InputError: an output whose folder is not there, a picture of a type that is
             not known, or a file that ``read_g2o`` or the solver refuses.
     """
-    if file.is_dir():
-        raise InputError(
-            f"{file}: run folders are not supported yet; give a pose graph, a g2o file"
-        )
-    _check_outputs(out, plot)
+    _check_output(out)
+    if plot is not None:
+        check_picture(plot)
     graph = read_g2o(file)
-    with tqdm(unit="step", disable=quiet or not sys.stderr.isatty()) as bar:
+    with iteration_bar(quiet) as progress:
         try:
-            result = optimise_pose_graph(graph, PoseGraphConfig(method=method), _shown_on(bar))
+            result = optimise_pose_graph(graph, PoseGraphConfig(method=method), progress)
         except InputError as error:
             raise InputError(f"{file}: {error}") from error
     write_g2o(out, result.graph.with_edges(~result.is_outlier))
     if plot is not None:
-        draw_before_after(result, plot)
+        _draw(result, plot)
     return result
 
 
-def _check_outputs(out: Path, plot: Path | None) -> None:
+def _check_output(out: Path) -> None:
     """What would fail after the work is refused before it."""
-    for path in (out, plot):
-        if path is not None and not path.parent.is_dir():
-            raise InputError(f"{path}: the folder {path.parent} is not there; make it first")
-        if path is not None and path.is_dir():
-            raise InputError(f"{path}: a folder; give the name of a file to write")
-    if plot is not None and plot.suffix.lower() not in PICTURE_TYPES:
-        raise InputError(f"{plot}: cannot draw {plot.suffix!r}; use {', '.join(PICTURE_TYPES)}")
-
-
-def _shown_on(bar: tqdm) -> Callable[[int, float], None]:
-    def show(iteration: int, cost: float) -> None:
-        bar.set_postfix_str(f"cost {cost:.6g}", refresh=False)
-        bar.update(iteration - bar.n)
-
-    return show
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
+    if out.is_dir():
+        raise InputError(f"{out}: a folder; give the name of a file to write")
 
 
 def format_result(result: PoseGraphResult) -> str:
@@ -95,7 +75,7 @@ def format_result(result: PoseGraphResult) -> str:
 # --- picture -------------------------------------------------------------------------------------
 
 
-def draw_before_after(result: PoseGraphResult, path: Path) -> None:
+def _draw(result: PoseGraphResult, path: Path) -> None:
     """Draw the graph at the poses given (or the odometry) and at the optimised ones.
 
     Odometry is blue, loops are grey, and those found wrong are red, in the left picture alone. A
@@ -103,18 +83,15 @@ def draw_before_after(result: PoseGraphResult, path: Path) -> None:
     """
     graph = result.graph
     spatial = not graph.is_planar and not _is_flat(graph.poses[:, :3, 3])
-    figure = Figure(figsize=(12, 6), layout="constrained")
-    FigureCanvasAgg(figure)
-    none = np.zeros(len(graph.edges), bool)
-    views = (
-        (f"before ({result.given}), cost {result.given_cost:.5g}", result.given_poses, none),
-        (f"after ({result.method}), cost {result.final_cost:.5g}", graph.poses, result.is_outlier),
+    columns = slice(3 if spatial else 2)
+    before = f"before ({result.given}), cost {result.given_cost:.5g}"
+    after = f"after ({result.method}), cost {result.final_cost:.5g}"
+    edges = _edges(graph, result.is_outlier)
+    draw_before_after(
+        path,
+        View(before, result.given_poses[:, columns, 3], edges),
+        View(after, graph.poses[:, columns, 3], [edges[0], edges[2]]),
     )
-    for k, (title, poses, hidden) in enumerate(views, start=1):
-        axes = figure.add_subplot(1, 2, k, projection="3d" if spatial else None)
-        axes.set_title(title)
-        _draw(axes, graph, poses[:, : 3 if spatial else 2, 3], result.is_outlier, hidden)
-    figure.savefig(path, dpi=150)
 
 
 def _is_flat(points: Array) -> bool:
@@ -123,22 +100,11 @@ def _is_flat(points: Array) -> bool:
     return bool(extent_m[2] < 0.1 * extent_m[:2].max())
 
 
-def _draw(axes: Any, graph: PoseGraph, points: Array, is_outlier: Mask, hidden: Mask) -> None:
-    """Edges between points (N, 2 or 3) in metres."""
-    lines: Any = LineCollection if points.shape[1] == 2 else Line3DCollection
+def _edges(graph: PoseGraph, is_outlier: Mask) -> list[tuple[Indices, str, float]]:
+    """Loops, wrong loops and odometry, with colours and widths."""
     odometry = graph.is_odometry
-    kinds = (
-        (~odometry & ~is_outlier, "0.7", 0.4),
-        (is_outlier & ~hidden, "tab:red", 0.4),
-        (odometry, "tab:blue", 0.9),
-    )
-    for mask, colour, width in kinds:
-        segments = points[graph.edges[mask]]
-        if len(segments):
-            axes.add_collection(lines(segments, colors=colour, linewidths=width))
-    low, high = points.min(axis=0), points.max(axis=0)
-    centre, half = (low + high) / 2, 0.55 * max(float(np.max(high - low)), 1e-3)
-    for name, middle in zip("xyz", centre, strict=False):
-        getattr(axes, f"set_{name}lim")(middle - half, middle + half)
-        getattr(axes, f"set_{name}label")(f"{name} [m]")
-    axes.set_aspect("equal")
+    return [
+        (graph.edges[~odometry & ~is_outlier], "0.7", 0.4),
+        (graph.edges[is_outlier], "tab:red", 0.4),
+        (graph.edges[odometry], "tab:blue", 0.9),
+    ]

@@ -41,6 +41,18 @@ def counting_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
+@contextmanager
+def iteration_bar(quiet: bool) -> Iterator[Callable[[int, float], None]]:
+    """A function ``(iteration, cost)`` that shows both, on a terminal alone."""
+    with tqdm(unit="step", disable=quiet or not sys.stderr.isatty()) as bar:
+
+        def show(iteration: int, cost: float) -> None:
+            bar.set_postfix_str(f"cost {cost:.6g}", refresh=False)
+            bar.update(iteration - bar.n)
+
+        yield show
+
+
 class Progress:
     """The bar of a run."""
 

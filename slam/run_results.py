@@ -21,6 +21,7 @@ from slam.system_interface import System
 
 logger = logging.getLogger(__name__)
 
+LANDMARKS_COMMENT = "bmask-slam landmarks, world frame, metres"
 EVALUATION_ROWS = (
     "ate_rmse",
     "rpe_trans_rmse_frame",
@@ -106,4 +107,4 @@ def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:
     columns = {"x": x, "y": y, "z": z, "red": red, "green": green, "blue": blue}
     columns["observations"] = cloud.observations.astype(np.int32)
     columns["id"] = cloud.ids.astype(np.int32)
-    write_ply(path, columns, "bmask-slam landmarks, world frame, metres")
+    write_ply(path, columns, LANDMARKS_COMMENT)

@@ -7,6 +7,7 @@ from slam.evaluation.evaluation import (
     evaluate_trajectory,
     format_json,
     format_table,
+    read_reference,
 )
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "evaluate_trajectory",
     "format_json",
     "format_table",
+    "read_reference",
 ]

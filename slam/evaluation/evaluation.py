@@ -109,9 +109,7 @@ def evaluate(
     """
     run_or_trajectory, reference = Path(run_or_trajectory), Path(reference)
     file = _file_in(run_or_trajectory, "trajectory.txt", "a run folder or a TUM trajectory file")
-    truth_file = _file_in(
-        reference, "groundtruth.txt", "a sequence with ground truth or a TUM file"
-    )
+    truth_file = _reference_file(reference)
     estimate, truth = read_tum(file), read_tum(truth_file)
     try:
         result = evaluate_trajectory(estimate, truth, _frames_given(file), with_scale)
@@ -122,6 +120,19 @@ def evaluate(
 
         plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, with_scale)
     return result
+
+
+def read_reference(path: Path) -> Trajectory:
+    """The trajectory of a TUM file, or a sequence folder's ground truth.
+
+    Raises:
+        InputError: it is missing or broken.
+    """
+    return read_tum(_reference_file(path))
+
+
+def _reference_file(path: Path) -> Path:
+    return _file_in(path, "groundtruth.txt", "a sequence with ground truth or a TUM file")
 
 
 def format_table(rows: list[Row]) -> str:

@@ -9,13 +9,13 @@ from pose_graph_rings import PER_LAP, ring
 
 from graph.g2o import read_g2o
 from graph.geometry import inverse, se3_exp, se3_log
+from graph.graduation import truncated_weights
 from graph.loop_consistency import supported_loops
 from graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
 from graph.pose_graph_factors import chordal_poses, pose_graph_cost
 from graph.pose_graph_optimisation import (
     PoseGraphConfig,
     optimise_pose_graph,
-    truncated_weights,
 )
 
 FOLDER = Path(__file__).resolve().parents[2] / "../shared/data/posegraphs"

@@ -88,10 +88,12 @@ def test_quiet_prints_only_the_path(capsys, file: Path, tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["none.g2o", "--out", "b.g2o"], "none.g2o: no such file"),
-        ([".", "--out", "b.g2o"], "run folders are not supported yet"),
+        ([".", "--out", "b"], "holds no graph; give the folder of a run"),
         (["in.g2o", "--out", "no/b.g2o"], "the folder no is not there"),
         (["in.g2o", "--out", "."], "a folder; give the name of a file"),
         (["in.g2o", "--out", "b.g2o", "--plot", "b.gif"], "cannot draw '.gif'"),
+        (["in.g2o", "--out", "b.g2o", "--overwrite"], "--overwrite: is of run folders"),
+        ([".", "--out", "b", "--method", "gnc"], "--method gnc: is of pose graphs"),
     ],
 )
 def test_one_line_says_what_is_wrong(

@@ -1,0 +1,1 @@
+"""Sub-commands of the command line, each with its parser and its handler in a module of its own."""

@@ -1,0 +1,88 @@
+"""``bmask-slam optimise``: a run folder or a pose graph, offline."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from graph.errors import InputError
+
+if TYPE_CHECKING:
+    from graph.pose_graph_optimisation import Method
+
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
+
+TEXT = "optimise a run folder, or a pose graph in g2o format, offline"
+MORE = """\
+A run folder gets a full bundle adjustment of poses and landmarks, wrong loops and wrong
+observations are found and left out, and --out becomes a new run folder with every frame carried
+along. A pose graph, 2-D or 3-D, is written to the file --out."""
+
+
+def add_optimise(commands: _Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser("optimise", help=TEXT, description=f"{TEXT}. {MORE}")
+    parser.set_defaults(handler=_optimise)
+    parser.add_argument("input", type=Path, metavar="INPUT", help="run folder, or g2o file")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="F", help="run folder or g2o file to write"
+    )
+    parser.add_argument(
+        "--method",
+        choices=("lm", "dogleg", "gnc"),
+        help="of a pose graph: lm (default), dogleg, or gnc, which finds wrong loops; odometry is "
+        "taken for right",
+    )
+    parser.add_argument(
+        "--reference", type=Path, metavar="GT", help="of a run: print errors before and after"
+    )
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace the run that --out holds; never the input"
+    )
+    parser.add_argument(
+        "--plot",
+        type=Path,
+        metavar="F",
+        help="picture before/after: png, pdf, svg (a run's default: before_after.png in --out)",
+    )
+    parser.add_argument("--quiet", action="store_true", help="print only the output's path")
+
+
+def _optimise(arguments: argparse.Namespace) -> int:
+    from slam.progress import console_log
+
+    with console_log():
+        text = (_run_folder if arguments.input.is_dir() else _pose_graph)(arguments)
+    print(arguments.out if arguments.quiet else text)
+    return 0
+
+
+def _run_folder(arguments: argparse.Namespace) -> str:
+    from slam.progress import iteration_bar
+    from slam.run_adjustment import AdjustOptions, adjust_run, format_adjustment
+
+    if arguments.method:
+        raise InputError(
+            f"--method {arguments.method}: is of pose graphs; a run folder is adjusted by lm, its "
+            "loops by gnc; leave it out"
+        )
+    names = ("out", "overwrite", "reference", "plot")
+    given = {name: getattr(arguments, name) for name in names}
+    with iteration_bar(arguments.quiet) as progress:
+        result = adjust_run(AdjustOptions(arguments.input, **given), progress=progress)
+    return (
+        f"{format_adjustment(result)}\n\nRun folder  {result.folder}\nPicture     {result.picture}"
+    )
+
+
+def _pose_graph(arguments: argparse.Namespace) -> str:
+    from slam.optimise import format_result, optimise_file
+
+    for option in ("reference", "overwrite"):
+        if getattr(arguments, option):
+            raise InputError(f"--{option}: is of run folders; leave it out for {arguments.input}")
+    method: Method = arguments.method or "lm"
+    result = optimise_file(arguments.input, arguments.out, method, arguments.plot, arguments.quiet)
+    picture = f"\nPicture        {arguments.plot}" if arguments.plot else ""
+    return f"{format_result(result)}\n\nGraph          {arguments.out}{picture}"
