@@ -13,7 +13,8 @@ import numpy as np
 
 from graph.camera import Camera
 from graph.gates import reprojection
-from graph.pruning import anchor_components, bridge, keyframes_held_by, remove
+from graph.holding import anchor_components, bridge, keyframes_held_by, loose_in
+from graph.pruning import remove
 from graph.shadow import Shadow, ids_array
 from graph.smoother_config import SmootherConfig
 from graph.solver import Variable
@@ -51,7 +52,7 @@ def repair(
     pairs = _broken_observations(shadow, camera)
     broken = remove(GraphUpdate(remove_observations=pairs), shadow, config)
     landmarks = _loose_landmarks(shadow, camera, config)
-    keyframes = _loose_keyframes(shadow, config)
+    keyframes = loose_in(shadow, config)
     if named is not None and not (len(held) or broken or len(landmarks) or len(keyframes)):
         landmarks = ids_array([named[1]] if named[0] == "landmark" else [])
         keyframes = ids_array([named[1]] if named[0] == "keyframe" else [])
@@ -98,27 +99,6 @@ def _loose_landmarks(shadow: Shadow, camera: Camera, config: SmootherConfig) -> 
     return np.setdiff1d(shadow.landmarks.ids, held)
 
 
-def _loose_keyframes(shadow: Shadow, config: SmootherConfig) -> IntArray:
-    """Keyframes that no chain of enough shared landmarks or relative poses ties to a prior."""
-    ids = shadow.keyframes.ids
-    seen = shadow.observations.select(shadow.observations.all_rows())
-    keyframe = np.searchsorted(ids, seen.keyframe_ids)
-    landmark = np.searchsorted(shadow.landmarks.ids, seen.landmark_ids)
-    edges = [np.searchsorted(ids, f.keyframes) for f in shadow.pose_factors.values()]
-    tied = np.zeros(len(ids), bool)
-    tied[[edge[0] for edge in edges if len(edge) == 1]] = True
-    while True:
-        known = np.zeros(len(shadow.landmarks.ids), bool)
-        known[landmark[tied[keyframe]]] = True
-        shared = np.bincount(keyframe[known[landmark]], minlength=len(ids))
-        now = tied | (shared >= config.min_shared_observations)
-        for edge in edges:
-            now[edge] |= now[edge].any()
-        if (now == tied).all():
-            return ids[~tied]
-        tied = now
-
-
 def _tie(loose: IntArray, shadow: Shadow, config: SmootherConfig) -> IntArray:
     """Bridge loose keyframes to firm ones, one at a time: one bridge may hold a whole part."""
     bridged: list[int] = []
@@ -130,5 +110,5 @@ def _tie(loose: IntArray, shadow: Shadow, config: SmootherConfig) -> IntArray:
         nearest = int(firm[np.argmin(np.abs(firm - k))])
         shadow.add_pose_factors([bridge(nearest, k, shadow, config)])
         bridged.append(k)
-        loose = np.intersect1d(loose[1:], _loose_keyframes(shadow, config))
+        loose = np.intersect1d(loose[1:], loose_in(shadow, config))
     return ids_array(bridged)

@@ -17,7 +17,8 @@ from graph.array_file import Arrays
 from graph.camera import Camera
 from graph.gates import describe, reprojection
 from graph.geometry import Array
-from graph.pruning import Removal, anchor_components, remove
+from graph.holding import anchor_components, release_bridges
+from graph.pruning import Removal, remove
 from graph.recovery import Repair, repair
 from graph.shadow import Shadow, ids_array
 from graph.smoother_config import SmootherConfig
@@ -34,6 +35,7 @@ from graph.updates import (
     RefusalReason,
     Refusals,
     RefusedFactor,
+    RemovalReport,
 )
 
 __all__ = ["Smoother", "SmootherConfig"]
@@ -46,6 +48,7 @@ class _Report:
 
     refused: Refusals = field(default_factory=Refusals)
     refused_factors: tuple[RefusedFactor, ...] = ()
+    removal: RemovalReport = field(default_factory=RemovalReport)
     landmarks: set[int] = field(default_factory=set)
     keyframes: set[int] = field(default_factory=set)
     bridged: set[int] = field(default_factory=set)
@@ -106,9 +109,9 @@ class Smoother:
         self._solver.elapsed_s = 0.0
         removal = remove(update, self._shadow, self._config)
         admitted = admit(self._with_first_prior(update), self._shadow, self._camera, self._config)
-        report = _Report(admitted.refused, admitted.refused_factors)
+        report = _Report(admitted.refused, admitted.refused_factors, removal.report)
         report.add_removal(removal)
-        change = self._enter(admitted, removal)
+        change = self._enter(admitted, removal, report)
         try:
             self._solver.update(self._shadow, change)
         except SolverError as failure:
@@ -215,18 +218,20 @@ class Smoother:
         )
         return dataclasses.replace(update, priors=(prior,))
 
-    def _enter(self, admitted: Admitted, removal: Removal) -> Change:
+    def _enter(self, admitted: Admitted, removal: Removal, report: _Report) -> Change:
         """Put what was admitted into the shadow, and say what ISAM2 must be told."""
         self._shadow.keyframes.insert(admitted.keyframe_ids, admitted.poses_world_camera)
         self._shadow.landmarks.insert(admitted.landmark_ids, admitted.points_world)
         rows = self._shadow.observations.add(admitted.observations)
-        numbers = self._shadow.add_pose_factors(admitted.pose_factors)
+        numbers = [*removal.pose_factors, *self._shadow.add_pose_factors(admitted.pose_factors)]
+        free, slots = release_bridges(admitted.observations, self._shadow, self._config)
+        report.bridged.difference_update(free.tolist())
         return Change(
             rows,
-            [*removal.pose_factors, *numbers],
+            [number for number in numbers if number in self._shadow.pose_factors],
             admitted.keyframe_ids,
             admitted.landmark_ids,
-            removal.slots,
+            [*removal.slots, *slots],
         )
 
     def _recover(
@@ -283,6 +288,7 @@ class Smoother:
             self._shadow.landmarks.values,
             report.refused,
             report.refused_factors,
+            report.removal,
             dropped_landmarks=ids_array(report.landmarks),
             dropped_keyframes=ids_array(report.keyframes),
             bridged_keyframes=ids_array(report.bridged),

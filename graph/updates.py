@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from enum import IntEnum
+from enum import Enum, IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,12 @@ from numpy.typing import NDArray
 from graph.geometry import Array
 
 IntArray = NDArray[np.int64]
+RelativePoseName = tuple[int, int, str]
+"""keyframe_a, keyframe_b, kind."""
 NO_LANDMARK = -1
 """Stands in a column of landmark ids where a whole keyframe is meant."""
+NO_KEYFRAME = -1
+"""Stands in a column of keyframe ids where a whole landmark is meant."""
 
 
 class RefusalReason(IntEnum):
@@ -38,6 +42,17 @@ class RefusalReason(IntEnum):
     BAD_COVARIANCE = 10
     SOLVER_FAILED = 11
     """ISAM2 could not solve with it; the graph goes on without it."""
+    PART_UNFIXED = 12
+    """A removal would take the last prior of the part of the graph that this keyframe is in."""
+
+
+class RemovalPolicy(Enum):
+    """What to do if a removal would leave something underconstrained."""
+
+    DROP = "drop"
+    """Carry it out: landmarks go with it, keyframes are held where they are (see pruning)."""
+    REFUSE = "refuse"
+    """Carry out nothing of the update's removals, and name each such variable."""
 
 
 def _no_ids() -> IntArray:
@@ -125,6 +140,7 @@ class GraphUpdate:
             nothing else constrains.
         remove_observations: (N, 2) columns keyframe id, landmark id.
         remove_relative_poses: triples (keyframe_a, keyframe_b, kind).
+        removal_policy: for what the removals, taken together, leave underconstrained.
 
     Ids to remove that the graph does not hold are passed over.
     """
@@ -139,7 +155,8 @@ class GraphUpdate:
     remove_landmarks: IntArray = field(default_factory=_no_ids)
     remove_keyframes: IntArray = field(default_factory=_no_ids)
     remove_observations: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
-    remove_relative_poses: tuple[tuple[int, int, str], ...] = ()
+    remove_relative_poses: tuple[RelativePoseName, ...] = ()
+    removal_policy: RemovalPolicy = RemovalPolicy.DROP
 
 
 @dataclass(frozen=True)
@@ -173,6 +190,26 @@ class RefusedFactor:
 
 
 @dataclass(frozen=True)
+class RemovalReport:
+    """What became of an update's removals; what followed from them is in the estimate.
+
+    Attributes:
+        landmark_ids, keyframe_ids: (N,) sorted ids that went as asked.
+        observations: (N, 2) keyframe id, landmark id of the single observations that went.
+        relative_poses: those that went by their names.
+        refused: under RemovalPolicy.REFUSE the variables that the removal would have left
+            underconstrained, a landmark with NO_KEYFRAME, a keyframe with NO_LANDMARK; if
+            there is any, nothing went.
+    """
+
+    landmark_ids: IntArray = field(default_factory=_no_ids)
+    keyframe_ids: IntArray = field(default_factory=_no_ids)
+    observations: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    relative_poses: tuple[RelativePoseName, ...] = ()
+    refused: Refusals = field(default_factory=Refusals)
+
+
+@dataclass(frozen=True)
 class GraphEstimate:
     """Everything in the graph after an update, and what the smoother did beyond its orders.
 
@@ -183,12 +220,14 @@ class GraphEstimate:
         points_world: (L, 3) their optimised positions in metres.
         refused: observations and new keyframes left out, with reasons.
         refused_factors: relative poses and priors left out.
+        removal: what went as asked, or why not.
         dropped_landmarks: ids that went without being asked for: left underconstrained by a
             removal, or thrown out after a failure of the solver.
         dropped_keyframes: the same for keyframes.
         bridged_keyframes: old keyframes that a removal left with too little; each is held by a
-            loose relative pose to a neighbour (kind "bridge"), or, where a whole part of the
-            graph lost its prior, by a prior at its current estimate.
+            loose relative pose to a neighbour (kind "bridge", which goes when enough other
+            factors hold it again), or, where a whole part of the graph lost its prior, by a
+            prior at its current estimate.
         rebuilt: ISAM2 failed and was made anew from the shadow.
         failed_variable: the variable it named last, such as "landmark 17"; "" if none.
         cost_before, cost_after: half the sum of (robust) squared whitened errors before and
@@ -203,6 +242,7 @@ class GraphEstimate:
     points_world: Array
     refused: Refusals = field(default_factory=Refusals)
     refused_factors: tuple[RefusedFactor, ...] = ()
+    removal: RemovalReport = field(default_factory=RemovalReport)
     dropped_landmarks: IntArray = field(default_factory=_no_ids)
     dropped_keyframes: IntArray = field(default_factory=_no_ids)
     bridged_keyframes: IntArray = field(default_factory=_no_ids)

@@ -2,79 +2,24 @@
 
 import numpy as np
 import pytest
+from graph_checks import assert_isam_matches_shadow, assert_same_optimum, filled
 from synthetic_room import CAMERA, Room, make_room
 
 from graph.geometry import inverse, se3_exp, se3_log
-from graph.keys import keyframe_keys, landmark_keys
 from graph.smoother import Smoother
 from graph.updates import (
-    GraphEstimate,
     GraphUpdate,
     Observations,
-    PosePrior,
     RefusalReason,
     RelativePose,
+    RemovalPolicy,
 )
 
 ROOM = make_room(keyframes=8, points=80, noise_px=0.3)
 
 
-def filled(room: Room = ROOM) -> Smoother:
-    smoother = Smoother(CAMERA)
-    for update in room.updates():
-        smoother.update(update)
-    return smoother
-
-
-def from_scratch(smoother: Smoother) -> GraphEstimate:
-    """The optimum of a new graph that is given what this one holds, from the room's truth."""
-    shadow = smoother._shadow
-    seen = shadow.observations.select(shadow.observations.all_rows())
-    factors = [f.factor for f in shadow.pose_factors.values()]
-    fresh = Smoother(CAMERA)
-    fresh.update(
-        GraphUpdate(
-            shadow.keyframes.ids,
-            ROOM.poses_world_camera[shadow.keyframes.ids],
-            shadow.landmarks.ids,
-            ROOM.points_world[shadow.landmarks.ids],
-            seen,
-            priors=tuple(f for f in factors if isinstance(f, PosePrior)),
-            relative_poses=tuple(f for f in factors if isinstance(f, RelativePose)),
-        )
-    )
-    return fresh.optimise_batch()
-
-
-def assert_isam_matches_shadow(smoother: Smoother) -> None:
-    """Every slot holds just the factor that the shadow believes to be there."""
-    shadow, isam = smoother._shadow, smoother._solver._isam
-    graph = isam.getFactorsUnsafe()
-    rows = shadow.observations.all_rows()
-    seen = shadow.observations.select(rows)
-    expected = dict(
-        zip(
-            shadow.observations.slots(rows).tolist(),
-            zip(keyframe_keys(seen.keyframe_ids), landmark_keys(seen.landmark_ids), strict=True),
-            strict=True,
-        )
-    )
-    for factor in shadow.pose_factors.values():
-        expected[factor.slot] = tuple(keyframe_keys(np.array(factor.keyframes)))
-    held = {i: tuple(graph.at(i).keys()) for i in range(graph.size()) if graph.exists(i)}
-    assert held == expected
-    assert len(expected) == len(rows) + len(shadow.pose_factors)
-
-
-def assert_same_optimum(smoother: Smoother) -> None:
-    expected, found = from_scratch(smoother), smoother.optimise_batch()
-    difference = se3_log(inverse(found.poses_world_camera) @ expected.poses_world_camera)
-    assert np.abs(difference).max() < 1e-5
-    np.testing.assert_allclose(found.points_world, expected.points_world, atol=1e-4)
-
-
 def test_a_landmark_goes_with_all_its_factors() -> None:
-    smoother = filled()
+    smoother = filled(ROOM)
     before = smoother.estimate()
     victims = before.landmark_ids[[3, 10]]
     views = np.isin(ROOM.observations.landmark_ids, victims).sum()
@@ -83,22 +28,22 @@ def test_a_landmark_goes_with_all_its_factors() -> None:
     np.testing.assert_array_equal(after.landmark_ids, np.setdiff1d(before.landmark_ids, victims))
     assert not after.rebuilt
     assert_isam_matches_shadow(smoother)
-    assert_same_optimum(smoother)
+    assert_same_optimum(smoother, ROOM)
 
 
 def test_a_keyframe_goes_with_all_its_factors() -> None:
-    smoother = filled()
+    smoother = filled(ROOM)
     before = smoother.estimate()
     after = smoother.update(GraphUpdate(remove_keyframes=np.array([4])))
     assert after.keyframe_ids.tolist() == [0, 1, 2, 3, 5, 6, 7]
     assert after.factors == before.factors - (ROOM.observations.keyframe_ids == 4).sum()
     assert not after.rebuilt
     assert_isam_matches_shadow(smoother)
-    assert_same_optimum(smoother)
+    assert_same_optimum(smoother, ROOM)
 
 
 def test_an_observation_goes_and_comes_again() -> None:
-    smoother = filled()
+    smoother = filled(ROOM)
     before = smoother.estimate()
     row = int(np.flatnonzero(seen_often(ROOM))[40])
     seen = ROOM.observations.select(np.array([row]))
@@ -112,13 +57,13 @@ def test_an_observation_goes_and_comes_again() -> None:
     twice = smoother.update(GraphUpdate(observations=seen))
     assert twice.refused.count(RefusalReason.DUPLICATE) == 1
     assert_isam_matches_shadow(smoother)
-    assert_same_optimum(smoother)
+    assert_same_optimum(smoother, ROOM)
 
 
 @pytest.mark.parametrize("in_one_update", [False, True])
 def test_an_id_is_used_again(in_one_update: bool) -> None:
     """Landmark 5 becomes another point, keyframe 7 is made anew."""
-    smoother = filled()
+    smoother = filled(ROOM)
     seen = ROOM.observations
     rows = (seen.landmark_ids == 5) | (seen.keyframe_ids == 7)
     assert rows.sum() > 20
@@ -140,13 +85,13 @@ def test_an_id_is_used_again(in_one_update: bool) -> None:
     assert len(estimate.refused) == 0
     assert {5} <= set(estimate.landmark_ids.tolist())
     assert_isam_matches_shadow(smoother)
-    assert_same_optimum(smoother)
+    assert_same_optimum(smoother, ROOM)
 
 
 def test_many_random_removals_and_returns() -> None:
     """Slots are used again and again and always hold what the shadow says."""
     rng = np.random.default_rng(5)
-    smoother = filled()
+    smoother = filled(ROOM)
     seen = ROOM.observations
     pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
     for _ in range(15):
@@ -172,7 +117,7 @@ def test_many_random_removals_and_returns() -> None:
         )
         assert not estimate.rebuilt
         assert_isam_matches_shadow(smoother)
-    assert_same_optimum(smoother)
+    assert_same_optimum(smoother, ROOM)
 
 
 def rng_select(rng: np.random.Generator, seen: Observations) -> Observations:
@@ -194,7 +139,7 @@ def test_what_is_not_there_is_passed_over() -> None:
     )
     empty = Smoother(CAMERA).update(nothing)
     assert len(empty.keyframe_ids) == 0
-    smoother = filled()
+    smoother = filled(ROOM)
     before = smoother.estimate()
     assert smoother.update(nothing).factors == before.factors
 
@@ -225,7 +170,7 @@ def test_a_landmark_left_with_one_monocular_view_goes_too() -> None:
 
 
 def test_a_keyframe_that_loses_its_landmarks_is_held_where_it_was() -> None:
-    smoother = filled()
+    smoother = filled(ROOM)
     before = smoother.estimate()
     seen = ROOM.observations
     mine = seen.landmark_ids[seen.keyframe_ids == 7]
@@ -239,8 +184,46 @@ def test_a_keyframe_that_loses_its_landmarks_is_held_where_it_was() -> None:
     assert (sigma_m > 0.01).any()  # and it says how badly it is known
 
 
+def test_two_keyframes_that_hold_only_each_other_are_tied_to_the_rest() -> None:
+    """Each shares enough with the other; what both share with the rest leaves a turn open."""
+    smoother, seen = filled(ROOM), ROOM.observations
+    last_two = np.isin(seen.keyframe_ids, [6, 7])
+    inside = np.isin(seen.landmark_ids, seen.landmark_ids[~last_two])
+    both = np.intersect1d(*(seen.landmark_ids[seen.keyframe_ids == k] for k in (6, 7)))
+    shared = np.intersect1d(both, seen.landmark_ids[~last_two])
+    rest = ~last_two & np.isin(seen.landmark_ids, shared[2:])
+    strangers = last_two & inside & ~np.isin(seen.landmark_ids, shared)
+    leaving = seen.select(rest | strangers)
+    pairs = np.stack([leaving.keyframe_ids, leaving.landmark_ids], axis=1)
+    careful = GraphUpdate(remove_observations=pairs, removal_policy=RemovalPolicy.REFUSE)
+    refused = smoother.update(careful).removal.refused
+    assert refused.count(RefusalReason.KEYFRAME_UNDERCONSTRAINED) == 2
+    assert set(refused.keyframe_ids.tolist()) == {6, 7}
+    after = smoother.update(GraphUpdate(remove_observations=pairs))
+    assert not after.rebuilt
+    assert len(after.bridged_keyframes) == 1  # it carries the other
+    assert after.keyframe_ids.tolist() == list(range(8))
+    again = smoother.update(GraphUpdate(observations=leaving))
+    assert again.factors == len(seen) + 1  # the bridge has gone: the observations and the prior
+    assert_isam_matches_shadow(smoother)
+
+
+def test_a_removal_that_would_take_the_only_prior_is_refused_with_that_reason() -> None:
+    smoother = filled(ROOM)
+    update = GraphUpdate(
+        remove_keyframes=np.array([0]),
+        remove_landmarks=np.array([5]),
+        removal_policy=RemovalPolicy.REFUSE,
+    )
+    before = smoother.estimate()
+    answer = smoother.update(update)
+    assert answer.removal.refused.count(RefusalReason.PART_UNFIXED) == 7
+    assert len(answer.removal.landmark_ids) == len(answer.removal.keyframe_ids) == 0
+    assert answer.factors == before.factors
+
+
 def test_the_world_stays_when_the_first_keyframe_goes() -> None:
-    smoother = filled()
+    smoother = filled(ROOM)
     before = smoother.optimise_batch()
     after = smoother.update(GraphUpdate(remove_keyframes=np.array([0])))
     assert not after.rebuilt
@@ -251,7 +234,7 @@ def test_the_world_stays_when_the_first_keyframe_goes() -> None:
 
 
 def test_everything_goes_and_a_new_graph_starts() -> None:
-    smoother = filled()
+    smoother = filled(ROOM)
     empty = smoother.update(GraphUpdate(remove_keyframes=np.arange(8)))
     assert empty.factors == 0
     assert len(empty.landmark_ids) == 0
@@ -259,12 +242,12 @@ def test_everything_goes_and_a_new_graph_starts() -> None:
         estimate = smoother.update(update)
     assert not estimate.rebuilt
     assert estimate.keyframe_ids.tolist() == list(range(8))
-    assert_same_optimum(smoother)
+    assert_same_optimum(smoother, ROOM)
 
 
 @pytest.mark.parametrize(("robust", "wrong_by"), [(None, 0.03), ("cauchy", 0.5), ("dcs", 0.5)])
 def test_a_wrong_loop_goes_by_its_name(robust: str | None, wrong_by: float) -> None:
-    smoother = filled()
+    smoother = filled(ROOM)
     right = smoother.optimise_batch()
     covariance = 1e-6 * np.eye(6)
     T_a_b = inverse(right.poses_world_camera[0]) @ right.poses_world_camera[7]
@@ -284,7 +267,7 @@ def test_a_wrong_loop_goes_by_its_name(robust: str | None, wrong_by: float) -> N
 
 def test_removal_in_the_first_update_after_a_restart() -> None:
     """ISAM2 refuses a removal in its very first update; here it is only a smaller graph."""
-    smoother = filled()
+    smoother = filled(ROOM)
     smoother.restart()
     estimate = smoother.update(
         GraphUpdate(remove_landmarks=np.array([5]), remove_keyframes=np.array([3]))
