@@ -6,14 +6,15 @@ spoils every value: what GTSAM would not see is found here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graph.camera import Camera
-from graph.geometry import Array, inverse
-from graph.shadow import Shadow
+from graph.geometry import Array, inverse, se3_log
+from graph.shadow import Shadow, ValueTable
 from graph.smoother_config import SmootherConfig
 from graph.updates import (
     GraphUpdate,
@@ -23,6 +24,7 @@ from graph.updates import (
     RefusalReason,
     RefusedFactor,
     RelativePose,
+    RelativePoseErrors,
 )
 
 Mask = NDArray[np.bool_]
@@ -173,6 +175,24 @@ def reprojection(
     whitened[mono, 2] = 0.0
     with np.errstate(over="ignore", invalid="ignore"):
         return points_camera[:, 2], np.sum(whitened**2, axis=1)
+
+
+def relative_pose_errors(
+    factors: Sequence[RelativePose], keyframes: ValueTable
+) -> RelativePoseErrors:
+    """Chi-square of relative poses between keyframes that the table holds."""
+    a = np.array([f.keyframe_a for f in factors], np.int64)
+    b = np.array([f.keyframe_b for f in factors], np.int64)
+    measured = np.array([f.T_a_b for f in factors]).reshape(-1, 4, 4)
+    covariances = np.array([f.covariance for f in factors]).reshape(-1, 6, 6)
+    r = se3_log(inverse(measured) @ inverse(keyframes.get(a)) @ keyframes.get(b))
+    kinds = np.array([f.kind for f in factors], np.str_)
+    return RelativePoseErrors(a, b, kinds, mahalanobis(r, covariances))
+
+
+def mahalanobis(r: Array, covariances: Array) -> Array:
+    """``r^T inverse(S) r`` of vectors (K, d) and covariances (K, d, d)."""
+    return np.sum(r * np.linalg.solve(covariances, r[..., None])[..., 0], axis=1)
 
 
 def _repeated(observations: Observations, shadow: Shadow) -> Mask:

@@ -53,6 +53,15 @@ def skew(v: Array) -> Array:
     return S - np.swapaxes(S, -1, -2)
 
 
+def adjoint(T_a_b: Array) -> Array:
+    """Adjoints (..., 6, 6): ``T_a_b @ se3_exp(xi) = se3_exp(adjoint(T_a_b) @ xi) @ T_a_b``."""
+    R = T_a_b[..., :3, :3]
+    A = np.zeros((*T_a_b.shape[:-2], 6, 6))
+    A[..., :3, :3] = A[..., 3:, 3:] = R
+    A[..., 3:, :3] = skew(T_a_b[..., :3, 3]) @ R
+    return A
+
+
 def _series(theta_rad: Array) -> tuple[Array, Array, Array]:
     """sin(a)/a, (1-cos a)/a^2 and (a-sin a)/a^3, by Taylor series near zero."""
     small = theta_rad < 1e-4

@@ -6,8 +6,10 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
-from graph.geometry import Array, inverse, se3_log
+from graph.gates import mahalanobis
+from graph.geometry import Array, adjoint, inverse, se3_log
 from graph.pose_graph import Mask, PoseGraph, is_connected, planar_coordinates, spanning_tree_poses
+from graph.updates import IntArray
 
 WINDOW = 3  # steps of odometry on either side of a cycle
 PROBABILITY = 0.999
@@ -42,12 +44,37 @@ def supported_loops(graph: PoseGraph) -> Mask:
     # Covariances are added as they are: cycles are short, and the gate is wide.
     S = loop_covariance[a] + loop_covariance[b] + steps[:, None, None] * step_covariance
     r = planar_coordinates(E) if graph.is_planar else se3_log(E)
-    chi_squares = _squared_norms(r, S)
+    chi_squares = mahalanobis(r, S)
     agree = chi_squares < chi2.ppf(PROBABILITY, r.shape[1])
     supported[loops[a[agree]]] = supported[loops[b[agree]]] = True
     return supported
 
 
-def _squared_norms(r: Array, S: Array) -> Array:
-    """``r^T inverse(S) r`` of vectors (K, d) and covariances (K, d, d)."""
-    return np.sum(r * np.linalg.solve(S, r[..., None])[..., 0], axis=1)
+def cycle_chi2(
+    T_a_b: Array,
+    covariances: Array,
+    ends: tuple[Array, Array],
+    pairs: tuple[IntArray, IntArray],
+    map_covariances: Array,
+) -> Array:
+    """Chi-square (P,), 6 degrees of freedom, of the cycles that pairs of loops close.
+
+    For loops (a, b) and (c, d): ``E = inverse(T_a_b) @ T_a_c @ T_c_d @ T_d_b``, whose middle steps
+    are the map's. Covariances are carried to E's right side by adjoints.
+
+    Args:
+        T_a_b: (N, 4, 4) measured; covariances: (N, 6, 6) on their right side.
+        ends: T_world_a and T_world_b (N, 4, 4), as in the map.
+        pairs: (P,) rows of the loops (a, b), and (P,) rows of the loops (c, d).
+        map_covariances: (2, P, 6, 6) of T_a_c and of T_d_b.
+    """
+    (first, second), (T_world_a, T_world_b) = pairs, ends
+    T_a_c = inverse(T_world_a[first]) @ T_world_a[second]
+    T_d_b = inverse(T_world_b[second]) @ T_world_b[first]
+    E = inverse(T_a_b[first]) @ T_a_c @ T_a_b[second] @ T_d_b
+    carry_c = adjoint(inverse(T_a_b[second] @ T_d_b))
+    carry_d = adjoint(inverse(T_d_b))
+    S = covariances[first] + map_covariances[1]
+    S = S + carry_c @ map_covariances[0] @ np.swapaxes(carry_c, -1, -2)
+    S = S + carry_d @ covariances[second] @ np.swapaxes(carry_d, -1, -2)
+    return mahalanobis(se3_log(E), S)

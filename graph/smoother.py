@@ -15,7 +15,7 @@ import numpy as np
 from graph.admission import Admitted, admit
 from graph.array_file import Arrays
 from graph.camera import Camera
-from graph.gates import describe, reprojection
+from graph.gates import describe, relative_pose_errors, reprojection
 from graph.geometry import Array
 from graph.holding import anchor_components, release_bridges
 from graph.pruning import Removal, remove
@@ -36,6 +36,8 @@ from graph.updates import (
     Refusals,
     RefusedFactor,
     RemovalReport,
+    RelativePose,
+    RelativePoseErrors,
 )
 
 __all__ = ["Smoother", "SmootherConfig"]
@@ -112,6 +114,7 @@ class Smoother:
         report = _Report(admitted.refused, admitted.refused_factors, removal.report)
         report.add_removal(removal)
         change = self._enter(admitted, removal, report)
+        change = dataclasses.replace(change, max_iterations=update.max_iterations)
         try:
             self._solver.update(self._shadow, change)
         except SolverError as failure:
@@ -155,6 +158,15 @@ class Smoother:
         depth_m, chi2 = reprojection(seen, poses, points, self._camera)
         is_stereo = np.isfinite(seen.measurements[:, 2])
         return ObservationErrors(seen.keyframe_ids, seen.landmark_ids, chi2, depth_m, is_stereo)
+
+    def relative_pose_errors(self, kind: str) -> RelativePoseErrors:
+        """Chi-square of every relative pose of a kind at the current estimate."""
+        factors = [
+            entry.factor
+            for _, entry in sorted(self._shadow.pose_factors.items())
+            if isinstance(entry.factor, RelativePose) and entry.factor.kind == kind
+        ]
+        return relative_pose_errors(factors, self._shadow.keyframes)
 
     def marginal_covariance(self, keyframe_id: int) -> Array:
         """Covariance (6, 6) of a pose's ``[rotation rad, translation m]`` on its right side.

@@ -35,13 +35,14 @@ def _no_ids() -> IntArray:
 @dataclass(frozen=True)
 class Change:
     """What to pass to ISAM2: rows and numbers of new factors in the shadow, ids of new
-    variables, and the slots of factors that left."""
+    variables, the slots of factors that left, and how many further steps may follow."""
 
     rows: IntArray = field(default_factory=_no_ids)
     numbers: list[int] = field(default_factory=list)
     keyframe_ids: IntArray = field(default_factory=_no_ids)
     landmark_ids: IntArray = field(default_factory=_no_ids)
     removed_slots: list[int] = field(default_factory=list)
+    max_iterations: int = 0
 
 
 class Solver:
@@ -145,7 +146,7 @@ class Solver:
             change.landmark_ids,
             shadow.landmarks.get(change.landmark_ids),
         )
-        slots, poses, points = self._run(graph, values, change.removed_slots)
+        slots, poses, points = self._run(graph, values, change)
         if len(poses) != len(shadow.keyframes.ids) or len(points) != len(shadow.landmarks.ids):
             self._isam = None
             raise SolverError("ISAM2 and the shadow hold different variables", None)
@@ -156,10 +157,10 @@ class Solver:
         shadow.keyframes.values, shadow.landmarks.values = poses, points
 
     def _run(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: list[int]
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, change: Change
     ) -> tuple[list[int], Array, Array]:
         assert self._isam is not None
-        started_s = time.perf_counter()
+        removed, started_s = change.removed_slots, time.perf_counter()
         try:
             keys = values.keys() if removed else []
             if any(self._isam.valueExists(key) for key in keys):
@@ -168,6 +169,9 @@ class Solver:
             slots = self._isam.update(graph, values, removed).getNewFactorsIndices()
             for _ in range(self._config.extra_iterations):
                 self._isam.update()
+            for _ in range(change.max_iterations):
+                if self._isam.update().getVariablesRelinearized() == 0:
+                    break
             return slots, *read_values(self._isam.calculateEstimate())
         except RuntimeError as error:
             raise self._failure(error) from error

@@ -141,6 +141,8 @@ class GraphUpdate:
         remove_observations: (N, 2) columns keyframe id, landmark id.
         remove_relative_poses: triples (keyframe_a, keyframe_b, kind).
         removal_policy: for what the removals, taken together, leave underconstrained.
+        max_iterations: further steps that ISAM2 may take until nothing moves any more, for a
+            change that moves much of the graph, such as a loop.
 
     Ids to remove that the graph does not hold are passed over.
     """
@@ -157,6 +159,7 @@ class GraphUpdate:
     remove_observations: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     remove_relative_poses: tuple[RelativePoseName, ...] = ()
     removal_policy: RemovalPolicy = RemovalPolicy.DROP
+    max_iterations: int = 0
 
 
 @dataclass(frozen=True)
@@ -272,3 +275,19 @@ class ObservationErrors:
     chi2: Array
     depth_m: Array
     is_stereo: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class RelativePoseErrors:
+    """How well each relative pose in the graph fits the current estimate, in insertion order.
+
+    Attributes:
+        keyframe_a, keyframe_b: (N,) int64.
+        kinds: (N,) str, as in RelativePose.
+        chi2: (N,) squared whitened errors WITHOUT any robust kernel, 6 degrees of freedom.
+    """
+
+    keyframe_a: IntArray
+    keyframe_b: IntArray
+    kinds: NDArray[np.str_]
+    chi2: Array

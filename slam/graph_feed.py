@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,26 +55,30 @@ class GraphFeed:
         self._removed_keyframes = state["removed_keyframes"].tolist()
 
     def keyframe_update(self, world: WorldMap, keyframe: Keyframe) -> GraphUpdate:
-        """The update that adds one keyframe and its landmarks, and removes what was forgotten."""
+        """The update that adds one keyframe and its landmarks, with every other change."""
         keypoints, ids = world.observed(keyframe)
         inside = world.landmarks.in_graph[ids]
         new_ids = self._promoted(world, keyframe, keypoints[~inside], ids[~inside], inside.sum())
         world.landmarks.in_graph[new_ids] = True
-        observed = self._unsent_observations(world)
-        removed = np.concatenate([np.zeros(0, np.int64), *self._removed])
-        gone = self._removed_keyframes
         begins = world.in_segment(keyframe.segment) == [keyframe]
-        self._removed, self._removed_keyframes = [], []
-        return GraphUpdate(
+        return replace(
+            self.map_update(world),
             keyframe_ids=np.array([keyframe.id]),
             poses_world_camera=keyframe.T_world_camera[None],
             landmark_ids=new_ids,
             points_world=world.landmarks.points_world[new_ids],
-            observations=observed,
             priors=(segment_prior(keyframe),) if begins else (),
-            remove_landmarks=removed,
-            remove_keyframes=np.array(gone, np.int64),
         )
+
+    def map_update(self, world: WorldMap) -> GraphUpdate:
+        """The update of what changed in the map, no keyframe being new: fused, forgotten."""
+        update = GraphUpdate(
+            observations=self._unsent_observations(world),
+            remove_landmarks=np.concatenate([np.zeros(0, np.int64), *self._removed]),
+            remove_keyframes=np.array(self._removed_keyframes, np.int64),
+        )
+        self._removed, self._removed_keyframes = [], []
+        return update
 
     def whole_update(self, world: WorldMap) -> GraphUpdate:
         """The update that fills an empty graph with the whole map, one prior a segment."""

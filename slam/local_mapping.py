@@ -59,26 +59,34 @@ def create_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> Int
 def fuse_into_neighbours(
     world: WorldMap, keyframe: Keyframe, new_ids: Ints, tracker: Tracker, config: MappingConfig
 ) -> Ints:
-    """Look for a keyframe's new landmarks in its covisible neighbours.
-
-    A free keypoint there becomes one more observation; one that has a landmark already shows a
-    duplicate, and the new landmark is fused into the old one. Returns the ids removed.
-    """
+    """Look for a keyframe's new landmarks in its covisible neighbours; returns the ids removed."""
     _, tracked = world.observed(keyframe)
     neighbours = [k for _, k in world.covisible(tracked, 15) if k is not keyframe]
+    return fuse_into(
+        world, neighbours[: config.fuse_neighbours], new_ids, tracker, config.fuse_radius_px
+    )
+
+
+def fuse_into(
+    world: WorldMap, keyframes: list[Keyframe], ids: Ints, tracker: Tracker, radius_px: float
+) -> Ints:
+    """Look for landmarks in keyframes that may show them too.
+
+    A free keypoint there becomes one more observation; one that has another landmark shows a
+    duplicate, and the younger is fused into the older. Returns the ids removed.
+    """
     removed = [np.zeros(0, np.int64)]
-    for neighbour in neighbours[: config.fuse_neighbours]:
-        living = world.landmarks.living(new_ids)
-        ids, matches = consistent_matches(world, neighbour, living, tracker, config.fuse_radius_px)
-        there = neighbour.landmark_ids[matches.train]
+    for keyframe in keyframes:
+        living = world.landmarks.living(ids)
+        visible, matches = consistent_matches(world, keyframe, living, tracker, radius_px)
+        here, there = visible[matches.query], keyframe.landmark_ids[matches.train]
         old = there >= 0
         old[old] = world.landmarks.alive[there[old]]
-        free = ~old
-        world.attach(neighbour, matches.train[free], ids[matches.query[free]])
-        duplicates = ids[matches.query[old]]
-        different = duplicates != there[old]
-        if different.any():
-            removed.append(world.replace_landmarks(duplicates[different], there[old][different]))
+        world.attach(keyframe, matches.train[~old], here[~old])
+        pairs = np.sort(np.stack([here[old], there[old]], axis=1), axis=1)
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        if len(pairs):
+            removed.append(world.replace_landmarks(pairs[:, 1], pairs[:, 0]))
     return np.concatenate(removed)
 
 

@@ -9,7 +9,8 @@ from graph.geometry import Array, inverse, orthonormalised
 from slam.features import Features
 from slam.landmarks import Ints
 from slam.local_mapping import MappingConfig, local_landmarks
-from slam.relocalisation import RelocalisationConfig, relocalise
+from slam.place_recognition import DescriptorIndex
+from slam.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from slam.results import TrackingStatus
 from slam.tracker import Tracked, Tracker
 from slam.world_map import Keyframe, WorldMap
@@ -22,12 +23,15 @@ class Localiser:
     """
 
     def __init__(
-        self, tracker: Tracker, relocalisation: RelocalisationConfig, mapping: MappingConfig
+        self,
+        tracker: Tracker,
+        places: DescriptorIndex,
+        config: tuple[RelocalisationConfig, MappingConfig],
     ):
         self.tracker = tracker
         self.lost_frames = 0
-        self._relocalisation = relocalisation
-        self._mapping = mapping
+        self._places = places
+        self._relocalisation, self._mapping = config
         self._T_world_last = np.eye(4)
         self._T_last_next = np.eye(4)
         self._recent_ids: Ints = np.zeros(0, np.int64)
@@ -77,7 +81,9 @@ class Localiser:
     ) -> Tracked | None:
         """The frame's pose against some keyframes, without a prior; None if it is not there."""
         rules = (self._relocalisation, self._mapping)
-        return relocalise(features, keyframes, world, self.tracker, rules)
+        min_votes = self._relocalisation.min_votes
+        candidates = similar_keyframes(features, keyframes, self._places, min_votes)
+        return relocalise(features, candidates, world, self.tracker, rules)
 
     def moved_on(self, T_world_tracked: Array, T_world_camera: Array, seen_ids: Ints) -> None:
         """A frame is done: T_world_tracked is its pose as tracked, T_world_camera as optimised."""

@@ -1,300 +1,260 @@
-"""Whether two keyframes really show the same place, and the pose between them if they do.
+"""From a keyframe to loops that may enter the graph: recognise, verify, wait for confirmation.
 
-Descriptors are matched without a prior and give a pose by RANSAC on 3-D to 3-D triples. There the
-points of each keyframe are searched in the other, and what both ways find refines the pose.
+One verified loop can still be wrong: rooms repeat. It waits until others, found from other
+keyframes, agree with it (pairwise consistency, Mangelson et al., ICRA 2018). What it does to the
+graph is tested once more afterwards, see ``Mapper.close_loops``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import Enum
+import logging
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import chi2
 
+from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
-from graph.geometry import Array, inverse, make_pose, orthonormalised, se3_exp, skew, transform
-from slam.features import Features
+from graph.gates import mahalanobis
+from graph.geometry import Array, inverse, se3_log
+from graph.loop_consistency import cycle_chi2
+from graph.updates import RelativePose
 from slam.landmarks import Ints, Mask
-from slam.matching import (
-    MatchConfig,
-    Matches,
-    WindowIndex,
-    consistent_rotation,
-    match_brute_force,
-    match_pairs,
-)
-from slam.pose_optimisation import CHI2_2DOF, CHI2_3DOF, jacobian, residuals
+from slam.loop_verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
+from slam.place_recognition import DescriptorIndex, IndexConfig, PlaceConfig, PlaceRecogniser
 from slam.world_map import Keyframe, WorldMap
 
-NEAREST_M = 0.1
-MAX_NOISE_SCALE = 3.0
-MEDIAN_TO_GATE = 2.366 / CHI2_3DOF  # of chi-square
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class LoopConfig:
-    """Gates of a loop.
+class LoopClosingConfig:
+    """When a loop enters the graph, and how strongly.
 
-    ``samples`` triples are drawn with ``seed``; of those whose sides are as long in both keyframes
-    the first ``hypotheses`` are tried. A match agrees if it is within ``ransac_px`` in BOTH images.
-    Guided matching looks within each of ``radii_px`` in turn. A loop needs ``min_inliers`` matches,
-    ``min_share`` of the points that the other keyframe should see, and sigmas below the limits.
-    ``max_turn_rad`` bounds how far a match may turn otherwise in the image than most.
+    A candidate's ``neighbours`` most covisible keyframes are verified with it. ``min_support``
+    loops from two keyframes must agree with each other at ``probability``; the last ``waiting``
+    ones are remembered. The map is trusted within ``drift_rad_per_m`` and ``drift_m_per_m`` of a
+    path: a loop must not ask for more drift, and only loops whose ends are within ``comparable_m``
+    of path are compared.
+
+    A loop's covariance is raised by ``model_sigma_rad`` and ``model_sigma_m``: what its inliers
+    do not know of, such as calibration; the landmarks fused after it say the rest. It stays while
+    its chi-square in the graph is below that of ``probability``. A map with a systematic error
+    (a wrong focal length) is surer of itself than it should be and would refute every loop; so
+    ``strong_support`` loops from three keyframes enter without a robust kernel and untested.
+    ``fuse_keyframes`` of the new side are searched for the old side's landmarks.
     """
 
-    seed: int = 0
-    samples: int = 6000
-    hypotheses: int = 400
-    side_tolerance: float = 0.1
-    ransac_px: float = 6.0
-    min_matches: int = 15
-    min_consensus: int = 12
-    radii_px: tuple[float, ...] = (12.0, 6.0)
-    min_inliers: int = 30
-    min_share: float = 0.1
-    max_sigma_rad: float = 0.02
-    max_sigma_m: float = 0.05
-    max_turn_rad: float = 0.5
-    first_distance: int = 110
-    first_ratio: float = 0.85
+    enabled: bool = True
+    neighbours: int = 2
+    min_support: int = 3
+    strong_support: int = 6
+    waiting: int = 30
+    probability: float = 0.999
+    comparable_m: float = 10.0
+    drift_rad_per_m: float = 0.005
+    drift_m_per_m: float = 0.02
+    model_sigma_rad: float = 0.003
+    model_sigma_m: float = 0.005
+    robust: str = "cauchy"
+    max_iterations: int = 10
+    fuse_keyframes: int = 10
+    index: IndexConfig = field(default_factory=IndexConfig)
+    places: PlaceConfig = field(default_factory=PlaceConfig)
+    verification: LoopConfig = field(default_factory=LoopConfig)
+
+    @property
+    def gate(self) -> float:
+        """Chi-square with 6 degrees of freedom at ``probability``."""
+        return float(chi2.ppf(self.probability, 6))
 
 
-@dataclass(frozen=True)
-class LoopView:
-    """What a keyframe brings to a loop.
+class LoopCloser:
+    """Knows every keyframe's descriptors, and which loops wait for confirmation."""
 
-    ``features`` are its N keypoints, ``landmark_ids`` (N,) their living landmarks, -1 for none,
-    ``points_camera`` (N, 3) these in its camera's frame, NaN also where the keypoint has no depth.
-    """
+    def __init__(self, camera: Camera, config: LoopClosingConfig):
+        self.config = config
+        self.index = DescriptorIndex(config.index)
+        self.recogniser = PlaceRecogniser(self.index, config.places)
+        self.waiting: list[LoopConstraint] = []
+        self.closed: list[tuple[int, int]] = []
+        self._camera = camera
 
-    keyframe_id: int
-    features: Features
-    points_camera: Array
-    landmark_ids: Ints
+    def state(self) -> Arrays:
+        """What was closed, what waits, and what the last query found."""
+        waiting = self.waiting
+        return {
+            "closed": np.array(self.closed, np.int64).reshape(-1, 2),
+            "ends": np.array([loop.ends for loop in waiting], np.int64).reshape(-1, 2),
+            "T_a_b": np.array([loop.T_a_b for loop in waiting]).reshape(-1, 4, 4),
+            "covariances": np.array([loop.covariance for loop in waiting]).reshape(-1, 6, 6),
+            "inliers": np.array([loop.inliers for loop in waiting], np.int64),
+            "noise_scales": np.array([loop.noise_scale for loop in waiting], float),
+            "landmark_pairs": np.concatenate(
+                [np.zeros((0, 2), np.int64), *(loop.landmark_pairs for loop in waiting)]
+            ),
+            "pairs": np.array([len(loop.landmark_pairs) for loop in waiting], np.int64),
+            **nested(recogniser=self.recogniser.state()),
+        }
 
+    def restore(self, state: Arrays, world: WorldMap) -> None:
+        """Become the closer of a state, with the keyframes of a map."""
+        self.index.restore({k.id: k.features.descriptors for k in world.keyframes.values()})
+        self.recogniser.restore(part(state, "recogniser"))
+        self.closed = [(a, b) for a, b in state["closed"].tolist()]
+        columns = (
+            state["T_a_b"],
+            state["covariances"],
+            state["inliers"].tolist(),
+            state["noise_scales"].tolist(),
+            np.split(state["landmark_pairs"], np.cumsum(state["pairs"])[:-1]),
+        )
+        ends = state["ends"].tolist()
+        self.waiting = [
+            LoopConstraint(*pair, *row)
+            for pair, row in zip(ends, zip(*columns, strict=False), strict=False)
+        ]
 
-Views = tuple[LoopView, LoopView]
-Pairs = tuple[Ints, Ints]  # keypoint a[k] goes with b[k]
-Search = tuple[float, Camera, LoopConfig]  # radius in px
+    def add(self, keyframe: Keyframe) -> None:
+        """A keyframe can be recognised from now on."""
+        self.index.add(keyframe.id, keyframe.features.descriptors)
 
+    def remove(self, keyframe_id: int) -> None:
+        """A keyframe left the map; loops that end in it are forgotten."""
+        self.index.remove(keyframe_id)
+        self.waiting = [loop for loop in self.waiting if keyframe_id not in loop.ends]
 
-class NoLoopReason(Enum):
-    """Why a candidate was refused."""
+    def loops_of(self, keyframe: Keyframe, world: WorldMap) -> list[LoopConstraint]:
+        """Loops from a new keyframe that are confirmed now, and those that they confirm."""
+        if not self.config.enabled:
+            return []
+        return self.confirm(self.propose(keyframe, world), world)
 
-    FEW_MATCHES = "too few descriptors match"
-    NO_CONSENSUS = "too few matches agree on a pose"
-    FEW_INLIERS = "too few points are found where the pose says"
-    LITTLE_SHARED = "too little is found of what should be seen"
-    UNCERTAIN = "a sigma of the pose is too large, given in units of its limit"
+    def propose(self, keyframe: Keyframe, world: WorldMap) -> list[LoopConstraint]:
+        """Verified loops that end in a keyframe, each beginning in an older one."""
 
+        def covisible(keyframe_id: int) -> list[int]:
+            _, ids = world.observed(world.keyframes[keyframe_id])
+            return [k.id for _, k in world.covisible(ids, 1) if k.id != keyframe_id]
 
-@dataclass(frozen=True)
-class NoLoop:
-    """A refusal: ``value`` is what was found, ``limit`` what would have been accepted."""
+        found: list[LoopConstraint] = []
+        excluded = self.recogniser.excluded(keyframe.id, covisible)
+        view = loop_view(keyframe, world)
+        for candidate in self.recogniser.query(
+            keyframe.id, keyframe.features.descriptors, covisible
+        ):
+            others = [k for k in covisible(candidate.keyframe_id) if k not in excluded]
+            others = others[: self.config.neighbours]
+            for other in (candidate.keyframe_id, *others):
+                if world.keyframes[other].segment != keyframe.segment:
+                    break
+                old = loop_view(world.keyframes[other], world)
+                result = verify_loop(old, view, self._camera, self.config.verification)
+                if isinstance(result, NoLoop):
+                    logger.info("no loop %d-%d: %s", other, keyframe.id, result)
+                    break
+                logger.info("loop %d-%d, %d inliers", other, keyframe.id, result.inliers)
+                found.append(result)
+        return found
 
-    reason: NoLoopReason
-    value: float
-    limit: float
+    def confirm(self, proposed: list[LoopConstraint], world: WorldMap) -> list[LoopConstraint]:
+        """The largest set that agrees, if it is large enough; the others go on waiting.
 
+        Every member is returned, so that a loop which waited enters with the one that confirms it.
+        """
+        loops = [loop for loop in proposed if self._within_drift(loop, world)]
+        if not loops:
+            return []
+        loops = [*self.waiting, *loops][-self.config.waiting :]
+        chosen = _largest_clique(self._agreement(loops, world))
+        supported = len(chosen) >= self.config.min_support
+        confirmed = [loops[k] for k in chosen] if supported else []
+        if len({loop.keyframe_b for loop in confirmed}) < 2:
+            confirmed = []
+        self.waiting = [loop for loop in loops if loop not in confirmed]
+        return confirmed
 
-@dataclass(frozen=True)
-class LoopConstraint:
-    """A measured pose between two keyframes: what graph.updates.RelativePose takes.
+    def is_strong(self, loops: list[LoopConstraint]) -> bool:
+        """Whether a confirmed set is believed against the graph."""
+        keyframes = {loop.keyframe_b for loop in loops}
+        return len(loops) >= self.config.strong_support and len(keyframes) >= 3
 
-    Attributes:
-        T_a_b: (4, 4), ``p_a = T_a_b @ p_b``.
-        covariance: (6, 6) of the tangent [rotation rad, translation m] at b (right side).
-        inliers: number of matches that it rests on.
-        noise_scale: residuals over their sigmas, at least 1; it has raised the covariance.
-        landmark_pairs: (P, 2) ids of landmarks, of a and of b, that are one and the same.
-    """
+    def relative_poses(self, loops: list[LoopConstraint]) -> tuple[RelativePose, ...]:
+        """What enters the graph for a confirmed set."""
+        robust = None if self.is_strong(loops) else self.config.robust
+        model = self._map_covariances(np.array(0.0))
+        return tuple(
+            RelativePose(*k.ends, k.T_a_b, k.covariance + model, robust, "loop") for k in loops
+        )
 
-    keyframe_a: int
-    keyframe_b: int
-    T_a_b: Array
-    covariance: Array
-    inliers: int
-    noise_scale: float
-    landmark_pairs: Ints
+    def _within_drift(self, loop: LoopConstraint, world: WorldMap) -> bool:
+        """Whether the map can have drifted as far as a loop says."""
+        a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
+        ids, travelled_m = _travelled(world)
+        row_a, row_b = np.searchsorted(ids, loop.ends)
+        S = loop.covariance + self._map_covariances(travelled_m[row_b] - travelled_m[row_a])
+        r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
+        fits = bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
+        if not fits:
+            logger.info("loop %d-%d asks for too much drift", *loop.ends)
+        return fits
 
+    def _agreement(self, loops: list[LoopConstraint], world: WorldMap) -> Mask:
+        """(N, N) whether loops agree; False where the map cannot say."""
+        first, second = np.triu_indices(len(loops), 1)
+        a, b = (np.array([getattr(k, f"keyframe_{end}") for k in loops]) for end in "ab")
+        poses = np.array([k.T_world_camera for k in world.keyframes.values()])
+        ids, travelled_m = _travelled(world)
+        row_a, row_b = np.searchsorted(ids, a), np.searchsorted(ids, b)
+        lengths = np.stack(
+            [np.abs(travelled_m[k[first]] - travelled_m[k[second]]) for k in (row_a, row_b)]
+        )
+        chi_square = cycle_chi2(
+            np.array([loop.T_a_b for loop in loops]),
+            np.array([loop.covariance for loop in loops]),
+            (poses[row_a], poses[row_b]),
+            (first, second),
+            self._map_covariances(lengths),
+        )
+        fine = (lengths < self.config.comparable_m).all(axis=0) & (chi_square < self.config.gate)
+        agree = np.zeros((len(loops), len(loops)), bool)
+        agree[first, second] = agree[second, first] = fine
+        return agree
 
-def loop_view(keyframe: Keyframe, world: WorldMap) -> LoopView:
-    """A keyframe with the landmarks that it observes, as they are now."""
-    points = np.full((len(keyframe.features), 3), np.nan)
-    living = np.full(len(keyframe.features), -1, np.int64)
-    rows, ids = world.observed(keyframe)
-    living[rows] = ids
-    points[rows] = transform(inverse(keyframe.T_world_camera), world.landmarks.points_world[ids])
-    points[~np.isfinite(keyframe.features.disparity_px) | ~(points[:, 2] > NEAREST_M)] = np.nan
-    return LoopView(keyframe.id, keyframe.features, points, living)
+    def _map_covariances(self, lengths_m: Array) -> Array:
+        """Covariances (..., 6, 6) of the map's relative pose over a path of these lengths.
 
-
-def verify_loop(
-    view_a: LoopView, view_b: LoopView, camera: Camera, config: LoopConfig | None = None
-) -> LoopConstraint | NoLoop:
-    """The pose of keyframe b in keyframe a from what they see alone; no prior pose is used."""
-    config = config or LoopConfig()
-    views = (view_a, view_b)
-    matches = _descriptor_matches(views, config)
-    if len(matches) < config.min_matches:
-        return NoLoop(NoLoopReason.FEW_MATCHES, len(matches), config.min_matches)
-    T_a_b, agreeing = _consensus(views, matches, (config.ransac_px, camera, config))
-    if agreeing < config.min_consensus:
-        return NoLoop(NoLoopReason.NO_CONSENSUS, agreeing, config.min_consensus)
-    for radius_px in config.radii_px:
-        a, b, expected = _guided_pairs(views, T_a_b, (radius_px, camera, config))
-        if (found := len(a)) >= config.min_inliers:
-            T_a_b, covariance, inliers, scale = _refine(views, (a, b), T_a_b, camera)
-            found = int(inliers.sum())
-        if found < config.min_inliers:
-            return NoLoop(NoLoopReason.FEW_INLIERS, found, config.min_inliers)
-    if found < config.min_share * expected:
-        return NoLoop(NoLoopReason.LITTLE_SHARED, found / expected, config.min_share)
-    limits = np.repeat([config.max_sigma_rad, config.max_sigma_m], 3)
-    worst = (np.sqrt(np.diagonal(covariance)) / limits).max()
-    if not worst <= 1.0:
-        return NoLoop(NoLoopReason.UNCERTAIN, worst, 1.0)
-    ids = np.stack([view_a.landmark_ids[a], view_b.landmark_ids[b]], axis=1)[inliers]
-    ids = np.unique(ids[(ids >= 0).all(axis=1) & (ids[:, 0] != ids[:, 1])], axis=0)
-    result = (T_a_b, covariance, found, scale, ids)
-    return LoopConstraint(view_a.keyframe_id, view_b.keyframe_id, *result)
-
-
-def align_triples(points_a: Array, points_b: Array) -> Array:
-    """T_a_b (..., 4, 4) with least squares of ``p_a - T_a_b @ p_b`` over points (..., N, 3).
-
-    Umeyama (1991) eq. (39)-(42) without scale, by batched SVD; N >= 3 and not on a line.
-    """
-    mean_a, mean_b = points_a.mean(axis=-2), points_b.mean(axis=-2)
-    centred_a, centred_b = points_a - mean_a[..., None, :], points_b - mean_b[..., None, :]
-    U, _, Vt = np.linalg.svd(np.swapaxes(centred_a, -1, -2) @ centred_b)
-    U[..., :, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[..., None]  # no reflection
-    R_a_b = U @ Vt
-    return make_pose(R_a_b, mean_a - (R_a_b @ mean_b[..., None])[..., 0])
-
-
-def _descriptor_matches(views: Views, config: LoopConfig) -> Matches:
-    """Keypoints of a (query) and b (train), both with points, of like descriptors and turn."""
-    rows_a, rows_b = (np.flatnonzero(np.isfinite(v.points_camera[:, 2])) for v in views)
-    a, b = (view.features for view in views)
-    first = MatchConfig(config.first_distance, config.first_ratio)
-    found = match_brute_force(a.descriptors[rows_a], b.descriptors[rows_b], first)
-    matches = Matches(rows_a[found.query], rows_b[found.train], found.distance)
-    turn_rad = a.angles_rad[matches.query] - b.angles_rad[matches.train]
-    return consistent_rotation(matches, turn_rad, config.max_turn_rad)
-
-
-def _consensus(views: Views, matches: Matches, search: Search) -> tuple[Array, int]:
-    """The T_a_b that most matches agree with, fitted to these, and their number."""
-    (limit_px, camera, config), rows = search, (matches.query, matches.train)
-    points_a, points_b = (v.points_camera[k] for v, k in zip(views, rows, strict=True))
-    pixels = tuple(v.features.pixels[k] for v, k in zip(views, rows, strict=True))
-    triples = np.random.default_rng(config.seed).integers(0, len(points_a), (config.samples, 3))
-    corners_a, corners_b = points_a[triples], points_b[triples]
-    sides = [np.linalg.norm(c - np.roll(c, 1, axis=1), axis=2) for c in (corners_a, corners_b)]
-    alike = np.abs(sides[0] - sides[1]) < config.side_tolerance * np.minimum(*sides)
-    chosen = np.flatnonzero(alike.all(axis=1))[: config.hypotheses]  # equal indices: a side of 0
-    if len(chosen) == 0:
-        return np.eye(4), 0
-    hypotheses = align_triples(corners_a[chosen], corners_b[chosen])
-    votes = _near(hypotheses, points_b, pixels[0], camera, limit_px)
-    votes &= _near(inverse(hypotheses), points_a, pixels[1], camera, limit_px)
-    inliers = votes[votes.sum(axis=1).argmax()]
-    T_a_b = align_triples(points_a[inliers], points_b[inliers]) if inliers.sum() > 2 else np.eye(4)
-    return T_a_b, int(inliers.sum())
-
-
-def _near(T_x_y: Array, points_y: Array, pixels_x: Array, camera: Camera, px: float) -> Mask:
-    """(..., N) whether points (N, 3) of y come to lie near pixels (N, 2) of x."""
-    points_x = transform(T_x_y, points_y)
-    front = points_x[..., 2] > NEAREST_M
-    points_x[..., 2] = np.where(front, points_x[..., 2], 1.0)
-    return front & (np.linalg.norm(camera.project(points_x) - pixels_x, axis=-1) < px)
-
-
-def _guided_pairs(views: Views, T_a_b: Array, search: Search) -> tuple[Ints, Ints, int]:
-    """Keypoints that match near the pose, neither way in conflict, and how many could have."""
-    query_a, train_b, seen_in_b = _guided(views, inverse(T_a_b), search)
-    query_b, train_a, seen_in_a = _guided(views[::-1], T_a_b, search)
-    pairs = np.unique(np.c_[np.r_[query_a, train_a], np.r_[train_b, query_b]], axis=0)
-    once_a = np.bincount(pairs[:, 0], minlength=1)[pairs[:, 0]] == 1
-    once_b = np.bincount(pairs[:, 1], minlength=1)[pairs[:, 1]] == 1
-    a, b = pairs[once_a & once_b].T
-    return a, b, max(min(seen_in_a, seen_in_b), 1)
-
-
-def _guided(views: Views, T_target_source: Array, search: Search) -> tuple[Ints, Ints, int]:
-    """Keypoints (source, target) that match within a radius, and how many points are in view."""
-    (source, target), (radius_px, camera, _) = views, search
-    rows = np.flatnonzero(np.isfinite(source.points_camera[:, 2]))
-    points = transform(T_target_source, source.points_camera[rows])
-    rows, points = rows[points[:, 2] > NEAREST_M], points[points[:, 2] > NEAREST_M]
-    pixels = camera.project(points)
-    inside = ((pixels > 0) & (pixels < [camera.width - 1, camera.height - 1])).all(axis=1)
-    rows, pixels = rows[inside], pixels[inside]
-    query, train = WindowIndex(target.features.pixels).pairs(pixels, np.full(len(rows), radius_px))
-    tables = (source.features.descriptors[rows], target.features.descriptors)
-    found = match_pairs((query, train), tables, MatchConfig())
-    return rows[found.query], found.train, len(rows)
+        A turn that grows along a path displaces its end by half of it times the length.
+        """
+        rules = self.config
+        sigmas = np.stack(
+            [
+                rules.model_sigma_rad + rules.drift_rad_per_m * lengths_m,
+                rules.model_sigma_m
+                + (rules.drift_m_per_m + rules.drift_rad_per_m * lengths_m / 2) * lengths_m,
+            ],
+            axis=-1,
+        )
+        return np.repeat(sigmas**2, 3, axis=-1)[..., None] * np.eye(6)
 
 
-def _refine(
-    views: Views, pairs: Pairs, T_a_b: Array, camera: Camera
-) -> tuple[Array, Array, Mask, float]:
-    """T_a_b on pairs, its covariance, which pairs are inliers, and the noise scale.
-
-    Gauss-Newton with Cauchy's kernel on all pairs, then on inliers alone. A pair with points on
-    both sides enters each way with half the weight, since it is one piece of information.
-    """
-    scale, active = 1.0, np.ones(len(pairs[0]), bool)
-    for kernel in (16.0, 4.0, 1.0, None, None, None, None):
-        r, J, W, gate = _linearised(views, pairs, T_a_b, camera)
-        chi2 = np.einsum("wni,wnij,wnj->n", r, W, r)
-        if kernel is None or kernel == 1.0:
-            asked = np.sqrt(np.median(chi2 / gate) / MEDIAN_TO_GATE)
-            scale = float(np.clip(asked, 1.0, MAX_NOISE_SCALE))
-        active = chi2 < gate * scale**2
-        w = active if kernel is None else 1 / (1 + chi2 / (kernel * gate))
-        H = np.einsum("n,wnia,wnij,wnjb->ab", w, J, W, J)
-        g = np.einsum("n,wnia,wnij,wnj->a", w, J, W, r)
-        T_a_b = orthonormalised(T_a_b @ se3_exp(-np.linalg.solve(H + 1e-9 * np.eye(6), g)))
-    return T_a_b, np.linalg.inv(H + 1e-9 * np.eye(6)) * scale**2, active, scale
+def _travelled(world: WorldMap) -> tuple[Ints, Array]:
+    """Ids (K,) of all keyframes, ascending, and metres (K,) of path up to each."""
+    ids = np.fromiter(world.keyframes, np.int64)
+    centres = np.array([k.T_world_camera[:3, 3] for k in world.keyframes.values()])
+    steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
+    return ids, np.cumsum(steps)
 
 
-def _linearised(views: Views, pairs: Pairs, T_a_b: Array, camera: Camera) -> tuple[Array, ...]:
-    """Residuals (2, M, 3), Jacobians (2, M, 3, 6), weights (2, M, 3, 3), gates (M,), for two ways.
-
-    Way 0 is a's points in b, way 1 b's points in a. For ``T_a_b <- T_a_b @ se3_exp(xi)`` the
-    inverse becomes ``T_b_a @ se3_exp(-Ad(T_a_b) @ xi)``. Without a point the weight is zero.
-    """
-    r_b, J_b, W_b = _way(views, pairs, T_a_b, camera)
-    r_a, J_a, W_a = _way(views[::-1], pairs[::-1], inverse(T_a_b), camera)
-    R_a_b, adjoint = T_a_b[:3, :3], np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = R_a_b
-    adjoint[3:, :3] = skew(T_a_b[:3, 3]) @ R_a_b
-    W = np.stack([W_b, W_a])
-    has_point, has_depth = W[:, :, 0, 0] > 0, W[:, :, 2, 2] > 1e-9
-    W /= has_point.sum(axis=0)[:, None, None]
-    gate = np.where(has_depth.any(axis=0), CHI2_3DOF, CHI2_2DOF)
-    return np.stack([r_b, r_a]), np.stack([J_b, -J_a @ adjoint]), W, gate
-
-
-def _way(views: Views, pairs: Pairs, T_source_target: Array, camera: Camera) -> tuple[Array, ...]:
-    """Residuals, Jacobians and weights of the source's points in the target's image.
-
-    A point is taken to be as uncertain as its own keyframe's measurement of it alone.
-    """
-    source, target = views
-    own, measured = source.points_camera[pairs[0]], target.features.measurements[pairs[1]]
-    known, stereo = np.isfinite(own[:, 2]), np.isfinite(measured[:, 2])
-    own, measured = np.where(known[:, None], own, [0, 0, 1]), np.nan_to_num(measured)
-    r, points = residuals(T_source_target, own, measured, camera)
-    J = jacobian(points, camera)
-    to_pixels = -J[:, :, 3:] @ T_source_target[:3, :3].T  # d(u, v, disparity) / d(own)
-    spread = to_pixels @ np.linalg.inv(-jacobian(own, camera)[:, :, 3:])
-    own_sigmas = np.where(known[:, None], source.features.sigmas_px[pairs[0]], 1.0)
-    sigmas = target.features.sigmas_px[pairs[1]].copy()
-    sigmas[~stereo, 2] = 1e6  # without depth, no weight
-    S = (spread * own_sigmas[:, None] ** 2) @ np.swapaxes(spread, 1, 2)
-    W = np.linalg.inv(S + sigmas[:, None] ** 2 * np.eye(3))
-    return r, J, W * known[:, None, None]
+def _largest_clique(agree: Mask) -> Ints:
+    """Indices of a largest set of which all agree, found greedily from each member."""
+    best: list[int] = []
+    order = np.argsort(-agree.sum(axis=1), kind="stable").tolist()
+    for start in order:
+        clique = [start]
+        for k in order:
+            if agree[k, clique].all():
+                clique.append(k)
+        if len(clique) > len(best):
+            best = clique
+    return np.sort(np.array(best, np.int64))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,10 +24,14 @@ from slam.local_mapping import (
     MappingConfig,
     create_landmarks,
     cull_landmarks,
+    fuse_into,
     fuse_into_neighbours,
+    local_landmarks,
     redundant_keyframe,
 )
 from slam.map_state import world_of, world_state
+from slam.loop_closing import LoopCloser, LoopClosingConfig
+from slam.loop_verification import LoopConstraint
 from slam.segments import join_segment
 from slam.tracker import Tracked, Tracker
 from slam.triangulation import triangulate_landmarks
@@ -42,12 +47,13 @@ class Mapper:
         self,
         camera: Camera,
         tracker: Tracker,
-        config: tuple[MappingConfig, GraphFeedConfig, SmootherConfig],
+        config: tuple[MappingConfig, GraphFeedConfig, SmootherConfig, LoopClosingConfig],
     ):
         self.camera = camera
         self.world = WorldMap()
         self.history = FrameHistory()
         self.smoother = Smoother(camera, config[2])
+        self.loops = LoopCloser(camera, config[3])
         self.update_ms: list[float] = []
         self._tracker = tracker
         self._mapping, self._graph_config = config[0], config[2]
@@ -62,6 +68,7 @@ class Mapper:
                 history=self.history.state(),
                 graph=self.smoother.state(),
                 feed=self._feed.state(),
+                loops=self.loops.state(),
             ),
         }
 
@@ -72,10 +79,12 @@ class Mapper:
         self.history.restore(part(state, "history"))
         self.smoother.restore(part(state, "graph"), path)
         self._feed.restore(part(state, "feed"))
+        self.loops.restore(part(state, "loops"), self.world)
 
     def restart(self) -> None:
         """Build anew, from now on, what a state cannot hold: go on like one that was restored."""
         self.smoother.restart()
+        self.loops.index.rebuild()
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Make a tracked frame a keyframe: landmarks are made, fused and culled."""
@@ -98,12 +107,39 @@ class Mapper:
         keyframe.features = without_image(keyframe.features)
         self._feed.forget_landmarks(fused)
         self._feed.forget_landmarks(cull_landmarks(world, local_ids, self._mapping))
+        self.loops.add(keyframe)
         return keyframe
 
     def optimise(self, keyframe: Keyframe) -> None:
         """Put a keyframe into the graph, read all poses and points back, cull a redundant one."""
         self._apply(self.smoother.update(self._feed.keyframe_update(self.world, keyframe)))
         self._cull_keyframe(keyframe)
+
+    def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
+        """Look for known places from a keyframe; loops that hold move the map and fuse landmarks.
+
+        The graph is asked afterwards: a loop that does not fit is removed, an older one too, and
+        waits for more support.
+        """
+        confirmed = self.loops.loops_of(keyframe, self.world)
+        if not confirmed:
+            return []
+        self._change_graph(relative_poses=self.loops.relative_poses(confirmed))
+        errors = self.smoother.relative_pose_errors("loop")
+        ends = np.stack([errors.keyframe_a, errors.keyframe_b], axis=1)
+        refuted = {(a, b) for a, b in ends[errors.chi2 > self.loops.config.gate].tolist()}
+        if self.loops.is_strong(confirmed):
+            refuted -= {loop.ends for loop in confirmed}
+        if refuted:
+            logger.info("loops refuted by the graph: %s", sorted(refuted))
+            gone = tuple((a, b, "loop") for a, b in sorted(refuted))
+            self._change_graph(remove_relative_poses=gone)
+        kept = [loop for loop in confirmed if loop.ends not in refuted]
+        self.loops.waiting += [loop for loop in confirmed if loop.ends in refuted]
+        if kept:
+            self._fuse(kept)
+            self.loops.closed += [loop.ends for loop in kept]
+        return kept
 
     def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
         """A frame of one segment was recognised in another: move the segment there, as one map.
@@ -127,6 +163,37 @@ class Mapper:
             logger.warning("graph rebuilt after a failure at %s", estimate.failed_variable)
         read_back(self.world, estimate)
 
+    def _change_graph(self, **changes: Any) -> None:
+        """An update that moves much of the graph: ISAM2 goes on until nothing moves any more."""
+        rounds = self.loops.config.max_iterations
+        update = replace(self._feed.map_update(self.world), max_iterations=rounds, **changes)
+        self._apply(self.smoother.update(update))
+
+    def _fuse(self, loops: list[LoopConstraint]) -> None:
+        """Landmarks of both sides of loops that are one become one: first the loops' own pairs."""
+        world = self.world
+        old_ids, new_side = self._sides(loops)
+        for loop in loops:
+            pairs = np.sort(loop.landmark_pairs, axis=1)
+            pairs = pairs[world.landmarks.alive[pairs].all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
+            self._feed.forget_landmarks(world.replace_landmarks(pairs[:, 1], pairs[:, 0]))
+        self._feed.forget_landmarks(
+            fuse_into(world, new_side, old_ids, self._tracker, self._mapping.fuse_radius_px)
+        )
+        self._change_graph()
+
+    def _sides(self, loops: list[LoopConstraint]) -> tuple[Ints, list[Keyframe]]:
+        """Landmarks around the loops' older ends, and the keyframes around their newer ends."""
+        world, count = self.world, self.loops.config.fuse_keyframes
+        old_ids, new_side = [], {}
+        for loop in loops:
+            _, seen = world.observed(world.keyframes[loop.keyframe_a])
+            old_ids.append(local_landmarks(world, seen, self._mapping))
+            _, seen = world.observed(world.keyframes[loop.keyframe_b])
+            near = world.covisible(seen, self._mapping.local_min_shared)[:count]
+            new_side.update({k.id: k for _, k in near})
+        return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
+
     def _cull_keyframe(self, newest: Keyframe) -> None:
         _, seen = self.world.observed(newest)
         strong = self.world.covisible(seen, 15)
@@ -140,6 +207,7 @@ class Mapper:
         self.history.hand_over(redundant.id, heir.id, T_heir_keyframe)
         self.world.remove_keyframe(redundant, heir)
         self._feed.forget_keyframe(redundant.id)
+        self.loops.remove(redundant.id)
 
 
 def without_image(features: Features) -> Features:

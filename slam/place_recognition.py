@@ -3,7 +3,7 @@
 An inverted index over all keyframes' BRISK descriptors answers a query in milliseconds. One
 query proves little, so candidates are grouped by covisibility, and a group must return in
 consecutive queries (as in ORB-SLAM, Mur-Artal 2015, VII.A). What is left is a candidate, not a
-loop: that is for slam/loop_closing.py to say.
+loop: that is for slam/loop_verification.py to say.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from graph.array_file import Arrays
 from graph.geometry import Array
 from slam.matching import Bits, Ints
 
@@ -120,7 +121,12 @@ class DescriptorIndex:
         self._descriptors[keyframe_id] = descriptors
         self._append(keyframe_id, descriptors)
         if not self._partitioned and self._rows >= ROWS_PER_LIST * self.config.lists:
-            self._rebuild()
+            self.rebuild()
+
+    def restore(self, descriptors: dict[int, Bits]) -> None:
+        """Hold these keyframes, (N, 8) descriptors by id, and no others."""
+        self._descriptors = dict(descriptors)
+        self.rebuild()
 
     def remove(self, keyframe_id: int) -> None:
         """Forget a keyframe; one that is not held is no error."""
@@ -129,7 +135,7 @@ class DescriptorIndex:
             return
         self._dead += len(descriptors)
         if 2 * self._dead > self._rows:
-            self._rebuild()
+            self.rebuild()
 
     def votes(self, descriptors: Bits, excluded: Collection[int] = ()) -> Votes:
         """Votes of descriptors (N, 8) for the keyframes held, but for the excluded ones."""
@@ -184,8 +190,8 @@ class DescriptorIndex:
         self._starts: list[int] = []  # first row of each block of rows
         self._owners: list[int] = []  # and the keyframe whose block it is
 
-    def _rebuild(self) -> None:
-        """Anew from the keyframes held, partitioned if there are enough descriptors.
+    def rebuild(self) -> None:
+        """Build the index anew from the keyframes held, partitioned if there are enough descriptors.
 
         The lists' centres are descriptors evenly picked from all: measured against k-means they
         find the same share of neighbours, and need no training.
@@ -213,6 +219,23 @@ class PlaceRecogniser:
         self.config = config or PlaceConfig()
         self._previous: list[tuple[frozenset[int], int]] = []
 
+    def state(self) -> Arrays:
+        """The groups that the last query found."""
+        groups = [sorted(group) for group, _ in self._previous]
+        return {
+            "members": np.array([k for group in groups for k in group], np.int64),
+            "sizes": np.array([len(group) for group in groups], np.int64),
+            "queries": np.array([queries for _, queries in self._previous], np.int64),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the recogniser of a state; the index is not part of it."""
+        groups = np.split(state["members"], np.cumsum(state["sizes"])[:-1])
+        self._previous = [
+            (frozenset(group.tolist()), queries)
+            for group, queries in zip(groups, state["queries"].tolist(), strict=False)
+        ]
+
     def query(
         self, keyframe_id: int, descriptors: Bits, covisible: Neighbours
     ) -> list[PlaceCandidate]:
@@ -220,9 +243,8 @@ class PlaceRecogniser:
 
         ``covisible`` gives the ids of the keyframes that share landmarks with one.
         """
-        recent = self.index.keyframe_ids[-self.config.recent :] if self.config.recent else []
-        excluded = {keyframe_id, *recent, *covisible(keyframe_id)}
-        groups = self._groups(self.index.votes(descriptors, excluded), covisible)
+        votes = self.index.votes(descriptors, self.excluded(keyframe_id, covisible))
+        groups = self._groups(votes, covisible)
         found = [
             (group, PlaceCandidate(best, votes, total, self._repeats(group) + 1))
             for group, best, votes, total in groups
@@ -231,6 +253,11 @@ class PlaceRecogniser:
         needed = self.config.consistent_queries
         consistent = [candidate for _, candidate in found if candidate.queries >= needed]
         return consistent[: self.config.candidates]
+
+    def excluded(self, keyframe_id: int, covisible: Neighbours) -> set[int]:
+        """The keyframes that are no candidates for this one's place: known to be near anyhow."""
+        recent = self.index.keyframe_ids[-self.config.recent :] if self.config.recent else []
+        return {keyframe_id, *recent, *covisible(keyframe_id)}
 
     def _groups(
         self, votes: Votes, covisible: Neighbours

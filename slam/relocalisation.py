@@ -11,6 +11,7 @@ from graph.geometry import Array, make_pose
 from slam.features import Features
 from slam.local_mapping import MappingConfig, local_landmarks
 from slam.matching import MatchConfig, WindowIndex, consistent_rotation, match_brute_force
+from slam.place_recognition import DescriptorIndex
 from slam.results import TrackingStatus
 from slam.tracker import Tracked, Tracker
 from slam.world_map import Keyframe, WorldMap
@@ -18,14 +19,14 @@ from slam.world_map import Keyframe, WorldMap
 
 @dataclass(frozen=True)
 class RelocalisationConfig:
-    """``candidates`` keyframes with the most votes are tried; a pose needs ``min_inliers``.
+    """``candidates`` keyframes with the most votes, at least ``min_votes``, are tried.
 
-    Every frame casts votes with ``query_keypoints`` of its descriptors. After ``patience_frames``
+    A pose needs ``min_inliers``. After ``patience_frames``
     lost frames a new map segment is begun, if the frame has ``min_new_points`` with depth.
     """
 
-    query_keypoints: int = 200
     candidates: int = 4
+    min_votes: float = 2.0
     min_matches: int = 15
     min_inliers: int = 30
     reprojection_px: float = 4.0
@@ -38,18 +39,18 @@ class RelocalisationConfig:
 
 def relocalise(
     features: Features,
-    keyframes: list[Keyframe],
+    candidates: list[Keyframe],
     world: WorldMap,
     tracker: Tracker,
     config: tuple[RelocalisationConfig, MappingConfig],
 ) -> Tracked | None:
-    """The frame against the most similar of some keyframes, or None if none of them fits.
+    """The frame against the first of some keyframes that fits, or None if none does.
 
     Descriptors are matched without a prior, the pose is found by P3P in RANSAC (OpenCV, whose
     random numbers are seeded, so that runs repeat), then refined on that keyframe's local map.
     """
     rules, mapping = config
-    for keyframe in similar_keyframes(features, keyframes, rules):
+    for keyframe in candidates[: rules.candidates]:
         T_world_camera = _pose_from(keyframe, features, world, tracker, rules)
         if T_world_camera is None:
             continue
@@ -64,14 +65,12 @@ def relocalise(
 
 
 def similar_keyframes(
-    features: Features, keyframes: list[Keyframe], config: RelocalisationConfig
+    features: Features, keyframes: list[Keyframe], places: DescriptorIndex, min_votes: float
 ) -> list[Keyframe]:
-    """The keyframes that most of a frame's descriptors find a near, unambiguous partner in."""
-    step = max(len(features) // config.query_keypoints, 1)
-    query = np.ascontiguousarray(features.descriptors[::step])
-    votes = [len(match_brute_force(query, k.features.descriptors, config.match)) for k in keyframes]
-    order = np.argsort(-np.array(votes, dtype=int), kind="stable")[: config.candidates]
-    return [keyframes[i] for i in order if votes[i] >= config.min_matches // 3]
+    """Those of some keyframes that a frame's descriptors vote for, most votes first."""
+    wanted = {keyframe.id: keyframe for keyframe in keyframes}
+    votes = places.votes(features.descriptors, set(places.keyframe_ids) - wanted.keys())
+    return [wanted[k] for k in votes.keyframe_ids[votes.scores >= min_votes].tolist()]
 
 
 def _pose_from(

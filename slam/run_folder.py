@@ -35,7 +35,7 @@ from graph.errors import InputError
 from graph.trajectory import Trajectory, write_tum
 from slam.results import FrameResult
 
-STAGES = ("features", "tracking", "keyframe", "graph")
+STAGES = ("features", "tracking", "keyframe", "graph", "loops")
 FILES = (
     "config.yaml",
     "trajectory.txt",

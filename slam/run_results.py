@@ -66,6 +66,7 @@ def measure(system: System, reference: Trajectory | None, tally: Tally, stride: 
     rows.append(_row("frames_per_second", len(tally.tracking_ms) / tally.wall_s, "Hz"))
     rows.append(_row("keyframes", int(statistics["keyframes"]), "keyframes"))
     rows.append(_row("landmarks", int(statistics["landmarks"]), "landmarks"))
+    rows.append(_row("loops_closed", int(statistics["loops_closed"]), "loops"))
     rows += _percentiles("isam2_update_ms", statistics["isam2_update_ms"])
     rows.append(_row("peak_rss_mb", peak_rss_mb(), "MB"))
     return rows

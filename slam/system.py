@@ -22,6 +22,7 @@ from slam.graph_feed import GraphFeedConfig
 from slam.keyframes import KeyframeConfig, KeyframeEvidence, keyframe_reason
 from slam.local_mapping import MappingConfig
 from slam.localiser import Localiser
+from slam.loop_closing import LoopClosingConfig
 from slam.mapper import Mapper
 from slam.relocalisation import RelocalisationConfig
 from slam.results import FrameResult, TrackingStatus
@@ -43,6 +44,7 @@ class SystemConfig:
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     feed: GraphFeedConfig = field(default_factory=GraphFeedConfig)
     graph: SmootherConfig = field(default_factory=SmootherConfig)
+    loops: LoopClosingConfig = field(default_factory=LoopClosingConfig)
     final_adjustment: bool = True
 
 
@@ -64,8 +66,10 @@ class SlamSystem:
         self.config = config = config or SystemConfig()
         self.extractor = BriskExtractor(camera, config.features)
         tracker = Tracker(camera, config.tracking)
-        self.localiser = Localiser(tracker, config.relocalisation, config.mapping)
-        self.mapper = Mapper(camera, tracker, (config.mapping, config.feed, config.graph))
+        rules = (config.mapping, config.feed, config.graph, config.loops)
+        self.mapper = Mapper(camera, tracker, rules)
+        places = self.mapper.loops.index
+        self.localiser = Localiser(tracker, places, (config.relocalisation, config.mapping))
         self._segment = 0
         self._reference: Keyframe | None = None
         self._frames_since_keyframe = 0
@@ -112,6 +116,9 @@ class SlamSystem:
         with clock.stage("graph"):
             if keyframe:
                 self.mapper.optimise(keyframe)
+        with clock.stage("loops"):
+            if keyframe:
+                self.mapper.close_loops(keyframe)
                 self._refer_to(keyframe)
         return FrameResult(
             index=frame.index,
@@ -166,6 +173,7 @@ class SlamSystem:
         return {
             "keyframes": len(self.mapper.world.keyframes),
             "landmarks": int(self.mapper.world.landmarks.alive.sum()),
+            "loops_closed": len(self.mapper.loops.closed),
             "isam2_update_ms": list(self.mapper.update_ms),
         }
 

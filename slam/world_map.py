@@ -137,6 +137,9 @@ class WorldMap:
         remap = np.arange(len(self.landmarks) + 1)
         remap[-1] = -1
         remap[old_ids] = new_ids
+        while (remap[remap] != remap).any():  # a chain of duplicates ends in one landmark
+            remap = remap[remap]
+        new_ids = remap[old_ids]
         involved = np.zeros(len(self.landmarks) + 1, bool)
         involved[old_ids] = True
         for keyframe in self.keyframes.values():

@@ -112,7 +112,12 @@ class FakeSystem:
         folder.write_bytes(b"graph and values")
 
     def statistics(self) -> dict[str, float | list[float]]:
-        return {"keyframes": 4, "landmarks": 2, "isam2_update_ms": [1.0, 2.0, 9.0]}
+        return {
+            "keyframes": 4,
+            "landmarks": 2,
+            "loops_closed": 1,
+            "isam2_update_ms": [1.0, 2.0, 9.0],
+        }
 
 
 def signal_at(frame: int, number: signal.Signals) -> Callable[[int], None]:

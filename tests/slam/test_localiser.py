@@ -9,6 +9,7 @@ from graph.geometry import Array, se3_exp
 from slam.features import Features
 from slam.local_mapping import MappingConfig
 from slam.localiser import Localiser
+from slam.place_recognition import DescriptorIndex
 from slam.relocalisation import RelocalisationConfig
 from slam.results import TrackingStatus
 from slam.tracker import Tracked, lost, untracked
@@ -34,7 +35,7 @@ def scene() -> tuple[Localiser, RecordingTracker, WorldMap, Features]:
     features = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
     world, tracker = WorldMap(), RecordingTracker()
     add_keyframe(world, np.eye(4), features)
-    localiser = Localiser(tracker, RelocalisationConfig(), MappingConfig())  # type: ignore[arg-type]
+    localiser = Localiser(tracker, DescriptorIndex(), (RelocalisationConfig(), MappingConfig()))  # type: ignore[arg-type]
     return localiser, tracker, world, features
 
 

@@ -9,6 +9,7 @@ from synthetic_view import CAMERA, render_plane
 from graph.geometry import Array, inverse, se3_exp, se3_log
 from slam.features import BriskExtractor, FeatureConfig
 from slam.local_mapping import MappingConfig, create_landmarks
+from slam.place_recognition import DescriptorIndex
 from slam.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from slam.tracker import Tracked, Tracker, TrackingConfig
 from slam.world_map import Keyframe, WorldMap
@@ -37,9 +38,17 @@ def world() -> WorldMap:
     return world
 
 
+def places(world: WorldMap) -> DescriptorIndex:
+    index = DescriptorIndex()
+    for keyframe in world.keyframes.values():
+        index.add(keyframe.id, keyframe.features.descriptors)
+    return index
+
+
 def find(world: WorldMap, T_world_camera: Array) -> Tracked | None:
     features = EXTRACTOR.extract(render_plane(T_world_camera))
-    return relocalise(features, list(world.keyframes.values()), world, TRACKER, RULES)
+    candidates = similar_keyframes(features, list(world.keyframes.values()), places(world), 2.0)
+    return relocalise(features, candidates, world, TRACKER, RULES)
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, 0.5])
@@ -61,4 +70,4 @@ def test_an_unknown_place_is_not_found(world: WorldMap) -> None:
 def test_the_most_similar_keyframe_comes_first(world: WorldMap) -> None:
     features = EXTRACTOR.extract(render_plane(at(1.0)))
     keyframes = list(world.keyframes.values())
-    assert similar_keyframes(features, keyframes, RULES[0])[0].id == 1
+    assert similar_keyframes(features, keyframes, places(world), 2.0)[0].id == 1

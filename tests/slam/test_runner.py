@@ -39,6 +39,7 @@ METRICS = [
     "frames_per_second",
     "keyframes",
     "landmarks",
+    "loops_closed",
     "isam2_update_ms_median",
     "isam2_update_ms_p95",
     "peak_rss_mb",

@@ -21,6 +21,7 @@ from graph.updates import GraphUpdate, RelativePose
 from slam.configuration import resolve
 from slam.frame import Frame
 from slam.landmarks import LandmarkTable
+from slam.loop_verification import LoopConstraint
 from slam.system import SlamSystem, SystemConfig
 
 FILE = Path("run/checkpoint")
@@ -58,6 +59,13 @@ def system() -> SlamSystem:
     system.mapper.smoother.update(GraphUpdate(relative_poses=(loop,)))
     system.mapper.smoother.restart()
     system.mapper._feed.forget_landmarks(np.array([5, 8]))  # none wait between two frames so far
+    loops, pairs = system.mapper.loops, np.array([[3, 7], [4, 9]])
+    loops.waiting = [
+        LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
+        for k in range(2)
+    ]
+    loops.closed = [(first, second)]
+    loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
     return system
 
 
@@ -86,8 +94,8 @@ def differences(a: Any, b: Any, where: str = "system") -> Iterator[str]:
     elif isinstance(a, (int, float, str, Enum, type(None))):
         if a != b:
             yield f"{where}: {a} and {b}"
-    elif isinstance(a, (list, tuple, set)):
-        yield from _different_items(sorted(a) if isinstance(a, set) else a, b, where)
+    elif isinstance(a, (list, tuple, set, frozenset)):
+        yield from _different_items(sorted(a) if isinstance(a, (set, frozenset)) else a, b, where)
     elif isinstance(a, dict):
         yield from differences(list(a), list(b), f"{where}.keys")
         for key in (a.keys() & b.keys()) - SCRATCH:
@@ -106,7 +114,7 @@ def _different_items(a: Any, b: Any, where: str) -> Iterator[str]:
         yield from differences(np.concatenate([nothing, *a]), np.concatenate([nothing, *b]), where)
         return
     yield from differences(len(a), len(b), f"{where}.length")
-    for i, (x, y) in enumerate(zip(a, sorted(b) if isinstance(b, set) else b, strict=False)):
+    for i, (x, y) in enumerate(zip(a, sorted(b) if isinstance(b, (set, frozenset)) else b, strict=False)):
         yield from differences(x, y, f"{where}[{i}]")
 
 
