@@ -109,11 +109,8 @@ class LoopCloser:
             state["noise_scales"].tolist(),
             np.split(state["landmark_pairs"], np.cumsum(state["pairs"])[:-1]),
         )
-        ends = state["ends"].tolist()
-        self.waiting = [
-            LoopConstraint(*pair, *row)
-            for pair, row in zip(ends, zip(*columns, strict=False), strict=False)
-        ]
+        a, b = state["ends"].T.tolist()
+        self.waiting = list(map(LoopConstraint, a, b, *columns))
 
     def add(self, keyframe: Keyframe) -> None:
         """A keyframe can be recognised from now on."""

@@ -29,9 +29,9 @@ from slam.local_mapping import (
     local_landmarks,
     redundant_keyframe,
 )
-from slam.map_state import world_of, world_state
 from slam.loop_closing import LoopCloser, LoopClosingConfig
 from slam.loop_verification import LoopConstraint
+from slam.map_state import world_of, world_state
 from slam.segments import join_segment
 from slam.tracker import Tracked, Tracker
 from slam.triangulation import triangulate_landmarks

@@ -191,7 +191,7 @@ class DescriptorIndex:
         self._owners: list[int] = []  # and the keyframe whose block it is
 
     def rebuild(self) -> None:
-        """Build the index anew from the keyframes held, partitioned if there are enough descriptors.
+        """Build the index anew, partitioned if the keyframes hold enough descriptors.
 
         The lists' centres are descriptors evenly picked from all: measured against k-means they
         find the same share of neighbours, and need no training.

@@ -95,7 +95,7 @@ def differences(a: Any, b: Any, where: str = "system") -> Iterator[str]:
         if a != b:
             yield f"{where}: {a} and {b}"
     elif isinstance(a, (list, tuple, set, frozenset)):
-        yield from _different_items(sorted(a) if isinstance(a, (set, frozenset)) else a, b, where)
+        yield from _different_items(_ordered(a), _ordered(b), where)
     elif isinstance(a, dict):
         yield from differences(list(a), list(b), f"{where}.keys")
         for key in (a.keys() & b.keys()) - SCRATCH:
@@ -108,13 +108,19 @@ def differences(a: Any, b: Any, where: str = "system") -> Iterator[str]:
         yield from differences(vars(a), vars(b), where)
 
 
+def _ordered(items: Any) -> Any:
+    return sorted(items) if isinstance(items, (set, frozenset)) else items
+
+
 def _different_items(a: Any, b: Any, where: str) -> Iterator[str]:
     if all(isinstance(item, np.ndarray) for item in (*a, *b)) and len(a) + len(b):
         nothing = (a or b)[0][:0]
         yield from differences(np.concatenate([nothing, *a]), np.concatenate([nothing, *b]), where)
         return
     yield from differences(len(a), len(b), f"{where}.length")
-    for i, (x, y) in enumerate(zip(a, sorted(b) if isinstance(b, (set, frozenset)) else b, strict=False)):
+    for i, (x, y) in enumerate(
+        zip(a, sorted(b) if isinstance(b, (set, frozenset)) else b, strict=False)
+    ):
         yield from differences(x, y, f"{where}[{i}]")
 
 
