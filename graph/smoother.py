@@ -35,9 +35,9 @@ from graph.updates import (
     RefusalReason,
     Refusals,
     RefusedFactor,
-    RemovalReport,
     RelativePose,
     RelativePoseErrors,
+    RemovalReport,
 )
 
 __all__ = ["Smoother", "SmootherConfig"]
@@ -113,8 +113,8 @@ class Smoother:
         admitted = admit(self._with_first_prior(update), self._shadow, self._camera, self._config)
         report = _Report(admitted.refused, admitted.refused_factors, removal.report)
         report.add_removal(removal)
-        change = self._enter(admitted, removal, report)
-        change = dataclasses.replace(change, max_iterations=update.max_iterations)
+        entered = self._enter(admitted, removal, report)
+        change = dataclasses.replace(entered, max_iterations=update.max_iterations)
         try:
             self._solver.update(self._shadow, change)
         except SolverError as failure:
