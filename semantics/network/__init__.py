@@ -1,0 +1,1 @@
+"""Mask R-CNN with the MaskIoU head, in plain torch: every stage a file."""

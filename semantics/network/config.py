@@ -1,0 +1,98 @@
+"""What a network is made of: one dataclass, and the variants that have names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+Backbone = Literal["resnet50", "resnet101", "mobilenet_v2"]
+
+
+@dataclass(frozen=True)
+class ImageConfig:
+    """How an image becomes the network's input.
+
+    Attributes:
+        short_px: length that the shorter side is scaled to ...
+        long_px: ... unless the longer side would exceed this.
+        mean, std: of red, green, blue in 0..1, subtracted and divided.
+    """
+
+    short_px: int = 800
+    long_px: int = 1333
+    mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
+    std: tuple[float, float, float] = (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """How the RPN's boxes are thinned out.
+
+    Attributes:
+        before_nms: best boxes of each pyramid level that enter the suppression.
+        after_nms: best boxes that leave it.
+        nms_iou: overlap above which the worse of two boxes goes.
+    """
+
+    before_nms: int = 1000
+    after_nms: int = 1000
+    nms_iou: float = 0.7
+
+
+@dataclass(frozen=True)
+class DetectionConfig:
+    """Which classified boxes become detections."""
+
+    min_score: float = 0.05
+    nms_iou: float = 0.5
+    max_count: int = 100
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The architecture. Two networks with equal values have equal parameter names and shapes.
+
+    Attributes:
+        classes: number of classes, background (0) included.
+        backbone: the convolutional body under the feature pyramid.
+        channels: channels of every pyramid level.
+        norm: "frozen": batch norm in the body only, its statistics fixed (torchvision's v1).
+            "batch": batch norm in body, pyramid and heads (v2). "none": none anywhere, since it
+            is folded into the weights (MobileNetV2).
+        norm_eps: added to the variance. torchvision sets it to 0 for its published v1 weights.
+        stride_in_1x1: the bottleneck's stride sits in its first convolution, as in the ResNets
+            of Caffe and of the original Mask Scoring R-CNN, and not in the 3x3 one.
+        rpn_convs: 3x3 convolutions in front of the RPN's two outputs.
+        box_convs: 3x3 convolutions in the box head, followed by one hidden layer; none: by two.
+        box_hidden: width of these layers.
+        mask_channels: channels of the mask head's four 3x3 convolutions.
+        maskiou_channels: the same of the MaskIoU head; 0: there is no such head.
+        maskiou_hidden: width of its two hidden layers.
+    """
+
+    classes: int = 91
+    backbone: Backbone = "resnet50"
+    channels: int = 256
+    norm: Literal["frozen", "batch", "none"] = "frozen"
+    norm_eps: float = 1e-5
+    stride_in_1x1: bool = False
+    rpn_convs: int = 1
+    box_convs: int = 0
+    box_hidden: int = 1024
+    mask_channels: int = 256
+    maskiou_channels: int = 0
+    maskiou_hidden: int = 1024
+    image: ImageConfig = ImageConfig()
+    proposals: ProposalConfig = ProposalConfig()
+    detections: DetectionConfig = DetectionConfig()
+
+    def with_maskiou(self) -> NetworkConfig:
+        """The same network with a MaskIoU head as wide as the mask head."""
+        return replace(self, maskiou_channels=self.mask_channels)
+
+
+RESNET50 = NetworkConfig()
+"""torchvision's maskrcnn_resnet50_fpn."""
+RESNET50_V2 = NetworkConfig(norm="batch", rpn_convs=2, box_convs=4)
+"""torchvision's maskrcnn_resnet50_fpn_v2."""
+RESNET101 = NetworkConfig(backbone="resnet101")

@@ -1,0 +1,66 @@
+"""The mask head, and the MaskIoU head that says how good a mask is (Huang et al. 2019)."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from semantics.network.config import NetworkConfig
+from semantics.network.layers import ConvBlock, NormKind, conv_stack
+
+BINS = 14
+"""RoIAlign bins of both heads; masks have twice as many."""
+
+
+def make_mask_head(config: NetworkConfig) -> nn.Sequential:
+    """Four 3x3 convolutions: (R, C, 14, 14) to (R, mask_channels, 14, 14)."""
+    norm: NormKind = "batch" if config.norm == "batch" else "none"
+    return nn.Sequential(*conv_stack(config.channels, config.mask_channels, 4, norm))
+
+
+class MaskPredictor(nn.Module):
+    """Doubles the size and gives one mask a class."""
+
+    def __init__(self, channels: int, classes: int) -> None:
+        super().__init__()
+        self.conv5_mask = nn.ConvTranspose2d(channels, channels, 2, 2)
+        self.mask_fcn_logits = nn.Conv2d(channels, classes, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(R, channels, 14, 14) to logits (R, classes, 28, 28)."""
+        return self.mask_fcn_logits(F.relu_(self.conv5_mask(x)))
+
+
+class MaskIoUHead(nn.Module):
+    """Predicts the IoU of a mask with the whole object, one value a class.
+
+    Input is the RoI's feature from before the mask head, with the mask as one channel more.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width, hidden = config.maskiou_channels, config.maskiou_hidden
+        convs = OrderedDict()
+        for k in range(1, 5):
+            inputs = config.channels + 1 if k == 1 else width
+            convs[f"maskiou_fcn{k}"] = ConvBlock((inputs, width), 3, stride=2 if k == 4 else 1)[0]
+        self.convs = nn.Sequential(convs)
+        self.maskiou_fc1 = nn.Linear(width * (BINS // 2) ** 2, hidden)
+        self.maskiou_fc2 = nn.Linear(hidden, hidden)
+        self.maskiou = nn.Linear(hidden, config.classes)
+
+    def forward(self, features: Tensor, masks: Tensor) -> Tensor:
+        """IoUs (R, classes) of mask probabilities (R, 28, 28) with features (R, C, 14, 14)."""
+        x = torch.cat([features, F.max_pool2d(masks[:, None], 2)], dim=1)
+        for conv in self.convs:
+            x = F.relu_(conv(x))
+        x = F.relu_(self.maskiou_fc1(x.flatten(1)))
+        return self.maskiou(F.relu_(self.maskiou_fc2(x)))
+
+
+def of_class(values: Tensor, labels: Tensor) -> Tensor:
+    """values[r, labels[r]]: what belongs to each RoI's own class."""
+    return values[torch.arange(len(labels), device=values.device), labels]
