@@ -16,6 +16,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from graph.data_files import data_path
 from graph.errors import InputError
 from slam.yaml_text import format_yaml, parse_yaml, read_yaml
 
@@ -27,23 +28,6 @@ class _Given(NamedTuple):
 
     value: Any
     source: str
-
-
-def data_path(*parts: str) -> Path:
-    """A file or folder of the project's ``data/``, in a checkout and in an installed wheel.
-
-    Raises:
-        InputError: there is no such file; the message lists what is there.
-    """
-    package = Path(__file__).resolve().parent
-    root = next((p for p in (package / "data", package.parent / "data") if p.is_dir()), None)
-    if root is None:
-        raise InputError(f"{package}: the project's data folder is missing; install it again")
-    path = root.joinpath(*parts)
-    if not path.exists():
-        there = sorted(p.stem for p in path.parent.glob(f"*{path.suffix}"))
-        raise InputError(f"{path}: no such file; there are: {', '.join(there) or 'none'}")
-    return path
 
 
 def find_config(name: str) -> Path:

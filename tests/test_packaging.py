@@ -86,7 +86,7 @@ def test_the_wheel_works_outside_the_checkout(installed: Path) -> None:
 
 
 def test_every_shipped_configuration_is_found_in_the_wheel(installed: Path) -> None:
-    code = "from slam.configuration import data_path; print(data_path('configs'))"
+    code = "from graph.data_files import data_path; print(data_path('configs'))"
     assert run_installed(installed, "-c", code).strip() == str(installed / "slam/data/configs")
     for path in (ROOT / "data/configs").glob("*.yaml"):
         run_installed(installed, "-m", "slam", "run", "-", "--config", path.stem, "--print-config")

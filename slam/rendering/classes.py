@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-CLASSES: tuple[str, ...] = (
-    "chair", "air conditioner", "screen", "robot", "desk", "bookcase", "door", "keyboard", "mouse",
-    "drone", "cup", "person", "trophy", "switchbox", "bottle", "flower pot", "book", "tv",
-    "jackboard", "cell phone", "potted plant", "suitcase", "umbrella",
-)  # fmt: skip
+from semantics.labels import read_label_set
+
+CLASSES: tuple[str, ...] = read_label_set("paper").names[1:]
 """A category's id in the annotations is its place here, from 1."""
 CATEGORY_IDS: dict[str, int] = {name: i for i, name in enumerate(CLASSES, 1)}

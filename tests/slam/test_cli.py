@@ -14,10 +14,11 @@ import pytest
 from fake_run import make_sequence, true_trajectory
 
 import slam.rendering.sequence
+from graph.data_files import data_path
 from graph.errors import InputError
 from graph.trajectory import write_tum
 from slam import cli
-from slam.configuration import data_path, resolve
+from slam.configuration import resolve
 from slam.rendering.sequence import SCENES, RenderConfig
 from slam.runner import RunSummary
 from slam.system import SystemConfig

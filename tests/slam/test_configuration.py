@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from graph.data_files import data_path
 from graph.errors import InputError
-from slam.configuration import data_path, dump, find_config, resolve
+from slam.configuration import dump, find_config, resolve
 
 
 class Kernel(Enum):
