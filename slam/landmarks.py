@@ -26,6 +26,7 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type, float]] = {
     "observations": ((), np.int64, 0),
     "visible": ((), np.int64, 0),
     "found": ((), np.int64, 0),
+    "replaced_by": ((), np.int64, -1),
     "alive": ((), np.bool_, False),
     "in_graph": ((), np.bool_, False),
 }
@@ -47,6 +48,7 @@ class LandmarkTable:
         patch_views: (N, 3) metres, from the point to the camera that took the patch.
         observations: (N,) keyframes that observe it.
         visible, found: (N,) frames in which it should have been, and was, matched.
+        replaced_by: (N,) the landmark that this one was fused into, -1 for none.
         alive, in_graph: (N,) bool.
     """
 
@@ -63,6 +65,7 @@ class LandmarkTable:
     observations: Ints
     visible: Ints
     found: Ints
+    replaced_by: Ints
     alive: Mask
     in_graph: Mask
 
@@ -96,6 +99,17 @@ class LandmarkTable:
         """Those of the ids that are still in the map."""
         ids = ids[ids >= 0]
         return ids[self.alive[ids]]
+
+    def current(self, ids: Ints) -> Ints:
+        """The ids (N,) >= 0 that stand for these now, in their order, fused ones followed.
+
+        A late answer about landmarks may name some that were fused or culled meanwhile; those
+        that were culled stay as they are, not alive.
+        """
+        ids = ids.copy()
+        while len(fused := np.flatnonzero(self.replaced_by[ids] >= 0)):
+            ids[fused] = self.replaced_by[ids[fused]]
+        return ids
 
     def remove(self, ids: Ints) -> None:
         """Take landmarks out of the map; keyframes drop them when they next look."""

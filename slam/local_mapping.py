@@ -51,7 +51,7 @@ def local_landmarks(world: WorldMap, seen_ids: Ints, config: MappingConfig) -> I
 def create_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> Ints:
     """Landmarks from every keypoint of a keyframe that has depth and no landmark yet."""
     features = keyframe.features
-    free = np.flatnonzero((keyframe.landmark_ids < 0) & np.isfinite(features.depth_m))
+    free = np.flatnonzero(keyframe.free & np.isfinite(features.depth_m))
     points = camera.backproject(features.pixels[free], features.depth_m[free])
     return world.make_landmarks(keyframe, free, transform(keyframe.T_world_camera, points))
 

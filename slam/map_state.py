@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from graph.array_file import Arrays, nested, part
 from slam.features import Features
 from slam.landmarks import LandmarkTable
-from slam.world_map import Keyframe, WorldMap
+from slam.world_map import CulledKeyframe, Keyframe, WorldMap
 
 _Columns = dict[str, tuple[tuple[int, ...], type]]  # shape of a row, and its type
 _KEYFRAME: _Columns = {
@@ -21,7 +21,11 @@ _KEYFRAME: _Columns = {
     "segment": ((), np.int64),
     "T_world_camera": ((4, 4), np.float64),
 }
-_KEYPOINT: _Columns = {"landmark_ids": ((), np.int64), "sent_ids": ((), np.int64)}
+_KEYPOINT: _Columns = {
+    "landmark_ids": ((), np.int64),
+    "sent_ids": ((), np.int64),
+    "masked": ((), np.bool_),
+}
 _FEATURE: _Columns = {
     "pixels": ((2,), np.float64),
     "image_pixels": ((2,), np.float64),
@@ -33,6 +37,7 @@ _FEATURE: _Columns = {
     "sigmas_px": ((3,), np.float64),
     "colours": ((3,), np.uint8),
 }  # a keyframe's features have no image any more
+_CULLED: _Columns = {"image_pixels": ((2,), np.float64), "landmark_ids": ((), np.int64)}
 
 
 def world_state(world: WorldMap) -> Arrays:
@@ -50,6 +55,7 @@ def world_state(world: WorldMap) -> Arrays:
             landmarks=world.landmarks.state(),
             keyframes=rows,
             keypoints=_joined(keyframes, _KEYPOINT) | _joined(features, _FEATURE),
+            culled=_culled_state(world.culled),
         ),
     }
 
@@ -72,11 +78,24 @@ def world_of(state: Arrays) -> WorldMap:
             features=Features(**{name: own[name] for name in _FEATURE}, gray=image),
             landmark_ids=own["landmark_ids"],
         )
-        keyframe.sent_ids = own["sent_ids"]
+        keyframe.sent_ids, keyframe.masked = own["sent_ids"], own["masked"]
         keyframes[keyframe_id] = keyframe
     landmarks = LandmarkTable()
     landmarks.restore(part(state, "landmarks"))
-    return WorldMap(keyframes, landmarks, int(state["next_keyframe_id"]))
+    culled = _culled_of(part(state, "culled"))
+    return WorldMap(keyframes, landmarks, int(state["next_keyframe_id"]), culled)
+
+
+def _culled_state(culled: dict[int, CulledKeyframe]) -> Arrays:
+    views = list(culled.values())
+    sizes = np.array([len(view.landmark_ids) for view in views], np.int64)
+    return {"id": np.array(list(culled), np.int64), "size": sizes, **_joined(views, _CULLED)}
+
+
+def _culled_of(state: Arrays) -> dict[int, CulledKeyframe]:
+    borders = np.cumsum(state["size"])[:-1]
+    pieces = (np.split(state[name], borders) for name in _CULLED)
+    return dict(zip(state["id"].tolist(), map(CulledKeyframe, *pieces), strict=False))
 
 
 def _joined(objects: Sequence[Any], columns: _Columns) -> dict[str, NDArray[Any]]:

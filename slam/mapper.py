@@ -31,6 +31,7 @@ from slam.local_mapping import (
 )
 from slam.loop_closing import LoopCloser, LoopClosingConfig
 from slam.loop_verification import LoopConstraint
+from slam.map_pruning import MapPruner
 from slam.map_state import world_of, world_state
 from slam.segments import join_segment
 from slam.tracker import Tracked, Tracker
@@ -150,6 +151,10 @@ class Mapper:
         self.smoother = Smoother(self.camera, self._graph_config)
         self._apply(self.smoother.update(self._feed.whole_update(self.world)))
         return joined
+
+    def pruner(self) -> MapPruner:
+        """Takes things out of map and graph, such as what a mask covers, at any time."""
+        return MapPruner(self.world, self.smoother, self.camera)
 
     def finish(self) -> None:
         """Full bundle adjustment of the graph; the map is then final."""

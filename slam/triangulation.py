@@ -82,4 +82,4 @@ def triangulate(
 
 
 def _free_without_depth(keyframe: Keyframe) -> Ints:
-    return np.flatnonzero((keyframe.landmark_ids < 0) & ~np.isfinite(keyframe.features.depth_m))
+    return np.flatnonzero(keyframe.free & ~np.isfinite(keyframe.features.depth_m))

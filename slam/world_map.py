@@ -8,8 +8,10 @@ import numpy as np
 
 from graph.geometry import Array
 from slam.features import Features
-from slam.landmarks import Ints, LandmarkTable
+from slam.landmarks import Ints, LandmarkTable, Mask
 from slam.subpixel import SubpixelConfig, cut_patches
+
+MAX_CULLED = 500
 
 
 @dataclass
@@ -24,6 +26,7 @@ class Keyframe:
         features: its keypoints.
         landmark_ids: (N,) landmark of every keypoint, -1 for none.
         sent_ids: (N,) the landmark for which a keypoint's observation was sent to the graph, or -1.
+        masked: (N,) keypoints on something that moves: they observe no landmark and make none.
     """
 
     id: int
@@ -34,18 +37,37 @@ class Keyframe:
     features: Features
     landmark_ids: Ints
     sent_ids: Ints = field(init=False)
+    masked: Mask = field(init=False)
 
     def __post_init__(self) -> None:
         self.sent_ids = np.full(len(self.landmark_ids), -1, np.int64)
+        self.masked = np.zeros(len(self.landmark_ids), bool)
+
+    @property
+    def free(self) -> Mask:
+        """Keypoints (N,) that observe nothing and may."""
+        return (self.landmark_ids < 0) & ~self.masked
+
+
+@dataclass(frozen=True)
+class CulledKeyframe:
+    """What late news about a culled keyframe need: image_pixels (N, 2) and landmark_ids (N,)."""
+
+    image_pixels: Array
+    landmark_ids: Ints
 
 
 @dataclass
 class WorldMap:
-    """Keyframes by id, in the order they were made, and the landmark table."""
+    """Keyframes by id, in the order they were made, and the landmark table.
+
+    ``culled`` remembers the keyframes that left last.
+    """
 
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
     landmarks: LandmarkTable = field(default_factory=LandmarkTable)
     next_keyframe_id: int = 0
+    culled: dict[int, CulledKeyframe] = field(default_factory=dict)
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Take a keyframe in; its id must be ``next_keyframe_id``."""
@@ -81,10 +103,48 @@ class WorldMap:
         return ids
 
     def attach(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:
-        """Record that keypoints (N,) of a keyframe observe landmarks (N,), and refresh these."""
-        landmarks, features = self.landmarks, keyframe.features
+        """Record that keypoints (N,) of a keyframe observe landmarks (N,), and refresh these.
+
+        Masked keypoints are passed over.
+        """
+        usable = ~keyframe.masked[keypoints]
+        keypoints, landmark_ids = keypoints[usable], landmark_ids[usable]
         keyframe.landmark_ids[keypoints] = landmark_ids
-        landmarks.observations[landmark_ids] += 1
+        self.landmarks.observations[landmark_ids] += 1
+        self._refresh(keyframe, keypoints, landmark_ids)
+
+    def mask(self, keyframe: Keyframe, keypoints: Ints) -> None:
+        """Record that keypoints (N,) of a keyframe lie on something that moves.
+
+        They observe nothing any more. Landmarks that looked as here take their looks from the
+        newest keyframe that is left.
+        """
+        keyframe.masked[keypoints] = True
+        landmarks, ids = self.landmarks, keyframe.landmark_ids[keypoints]
+        keyframe.landmark_ids[keypoints] = keyframe.sent_ids[keypoints] = -1
+        ids = landmarks.living(ids)
+        landmarks.observations[ids] -= 1
+        stale = ids[landmarks.last_keyframe[ids] == keyframe.id]
+        landmarks.last_keyframe[stale] = -1
+        landmarks.patch_views[stale] = np.nan
+        for other in self.keyframes.values():
+            rows = np.flatnonzero(np.isin(other.landmark_ids, stale))
+            self._refresh(other, rows, other.landmark_ids[rows])
+
+    def mask_landmarks(self, landmark_ids: Ints) -> None:
+        """Take landmarks out for good: the keypoints that observe them are masked."""
+        gone = np.zeros(len(self.landmarks) + 1, bool)  # the last entry answers for id -1
+        gone[landmark_ids] = True
+        for keyframe in self.keyframes.values():
+            rows = gone[keyframe.landmark_ids]
+            keyframe.masked |= rows
+            keyframe.landmark_ids[rows] = keyframe.sent_ids[rows] = -1
+        self.landmarks.observations[landmark_ids] = 0
+        self.landmarks.remove(landmark_ids)
+
+    def _refresh(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:
+        """Landmarks (N,) look as these keypoints (N,), where no newer keyframe sees them."""
+        landmarks, features = self.landmarks, keyframe.features
         newest = landmarks.last_keyframe[landmark_ids] <= keyframe.id
         ids, rows = landmark_ids[newest], keypoints[newest]
         landmarks.last_keyframe[ids] = keyframe.id
@@ -101,6 +161,10 @@ class WorldMap:
         self.landmarks.observations[ids] -= 1
         self.landmarks.host[self.landmarks.host == keyframe.id] = heir.id
         del self.keyframes[keyframe.id]
+        pixels = keyframe.features.image_pixels
+        self.culled[keyframe.id] = CulledKeyframe(pixels, keyframe.landmark_ids)
+        if len(self.culled) > MAX_CULLED:
+            del self.culled[next(iter(self.culled))]
 
     def renew_patches(self, keyframe: Keyframe, config: SubpixelConfig) -> None:
         """Give landmarks the patch of a keyframe that sees them too differently from their own.
@@ -156,5 +220,6 @@ class WorldMap:
             self.attach(keyframe, rows[keep], targets[keep])
         np.add.at(self.landmarks.found, new_ids, self.landmarks.found[old_ids])
         np.add.at(self.landmarks.visible, new_ids, self.landmarks.visible[old_ids])
+        self.landmarks.replaced_by[old_ids] = new_ids
         self.landmarks.remove(old_ids)
         return old_ids

@@ -1,0 +1,182 @@
+"""Taking things out of the map and the graph together: what a mask covers, or landmarks by id.
+
+News about a keyframe may come seconds after it. By then its landmarks may have been fused into
+others, culled, or retired from the graph, the keyframe may have been culled, its segment joined
+to another, a loop closed. So everything is looked up by the ids as they are now. The graph is
+asked first, since it may refuse; the map follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import Enum, IntEnum
+
+import cv2
+import numpy as np
+
+from graph.camera import Camera
+from graph.geometry import Array
+from graph.smoother import Smoother
+from graph.updates import GraphUpdate, Refusals, RemovalPolicy
+from slam.graph_feed import read_back
+from slam.landmarks import Ints, Mask
+from slam.world_map import Keyframe, WorldMap
+
+
+class MaskScope(Enum):
+    """What leaves where a mask covers a keyframe's keypoints."""
+
+    VIEW = "view"
+    """The keyframe's own observations: something stood before the landmarks there."""
+    LANDMARKS = "landmarks"
+    """The landmarks, with all observations: they are on the thing itself."""
+
+
+class KeptReason(IntEnum):
+    """Why a landmark that was asked for did not leave."""
+
+    NOT_IN_MAP = 1
+    """It never was, or was culled or pruned before."""
+    KEYFRAME_CULLED = 2
+    """Its observation left with the keyframe; nothing is left of it to take out."""
+    REFUSED = 3
+    """The whole request was refused."""
+
+
+def _no_ids() -> Ints:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class PruneReport:
+    """What became of a request.
+
+    Attributes:
+        landmark_ids: (N,) sorted, out of the map and the graph with all their observations.
+        observations: (N, 2) keyframe id, landmark id of those that left alone.
+        kept_ids, kept_reasons: (M,) landmarks that stay, and why (KeptReason).
+        refused: why nothing was done; "" if it was.
+        refused_variables: what the graph would have been left with, if that is the reason.
+        dropped_landmarks: (N,) out of the graph as well, left underconstrained there; they are
+            still in the map and may enter again.
+        bridged_keyframes: (N,) left with too little, and held loosely where they are.
+    """
+
+    landmark_ids: Ints = field(default_factory=_no_ids)
+    observations: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    kept_ids: Ints = field(default_factory=_no_ids)
+    kept_reasons: Ints = field(default_factory=_no_ids)
+    refused: str = ""
+    refused_variables: Refusals = field(default_factory=Refusals)
+    dropped_landmarks: Ints = field(default_factory=_no_ids)
+    bridged_keyframes: Ints = field(default_factory=_no_ids)
+
+
+def covered(mask: Mask, image_pixels: Array, border_px: int) -> Ints:
+    """Indices of the pixels (N, 2), as detected, that lie in a mask (H, W) less its border.
+
+    A negative border widens the mask. The image's own edge is no border of the mask.
+    """
+    side = 2 * abs(border_px) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    change = cv2.erode if border_px > 0 else cv2.dilate
+    inner = change(mask.astype(np.uint8), disc)
+    columns, rows = np.rint(image_pixels).astype(np.int64).T
+    height, width = mask.shape
+    inside = inner[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    return np.flatnonzero(inside)
+
+
+@dataclass(frozen=True)
+class MapPruner:
+    """Takes things out of one map and its graph, and leaves both consistent.
+
+    ``policy`` says whether the graph refuses what would leave something underconstrained.
+    Masks lose ``border_px`` all round, since segmentation errs there; negative widens them.
+    """
+
+    world: WorldMap
+    smoother: Smoother
+    camera: Camera
+    policy: RemovalPolicy = RemovalPolicy.DROP
+    border_px: int = 2
+
+    def prune_mask(
+        self, keyframe_id: int, mask: Mask, scope: MaskScope = MaskScope.VIEW
+    ) -> PruneReport:
+        """Take out what a keyframe observes under a mask (H, W) of its image, as recorded.
+
+        The keypoints observe nothing from now on and make no landmark; under
+        MaskScope.LANDMARKS all keypoints do so that observe the same landmarks.
+        """
+        expected = (self.camera.height, self.camera.width)
+        if mask.shape != expected or mask.dtype != bool:
+            given = f"{mask.dtype} of shape {mask.shape}"
+            return PruneReport(refused=f"the mask is {given}, the image needs bool {expected}")
+        keyframe = self.world.keyframes.get(keyframe_id)
+        if keyframe is not None:
+            keypoints = covered(mask, keyframe.features.image_pixels, self.border_px)
+            return self._prune_view(keyframe, keypoints, scope)
+        culled = self.world.culled.get(keyframe_id)
+        if culled is None:
+            return PruneReport(refused=f"keyframe {keyframe_id} is not in the map")
+        keypoints = covered(mask, culled.image_pixels, self.border_px)
+        ids = culled.landmark_ids[keypoints]
+        if scope is MaskScope.LANDMARKS:
+            return self.prune_landmarks(ids[ids >= 0])
+        left = self.world.landmarks.living(self.world.landmarks.current(ids[ids >= 0]))
+        return _with_kept(PruneReport(), left, KeptReason.KEYFRAME_CULLED)
+
+    def prune_landmarks(self, ids: Ints) -> PruneReport:
+        """Take landmarks (N,) out entirely; of fused ones, what they were fused into."""
+        landmarks = self.world.landmarks
+        known = (ids >= 0) & (ids < len(landmarks))
+        unknown, ids = ids[~known], np.unique(landmarks.current(ids[known]))
+        alive = landmarks.alive[ids]
+        report = self._carry_out(ids[alive], np.zeros((0, 2), np.int64))
+        absent = np.union1d(unknown, ids[~alive])
+        return _with_kept(report, absent, KeptReason.NOT_IN_MAP)
+
+    def _prune_view(self, keyframe: Keyframe, keypoints: Ints, scope: MaskScope) -> PruneReport:
+        ids = keyframe.landmark_ids[keypoints]
+        alive = (ids >= 0) & self.world.landmarks.alive[ids]
+        leaves = alive & (self.world.landmarks.observations[ids] <= 1)  # nobody else sees it
+        if scope is MaskScope.LANDMARKS:
+            leaves = alive
+        single = ids[alive & ~leaves]
+        pairs = np.stack([np.full(len(single), keyframe.id), single], axis=1)
+        report = self._carry_out(np.unique(ids[leaves]), pairs)
+        if not report.refused:
+            self.world.mask(keyframe, keypoints)
+        return _with_kept(report, ids[(ids >= 0) & ~alive], KeptReason.NOT_IN_MAP)
+
+    def _carry_out(self, ids: Ints, pairs: Ints) -> PruneReport:
+        """Take landmarks out of graph and map, single observations (N, 2) out of the graph."""
+        if not len(ids) and not len(pairs):
+            return PruneReport()
+        update = GraphUpdate(
+            remove_landmarks=ids, remove_observations=pairs, removal_policy=self.policy
+        )
+        estimate = self.smoother.update(update)
+        refused = estimate.removal.refused
+        if len(refused):
+            text = f"{len(refused)} landmarks and keyframes would be left underconstrained"
+            report = PruneReport(refused=text, refused_variables=refused)
+            return _with_kept(report, np.union1d(ids, pairs[:, 1]), KeptReason.REFUSED)
+        self.world.mask_landmarks(ids)
+        read_back(self.world, estimate)
+        return PruneReport(
+            landmark_ids=ids,
+            observations=pairs,
+            dropped_landmarks=estimate.dropped_landmarks,
+            bridged_keyframes=estimate.bridged_keyframes,
+        )
+
+
+def _with_kept(report: PruneReport, ids: Ints, reason: KeptReason) -> PruneReport:
+    """The report with more landmarks that stay."""
+    return replace(
+        report,
+        kept_ids=np.concatenate([report.kept_ids, ids]),
+        kept_reasons=np.concatenate([report.kept_reasons, np.full(len(ids), reason)]),
+    )
