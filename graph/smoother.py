@@ -15,12 +15,13 @@ import numpy as np
 from graph.admission import Admitted, admit
 from graph.array_file import Arrays
 from graph.camera import Camera
+from graph.covariances import Marginals
 from graph.gates import describe, relative_pose_errors, reprojection
 from graph.geometry import Array
 from graph.holding import anchor_components, release_bridges
 from graph.pruning import Removal, remove
 from graph.recovery import Repair, repair
-from graph.shadow import Shadow, ids_array
+from graph.shadow import Shadow, ValueTable, ids_array
 from graph.smoother_config import SmootherConfig
 from graph.solver import Change, Solver, SolverError, Variable
 from graph.storage import graph_arrays, read_graph, shadow_of, write_graph
@@ -181,13 +182,18 @@ class Smoother:
     ) -> Array:
         """Joint covariance (6K + 3L square): keyframes in the given order, then landmarks."""
         landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
-        for table, ids in (
-            (self._shadow.keyframes, keyframe_ids),
-            (self._shadow.landmarks, landmarks),
-        ):
-            if not table.contains(ids).all():
-                raise KeyError(f"not in the graph: {ids[~table.contains(ids)].tolist()}")
+        _check_known(self._shadow.keyframes, keyframe_ids)
+        _check_known(self._shadow.landmarks, landmarks)
         return self._solver.marginal_covariance(self._shadow, keyframe_ids, landmarks)
+
+    def marginals(self, landmark_ids: IntArray | None = None) -> Marginals:
+        """Covariances of every keyframe, and of some landmarks, from one factorisation.
+
+        Raises KeyError for an unknown id, SolverError for a graph that cannot be solved.
+        """
+        landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
+        _check_known(self._shadow.landmarks, landmarks)
+        return self._solver.marginals(self._shadow, landmarks)
 
     def restart(self) -> None:
         """Throw ISAM2 away; the next update makes it from the current values.
@@ -310,3 +316,9 @@ class Smoother:
             solver_ms=1e3 * self._solver.elapsed_s,
             factors=len(self._shadow),
         )
+
+
+def _check_known(table: ValueTable, ids: IntArray) -> None:
+    known = table.contains(ids)
+    if not known.all():
+        raise KeyError(f"not in the graph: {ids[~known].tolist()}")

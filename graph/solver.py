@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from graph.camera import Camera
+from graph.covariances import Marginals, marginals_of
 from graph.factors import FactorMaker, make_graph, make_values, read_values
 from graph.geometry import Array
 from graph.keys import keyframe_keys, landmark_keys, variable_named_in
@@ -124,6 +125,13 @@ class Solver:
             return np.block([[joint.at(a, b) for b in keys] for a in keys])
         except RuntimeError as error:
             raise self._failure(error) from error
+
+    def marginals(self, shadow: Shadow, landmarks: IntArray) -> Marginals:
+        """Covariances of every keyframe and of some landmarks at the shadow's current values."""
+        try:
+            return marginals_of(*self._everything(shadow), shadow.keyframes.ids, landmarks)
+        except RuntimeError as error:
+            raise SolverError(str(error).strip(), variable_named_in(str(error))) from error
 
     def _everything(self, shadow: Shadow) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """All factors and values, in an order that depends on the shadow's contents alone."""

@@ -16,6 +16,7 @@ from graph.camera import Camera
 from graph.geometry import Array
 from graph.smoother_config import SmootherConfig
 from graph.trajectory import Trajectory
+from slam.covariances import KeyframeCovariances
 from slam.features import BriskExtractor, FeatureConfig, Features
 from slam.frame import Frame
 from slam.graph_feed import GraphFeedConfig
@@ -163,6 +164,16 @@ class SlamSystem:
         return LandmarkCloud(
             ids, table.points_world[ids], table.colours[ids], table.observations[ids]
         )
+
+    def keyframe_covariances(self) -> KeyframeCovariances:
+        """How sure the graph is of the keyframes of the largest segment."""
+        found = self.mapper.smoother.marginals()
+        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        stamps = {k.id: k.timestamp_s for k in chosen}
+        rows = np.flatnonzero(np.isin(found.keyframe_ids, list(stamps)))
+        ids = found.keyframe_ids[rows]
+        stamps_s = np.array([stamps[i] for i in ids.tolist()])
+        return KeyframeCovariances(ids, stamps_s, found.keyframes[rows])
 
     def save_graph(self, path: Path) -> None:
         """Write the graph and its values so that they load again."""
