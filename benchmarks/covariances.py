@@ -4,9 +4,9 @@
 
 NEES is the squared error in units of the stated covariance, divided by its degrees of freedom
 here: 1 on average if the covariance is right, and its square root is the factor by which the
-stated sigmas are too small. (The first pose of a room is exact, though its prior allows 0.1 mm:
-a NEES of absolute poses a little below 1 is right there.) On rendered images it also holds what no factor states: errors of
-registration, of wrong matches, of noise that is not Gaussian.
+stated sigmas are too small. The first pose of a room is exact, though its prior allows 0.1 mm: a
+NEES of absolute poses a little below 1 is right there. On rendered images it also holds what no
+factor states: errors of registration, of wrong matches, of noise that is not Gaussian.
 """
 
 from __future__ import annotations
