@@ -1,4 +1,4 @@
-"""Taking things out of the map and the graph together: what a mask covers, or landmarks by id.
+"""Taking things out of the map and the graph together: what a mask covers, landmarks, a loop.
 
 News about a keyframe may come seconds after it. By then its landmarks may have been fused into
 others, culled, or retired from the graph, the keyframe may have been culled, its segment joined
@@ -17,7 +17,7 @@ import numpy as np
 from graph.camera import Camera
 from graph.geometry import Array
 from graph.smoother import Smoother
-from graph.updates import GraphUpdate, Refusals, RemovalPolicy
+from graph.updates import GraphEstimate, GraphUpdate, Refusals, RelativePoseName, RemovalPolicy
 from slam.graph_feed import read_back
 from slam.landmarks import Ints, Mask
 from slam.world_map import Keyframe, WorldMap
@@ -54,6 +54,7 @@ class PruneReport:
     Attributes:
         landmark_ids: (N,) sorted, out of the map and the graph with all their observations.
         observations: (N, 2) keyframe id, landmark id of those that left alone.
+        loops: names of the relative poses that left.
         kept_ids, kept_reasons: (M,) landmarks that stay, and why (KeptReason).
         refused: why nothing was done; "" if it was.
         refused_variables: what the graph would have been left with, if that is the reason.
@@ -64,6 +65,7 @@ class PruneReport:
 
     landmark_ids: Ints = field(default_factory=_no_ids)
     observations: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    loops: tuple[RelativePoseName, ...] = ()
     kept_ids: Ints = field(default_factory=_no_ids)
     kept_reasons: Ints = field(default_factory=_no_ids)
     refused: str = ""
@@ -137,6 +139,68 @@ class MapPruner:
         absent = np.union1d(unknown, ids[~alive])
         return _with_kept(report, absent, KeptReason.NOT_IN_MAP)
 
+    def prune_loop(self, keyframe_a: int, keyframe_b: int) -> PruneReport:
+        """Take a loop out: its relative poses, and every landmark that it fused falls in two.
+
+        A landmark is taken for fused by the loop if keyframes around both ends see it (covisible
+        with an end and nearer to it in time), but none in between for half of the way or more;
+        the newer side's views leave it.
+        """
+        ends = sorted((keyframe_a, keyframe_b))
+        missing = [k for k in ends if k not in self.world.keyframes]
+        if missing:
+            return PruneReport(refused=f"keyframe {missing[0]} is not in the map")
+        old_side, new_side = (self._side(end, ends) for end in ends)
+        fused = np.intersect1d(self._seen_from(old_side), self._seen_from(new_side))
+        fused = fused[self._longest_pause(fused) >= np.ptp(self._position(ends)) / 2]
+        pairs = [
+            np.stack([np.full(len(ids), k.id), ids], axis=1)
+            for k in new_side
+            if len(ids := np.intersect1d(self.world.observed(k)[1], fused))
+        ]
+        names = ((ends[0], ends[1], "loop"), (ends[1], ends[0], "loop"))
+        update = GraphUpdate(
+            remove_observations=np.concatenate([np.zeros((0, 2), np.int64), *pairs]),
+            remove_relative_poses=names,
+            removal_policy=self.policy,
+        )
+        report, estimate = self._ask(update)
+        if estimate is None:
+            return report
+        self.world.split(fused, new_side, self.camera)
+        read_back(self.world, estimate)
+        return replace(report, loops=estimate.removal.relative_poses)
+
+    def _side(self, end: int, ends: list[int]) -> list[Keyframe]:
+        """Keyframes covisible with one end of a loop and nearer to it than to the other."""
+        (other,) = (k for k in ends if k != end)
+        _, seen = self.world.observed(self.world.keyframes[end])
+        near = [k for _, k in self.world.covisible(seen, 1)]
+        return [k for k in near if abs(k.id - end) < abs(k.id - other)]
+
+    def _position(self, keyframe_ids: list[int]) -> Ints:
+        """Place (N,) of keyframes among those in the map."""
+        return np.searchsorted(sorted(self.world.keyframes), keyframe_ids)
+
+    def _longest_pause(self, ids: Ints) -> Ints:
+        """Keyframes (N,) from one view of each landmark to its next, at most; ids sorted."""
+        views = [
+            np.stack([np.searchsorted(ids, mine), np.full(len(mine), place)])
+            for place, k in enumerate(sorted(self.world.keyframes))
+            if len(mine := np.intersect1d(self.world.observed(self.world.keyframes[k])[1], ids))
+        ]
+        row, place = np.concatenate([np.zeros((2, 0), np.int64), *views], axis=1)
+        order = np.lexsort((place, row))
+        row, step = row[order], np.diff(place[order], prepend=0)
+        first = np.diff(row, prepend=-1) > 0
+        longest = np.zeros(len(ids), np.int64)
+        np.maximum.at(longest, row[~first], step[~first])
+        return longest
+
+    def _seen_from(self, keyframes: list[Keyframe]) -> Ints:
+        ids = [self.world.observed(keyframe)[1] for keyframe in keyframes]
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))
+
     def _prune_view(self, keyframe: Keyframe, keypoints: Ints, scope: MaskScope) -> PruneReport:
         ids = keyframe.landmark_ids[keypoints]
         alive = (ids >= 0) & self.world.landmarks.alive[ids]
@@ -157,20 +221,29 @@ class MapPruner:
         update = GraphUpdate(
             remove_landmarks=ids, remove_observations=pairs, removal_policy=self.policy
         )
+        report, estimate = self._ask(update)
+        if estimate is None:
+            return report
+        self.world.mask_landmarks(ids)
+        read_back(self.world, estimate)
+        return report
+
+    def _ask(self, update: GraphUpdate) -> tuple[PruneReport, GraphEstimate | None]:
+        """Let the graph do it; without an estimate if it refused, then the map must not change."""
         estimate = self.smoother.update(update)
         refused = estimate.removal.refused
+        ids, pairs = update.remove_landmarks, update.remove_observations
         if len(refused):
             text = f"{len(refused)} landmarks and keyframes would be left underconstrained"
             report = PruneReport(refused=text, refused_variables=refused)
-            return _with_kept(report, np.union1d(ids, pairs[:, 1]), KeptReason.REFUSED)
-        self.world.mask_landmarks(ids)
-        read_back(self.world, estimate)
+            kept = np.union1d(ids, pairs[:, 1])
+            return _with_kept(report, kept, KeptReason.REFUSED), None
         return PruneReport(
             landmark_ids=ids,
             observations=pairs,
             dropped_landmarks=estimate.dropped_landmarks,
             bridged_keyframes=estimate.bridged_keyframes,
-        )
+        ), estimate
 
 
 def _with_kept(report: PruneReport, ids: Ints, reason: KeptReason) -> PruneReport:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graph.geometry import Array
+from graph.camera import Camera
+from graph.geometry import Array, transform
 from slam.features import Features
 from slam.landmarks import Ints, LandmarkTable, Mask
 from slam.subpixel import SubpixelConfig, cut_patches
@@ -116,10 +117,16 @@ class WorldMap:
     def mask(self, keyframe: Keyframe, keypoints: Ints) -> None:
         """Record that keypoints (N,) of a keyframe lie on something that moves.
 
-        They observe nothing any more. Landmarks that looked as here take their looks from the
-        newest keyframe that is left.
+        They observe nothing any more and never will.
         """
         keyframe.masked[keypoints] = True
+        self.detach(keyframe, keypoints)
+
+    def detach(self, keyframe: Keyframe, keypoints: Ints) -> None:
+        """Record that keypoints (N,) of a keyframe observe nothing after all.
+
+        Landmarks that looked as here take their looks from the newest keyframe that is left.
+        """
         landmarks, ids = self.landmarks, keyframe.landmark_ids[keypoints]
         keyframe.landmark_ids[keypoints] = keyframe.sent_ids[keypoints] = -1
         ids = landmarks.living(ids)
@@ -130,6 +137,26 @@ class WorldMap:
         for other in self.keyframes.values():
             rows = np.flatnonzero(np.isin(other.landmark_ids, stale))
             self._refresh(other, rows, other.landmark_ids[rows])
+
+    def split(self, landmark_ids: Ints, keyframes: list[Keyframe], camera: Camera) -> Ints:
+        """Undo a wrong fusion: what these keyframes see becomes landmarks of its own.
+
+        Each lies where the first of the keyframes that measures its depth sees it; without any,
+        its views are given up. Returns the new ids.
+        """
+        twin = np.full(len(self.landmarks) + 1, -1, np.int64)
+        for keyframe in keyframes:
+            rows = np.flatnonzero(np.isin(keyframe.landmark_ids, landmark_ids))
+            ids = keyframe.landmark_ids[rows]
+            self.detach(keyframe, rows)
+            known = twin[ids] >= 0
+            self.attach(keyframe, rows[known], twin[ids[known]])
+            first = ~known & np.isfinite(keyframe.features.depth_m[rows])
+            pixels, depth_m = keyframe.features.pixels, keyframe.features.depth_m
+            points = camera.backproject(pixels[rows[first]], depth_m[rows[first]])
+            points_world = transform(keyframe.T_world_camera, points)
+            twin[ids[first]] = self.make_landmarks(keyframe, rows[first], points_world)
+        return twin[twin >= 0]
 
     def mask_landmarks(self, landmark_ids: Ints) -> None:
         """Take landmarks out for good: the keypoints that observe them are masked."""

@@ -19,7 +19,7 @@ from synthetic_view import (
 
 from graph.geometry import Array, se3_exp
 from graph.smoother import Smoother
-from graph.updates import RemovalPolicy
+from graph.updates import GraphUpdate, RelativePose, RemovalPolicy
 from slam.configuration import resolve
 from slam.graph_feed import GraphFeed, GraphFeedConfig, read_back
 from slam.map_pruning import KeptReason, MapPruner, MaskScope, covered
@@ -352,3 +352,36 @@ def test_masked_keypoints_and_culled_keyframes_are_in_the_state_of_the_map() -> 
     for k, view in session.world.culled.items():
         np.testing.assert_array_equal(world.culled[k].image_pixels, view.image_pixels)
         np.testing.assert_array_equal(world.culled[k].landmark_ids, view.landmark_ids)
+
+
+def test_a_wrong_loop_leaves_with_what_it_fused() -> None:
+    """The last keyframes saw other points, 1 m aside; a loop declared them to be the first ones."""
+    session = Session(4)
+    first, T_wrong = session.points.copy(), np.array([1.0, 0.0, 0.0])
+    for _ in range(4):  # on the way, half of the first points are still in view
+        session.add_keyframe(np.arange(30, COUNT))
+    session.points = np.where(np.arange(COUNT)[:, None] < 30, first + T_wrong, first)
+    ends = [session.add_keyframe(np.arange(COUNT), anew=np.arange(30)) for _ in range(2)]
+    session.add_keyframe(np.arange(COUNT))
+    before = [k.T_world_camera for k in session.world.keyframes.values()]
+    new_ids = ends[1].landmark_ids[:30].copy()
+    T_a_b = np.eye(4)
+    T_a_b[0, 3] = -0.5
+    session.feed.forget_landmarks(session.world.replace_landmarks(new_ids[:10], np.arange(10)))
+    session.add_keyframe(np.arange(COUNT))
+    loop = RelativePose(0, ends[1].id, T_a_b, np.eye(6) * 1e-4, "cauchy", "loop")
+    session.smoother.update(GraphUpdate(relative_poses=(loop,)))
+    report = session.pruner().prune_loop(ends[1].id, 0)
+    assert report.loops == ((0, ends[1].id, "loop"),)
+    assert set(report.observations[:, 1].tolist()) >= set(range(10))
+    assert (report.observations[:, 0] >= ends[0].id).all()
+    session.add_keyframe(np.arange(COUNT))
+    read_back(session.world, session.smoother.optimise_batch())
+    assert_consistent(session.world, session.smoother)
+    after = [session.world.keyframes[k].T_world_camera for k in range(len(before))]
+    np.testing.assert_allclose(after, before, atol=0.03)
+    now = session.world.landmarks.points_world[ends[1].landmark_ids[:10]]
+    np.testing.assert_allclose(now, session.points[:10], atol=0.1)
+    np.testing.assert_allclose(session.world.landmarks.points_world[:10], first[:10], atol=0.1)
+    absent = session.pruner().prune_loop(0, 99)
+    assert absent.refused == "keyframe 99 is not in the map"
