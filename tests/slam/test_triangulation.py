@@ -61,7 +61,8 @@ def test_points_behind_the_cameras_are_refused() -> None:
     assert not good.any()
 
 
-def test_keyframes_without_depth_get_landmarks_that_both_observe() -> None:
+def two_blind_views() -> tuple[WorldMap, np.ndarray]:
+    """Two keyframes that share 20 landmarks and see 30 points more without depth."""
     rng = np.random.default_rng(5)
     known, blind = points(20, 1.5), points(30, 2.5)
     descriptors = random_descriptors(50, rng)
@@ -73,9 +74,22 @@ def test_keyframes_without_depth_get_landmarks_that_both_observe() -> None:
         keyframes.append(add_keyframe(world, T, features))
     ids = world.make_landmarks(keyframes[0], np.arange(20), known)
     world.attach(keyframes[1], np.arange(20), ids)
-    made = triangulate_landmarks(world, keyframes[1], CAMERA, CONFIG)
+    return world, blind
+
+
+def test_keyframes_without_depth_get_landmarks_that_both_observe() -> None:
+    world, blind = two_blind_views()
+    made = triangulate_landmarks(world, world.keyframes[1], CAMERA, CONFIG)
     assert len(made) == 30
     assert np.allclose(world.landmarks.points_world[made], blind, atol=1e-6)
     assert (world.landmarks.observations[made] == 2).all()
-    for keyframe in keyframes:
+    for keyframe in world.keyframes.values():
         assert (keyframe.landmark_ids[20:] == made).all()
+
+
+def test_masked_keypoints_are_not_triangulated() -> None:
+    world, _ = two_blind_views()
+    world.mask(world.keyframes[0], np.arange(25, 40))
+    made = triangulate_landmarks(world, world.keyframes[1], CAMERA, CONFIG)
+    assert len(made) == 15
+    assert (world.keyframes[1].landmark_ids[25:40] == -1).all()
