@@ -155,16 +155,6 @@ class SlamSystem:
         stamps = np.array([k.timestamp_s for k in chosen])
         return Trajectory(stamps, np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4))
 
-    def landmarks(self) -> LandmarkCloud:
-        """The living landmarks of the largest segment, with their colours."""
-        table = self.mapper.world.landmarks
-        chosen = self.mapper.world.in_segment(largest(self.segments()))
-        hosts = [k.id for k in chosen]
-        ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
-        return LandmarkCloud(
-            ids, table.points_world[ids], table.colours[ids], table.observations[ids]
-        )
-
     def keyframe_covariances(self) -> KeyframeCovariances:
         """How sure the graph is of the keyframes of the largest segment."""
         found = self.mapper.smoother.marginals()
@@ -174,6 +164,16 @@ class SlamSystem:
         ids = found.keyframe_ids[rows]
         stamps_s = np.array([stamps[i] for i in ids.tolist()])
         return KeyframeCovariances(ids, stamps_s, found.keyframes[rows])
+
+    def landmarks(self) -> LandmarkCloud:
+        """The living landmarks of the largest segment, with their colours."""
+        table = self.mapper.world.landmarks
+        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        hosts = [k.id for k in chosen]
+        ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
+        return LandmarkCloud(
+            ids, table.points_world[ids], table.colours[ids], table.observations[ids]
+        )
 
     def save_graph(self, path: Path) -> None:
         """Write the graph and its values so that they load again."""
