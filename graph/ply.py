@@ -63,16 +63,31 @@ def read_ply(path: Path) -> dict[str, NDArray[Any]]:
     lines = head.decode("ascii", errors="replace").splitlines()
     if not separator or lines[:1] != ["ply"] or _FORMAT not in lines:
         raise InputError(f"{path}: not a PLY file of '{_FORMAT}'; convert it")
-    layout, count = [], 0
-    for words in (line.split() for line in lines[1:]):
-        if words[0] == "element" and words[1] == "vertex":
-            count = int(words[2])
-        elif words[0] == "property":
-            if words[1] not in _TYPES:
-                raise InputError(f"{path}: a {words[1]} property; only plain vertices are read")
-            layout.append((words[2], _TYPES[words[1]]))
-    dtype = np.dtype(layout)
+    try:
+        count, dtype = _layout(lines[1:])
+    except (ValueError, IndexError, KeyError) as error:
+        raise InputError(
+            f"{path}: its header cannot be read ({error}); only plain vertices are supported"
+        ) from error
     if len(body) < count * dtype.itemsize:
         raise InputError(f"{path}: {len(body)} bytes for {count} vertices; the file is cut off")
     vertices = np.frombuffer(body, dtype, count)
     return {name: vertices[name].copy() for name in vertices.dtype.names or ()}
+
+
+def _layout(lines: list[str]) -> tuple[int, np.dtype]:
+    """Number and type of the vertices by a header's lines; they must be its first element."""
+    count, properties, element = 0, [], ""
+    for words in filter(None, (line.split() for line in lines)):
+        if words[0] == "element":
+            if not element and words[1] != "vertex":
+                raise ValueError(f"its first element is {words[1]!r}")
+            element = words[1]
+            count = int(words[2]) if element == "vertex" else count
+        elif words[0] == "property" and element == "vertex":
+            if words[1] not in _TYPES:
+                raise ValueError(f"a {words[1]} property")
+            properties.append((words[2], _TYPES[words[1]]))
+    if count < 0 or not properties:
+        raise ValueError("no vertex with properties")
+    return count, np.dtype(properties)

@@ -1,22 +1,95 @@
-"""Trajectories in the formats of KITTI and EuRoC (TUM's is in ``graph.trajectory``)."""
+"""Trajectories as KITTI and EuRoC write them, and files of any format told apart.
+
+TUM's format is in ``graph.trajectory``.
+"""
 
 from __future__ import annotations
 
 import os
 from fractions import Fraction
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from graph.errors import InputError, finite_number
 from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
-from graph.trajectory import Trajectory
+from graph.trajectory import Trajectory, read_tum
 
 EUROC_HEADER = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 )
 EUROC_COLUMNS = (8, 17)  # 17 in the data sets' own ground truth: velocity and biases follow
 MAX_SKEWNESS = 1e-3
+MIN_STEP_NS = 1e5  # ten thousand poses a second; whole seconds are never that far apart
+KITTI_COLUMNS = 12
+TrajectoryFormat = Literal["tum", "kitti", "euroc"]
+
+
+def read_trajectory(path: Path, stamps_s: Array | None = None) -> Trajectory:
+    """Read a trajectory in any of the three formats, known by its first line.
+
+    KITTI has no stamps: ``stamps_s`` (N,) are those of its lines; the other formats ignore them.
+
+    Raises:
+        InputError: no file, what the format's reader refuses, or KITTI without stamps, or with
+            another number of them than poses.
+    """
+    form = recognise(path)
+    if form == "euroc":
+        return read_euroc(path)
+    if form == "tum":
+        return read_tum(path)
+    poses = read_kitti(path)
+    if stamps_s is None:
+        raise InputError(
+            f"{path}: {KITTI_COLUMNS} columns, the format of KITTI, which has no stamps; give them "
+            "with --times, a file with a stamp in seconds a line"
+        )
+    if len(stamps_s) != len(poses):
+        raise InputError(
+            f"{path}: {len(poses)} poses for {len(stamps_s)} stamps; in the format of KITTI a line "
+            "belongs to a frame; give the stamps of these poses with --times"
+        )
+    return Trajectory(stamps_s, poses)
+
+
+def recognise(path: Path) -> TrajectoryFormat:
+    """The format of a trajectory file; TUM's if it is none of the others.
+
+    KITTI has twelve columns. EuRoC has commas and whole stamps, which are steps of nanoseconds
+    apart: a TUM file may have commas too.
+    """
+    lines = [line for _, line in _lines(path)]
+    if lines and len(lines[0].split()) == KITTI_COLUMNS:
+        return "kitti"
+    ends = [lines[k].split(",")[0].strip() for k in (0, -1)] if lines else []
+    if not all("," in lines[k] and end.isdigit() for k, end in zip((0, -1), ends, strict=False)):
+        return "tum"
+    step = (int(ends[-1]) - int(ends[0])) / max(len(lines) - 1, 1) if ends else 0.0
+    return "euroc" if step > MIN_STEP_NS or (len(lines) == 1 and int(ends[0]) > 1e12) else "tum"
+
+
+def read_times(path: Path) -> Array:
+    """Stamps (N,) in seconds, the first word of each line: KITTI's times.txt, or a TUM file.
+
+    Raises:
+        InputError: no file, no line, a value that is no finite number, or stamps that do not
+            increase.
+    """
+    rows = [(where, line.replace(",", " ").split()[0]) for where, line in _lines(path)]
+    stamps_s = np.array([finite_number(word, where) for where, word in rows])
+    if not len(stamps_s):
+        raise InputError(f"{path}: no stamp in the file; expected one in seconds a line")
+    if (np.diff(stamps_s) <= 0).any():
+        where = rows[int(np.argmax(np.diff(stamps_s) <= 0)) + 1][0]
+        raise InputError(f"{where}: a stamp that is not later than the one before; correct it")
+    return stamps_s
+
+
+def write_times(path: Path, stamps_s: Array) -> None:
+    """Write stamps (N,) in seconds as ``read_times`` reads them."""
+    _write(path, [f"{stamp:.6f}" for stamp in stamps_s.tolist()])
 
 
 def write_kitti(path: Path, poses_world_camera: Array) -> None:
@@ -35,7 +108,7 @@ def read_kitti(path: Path) -> Array:
         InputError: no file, no pose, another number of columns than 12, a value that is no finite
             number, or a matrix that is no rotation.
     """
-    rows = [_numbers(line.split(), where, (12,)) for where, line in _lines(path)]
+    rows = [_numbers(line.split(), where, (KITTI_COLUMNS,)) for where, line in _lines(path)]
     if not rows:
         raise InputError(f"{path}: no pose in the file; expected 12 numbers a line")
     top = np.array(rows).reshape(-1, 3, 4)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from graph.errors import InputError
 from slam import __version__
+from slam.commands.export import add_export
 from slam.commands.optimise import add_optimise
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_render(commands)
     _add_info(commands)
     add_optimise(commands)
+    add_export(commands)
     return parser
 
 
@@ -93,7 +95,7 @@ def _add_run(commands: _Commands) -> None:
     parser.add_argument("--config", metavar="F", help=CONFIG_HELP)
     parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
     parser.add_argument("--print-config", action="store_true", help="print it resolved, and end")
-    parser.add_argument("--reference", type=Path, metavar="F", help="TUM trajectory to compare to")
+    parser.add_argument("--reference", type=Path, metavar="F", help="trajectory to compare to")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--stride", type=int, default=1, metavar="N", help="take every N-th frame")
     parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
@@ -148,10 +150,11 @@ def _add_evaluate(commands: _Commands) -> None:
     text = "compare a trajectory with a reference"
     parser = commands.add_parser("evaluate", help=text, description=text)
     parser.set_defaults(handler=_evaluate)
-    parser.add_argument("run_or_trajectory", type=Path, help="run folder or TUM trajectory")
-    parser.add_argument(
-        "--reference", type=Path, required=True, help="TUM trajectory, or sequence with one"
-    )
+    parser.add_argument("run_or_trajectory", type=Path, help="run folder or trajectory")
+    text = "trajectory (TUM, EuRoC or KITTI), or sequence with one"
+    parser.add_argument("--reference", type=Path, required=True, help=text)
+    text = "stamps of a KITTI trajectory, one a line (default: those of the run's frames)"
+    parser.add_argument("--times", type=Path, metavar="F", help=text)
     parser.add_argument("--json", action="store_true", help="print the rows as JSON")
     parser.add_argument("--plot", type=Path, metavar="F", help="write the picture (png, pdf, svg)")
     parser.add_argument("--with-scale", action="store_true", help="align with Sim(3): monocular")
@@ -163,7 +166,11 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     with console_log():
         result = evaluate(
-            arguments.run_or_trajectory, arguments.reference, arguments.plot, arguments.with_scale
+            arguments.run_or_trajectory,
+            arguments.reference,
+            arguments.plot,
+            arguments.with_scale,
+            arguments.times,
         )
     print(format_json(result.rows) if arguments.json else format_table(result.rows))
     return 0

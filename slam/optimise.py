@@ -1,4 +1,4 @@
-"""Offline optimisation of a pose graph file: read, optimise, write, draw."""
+"""Offline optimisation of a g2o file, with landmarks or without: read, optimise, write, draw."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from graph.bundle_adjustment import Adjustment, adjust
 from graph.errors import InputError
 from graph.g2o import read_g2o, write_g2o
+from graph.g2o_landmarks import write_landmark_graph
+from graph.g2o_landmarks_reader import read_landmark_graph
 from graph.geometry import Array
+from graph.iteration import Progress
 from graph.pose_graph import Mask, PoseGraph
 from graph.pose_graph_optimisation import (
     Method,
@@ -17,12 +21,16 @@ from graph.pose_graph_optimisation import (
     optimise_pose_graph,
 )
 from graph.trajectory import Indices
+from slam.adjustment_report import Placed, draw_adjustment
 from slam.before_after import View, check_picture, draw_before_after
-from slam.progress import iteration_bar
 
 
 def optimise_file(
-    file: Path, out: Path, method: Method = "lm", plot: Path | None = None, quiet: bool = False
+    file: Path,
+    out: Path,
+    method: Method = "lm",
+    plot: Path | None = None,
+    progress: Progress = lambda iteration, cost: None,
 ) -> PoseGraphResult:
     """Optimise a g2o file and write the graph, without the edges found wrong, to ``out``.
 
@@ -34,15 +42,41 @@ def optimise_file(
     if plot is not None:
         check_picture(plot)
     graph = read_g2o(file)
-    with iteration_bar(quiet) as progress:
-        try:
-            result = optimise_pose_graph(graph, PoseGraphConfig(method=method), progress)
-        except InputError as error:
-            raise InputError(f"{file}: {error}") from error
+    try:
+        result = optimise_pose_graph(graph, PoseGraphConfig(method=method), progress)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
     write_g2o(out, result.graph.with_edges(~result.is_outlier))
     if plot is not None:
         _draw(result, plot)
     return result
+
+
+def adjust_file(
+    file: Path,
+    out: Path,
+    plot: Path | None = None,
+    progress: Progress = lambda iteration, cost: None,
+) -> tuple[Adjustment, Placed]:
+    """Adjust the graph with landmarks of a g2o file and write it, without outliers, to ``out``.
+
+    Raises:
+        InputError: as ``optimise_file``.
+    """
+    _check_output(out)
+    if plot is not None:
+        check_picture(plot)
+    shadow, camera = read_landmark_graph(file)
+    before = Placed.of(shadow)
+    try:
+        adjustment = adjust(shadow, camera, progress=progress)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    after = Placed.of(shadow)
+    write_landmark_graph(out, shadow, camera)
+    if plot is not None:
+        draw_adjustment(plot, before, after, adjustment)
+    return adjustment, after
 
 
 def _check_output(out: Path) -> None:

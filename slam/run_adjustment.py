@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from graph.bundle_adjustment import Adjustment, AdjustmentConfig, Stage, adjust, loop_edges
+from graph.bundle_adjustment import Adjustment, AdjustmentConfig, adjust
 from graph.errors import InputError
 from graph.geometry import Array, inverse, se3_exp, se3_log
 from graph.iteration import Progress
@@ -20,9 +20,17 @@ from graph.shadow import Shadow
 from graph.storage import write_graph
 from graph.trajectory import Trajectory
 from graph.updates import IntArray
-from slam.before_after import View, check_picture, draw_before_after
-from slam.evaluation import EvaluationResult, Row, evaluate_trajectory, format_json, read_reference
-from slam.evaluation.plot import plot_trajectory, view_plane
+from slam.adjustment_report import Placed, draw_adjustment, format_adjustment
+from slam.before_after import check_picture
+from slam.evaluation import (
+    EvaluationResult,
+    Row,
+    evaluate_trajectory,
+    format_json,
+    frame_stamps,
+    read_reference,
+)
+from slam.evaluation.plot import plot_trajectory
 from slam.run_folder import RunFolder
 from slam.run_results import EVALUATION_ROWS, LANDMARKS_COMMENT
 from slam.saved_run import SavedRun, read_run
@@ -39,15 +47,14 @@ class RunAdjustment:
     Attributes:
         folder: the new run folder.
         adjustment: what was done.
-        keyframes, landmarks: how many there are in the graph.
+        placed: the graph's keyframes and landmarks after it.
         errors: before and after, against the reference, if there is one.
         picture: before and after.
     """
 
     folder: Path
     adjustment: Adjustment
-    keyframes: int
-    landmarks: int
+    placed: Placed
     errors: tuple[EvaluationResult, EvaluationResult] | None
     picture: Path
 
@@ -88,7 +95,9 @@ def adjust_run(
     if plot is not None:
         check_picture(plot)
     run = read_run(path)
-    truth = None if options.reference is None else read_reference(options.reference)
+    truth = None
+    if options.reference is not None:
+        truth = read_reference(options.reference, frame_stamps(path / "trajectory.txt"))
     before = Placed.of(run.shadow)
     with RunFolder(out, options.overwrite) as folder:
         logger.info("bundle adjustment of %s", path)
@@ -97,29 +106,6 @@ def adjust_run(
         except InputError as error:
             raise InputError(f"{path / 'graph'}: {error}") from error
         return _write(run, before, adjustment, folder, truth, plot)
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """Where a graph's variables are: ids (K,), poses (K, 4, 4), ids (L,), points (L, 3), loops."""
-
-    keyframe_ids: IntArray
-    poses_world_camera: Array
-    landmark_ids: IntArray
-    points_world: Array
-    loops: IntArray
-
-    @classmethod
-    def of(cls, shadow: Shadow) -> Placed:
-        """A copy that stays when the graph changes."""
-        keyframes, landmarks = shadow.keyframes, shadow.landmarks
-        return cls(
-            keyframes.ids.copy(),
-            keyframes.values.copy(),
-            landmarks.ids.copy(),
-            landmarks.values.copy(),
-            loop_edges(shadow),
-        )
 
 
 def _write(
@@ -153,14 +139,13 @@ def _write(
     result = RunAdjustment(
         folder.path,
         adjustment,
-        len(after.keyframe_ids),
-        len(after.landmark_ids),
+        after,
         errors,
         plot or folder.path / PICTURE,
     )
     folder.write_text("metrics.json", format_json(result_rows(result)))
     plot_trajectory(folder.path / "trajectory.png", trajectory, truth, folder.path.name)
-    _draw(result.picture, before, after, adjustment)
+    draw_adjustment(result.picture, before, after, adjustment)
     return result
 
 
@@ -238,8 +223,8 @@ def result_rows(result: RunAdjustment) -> list[Row]:
     if result.errors is not None:
         errors = [row for row in result.errors[1].rows if row["name"] in EVALUATION_ROWS]
     names: tuple[tuple[str, float, str], ...] = (
-        ("keyframes", result.keyframes, "keyframes"),
-        ("landmarks", result.landmarks, "landmarks"),
+        ("keyframes", len(result.placed.keyframe_ids), "keyframes"),
+        ("landmarks", len(result.placed.landmark_ids), "landmarks"),
         ("cost_initial", done.initial_cost, "1/2 chi2"),
         ("cost_final", done.final_cost, "1/2 chi2"),
         ("iterations", done.iterations, "steps"),
@@ -251,50 +236,12 @@ def result_rows(result: RunAdjustment) -> list[Row]:
     return errors + [{"name": name, "value": value, "unit": unit} for name, value, unit in names]
 
 
-def format_adjustment(result: RunAdjustment) -> str:
-    """A few lines on what was adjusted, from where, and how it ended."""
-    done, share = result.adjustment, 0.0
-    if done.observations:
-        share = 100 * len(done.wrong_observations) / done.observations
-    rows = [
-        ("graph", f"{result.keyframes} keyframes, {result.landmarks} landmarks"),
-        *((f"stage {stage.name}", _stage_text(stage)) for stage in done.stages),
-        ("wrong loops", f"{len(done.wrong_loops)} of {done.loops}, left out"),
-        ("wrong views", f"{len(done.wrong_observations)} of {done.observations} ({share:.2f} %)"),
-        ("time", f"{done.duration_ms:.0f} ms"),
-    ]
-    if result.errors is not None:
-        before, after = result.errors
-        rows += [
-            (name, f"{before.value(name):.4f} -> {after.value(name):.4f}")
-            for name in EVALUATION_ROWS
-            if any(row["name"] == name for row in after.rows)
-        ]
-    return "\n".join(f"{name:24}{value}" for name, value in rows)
-
-
-def _stage_text(stage: Stage) -> str:
-    return (
-        f"cost {stage.cost_before:.6g} -> {stage.cost_after:.6g}, {stage.iterations} steps, "
-        f"{stage.factors} factors"
-    )
-
-
-def _draw(path: Path, before: Placed, after: Placed, adjustment: Adjustment) -> None:
-    """Path, loops (wrong ones red) and landmarks, seen along the axis of least motion."""
-    plane = view_plane(after.poses_world_camera[:, :3, 3])
-    ends = np.arange(len(before.keyframe_ids))
-    path_edges = np.stack([ends[:-1], ends[1:]], axis=1)
-    views = []
-    for state, cost, title in (
-        (before, adjustment.initial_cost, "before"),
-        (after, adjustment.final_cost, "after"),
-    ):
-        loops = np.searchsorted(before.keyframe_ids, state.loops)
-        wrong = np.searchsorted(before.keyframe_ids, adjustment.wrong_loops)
-        edges = [(path_edges, "tab:blue", 0.9), (loops, "tab:green", 0.6)]
-        edges += [(wrong, "tab:red", 0.6)] if state is before else []
-        positions = state.poses_world_camera[:, :3, 3][:, plane]
-        cloud, axes = state.points_world[:, plane], "".join("xyz"[k] for k in plane)
-        views.append(View(f"{title}, cost {cost:.5g}", positions, edges, cloud, axes))
-    draw_before_after(path, *views)
+def format_run_adjustment(result: RunAdjustment) -> str:
+    """What was done, and the errors before and after."""
+    lines = [format_adjustment(result.adjustment, result.placed)]
+    for before, after in zip(*(errors.rows for errors in result.errors or ()), strict=True):
+        if after["name"] in EVALUATION_ROWS:
+            lines.append(
+                f"{after['name']:24}{before['value']:.4f} -> {after['value']:.4f} {after['unit']}"
+            )
+    return "\n".join(lines)

@@ -17,7 +17,8 @@ from typing import Any
 
 from graph.camera import Camera
 from graph.errors import InputError
-from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps, read_tum
+from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
+from graph.trajectory_formats import read_trajectory
 from slam import __version__
 from slam.configuration import dump
 from slam.evaluation import Row
@@ -120,7 +121,7 @@ def run(
 
 
 def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
-    """The trajectory to compare with: a TUM file's, a sequence folder's, or the sequence's own.
+    """The trajectory to compare with: a file's, a sequence folder's, or the sequence's own.
 
     Raises:
         InputError: the given file is missing or broken, or shares no time with the sequence.
@@ -128,7 +129,7 @@ def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
     if path is None:
         return sequence.groundtruth
     file = path / "groundtruth.txt" if path.is_dir() else path
-    reference = read_tum(file)
+    reference = read_trajectory(file, sequence.timestamps_s)
     shared = len(associate_stamps(sequence.timestamps_s, reference.timestamps_s)[0])
     if shared < MIN_REFERENCE_POSES:
         raise InputError(

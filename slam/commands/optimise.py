@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, TypeAlias
 from graph.errors import InputError
 
 if TYPE_CHECKING:
+    from graph.iteration import Progress
     from graph.pose_graph_optimisation import Method
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
-TEXT = "optimise a run folder, or a pose graph in g2o format, offline"
+TEXT = "optimise a run folder or a graph in g2o format, offline"
 MORE = """\
 A run folder gets a full bundle adjustment of poses and landmarks, wrong loops and wrong
 observations are found and left out, and --out becomes a new run folder with every frame carried
-along. A pose graph, 2-D or 3-D, is written to the file --out."""
+along. So does a g2o file with observations of landmarks, as `bmask-slam export` writes it; it and a
+pose graph, 2-D or 3-D, are written to the file --out."""
 
 
 def add_optimise(commands: _Commands) -> None:
@@ -50,39 +52,50 @@ def add_optimise(commands: _Commands) -> None:
 
 
 def _optimise(arguments: argparse.Namespace) -> int:
-    from slam.progress import console_log
+    from slam.progress import console_log, iteration_bar
 
-    with console_log():
-        text = (_run_folder if arguments.input.is_dir() else _pose_graph)(arguments)
+    work = _run_folder if arguments.input.is_dir() else _file
+    with console_log(), iteration_bar(arguments.quiet) as progress:
+        text = work(arguments, progress)
     print(arguments.out if arguments.quiet else text)
     return 0
 
 
-def _run_folder(arguments: argparse.Namespace) -> str:
-    from slam.progress import iteration_bar
-    from slam.run_adjustment import AdjustOptions, adjust_run, format_adjustment
+def _run_folder(arguments: argparse.Namespace, progress: Progress) -> str:
+    from slam.run_adjustment import AdjustOptions, adjust_run, format_run_adjustment
 
-    if arguments.method:
-        raise InputError(
-            f"--method {arguments.method}: is of pose graphs; a run folder is adjusted by lm, its "
-            "loops by gnc; leave it out"
-        )
+    _refuse_method(arguments, "a run folder")
     names = ("out", "overwrite", "reference", "plot")
     given = {name: getattr(arguments, name) for name in names}
-    with iteration_bar(arguments.quiet) as progress:
-        result = adjust_run(AdjustOptions(arguments.input, **given), progress=progress)
+    result = adjust_run(AdjustOptions(arguments.input, **given), progress=progress)
     return (
-        f"{format_adjustment(result)}\n\nRun folder  {result.folder}\nPicture     {result.picture}"
+        f"{format_run_adjustment(result)}\n\nRun folder              {result.folder}\n"
+        f"Picture                 {result.picture}"
     )
 
 
-def _pose_graph(arguments: argparse.Namespace) -> str:
-    from slam.optimise import format_result, optimise_file
+def _file(arguments: argparse.Namespace, progress: Progress) -> str:
+    from graph.g2o_landmarks import has_landmarks
+    from slam.adjustment_report import format_adjustment
+    from slam.optimise import adjust_file, format_result, optimise_file
 
     for option in ("reference", "overwrite"):
         if getattr(arguments, option):
             raise InputError(f"--{option}: is of run folders; leave it out for {arguments.input}")
-    method: Method = arguments.method or "lm"
-    result = optimise_file(arguments.input, arguments.out, method, arguments.plot, arguments.quiet)
+    paths = arguments.input, arguments.out
+    if has_landmarks(arguments.input):
+        _refuse_method(arguments, "a graph with landmarks")
+        text = format_adjustment(*adjust_file(*paths, arguments.plot, progress))
+    else:
+        method: Method = arguments.method or "lm"
+        text = format_result(optimise_file(*paths, method, arguments.plot, progress))
     picture = f"\nPicture        {arguments.plot}" if arguments.plot else ""
-    return f"{format_result(result)}\n\nGraph          {arguments.out}{picture}"
+    return f"{text}\n\nGraph          {arguments.out}{picture}"
+
+
+def _refuse_method(arguments: argparse.Namespace, what: str) -> None:
+    if arguments.method:
+        raise InputError(
+            f"--method {arguments.method}: is of pose graphs; {what} is adjusted by lm, its loops "
+            "by gnc; leave it out"
+        )

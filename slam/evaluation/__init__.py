@@ -7,6 +7,7 @@ from slam.evaluation.evaluation import (
     evaluate_trajectory,
     format_json,
     format_table,
+    frame_stamps,
     read_reference,
 )
 
@@ -17,5 +18,6 @@ __all__ = [
     "evaluate_trajectory",
     "format_json",
     "format_table",
+    "frame_stamps",
     "read_reference",
 ]

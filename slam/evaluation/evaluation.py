@@ -12,6 +12,7 @@ from typing import TypedDict
 import numpy as np
 
 from graph.errors import InputError
+from graph.geometry import Array
 from graph.metrics import (
     AbsoluteError,
     RelativeError,
@@ -25,8 +26,8 @@ from graph.trajectory import (
     Trajectory,
     associate,
     nearest_indices,
-    read_tum,
 )
+from graph.trajectory_formats import read_times, read_trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -101,18 +102,25 @@ def evaluate(
     reference: Path,
     plot: Path | None = None,
     with_scale: bool = False,
+    times: Path | None = None,
 ) -> EvaluationResult:
-    """Evaluate a run folder or a TUM file against a TUM file or a sequence folder.
+    """Evaluate a run folder or a trajectory against a trajectory or a sequence folder.
+
+    Trajectories are in the format of TUM, EuRoC or KITTI. The latter's stamps are those of the file
+    ``times``, or of the run's frames.
 
     Raises:
         InputError: a file that is missing or broken, or trajectories that share no time.
     """
     run_or_trajectory, reference = Path(run_or_trajectory), Path(reference)
-    file = _file_in(run_or_trajectory, "trajectory.txt", "a run folder or a TUM trajectory file")
+    file = _file_in(run_or_trajectory, "trajectory.txt", "a run folder or a trajectory file")
     truth_file = _reference_file(reference)
-    estimate, truth = read_tum(file), read_tum(truth_file)
+    frames_s = frame_stamps(file)
+    stamps_s = read_times(times) if times else frames_s
+    estimate, truth = (read_trajectory(path, stamps_s) for path in (file, truth_file))
+    frames = None if frames_s is None else len(frames_s)
     try:
-        result = evaluate_trajectory(estimate, truth, _frames_given(file), with_scale)
+        result = evaluate_trajectory(estimate, truth, frames, with_scale)
     except InputError as error:
         raise InputError(f"{file} against {truth_file}: {error}") from error
     if plot is not None:
@@ -122,17 +130,28 @@ def evaluate(
     return result
 
 
-def read_reference(path: Path) -> Trajectory:
-    """The trajectory of a TUM file, or a sequence folder's ground truth.
+def read_reference(path: Path, stamps_s: Array | None = None) -> Trajectory:
+    """The trajectory in a file, or a sequence folder's ground truth.
+
+    ``stamps_s`` are those of the lines of a file in the format of KITTI.
 
     Raises:
         InputError: it is missing or broken.
     """
-    return read_tum(_reference_file(path))
+    return read_trajectory(_reference_file(path), stamps_s)
+
+
+def frame_stamps(trajectory_file: Path) -> Array | None:
+    """Stamps of all frames of the run that a trajectory.txt belongs to, None if it has no run."""
+    path = trajectory_file.parent / "frames.csv"
+    if trajectory_file.name != "trajectory.txt" or not path.is_file():
+        return None
+    with path.open(encoding="utf-8", newline="") as file:
+        return np.array([float(row["timestamp"]) for row in csv.DictReader(file)])
 
 
 def _reference_file(path: Path) -> Path:
-    return _file_in(path, "groundtruth.txt", "a sequence with ground truth or a TUM file")
+    return _file_in(path, "groundtruth.txt", "a sequence with ground truth or a trajectory file")
 
 
 def format_table(rows: list[Row]) -> str:
@@ -203,12 +222,3 @@ def _file_in(path: Path, name: str, expected: str) -> Path:
     if not file.is_file():
         raise InputError(f"{file}: no such file; give {expected}")
     return file
-
-
-def _frames_given(trajectory_file: Path) -> int | None:
-    """The number of rows of the frames.csv beside a run's trajectory, None without one."""
-    path = trajectory_file.parent / "frames.csv"
-    if trajectory_file.name != "trajectory.txt" or not path.is_file():
-        return None
-    with path.open(encoding="utf-8", newline="") as file:
-        return sum(1 for _ in csv.DictReader(file))

@@ -57,7 +57,34 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
     path.write_text("ply\nformat ascii 1.0\nend_header\n")
     with pytest.raises(InputError, match="not a PLY file of"):
         read_ply(path)
-    header = "ply\nformat binary_little_endian 1.0\nelement face 1\n"
-    path.write_text(header + "property list uchar int vertex_indices\nend_header\n")
-    with pytest.raises(InputError, match="a list property"):
+
+
+HEADER = "ply\nformat binary_little_endian 1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("element face 1\nproperty list uchar int vertex_indices\n", "first element is 'face'"),
+        ("element vertex 1\nproperty list uchar int x\n", "a list property"),
+        ("element vertex many\nproperty float x\n", "'many'"),
+        ("element vertex -1\nproperty float x\n", "no vertex"),
+        ("element vertex 1\nproperty float\n", "out of range"),
+        ("element vertex 1\nproperty float x\nproperty float x\n", "x"),
+        ("element vertex 1\n\n", "no vertex with properties"),
+    ],
+)
+def test_broken_headers_are_refused(tmp_path: Path, header: str, message: str) -> None:
+    path = tmp_path / "a.ply"
+    path.write_text(f"{HEADER}{header}end_header\n" + 20 * "x")
+    with pytest.raises(InputError, match="its header cannot be read") as error:
         read_ply(path)
+    assert message in str(error.value)
+
+
+def test_what_follows_the_vertices_is_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    header = HEADER + "element vertex 2\nproperty uchar x\n"
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_bytes(header.encode() + b"\x05\x07" + b"\x03abcdefghijkl")
+    assert {name: column.tolist() for name, column in read_ply(path).items()} == {"x": [5, 7]}

@@ -7,8 +7,17 @@ import pytest
 
 from graph.errors import InputError
 from graph.geometry import se3_exp
-from graph.trajectory import Trajectory
-from graph.trajectory_formats import read_euroc, read_kitti, write_euroc, write_kitti
+from graph.trajectory import Trajectory, write_tum
+from graph.trajectory_formats import (
+    read_euroc,
+    read_kitti,
+    read_times,
+    read_trajectory,
+    recognise,
+    write_euroc,
+    write_kitti,
+    write_times,
+)
 
 
 @pytest.fixture
@@ -94,3 +103,58 @@ def test_no_file(tmp_path: Path) -> None:
     for read in (read_kitti, read_euroc):
         with pytest.raises(InputError, match="no such trajectory file"):
             read(tmp_path / "none")
+
+
+# --- any of the three -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start_s", [0.0, 1403636579.75])
+def test_the_format_is_recognised(tmp_path: Path, trajectory: Trajectory, start_s: float) -> None:
+    moved = Trajectory(start_s + 0.25 * np.arange(50), trajectory.poses_world_camera)
+    write_tum(tmp_path / "tum", moved)
+    write_euroc(tmp_path / "euroc", moved)
+    write_kitti(tmp_path / "kitti", moved.poses_world_camera)
+    for name in ("tum", "euroc", "kitti"):
+        assert recognise(tmp_path / name) == name
+        found = read_trajectory(tmp_path / name, moved.timestamps_s)
+        np.testing.assert_array_equal(found.timestamps_s, moved.timestamps_s)
+        np.testing.assert_allclose(found.poses_world_camera, moved.poses_world_camera, atol=2e-9)
+
+
+def test_tum_with_commas_is_no_euroc(tmp_path: Path) -> None:
+    file = tmp_path / "a.txt"
+    file.write_text("".join(f"{1403636579 + k},{k},0,0,0,0,0,1\n" for k in range(4)))
+    assert recognise(file) == "tum"
+    assert read_trajectory(file).timestamps_s.tolist() == [1403636579.0 + k for k in range(4)]
+
+
+def test_kitti_needs_stamps_and_says_how(tmp_path: Path, trajectory: Trajectory) -> None:
+    file = tmp_path / "a.txt"
+    write_kitti(file, trajectory.poses_world_camera)
+    with pytest.raises(InputError, match=r"has no stamps; give them with --times"):
+        read_trajectory(file)
+    with pytest.raises(InputError, match="50 poses for 49 stamps"):
+        read_trajectory(file, trajectory.timestamps_s[1:])
+
+
+def test_times_are_read_back_and_taken_from_tum(tmp_path: Path, trajectory: Trajectory) -> None:
+    write_times(tmp_path / "times.txt", trajectory.timestamps_s)
+    write_tum(tmp_path / "tum.txt", trajectory)
+    for name in ("times.txt", "tum.txt"):
+        np.testing.assert_allclose(read_times(tmp_path / name), trajectory.timestamps_s, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no stamp in the file"),
+        ("1\nx\n", ":2: 'x' is not a finite number"),
+        ("# t\n1\n3\n2\n", ":4: a stamp that is not later"),
+        ("1\n1\n", ":2: a stamp that is not later"),
+    ],
+)
+def test_broken_times_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "t").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_times(tmp_path / "t")
+    assert message in str(error.value)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graph.g2o_landmarks_reader import read_landmark_graph
 from graph.geometry import inverse, make_pose, se3_exp, so3_exp
 from graph.ply import read_ply
 from graph.storage import read_graph, write_graph
@@ -124,6 +125,20 @@ def test_keyframes_landmarks_and_graph_fit_together(kitchen: Path, tmp_path: Pat
     assert optimise(out, "--out", again, "--quiet") == 0
     T = read_tum(again / "trajectory.txt").poses_world_camera
     assert np.abs(T - frames.poses_world_camera).max() < 5e-3
+
+
+def test_the_exported_graph_is_adjusted_to_the_same_cost(kitchen: Path, tmp_path: Path) -> None:
+    file, out, folder = tmp_path / "a.g2o", tmp_path / "b.g2o", tmp_path / "run"
+    words = ["export", kitchen, "--format", "g2o", "--out", file, "--quiet"]
+    assert cli.main([str(word) for word in words]) == 0
+    plot = tmp_path / "before_after.svg"
+    assert optimise(file, "--out", out, "--plot", plot, "--quiet") == 0
+    assert optimise(kitchen, "--out", folder, "--quiet") == 0
+    (shadow, _), (read, _) = read_graph(folder / "graph"), read_landmark_graph(out)
+    assert len(read.observations) == len(shadow.observations)
+    np.testing.assert_allclose(read.keyframes.values, shadow.keyframes.values, atol=1e-6)
+    np.testing.assert_allclose(read.landmarks.values, shadow.landmarks.values, atol=1e-4)
+    assert plot.stat().st_size > 1000
 
 
 def test_what_cannot_be_is_refused(capsys, kitchen: Path, tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_run_folder_against_sequence_folder(tmp_path):
 def test_bad_input(tmp_path):
     write_tum(tmp_path / "late.txt", Trajectory(arc().timestamps_s + 50, arc().poses_world_camera))
     write_tum(tmp_path / "groundtruth.txt", arc())
-    with pytest.raises(InputError, match="no such file; give a run folder or a TUM"):
+    with pytest.raises(InputError, match="no such file; give a run folder or a traj"):
         evaluate(tmp_path / "none", tmp_path)
     with pytest.raises(InputError, match=r"trajectory\.txt: no such file"):
         evaluate(tmp_path, tmp_path)
