@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import chi2
@@ -13,28 +15,47 @@ from graph.updates import IntArray
 
 WINDOW = 3  # steps of odometry on either side of a cycle
 PROBABILITY = 0.999
+MIN_CYCLES = 20  # to judge the noise by
+SCALE_MARGIN = 10.0  # below which a scale of the noise is not told from 1
 
 
-def supported_loops(graph: PoseGraph) -> Mask:
-    """(M,) loop edges that another one confirms; all false where odometry leaves gaps.
+@dataclass(frozen=True, eq=False)
+class LoopSupport:
+    """What short cycles say of a pose graph.
+
+    Attributes:
+        supported: (M,) bool, loop edges that another one confirms.
+        noise_scale: by which the bounds of chi-squares are to be multiplied; 1 where the
+            information matrices are about right, or where there are too few cycles to tell.
+    """
+
+    supported: Mask
+    noise_scale: float
+
+
+def loop_support(graph: PoseGraph) -> LoopSupport:
+    """Which loops confirm each other; none where odometry leaves gaps.
 
     Two loops (i, j) and (k, l) whose ends are few odometry steps apart close a cycle,
     ``E = inverse(T_i_j) @ T_i_k @ T_k_l @ T_l_j``, the identity but for the noise of its edges. A
     random loop has no such partner. Absence of one proves nothing: the place was seen only once.
+
+    Some files state information that is off by orders of magnitude, parking-garage's by four. All
+    loops would then confirm each other, or none. Cycles of right loops, the majority, show it: the
+    median of their chi-squares against that of the distribution. A margin is left, for what is
+    neglected here and because unconfirmed loops may be worse than confirmed ones.
     """
     supported = np.zeros(len(graph.edges), bool)
     odometry = graph.with_edges(graph.is_odometry)
-    if not is_connected(odometry):
-        return supported
     loops = np.flatnonzero(~graph.is_odometry)
+    if len(loops) < 2 or not is_connected(odometry):
+        return LoopSupport(supported, 1.0)
     i, j = graph.edges[loops].T
     swapped = i > j
     T = np.where(
         swapped[:, None, None], inverse(graph.measurements[loops]), graph.measurements[loops]
     )
     i, j = np.minimum(i, j), np.maximum(i, j)
-    if len(loops) < 2:
-        return supported
     a, b = KDTree(np.stack([i, j], axis=1)).query_pairs(WINDOW, p=np.inf, output_type="ndarray").T
     path = spanning_tree_poses(odometry)
     E = inverse(T[a]) @ inverse(path[i[a]]) @ path[i[b]] @ T[b] @ inverse(path[j[b]]) @ path[j[a]]
@@ -45,9 +66,14 @@ def supported_loops(graph: PoseGraph) -> Mask:
     S = loop_covariance[a] + loop_covariance[b] + steps[:, None, None] * step_covariance
     r = planar_coordinates(E) if graph.is_planar else se3_log(E)
     chi_squares = mahalanobis(r, S)
-    agree = chi_squares < chi2.ppf(PROBABILITY, r.shape[1])
+    expected = chi2(r.shape[1])
+    scale = 1.0
+    if len(chi_squares) >= MIN_CYCLES:
+        ratio = float(np.median(chi_squares) / expected.median())
+        scale = max(min(1.0, SCALE_MARGIN * ratio), ratio / SCALE_MARGIN)
+    agree = chi_squares < scale * expected.ppf(PROBABILITY)
     supported[loops[a[agree]]] = supported[loops[b[agree]]] = True
-    return supported
+    return LoopSupport(supported, scale)
 
 
 def cycle_chi2(

@@ -20,7 +20,7 @@ from graph.errors import InputError
 from graph.geometry import Array
 from graph.graduation import first_mu, graduate
 from graph.iteration import Progress, iterate
-from graph.loop_consistency import supported_loops
+from graph.loop_consistency import LoopSupport, loop_support
 from graph.pose_graph import (
     Mask,
     PoseGraph,
@@ -37,7 +37,6 @@ from graph.pose_graph_factors import (
 )
 
 Method = Literal["lm", "dogleg", "gnc"]
-WARM_MU = 0.1  # edges with a chi-square beyond 11 times the limit have weight 0 then
 LEAST_WEIGHT = 1e-6  # where odometry does not connect: what one edge alone holds stays solvable
 
 
@@ -98,15 +97,17 @@ def optimise_pose_graph(
     solver = _Solver(graph, config, progress)
     try:
         is_outlier = np.zeros(len(graph.edges), bool)
-        trusted = ~is_outlier
+        support, trusted = None, ~is_outlier
         if config.method == "gnc":
-            trusted = _trusted(graph)
+            support = loop_support(graph)
+            trusted = support.supported | graph.is_odometry
+            trusted = trusted if support.supported.any() else ~is_outlier
         given = "file" if graph.has_poses else "odometry"
         given_poses = graph.poses if graph.has_poses else spanning_tree_poses(graph)
         start, poses = _best_start(graph, {given: given_poses}, trusted)
         solver.start_from(poses)
-        if config.method == "gnc":
-            is_outlier = _graduated_non_convexity(graph, solver, config, trusted)
+        if support is not None:
+            is_outlier = _graduated_non_convexity(graph, solver, config, support)
         solver.weigh(np.where(is_outlier, 0.0, 1.0))
         final_cost = solver.run(config.max_iterations)
     except RuntimeError as error:  # GTSAM's exceptions all arrive as this
@@ -208,31 +209,33 @@ def _best_start(graph: PoseGraph, given: dict[str, Array], trusted: Mask) -> tup
 # --- graduated non-convexity ---------------------------------------------------------------------
 
 
-def _trusted(graph: PoseGraph) -> Mask:
-    """(M,) odometry and the loops that others confirm; all edges if there is no such loop."""
-    supported = supported_loops(graph)
-    return supported | graph.is_odometry if supported.any() else np.ones(len(supported), bool)
-
-
 def _graduated_non_convexity(
-    graph: PoseGraph, solver: _Solver, config: PoseGraphConfig, trusted: Mask
+    graph: PoseGraph, solver: _Solver, config: PoseGraphConfig, support: LoopSupport
 ) -> Mask:
     """(M,) the wrong edges: GNC with truncated least squares (Yang et al., RA-L 2020).
 
     mu starts where the cost is convex and grows until every weight is 0 or 1. From the solution of
-    trusted edges alone it starts much later: what disagrees widely with that is out at once. This
-    is also what keeps it quick, since random edges fill the factorisation. Odometry edges keep
-    weight 1. The solver is left at the solution.
+    odometry and the loops that others confirm it starts later, where the worst of these still
+    counts: what disagrees more is out at once. This is also what keeps it quick, since random edges
+    fill the factorisation. Odometry edges keep weight 1. The solver is left at the solution.
     """
-    limit = float(chi2.ppf(config.inlier_probability, graph.information.shape[-1]))
+    degrees = graph.information.shape[-1]
+    limit = support.noise_scale * float(chi2.ppf(config.inlier_probability, degrees))
     known = graph.is_odometry
     least = 0.0 if is_connected(graph.with_edges(known)) else LEAST_WEIGHT
-    solver.weigh(trusted.astype(float))
-    solver.run(config.gnc_inner_iterations)
+    confirmed = support.supported[~known]
+    if confirmed.any():
+        solver.weigh((known | support.supported).astype(float))
+        solver.run(config.max_iterations)
+    else:
+        solver.run(config.gnc_inner_iterations)
     chi_squares = solver.chi_squares()[~known]
     if not (chi_squares > limit).any():
         return np.zeros(len(known), bool)
-    mu = max(first_mu(chi_squares, limit), 0.0 if trusted.all() else WARM_MU)
+    mu = first_mu(chi_squares, limit)
+    if confirmed.any():
+        worst = float(chi_squares[confirmed].max())
+        mu = max(mu, limit / max(worst - limit, limit))
 
     def solve(weights: Array) -> Array:
         all_weights = np.ones(len(known))

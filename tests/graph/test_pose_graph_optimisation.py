@@ -10,7 +10,7 @@ from pose_graph_rings import PER_LAP, ring
 from graph.g2o import read_g2o
 from graph.geometry import inverse, se3_exp, se3_log
 from graph.graduation import truncated_weights
-from graph.loop_consistency import supported_loops
+from graph.loop_consistency import loop_support
 from graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
 from graph.pose_graph_factors import chordal_poses, pose_graph_cost
 from graph.pose_graph_optimisation import (
@@ -168,16 +168,30 @@ def test_gnc_without_odometry_keeps_the_graph_connected() -> None:
 @BOTH
 def test_loops_are_confirmed_by_their_neighbours(planar: bool) -> None:
     graph, wrong = with_wrong_loops(ring(90, planar, seed=2, sigma=0.01), 10)
-    supported = supported_loops(graph)
+    supported = loop_support(graph).supported
     assert not supported[wrong].any()
     assert supported[~wrong & ~graph.is_odometry].mean() > 0.95
     turned = graph.edges[:, ::-1].copy(), inverse(graph.measurements)
     loops = ~graph.is_odometry
     edges, measurements = graph.edges.copy(), graph.measurements.copy()
     edges[loops], measurements[loops] = turned[0][loops], turned[1][loops]
-    again = supported_loops(replace(graph, edges=edges, measurements=measurements))
+    again = loop_support(replace(graph, edges=edges, measurements=measurements)).supported
     assert (again == supported).mean() > 0.98
     assert PER_LAP > 6  # no loop of a lap lies in the window of another lap's
+
+
+@BOTH
+@pytest.mark.parametrize(("stated", "scale"), [(1e-5, 1e-4), (1.0, 1.0), (100.0, 10.0)])
+def test_wrong_loops_are_found_where_the_stated_information_is_off(
+    planar: bool, stated: float, scale: float
+) -> None:
+    """Information 1e-5 of what the noise is (as parking-garage's): random loops would fit in."""
+    graph, wrong = with_wrong_loops(ring(90, planar, seed=2, sigma=0.01), 20)
+    graph = replace(graph, information=stated * graph.information)
+    assert 1.0 <= loop_support(graph).noise_scale / scale < 10.0
+    result = optimise_pose_graph(graph, PoseGraphConfig(method="gnc"))
+    assert result.is_outlier[wrong].all()
+    assert result.is_outlier[~wrong].sum() <= 1
 
 
 def test_truncated_weights_go_from_all_to_nothing() -> None:
