@@ -37,8 +37,15 @@ def find_config(name: str) -> Path:
     return Path(name)
 
 
-def resolve(cls: type[Config], file: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+def resolve(
+    cls: type[Config],
+    file: Path | None = None,
+    overrides: Sequence[str] = (),
+    section: str | None = None,
+) -> Config:
     """The configuration ``cls()`` with a file's values and then ``a.b=c`` overrides applied.
+
+    Of the file only one ``section`` is looked at if it is given.
 
     Raises:
         InputError: an unreadable file, an unknown key, a value of the wrong type, or one that
@@ -46,7 +53,10 @@ def resolve(cls: type[Config], file: Path | None = None, overrides: Sequence[str
     """
     given: dict[str, _Given] = {}
     if file is not None:
-        given |= _flatten(cls, read_yaml(file), str(file))
+        content = read_yaml(file)
+        if section is not None and isinstance(content, dict):
+            content = content.get(section) or {}
+        given |= _flatten(cls, content, str(file))
     for text in overrides:
         path, separator, value = text.partition("=")
         if not separator or not path.strip():

@@ -19,7 +19,6 @@ from graph.storage import read_graph
 from graph.trajectory import Trajectory, read_tum
 from graph.updates import IntArray
 from slam.configuration import resolve
-from slam.system import SystemConfig
 
 MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals
 MAX_POSE_ERROR = 1e-5  # of poses with nine: metres, and entries of rotations
@@ -63,7 +62,7 @@ def read_run(path: Path) -> SavedRun:
         path,
         shadow,
         camera,
-        resolve(SystemConfig, config if config.is_file() else None).graph,
+        resolve(SmootherConfig, config if config.is_file() else None, section="graph"),
         _keyframe_stamps(path / "frames.csv", shadow.keyframes.ids),
         {name: read_tum(path / name) for name in names},
         read_tum(path / "keyframes.txt"),

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graph.errors import InputError
 from graph.g2o_landmarks_reader import read_landmark_graph
 from graph.geometry import inverse, make_pose, se3_exp, so3_exp
 from graph.ply import read_ply
@@ -15,6 +16,7 @@ from graph.trajectory import Trajectory, read_tum, write_tum
 from slam import cli
 from slam.run_adjustment import carry_along
 from slam.runner import RunOptions, run
+from slam.saved_run import read_run
 from slam.system import SystemConfig
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/redkitchen"
@@ -139,6 +141,17 @@ def test_the_exported_graph_is_adjusted_to_the_same_cost(kitchen: Path, tmp_path
     np.testing.assert_allclose(read.keyframes.values, shadow.keyframes.values, atol=1e-6)
     np.testing.assert_allclose(read.landmarks.values, shadow.landmarks.values, atol=1e-4)
     assert plot.stat().st_size > 1000
+
+
+def test_of_the_configuration_only_the_graphs_part_counts(kitchen: Path, tmp_path: Path) -> None:
+    """A run of another version, whose other settings have other names, is adjusted too."""
+    other = tmp_path / "other"
+    shutil.copytree(kitchen, other)
+    (other / "config.yaml").write_text("tracking: {gone: 1}\ngraph: {huber_stereo: 5.5}\n")
+    assert read_run(other).config.huber_stereo == 5.5
+    (other / "config.yaml").write_text("graph: {gone: 1}\n")
+    with pytest.raises(InputError, match="gone"):
+        read_run(other)
 
 
 def test_what_cannot_be_is_refused(capsys, kitchen: Path, tmp_path: Path) -> None:
