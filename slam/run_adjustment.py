@@ -242,6 +242,6 @@ def format_run_adjustment(result: RunAdjustment) -> str:
     for before, after in zip(*(errors.rows for errors in result.errors or ()), strict=True):
         if after["name"] in EVALUATION_ROWS:
             lines.append(
-                f"{after['name']:24}{before['value']:.4f} -> {after['value']:.4f} {after['unit']}"
+                f"{after['name']:24}{before['value']:.5f} -> {after['value']:.5f} {after['unit']}"
             )
     return "\n".join(lines)
