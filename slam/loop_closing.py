@@ -37,8 +37,8 @@ class LoopClosingConfig:
     path: a loop must not ask for more drift, and only loops whose ends are within ``comparable_m``
     of path are compared.
 
-    A loop's covariance is raised by ``model_sigma_rad`` and ``model_sigma_m``: what its inliers
-    do not know of, such as calibration; the landmarks fused after it say the rest. It stays while
+    A loop's covariance is raised by ``model_sigma_rad``, ``model_sigma_m`` and ``model_share`` of
+    its own turn and shift: what its inliers do not know of, such as calibration. It stays while
     its chi-square in the graph is below that of ``probability``. A map with a systematic error
     (a wrong focal length) is surer of itself than it should be and would refute every loop; so
     ``strong_support`` loops from three keyframes enter without a robust kernel and untested.
@@ -56,6 +56,7 @@ class LoopClosingConfig:
     drift_m_per_m: float = 0.02
     model_sigma_rad: float = 0.003
     model_sigma_m: float = 0.005
+    model_share: float = 0.02
     robust: str = "cauchy"
     max_iterations: int = 10
     fuse_keyframes: int = 10
@@ -179,10 +180,15 @@ class LoopCloser:
     def relative_poses(self, loops: list[LoopConstraint]) -> tuple[RelativePose, ...]:
         """What enters the graph for a confirmed set."""
         robust = None if self.is_strong(loops) else self.config.robust
-        model = self._map_covariances(np.array(0.0))
         return tuple(
-            RelativePose(*k.ends, k.T_a_b, k.covariance + model, robust, "loop") for k in loops
+            RelativePose(*k.ends, k.T_a_b, self._loop_covariance(k), robust, "loop") for k in loops
         )
+
+    def _loop_covariance(self, loop: LoopConstraint) -> Array:
+        """Covariance (6, 6) of a loop with what its inliers do not know of."""
+        rules, change = self.config, np.linalg.norm(se3_log(loop.T_a_b).reshape(2, 3), axis=1)
+        sigmas = np.array([rules.model_sigma_rad, rules.model_sigma_m]) + rules.model_share * change
+        return loop.covariance + np.diag(np.repeat(sigmas**2, 3))
 
     def _within_drift(self, loop: LoopConstraint, world: WorldMap) -> bool:
         """Whether the map can have drifted as far as a loop says."""

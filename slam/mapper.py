@@ -175,7 +175,7 @@ class Mapper:
         self._apply(self.smoother.update(update))
 
     def _fuse(self, loops: list[LoopConstraint]) -> None:
-        """Landmarks of both sides of loops that are one become one: first the loops' own pairs."""
+        """Landmarks of both sides that are one become one: first the loops' own pairs."""
         world = self.world
         old_ids, new_side = self._sides(loops)
         for loop in loops:
