@@ -78,14 +78,16 @@ class LoopCloser:
         self.index = DescriptorIndex(config.index)
         self.recogniser = PlaceRecogniser(self.index, config.places)
         self.waiting: list[LoopConstraint] = []
-        self.closed: list[tuple[int, int]] = []
+        self.closed: dict[tuple[int, int], bool] = {}
+        """Ends of the loops in the graph, and whether each is believed against it."""
         self._camera = camera
 
     def state(self) -> Arrays:
         """What was closed, what waits, and what the last query found."""
         waiting = self.waiting
         return {
-            "closed": np.array(self.closed, np.int64).reshape(-1, 2),
+            "closed": np.array(list(self.closed), np.int64).reshape(-1, 2),
+            "believed": np.array(list(self.closed.values()), bool),
             "ends": np.array([loop.ends for loop in waiting], np.int64).reshape(-1, 2),
             "T_a_b": np.array([loop.T_a_b for loop in waiting]).reshape(-1, 4, 4),
             "covariances": np.array([loop.covariance for loop in waiting]).reshape(-1, 6, 6),
@@ -102,7 +104,8 @@ class LoopCloser:
         """Become the closer of a state, with the keyframes of a map."""
         self.index.restore({k.id: k.features.descriptors for k in world.keyframes.values()})
         self.recogniser.restore(part(state, "recogniser"))
-        self.closed = [(a, b) for a, b in state["closed"].tolist()]
+        ends_closed = map(tuple, state["closed"].tolist())
+        self.closed = dict(zip(ends_closed, state["believed"].tolist(), strict=True))
         columns = (
             state["T_a_b"],
             state["covariances"],

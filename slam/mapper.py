@@ -119,27 +119,21 @@ class Mapper:
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
         """Look for known places from a keyframe; loops that hold move the map and fuse landmarks.
 
-        The graph is asked afterwards: a loop that does not fit is removed, an older one too, and
-        waits for more support.
+        The graph is asked afterwards: a loop that does not fit is removed and waits for more
+        support; an older one that no longer fits goes with what it fused.
         """
         confirmed = self.loops.loops_of(keyframe, self.world)
         if not confirmed:
             return []
         self._change_graph(relative_poses=self.loops.relative_poses(confirmed))
-        errors = self.smoother.relative_pose_errors("loop")
-        ends = np.stack([errors.keyframe_a, errors.keyframe_b], axis=1)
-        refuted = {(a, b) for a, b in ends[errors.chi2 > self.loops.config.gate].tolist()}
-        if self.loops.is_strong(confirmed):
-            refuted -= {loop.ends for loop in confirmed}
-        if refuted:
-            logger.info("loops refuted by the graph: %s", sorted(refuted))
-            gone = tuple((a, b, "loop") for a, b in sorted(refuted))
-            self._change_graph(remove_relative_poses=gone)
+        believed = self.loops.is_strong(confirmed)
+        self.loops.closed |= {loop.ends: believed for loop in confirmed}
+        refuted = self._refuted_loops()
         kept = [loop for loop in confirmed if loop.ends not in refuted]
         self.loops.waiting += [loop for loop in confirmed if loop.ends in refuted]
+        self._remove_loops(refuted, {loop.ends for loop in confirmed})
         if kept:
             self._fuse(kept)
-            self.loops.closed += [loop.ends for loop in kept]
         return kept
 
     def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
@@ -173,6 +167,30 @@ class Mapper:
         rounds = self.loops.config.max_iterations
         update = replace(self._feed.map_update(self.world), max_iterations=rounds, **changes)
         self._apply(self.smoother.update(update))
+
+    def _refuted_loops(self) -> set[tuple[int, int]]:
+        """Loops that are not in the graph, or do not fit it and are not believed against it."""
+        errors = self.smoother.relative_pose_errors("loop")
+        ends = np.stack([errors.keyframe_a, errors.keyframe_b], axis=1)
+        fits = (errors.chi2 <= self.loops.config.gate).tolist()
+        inside = dict(zip(map(tuple, ends.tolist()), fits, strict=True))
+        return {
+            pair
+            for pair, believed in self.loops.closed.items()
+            if not (inside.get(pair, False) or (believed and pair in inside))
+        }
+
+    def _remove_loops(self, refuted: set[tuple[int, int]], fresh: set[tuple[int, int]]) -> None:
+        """Take loops out of the graph, and apart what those that are not fresh have fused."""
+        if not refuted:
+            return
+        logger.info("loops refuted by the graph: %s", sorted(refuted))
+        gone = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
+        self._change_graph(remove_relative_poses=gone)
+        for a, b in sorted(refuted - fresh):
+            self.pruner().prune_loop(a, b)
+        for ends in refuted:
+            self.loops.closed.pop(ends, None)
 
     def _fuse(self, loops: list[LoopConstraint]) -> None:
         """Landmarks of both sides that are one become one: first the loops' own pairs."""

@@ -10,6 +10,7 @@ from synthetic_view import CAMERA, add_keyframe, make_features, random_descripto
 
 from graph.geometry import Array, inverse, make_pose, se3_exp, se3_log, so3_exp, transform
 from graph.smoother_config import SmootherConfig
+from graph.updates import RelativePoseErrors
 from slam.graph_feed import GraphFeedConfig
 from slam.local_mapping import MappingConfig
 from slam.loop_closing import LoopCloser, LoopClosingConfig
@@ -75,8 +76,9 @@ class Ring:
     def _observe(self, keyframe: Keyframe, seen: Array) -> None:
         world, k = self.mapper.world, keyframe.id
         known = {p: self.landmark_of[p] for p in seen.tolist() if p in self.landmark_of}
-        alive = world.landmarks.alive
-        tracked = {p: i for p, (i, at) in known.items() if k - at <= self.memory and alive[i]}
+        now = world.landmarks.current(np.arange(len(world.landmarks)))
+        alive = world.landmarks.alive[now]
+        tracked = {p: now[i] for p, (i, at) in known.items() if k - at <= self.memory and alive[i]}
         rows = np.array([row for row, p in enumerate(seen.tolist()) if p in tracked], np.int64)
         ids = np.array([tracked[p] for p in seen[rows].tolist()], np.int64)
         world.attach(keyframe, rows, ids)
@@ -211,3 +213,28 @@ def test_loops_of_a_keyframe_that_left_are_forgotten() -> None:
     assert [loop.keyframe_a for loop in closer.waiting] == [3]
     closer.remove(36)
     assert closer.waiting == []
+
+
+def test_an_old_loop_that_no_longer_fits_goes_with_what_it_fused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ring = Ring()
+    loops = ring.run(ONCE_ROUND + 2)
+    a, b = (ring.mapper.world.keyframes[k] for k in loops[-1].ends)
+    assert len(np.intersect1d(*(ring.mapper.world.observed(k)[1] for k in (a, b)))) > 50
+    closer, smoother = ring.mapper.loops, ring.mapper.smoother
+    errors = smoother.relative_pose_errors("loop")
+    assert set(closer.closed) == set(zip(errors.keyframe_a, errors.keyframe_b, strict=True))
+    closer.closed = dict.fromkeys(closer.closed, False)
+    extra = constraint(20, 36, inverse(pose_of(20)) @ pose_of(36))
+    monkeypatch.setattr(closer, "loops_of", lambda *_: [extra])
+    asked = smoother.relative_pose_errors
+
+    def old_ones_bad(kind: str) -> RelativePoseErrors:
+        errors = asked(kind)
+        return replace(errors, chi2=np.where(errors.keyframe_a < 20, 1e3, 0.0))
+
+    monkeypatch.setattr(smoother, "relative_pose_errors", old_ones_bad)
+    assert ring.step()[1] == [extra]
+    assert list(closer.closed) == [extra.ends]
+    assert len(np.intersect1d(*(ring.mapper.world.observed(k)[1] for k in (a, b)))) < 10

@@ -64,7 +64,7 @@ def system() -> SlamSystem:
         LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
         for k in range(2)
     ]
-    loops.closed = [(first, second)]
+    loops.closed = {(first, second): True, (first, second + 1): False}
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
     return system
 
