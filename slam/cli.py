@@ -12,15 +12,13 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from graph.errors import InputError
 from slam import __version__
 from slam.commands.export import add_export
 from slam.commands.optimise import add_optimise
-
-if TYPE_CHECKING:
-    from slam.runner import RunSummary
+from slam.commands.run import add_run
 
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
 EPILOG = """\
@@ -29,8 +27,6 @@ first steps:
   bmask-slam run office                                run on it; results go to runs/office
   bmask-slam evaluate runs/office --reference office   compare a trajectory with a reference
 """
-CONFIG_HELP = "YAML file, or the name of a shipped one such as 'paper'"
-SET_HELP = "one value of the configuration, such as tracking.min_inliers=20; may be repeated"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
@@ -70,7 +66,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"bmask-slam {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    _add_run(commands)
+    add_run(commands)
     _add_evaluate(commands)
     _add_render(commands)
     _add_info(commands)
@@ -80,67 +76,6 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
-
-
-# --- run -----------------------------------------------------------------------------------------
-
-
-def _add_run(commands: _Commands) -> None:
-    text = "run the system over a sequence and write a run folder"
-    parser = commands.add_parser("run", help=text, description=text)
-    parser.set_defaults(handler=_run)
-    parser.add_argument("sequence", type=Path, help="folder in TUM layout")
-    parser.add_argument("--out", type=Path, help="run folder (default: runs/<sequence>, numbered)")
-    parser.add_argument("--overwrite", action="store_true", help="replace the run that --out holds")
-    parser.add_argument("--config", metavar="F", help=CONFIG_HELP)
-    parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
-    parser.add_argument("--print-config", action="store_true", help="print it resolved, and end")
-    parser.add_argument("--reference", type=Path, metavar="F", help="trajectory to compare to")
-    parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
-    parser.add_argument("--stride", type=int, default=1, metavar="N", help="take every N-th frame")
-    parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
-
-
-def _run(arguments: argparse.Namespace) -> int:
-    from slam.configuration import dump, find_config, resolve
-    from slam.progress import console_log
-    from slam.runner import RunOptions, run
-    from slam.system import SystemConfig
-
-    file = find_config(arguments.config) if arguments.config else None
-    config = resolve(SystemConfig, file, arguments.set)
-    if arguments.print_config:
-        print(dump(config), end="")
-        return 0
-    options = RunOptions(
-        sequence=arguments.sequence,
-        config=config,
-        config_name=file.stem if file else "",
-        out=arguments.out,
-        overwrite=arguments.overwrite,
-        reference=arguments.reference,
-        max_frames=arguments.max_frames,
-        stride=arguments.stride,
-        quiet=arguments.quiet,
-    )
-    with console_log():
-        summary = run(options)
-    _print_summary(summary, arguments.quiet)
-    return 128 + summary.stopped_by if summary.stopped_by else 0
-
-
-def _print_summary(summary: RunSummary, quiet: bool) -> None:
-    from slam.evaluation import format_table
-
-    if quiet:
-        print(summary.folder)
-        return
-    print(format_table(summary.rows))
-    if summary.skipped:
-        print(f"\n{summary.skipped} broken frames were skipped, see log.txt")
-    if summary.stopped_by:
-        print(f"\nStopped by {summary.stopped_by.name} after {summary.frames} frames; all is saved")
-    print(f"\nRun folder  {summary.folder}\nPicture     {summary.folder / 'trajectory.png'}")
 
 
 # --- evaluate ------------------------------------------------------------------------------------

@@ -53,6 +53,12 @@ class Localiser:
         self._T_world_last, self._T_last_next = state["T_world_last"], state["T_last_next"]
         self._recent_ids, self._local_ids = state["recent_ids"], state["local_ids"]
 
+    def forget(self, lost_frames: int) -> None:
+        """Lost for so many frames, knowing nothing about where the camera is."""
+        self.lost_frames = lost_frames
+        self._recent_ids = self._local_ids = np.zeros(0, np.int64)
+        self.restart(np.eye(4))
+
     @property
     def local_ids(self) -> Ints:
         """Landmarks of the local map that the next frame will be tracked against."""

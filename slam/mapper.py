@@ -87,6 +87,11 @@ class Mapper:
         self.smoother.restart()
         self.loops.index.rebuild()
 
+    def begin_session(self) -> None:
+        """Forget the frames that were tracked, and the times; map and graph stay."""
+        self.history = FrameHistory()
+        self.update_ms = []
+
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Make a tracked frame a keyframe: landmarks are made, fused and culled."""
         world = self.world

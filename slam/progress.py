@@ -10,17 +10,18 @@ from types import TracebackType
 
 from tqdm import tqdm
 
-from slam.results import FrameResult, TrackingStatus
+from slam.results import TrackingStatus
 
 TERMINAL_INTERVAL_S = 0.1
 FILE_INTERVAL_S = 10.0
 
 
-def make_bar(total: int | None, quiet: bool) -> tqdm:
+def make_bar(total: int | None, quiet: bool, done: int = 0) -> tqdm:
     """A bar on stderr; a line every 10 s where that is no terminal, nothing if quiet."""
     interval_s = TERMINAL_INTERVAL_S if sys.stderr.isatty() else FILE_INTERVAL_S
     return tqdm(
         total=total,
+        initial=done,
         disable=quiet,
         unit="frame",
         mininterval=interval_s,
@@ -54,12 +55,10 @@ def iteration_bar(quiet: bool) -> Iterator[Callable[[int, float], None]]:
 
 
 class Progress:
-    """The bar of a run."""
+    """The bar of a run, or of the rest of one whose first ``done`` frames are done."""
 
-    def __init__(self, total: int, quiet: bool) -> None:
-        self._bar = make_bar(total, quiet)
-        self._keyframes = 0
-        self._lost = 0
+    def __init__(self, total: int, quiet: bool, done: int = 0) -> None:
+        self._bar = make_bar(total, quiet, done)
 
     def __enter__(self) -> Progress:
         return self
@@ -72,11 +71,9 @@ class Progress:
     ) -> None:
         self._bar.close()
 
-    def update(self, result: FrameResult) -> None:
-        """Count a frame."""
-        self._keyframes += result.keyframe_id is not None
-        self._lost += result.status is TrackingStatus.LOST
-        text = f"{result.status.value}, {self._keyframes} keyframes, {self._lost} lost"
+    def update(self, status: TrackingStatus, keyframes: int, lost: int) -> None:
+        """One more frame, with its status and what was counted so far."""
+        text = f"{status.value}, {keyframes} keyframes, {lost} lost"
         self._bar.set_postfix_str(text, refresh=False)
         self._bar.update()
 

@@ -8,9 +8,12 @@ keyframes.txt         the keyframes, as trajectory.txt
 frames.csv            one line a frame: status, matches, inliers, milliseconds a stage, keyframe
 landmarks.ply         x y z (world, metres), red green blue, observations, id
 graph                 the saved factor graph and values, one file that loads again
+map                   keyframes, landmarks and graph, for ``run --map`` and ``run --localise``
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference
 log.txt               what the program had to say
+checkpoint            while a run with ``--checkpoint-every`` is not finished: all it needs to
+                      be resumed (``run --resume``); it is gone when the run is complete
 ====================  ============================================================================
 
 ``frames.csv`` and ``log.txt`` grow line by line; everything else is written under a temporary name
@@ -30,6 +33,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
+from typing import IO, Any
 
 from graph.errors import InputError
 from graph.trajectory import Trajectory, write_tum
@@ -43,10 +47,12 @@ FILES = (
     "frames.csv",
     "landmarks.ply",
     "graph",
+    "map",
     "metrics.json",
     "trajectory.png",
     "log.txt",
 )
+CHECKPOINT = "checkpoint"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("graph", "semantics", "mapping", "slam")
 COLUMNS = (
@@ -74,32 +80,39 @@ class RunFolder:
     """An open run folder; a context manager that closes its files.
 
     A run that is refused before its first frame leaves nothing: the folder is removed again.
+    While it is open no other process can write a run there.
     """
 
-    def __init__(self, path: Path, overwrite: bool = False) -> None:
-        """Make the folder, with an empty frames.csv and log.txt.
+    def __init__(
+        self, path: Path, overwrite: bool = False, resume_bytes: int | None = None
+    ) -> None:
+        """Make the folder, with an empty frames.csv and log.txt; or go on with the run it holds,
+        frames.csv being cut to ``resume_bytes``.
 
         Raises:
-            InputError: it cannot be written, or already holds a run and ``overwrite`` is not set.
+            InputError: it cannot be written, or already holds a run and ``overwrite`` is not set,
+                or a process still writes there, or frames.csv is not that of the run to resume.
         """
         self.path = path
-        self._made = _make_folder(path)
-        held = [name for name in FILES if os.path.lexists(path / name)]
-        if held and not overwrite:
-            raise InputError(
-                f"{path}: already holds a run ({held[0]}); choose another --out or add --overwrite"
-            )
+        self._begun = resume_bytes is not None
+        self._made = [] if self._begun else _make_folder(path)
+        if resume_bytes is None:
+            _clear(path, overwrite)
+        else:
+            _check_frames(path / "frames.csv", resume_bytes)
         try:
-            _remove(path, held)
-            self._log = _LogFile(path / "log.txt", mode="x", encoding="utf-8")
-            self._frames = (path / "frames.csv").open("x", encoding="utf-8", newline="")
+            mode = "a" if self._begun else "x"
+            self._frames = (path / "frames.csv").open(mode, encoding="utf-8", newline="")
+            _lock(self._frames, path)
+            self._log = _LogFile(path / "log.txt", mode=mode, encoding="utf-8")
+            self._frames.truncate(resume_bytes or 0)
         except OSError as error:
             _remove_empty(self._made)
             raise _unwritable(path, error) from error
         self._rows = csv.DictWriter(self._frames, COLUMNS, lineterminator="\n")
-        self._rows.writeheader()
-        self._frames.flush()
-        self._written = 0
+        if not self._begun:
+            self._rows.writeheader()
+            self._frames.flush()
         self._levels: dict[str, int] = {}
 
     def __enter__(self) -> RunFolder:
@@ -129,8 +142,8 @@ class RunFolder:
             logging.getLogger(name).setLevel(level)
         self._log.close()
         self._frames.close()
-        if isinstance(error, InputError) and not self._written:
-            _remove(self.path, FILES)
+        if isinstance(error, InputError) and not self._begun:
+            _remove(self.path, (CHECKPOINT, *FILES))
             _remove_empty(self._made)
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             raise InputError(
@@ -157,7 +170,16 @@ class RunFolder:
         row |= {f"{stage}_ms": f"{ms:.3f}" for stage, ms in result.stage_ms.items()}
         self._rows.writerow(row)
         self._frames.flush()
-        self._written += 1
+        self._begun = True
+
+    def synced_bytes(self) -> int:
+        """The size of frames.csv, all of it on disk."""
+        os.fsync(self._frames.fileno())
+        return os.fstat(self._frames.fileno()).st_size
+
+    def complete(self) -> None:
+        """Say that the run is finished: there is nothing to resume."""
+        _remove(self.path, [CHECKPOINT])
 
     def write_trajectory(self, trajectory: Trajectory, name: str = "trajectory.txt") -> None:
         """Replace trajectory.txt (or keyframes.txt) by the poses of T_world_camera."""
@@ -180,6 +202,50 @@ class RunFolder:
             os.replace(temporary, path)
         finally:
             _remove(self.path, [temporary.name])
+
+
+def _clear(path: Path, overwrite: bool) -> None:
+    """Remove the run that a folder holds, its checkpoint first. Raises InputError."""
+    held = [name for name in (CHECKPOINT, *FILES) if os.path.lexists(path / name)]
+    if held and not overwrite:
+        cure = "go on with --resume, " if held[0] == CHECKPOINT else ""
+        raise InputError(
+            f"{path}: already holds a run ({held[0]}); {cure}choose another --out or add "
+            "--overwrite"
+        )
+    try:
+        if "frames.csv" in held:
+            with (path / "frames.csv").open("rb") as file:
+                _lock(file, path)
+        _remove(path, held)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def _lock(file: IO[Any], path: Path) -> None:
+    """Keep other processes from writing here as long as the file is open, or refuse to."""
+    if sys.platform == "win32":
+        return
+    import fcntl  # noqa: PLC0415 - Unix only
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise InputError(
+            f"{path}: a process is writing a run there; wait for it, or choose another --out"
+        ) from error
+
+
+def _check_frames(frames: Path, size: int) -> None:
+    """Refuse a frames.csv that does not begin with the bytes of a checkpoint."""
+    header, found = ",".join(COLUMNS), b""
+    if frames.is_file():
+        found = frames.read_bytes()[: max(size, 0)]
+    if len(found) < size or found.partition(b"\n")[0] != header.encode():
+        raise InputError(
+            f"{frames}: not the file that the checkpoint knows, with {size} bytes or more and the "
+            f"columns {header}; start the run again with --overwrite"
+        )
 
 
 def _make_folder(path: Path) -> list[Path]:

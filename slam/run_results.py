@@ -14,7 +14,7 @@ from graph.trajectory import Trajectory
 from slam.evaluation import Row, evaluate_trajectory, format_json
 from slam.evaluation.plot import plot_trajectory
 from slam.memory import peak_rss_mb
-from slam.results import FrameResult
+from slam.results import FrameResult, TrackingStatus
 from slam.run_folder import RunFolder
 from slam.system import LandmarkCloud
 from slam.system_interface import System
@@ -37,18 +37,29 @@ class Tally:
     Attributes:
         tracking_ms: of each frame, features and tracking; what a keyframe adds is not in it.
         next_index: the first index of the sequence that was not reached.
-        wall_s: time of the whole loop.
+        keyframes: frames that became one.
+        lost: frames without a pose.
+        wall_s: time of the whole loop, without what a kill threw away.
     """
 
     tracking_ms: list[float] = field(default_factory=list)
     next_index: int = 0
+    keyframes: int = 0
+    lost: int = 0
     wall_s: float = 0.0
+
+    @property
+    def frames(self) -> int:
+        """Frames given to the system."""
+        return len(self.tracking_ms)
 
     def count(self, result: FrameResult) -> None:
         """Count a frame."""
         stages = result.stage_ms
         self.tracking_ms.append(stages["features"] + stages.get("tracking", 0.0))
         self.next_index = result.index + 1
+        self.keyframes += result.keyframe_id is not None
+        self.lost += result.status is TrackingStatus.LOST
 
 
 def measure(system: System, reference: Trajectory | None, tally: Tally, stride: int) -> list[Row]:
@@ -63,7 +74,7 @@ def measure(system: System, reference: Trajectory | None, tally: Tally, stride: 
         except InputError as error:
             logger.warning("no comparison with the reference: %s", error)
     rows += _percentiles("tracking_ms", tally.tracking_ms)
-    rows.append(_row("frames_per_second", len(tally.tracking_ms) / tally.wall_s, "Hz"))
+    rows.append(_row("frames_per_second", tally.frames / tally.wall_s, "Hz"))
     rows.append(_row("keyframes", int(statistics["keyframes"]), "keyframes"))
     rows.append(_row("landmarks", int(statistics["landmarks"]), "landmarks"))
     rows.append(_row("loops_closed", int(statistics["loops_closed"]), "loops"))
@@ -95,10 +106,14 @@ def save(
         if segment.timestamps_s[0] not in trajectory.timestamps_s:
             folder.write_trajectory(segment, f"trajectory_segment_{number}.txt")
     write_landmarks(folder.path / "landmarks.ply", system.landmarks())
-    with folder.replacing("graph") as graph:
-        system.save_graph(graph)
+    for name, write in system.files().items():
+        with folder.replacing(name) as temporary:
+            write(temporary)
     folder.write_text("metrics.json", format_json(rows))
     plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title)
+    for name in system.files():
+        size_mb = (folder.path / name).stat().st_size / 1e6
+        logger.info("%s: %.1f MB", name, size_mb)
 
 
 def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:

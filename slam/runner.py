@@ -8,9 +8,9 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,56 +20,27 @@ from graph.errors import InputError
 from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from graph.trajectory_formats import read_trajectory
 from slam import __version__
+from slam.checkpoint import Checkpoints, read_checkpoint
 from slam.configuration import dump
 from slam.evaluation import Row
 from slam.frame import Frame
+from slam.map_file import read_map
+from slam.map_localisation import MapLocalisation
 from slam.progress import Progress
-from slam.run_folder import RunFolder, free_run_path
+from slam.run_folder import CHECKPOINT, RunFolder, free_run_path
+from slam.run_options import RunOptions
 from slam.run_results import Tally, measure, save
 from slam.sequences import Sequence, open_sequence
 from slam.stop import StopRequest
 from slam.system import SlamSystem, SystemConfig
 from slam.system_interface import System
 
+__all__ = ["RunOptions", "RunSummary", "resume", "run"]
 logger = logging.getLogger(__name__)
 
 SNAPSHOT_FRAMES = 30
 SNAPSHOT_GROWTH = 1.05
 MIN_REFERENCE_POSES = 3
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What to run and where to put it.
-
-    Attributes:
-        sequence: folder in TUM layout.
-        config: of the system.
-        config_name: for the name of the run folder, where ``out`` is None.
-        out: the run folder; None: the first free ``runs/<sequence>[-<config_name>][-<n>]``.
-        overwrite: replace the run that ``out`` holds.
-        reference: TUM file or sequence folder to compare with; None: the sequence's own, if any.
-        max_frames: stop after so many frames.
-        stride: take every n-th frame.
-        quiet: no progress bar.
-    """
-
-    sequence: Path
-    config: SystemConfig = field(default_factory=SystemConfig)
-    config_name: str = ""
-    out: Path | None = None
-    overwrite: bool = False
-    reference: Path | None = None
-    max_frames: int | None = None
-    stride: int = 1
-    quiet: bool = False
-
-    def __post_init__(self) -> None:
-        for option in ("stride", "max_frames"):
-            value = getattr(self, option)
-            if value is not None and value < 1:
-                name = option.replace("_", "-")
-                raise InputError(f"--{name} {value}: must be a whole number of at least 1")
 
 
 @dataclass(frozen=True)
@@ -82,6 +53,7 @@ class RunSummary:
         frames: frames given to the system.
         skipped: frames that were broken, not counted in ``frames``.
         stopped_by: the signal that ended the run early, or None.
+        resumable: the run can be resumed from its last checkpoint, since it was stopped.
     """
 
     folder: Path
@@ -89,19 +61,21 @@ class RunSummary:
     frames: int
     skipped: int
     stopped_by: signal.Signals | None = None
+    resumable: bool = False
 
 
-def run(
-    options: RunOptions, make_system: Callable[[Camera, SystemConfig], System] = SlamSystem
-) -> RunSummary:
+MakeSystem = Callable[[Camera, SystemConfig], System]
+
+
+def run(options: RunOptions, make_system: MakeSystem = SlamSystem) -> RunSummary:
     """Run the system over a sequence and fill the run folder.
 
     SIGINT and SIGTERM end it after the current frame; what was tracked so far is then finished
     and saved like a whole run.
 
     Raises:
-        InputError: a broken sequence or reference, or a run folder that cannot be used; nothing is
-            left behind unless frames had been tracked before.
+        InputError: a broken sequence, reference or map, or a run folder that cannot be used;
+            nothing is left behind unless frames had been tracked before.
     """
     sequence = open_sequence(options.sequence)
     reference = find_reference(options.reference, sequence)
@@ -111,13 +85,41 @@ def run(
         StopRequest() as stop,
     ):
         describe_run(folder, options, sequence)
-        system = make_system(sequence.camera, options.config)
-        tally = track(system, sequence, folder, options, stop)
-        system.finish()
-        rows = measure(system, reference, tally, options.stride)
-        save(system, folder, rows, reference, name)
-    skipped = sum(index < tally.next_index for index, _ in sequence.skipped)
-    return RunSummary(folder.path, rows, len(tally.tracking_ms), skipped, stop.signal)
+        system = start_system(options, sequence, make_system)
+        tally = Tally()
+        track((system, tally), sequence, folder, options, stop)
+        return conclude((system, tally), (sequence, reference), folder, options, stop)
+
+
+def resume(
+    path: Path, given: Mapping[str, Any] | None = None, make_system: MakeSystem = SlamSystem
+) -> RunSummary | None:
+    """Go on with a run that was killed, from its last checkpoint; None if it is finished.
+
+    ``given`` are options (attributes of RunOptions) that the user repeats: the sequence may have
+    been moved, the others must be the run's own.
+
+    Raises:
+        InputError: there is no checkpoint, it is broken or of another version, or sequence,
+            configuration or options are not those that the run was begun with.
+    """
+    if (path / "metrics.json").exists() and not (path / CHECKPOINT).exists():
+        return None
+    checkpoint = read_checkpoint(path)
+    options = checkpoint.options.with_given(given or {})
+    sequence = open_sequence(options.sequence)
+    checkpoint.check_sequence(sequence)
+    reference = find_reference(options.reference, sequence)
+    system, tally = make_system(sequence.camera, options.config), checkpoint.tally
+    system.restore(checkpoint.state, path / CHECKPOINT)
+    with RunFolder(path, resume_bytes=checkpoint.frames_bytes) as folder, StopRequest() as stop:
+        logger.info("resumed after %d frames: %s", tally.frames, shlex.join(sys.argv))
+        if not tally.frames:
+            logger.warning("%s: no checkpoint was reached; starting from the beginning", path)
+        for index, reason in checkpoint.skipped:
+            sequence.skip(index, reason)
+        track((system, tally), sequence, folder, options, stop)
+        return conclude((system, tally), (sequence, reference), folder, options, stop)
 
 
 def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
@@ -155,57 +157,114 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
         logger.info("frame %d is broken: %s", index, reason)
 
 
+def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSystem) -> System:
+    """The system of a new run: empty, or with the map that the options name.
+
+    Raises:
+        InputError: the map cannot be read, or is to be continued with another camera.
+    """
+    source = options.map or options.localise
+    if source is None:
+        return make_system(sequence.camera, options.config)
+    state, camera = read_map(source)
+    if options.map and camera != sequence.camera:
+        raise InputError(
+            f"{source}: made with {camera}, but {sequence.folder} has {sequence.camera}; a map "
+            "goes on with its own camera only (--localise takes any)"
+        )
+    make = MapLocalisation if options.localise else make_system
+    system = make(sequence.camera, options.config)
+    system.restore(state, source)
+    system.begin_session()
+    logger.info("%s: %s keyframes", source, system.statistics()["keyframes"])
+    return system
+
+
 def track(
-    system: System, sequence: Sequence, folder: RunFolder, options: RunOptions, stop: StopRequest
-) -> Tally:
-    """Process frames until the end, ``max_frames`` or a stop request, recording each."""
+    progress: tuple[System, Tally],
+    sequence: Sequence,
+    folder: RunFolder,
+    options: RunOptions,
+    stop: StopRequest,
+) -> None:
+    """Process frames until the end, ``max_frames`` or a stop request, recording each.
+
+    The system and what is counted of it go on from where they are.
+    """
+    system, tally = progress
     end = len(sequence)
     if options.max_frames is not None:
         end = min(end, options.max_frames * options.stride)
-    frames = sequence.frames(0, end, options.stride, prepare=_timed(system.prepare))
-    tally, total = Tally(), len(range(0, end, options.stride))
-    start_s = time.perf_counter()
+    indices = range(0, end, options.stride)
+    begin = -(-tally.next_index // options.stride)
+    frames = sequence.frames(
+        begin * options.stride, end, options.stride, prepare=_timed(system.prepare)
+    )
+    checkpoints = Checkpoints(folder, options, sequence)
+    start_s = time.perf_counter() - tally.wall_s
     with (
         closing(frames),  # type: ignore[type-var]
-        Progress(total, options.quiet) as bar,
-        _snapshots(system, folder) as snapshot,
+        Progress(len(indices), options.quiet, begin) as bar,
+        _snapshots(system, folder, tally) as snapshot,
     ):
+        if not tally.frames:
+            checkpoints.write(system, tally)
         for frame, (features, features_ms) in frames:
             result = system.process(frame, features)
             result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
             folder.write_frame(result)
             tally.count(result)
-            bar.update(result)
-            snapshot(len(tally.tracking_ms))
+            tally.wall_s = time.perf_counter() - start_s
+            bar.update(result.status, tally.keyframes, tally.lost)
+            snapshot()
             if stop.signal is not None:
                 break
+            checkpoints.after_frame(system, tally)
         else:
             tally.next_index = end
-    tally.wall_s = time.perf_counter() - start_s
-    logger.info("%d frames in %.1f s", len(tally.tracking_ms), tally.wall_s)
-    return tally
+            checkpoints.write(system, tally)
+    logger.info("%d frames in %.1f s", tally.frames, tally.wall_s)
+
+
+def conclude(
+    progress: tuple[System, Tally],
+    inputs: tuple[Sequence, Trajectory | None],
+    folder: RunFolder,
+    options: RunOptions,
+    stop: StopRequest,
+) -> RunSummary:
+    """Finish the system, measure and save; a run that was not stopped is complete then."""
+    (system, tally), (sequence, reference) = progress, inputs
+    system.finish()
+    rows = measure(system, reference, tally, options.stride)
+    title = "-".join(filter(None, (sequence.name, options.config_name)))
+    save(system, folder, rows, reference, title)
+    if stop.signal is None:
+        folder.complete()
+    skipped = sum(index < tally.next_index for index, _ in sequence.skipped)
+    resumable = stop.signal is not None and options.checkpoint_every is not None
+    return RunSummary(folder.path, rows, tally.frames, skipped, stop.signal, resumable)
 
 
 @contextmanager
-def _snapshots(system: System, folder: RunFolder) -> Iterator[Callable[[int], None]]:
-    """A function that, told the number of frames, saves the trajectory now and then.
+def _snapshots(system: System, folder: RunFolder, tally: Tally) -> Iterator[Callable[[], None]]:
+    """A function, called after every frame, that saves the trajectory now and then.
 
     It grows rarer with the trajectory, so that the cost of a frame does not grow. Whatever ends
     the block, the trajectory is saved once more if there were any frames.
     """
-    frames, due = 0, SNAPSHOT_FRAMES
+    due = tally.frames + SNAPSHOT_FRAMES
 
-    def snapshot(count: int) -> None:
-        nonlocal frames, due
-        frames = count
-        if count >= due:
+    def snapshot() -> None:
+        nonlocal due
+        if tally.frames >= due:
             folder.write_trajectory(system.trajectory())
-            due = int(count * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
+            due = int(tally.frames * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
 
     try:
         yield snapshot
     finally:
-        if frames:
+        if tally.frames:
             folder.write_trajectory(system.trajectory())
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,11 +25,14 @@ from slam.keyframes import KeyframeConfig, KeyframeEvidence, keyframe_reason
 from slam.local_mapping import MappingConfig
 from slam.localiser import Localiser
 from slam.loop_closing import LoopClosingConfig
+from slam.map_file import MAP, write_map
 from slam.mapper import Mapper
 from slam.relocalisation import RelocalisationConfig
 from slam.results import FrameResult, TrackingStatus
 from slam.tracker import Tracked, Tracker, TrackingConfig, lost, untracked
 from slam.world_map import Keyframe
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ class SlamSystem:
         self._segment = 0
         self._reference: Keyframe | None = None
         self._frames_since_keyframe = 0
+        self._first_keyframe = 0  # of this session
 
     def state(self) -> Arrays:
         """All that the past has left behind, as named arrays (docs: "Checkpoints")."""
@@ -81,6 +86,7 @@ class SlamSystem:
             "segment": np.array(self._segment),
             "reference": np.array(-1 if self._reference is None else self._reference.id),
             "frames_since_keyframe": np.array(self._frames_since_keyframe),
+            "first_keyframe": np.array(self._first_keyframe),
             **nested(mapper=self.mapper.state(), localiser=self.localiser.state()),
         }
 
@@ -92,10 +98,25 @@ class SlamSystem:
         self._segment = int(state["segment"])
         self._reference = self.mapper.world.keyframes.get(int(state["reference"]))
         self._frames_since_keyframe = int(state["frames_since_keyframe"])
+        self._first_keyframe = int(state["first_keyframe"])
 
     def restart(self) -> None:
         """From here on, go on exactly like a system restored from the present state."""
         self.mapper.restart()
+
+    def begin_session(self) -> None:
+        """Forget where the camera was and what was tracked; the map stays.
+
+        The first frame is looked for in the map's largest segment. What is not recognised there
+        begins a segment of its own, which is joined once it is.
+        """
+        world = self.mapper.world
+        self._segment = world.largest_segment()
+        self._reference = world.in_segment(self._segment)[-1]
+        self._frames_since_keyframe = 0
+        self._first_keyframe = world.next_keyframe_id
+        self.mapper.begin_session()
+        self.localiser.forget(self.config.relocalisation.patience_frames)
 
     def prepare(self, frame: Frame) -> Features:
         """The frame's features; pure, so that it may run ahead in another thread."""
@@ -138,6 +159,9 @@ class SlamSystem:
         """The last optimisation; the map is then final."""
         if self.config.final_adjustment:
             self.mapper.finish()
+        known = self.mapper.world.in_segment(largest(self.segments()))
+        if self._first_keyframe and known and known[0].id >= self._first_keyframe:
+            logger.warning("never recognised in the map: the trajectory has a frame of its own")
 
     def trajectory(self) -> Trajectory:
         """Every frame with a pose in the largest segment, from the keyframes as they are now."""
@@ -150,8 +174,9 @@ class SlamSystem:
         return self.mapper.history.trajectories(self.mapper.world)
 
     def keyframe_trajectory(self) -> Trajectory:
-        """The keyframes of the largest segment."""
+        """The keyframes of the largest segment that this session made."""
         chosen = self.mapper.world.in_segment(largest(self.segments()))
+        chosen = [k for k in chosen if k.id >= self._first_keyframe]
         stamps = np.array([k.timestamp_s for k in chosen])
         return Trajectory(stamps, np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4))
 
@@ -175,9 +200,12 @@ class SlamSystem:
             ids, table.points_world[ids], table.colours[ids], table.observations[ids]
         )
 
-    def save_graph(self, path: Path) -> None:
-        """Write the graph and its values so that they load again."""
-        self.mapper.smoother.save(path)
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """What it saves so that it loads again: a function that writes a file, by its name."""
+        return {
+            "graph": self.mapper.smoother.save,
+            MAP: lambda path: write_map(path, self.state(), self.camera),
+        }
 
     def statistics(self) -> dict[str, float | list[float]]:
         """Sizes of the map and the time of every graph update in milliseconds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -78,6 +79,11 @@ class WorldMap:
     def in_segment(self, segment: int) -> list[Keyframe]:
         """The keyframes of one map segment, oldest first."""
         return [k for k in self.keyframes.values() if k.segment == segment]
+
+    def largest_segment(self) -> int:
+        """The segment with most keyframes, the older of equal ones; 0 where there is none."""
+        counts = Counter(k.segment for k in self.keyframes.values())
+        return min(counts, key=lambda segment: (-counts[segment], segment), default=0)
 
     def segment_of(self, landmark_ids: Ints) -> int:
         """The segment whose keyframes made most of these landmarks."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from graph.array_file import Arrays
 from graph.camera import Camera
 from graph.trajectory import Trajectory, write_tum
 from slam.frame import Frame
@@ -65,6 +66,7 @@ class FakeSystem:
         self.z_error_m = z_error_m
         self.numbers: list[int] = []
         self.finished = False
+        self.restarts = 0
 
     def prepare(self, frame: Frame) -> int:
         return int(frame.rgb[0, 0, 0])
@@ -107,9 +109,24 @@ class FakeSystem:
         colours = np.array([[255, 1, 2], [3, 4, 250]], np.uint8)
         return LandmarkCloud(np.array([3, 8]), points, colours, np.array([2, 300]))
 
-    def save_graph(self, folder: Path) -> None:
+    def files(self) -> dict[str, Callable[[Path], None]]:
         assert self.finished
-        folder.write_bytes(b"graph and values")
+        return {name: lambda path, name=name: self.save(path, name) for name in ("graph", "map")}
+
+    def save(self, path: Path, name: str) -> None:
+        path.write_bytes(name.encode())
+
+    def state(self) -> Arrays:
+        return {"numbers": np.array(self.numbers, np.int64)}
+
+    def restore(self, state: Arrays, path: Path) -> None:
+        self.numbers = state["numbers"].tolist()
+
+    def restart(self) -> None:
+        self.restarts += 1
+
+    def begin_session(self) -> None:
+        raise NotImplementedError
 
     def statistics(self) -> dict[str, float | list[float]]:
         return {

@@ -72,7 +72,7 @@ def test_a_run_leaves_the_whole_contract(sequence: Path, out: Path) -> None:
     tracked = [k for k in range(20) if k % 7 != 6]
     np.testing.assert_allclose(read_tum(out / "trajectory.txt").timestamps_s * 10, tracked)
     np.testing.assert_allclose(read_tum(out / "keyframes.txt").timestamps_s * 10, [0, 5, 10, 15])
-    assert (out / "graph").read_bytes() == b"graph and values"
+    assert (out / "graph").read_bytes() == b"graph"
     assert (out / "trajectory.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((out / "metrics.json").read_text()) == summary.rows
     assert "Python" in (out / "log.txt").read_text()
@@ -258,7 +258,7 @@ def test_a_bug_is_in_the_log_with_its_traceback(sequence: Path, out: Path) -> No
 
 def test_a_full_disk_is_said_and_keeps_what_was_written(sequence: Path, out: Path) -> None:
     class Full(FakeSystem):
-        def save_graph(self, folder: Path) -> None:
+        def save(self, path: Path, name: str) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(InputError, match=r"out: No space left on device; free some space"):
