@@ -49,7 +49,7 @@ class FileKind:
 def write_arrays(path: Path, kind: FileKind, header: Header, arrays: Arrays) -> None:
     """Save arrays and a header of JSON values, atomically. Raises InputError if it cannot."""
     names = list(arrays)  # the zip's own directory has no checksum
-    header = {"format": kind.format, "version": kind.version, "arrays": names, **header}
+    header = {**header, "format": kind.format, "version": kind.version, "arrays": names}
     temporary = path.with_name(path.name + ".tmp")
     try:
         with temporary.open("wb") as file:

@@ -63,7 +63,7 @@ class Checkpoint:
         ):
             if not same:
                 raise InputError(
-                    f"{sequence.folder}: its {what} are not those that the run was begun with; "
+                    f"{sequence.folder}: not the {what} that the run was begun with; "
                     "restore the sequence, or start a new run"
                 )
 

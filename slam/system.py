@@ -202,10 +202,11 @@ class SlamSystem:
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """What it saves so that it loads again: a function that writes a file, by its name."""
-        return {
-            "graph": self.mapper.smoother.save,
-            MAP: lambda path: write_map(path, self.state(), self.camera),
-        }
+        return {"graph": self.mapper.smoother.save, MAP: self.save_map}
+
+    def save_map(self, path: Path) -> None:
+        """Write all that was learned, but no times: the same run gives the same bytes."""
+        write_map(path, self.state() | {"mapper.update_ms": np.zeros(0)}, self.camera)
 
     def statistics(self) -> dict[str, float | list[float]]:
         """Sizes of the map and the time of every graph update in milliseconds."""
