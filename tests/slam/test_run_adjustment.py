@@ -93,7 +93,8 @@ def test_a_run_folder_becomes_a_better_one(capsys, kitchen: Path, tmp_path: Path
     assert "wrong views" in printed
     assert str(out / "before_after.png") in printed
     assert {p.name: p.read_bytes() for p in kitchen.iterdir()} == before
-    assert {p.name for p in out.iterdir()} >= {*before, "before_after.png"}
+    missing = {"map"}  # its values would have to be those of the new graph
+    assert {p.name for p in out.iterdir()} >= {*before, "before_after.png"} - missing
     assert value(out, "cost_final") < value(out, "cost_initial")
     assert value(out, "ate_rmse") < 1.05 * value(kitchen, "ate_rmse")
     old, new = (read_tum(folder / "trajectory.txt") for folder in (kitchen, out))
