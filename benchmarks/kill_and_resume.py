@@ -3,8 +3,8 @@
     python benchmarks/kill_and_resume.py SEQUENCE --every 60 --kills 10
 
 Each row is a run of its own: the program is started as a user would, killed (SIGKILL) at a moment
-drawn from the whole time that the undisturbed run took, and resumed. Of the undisturbed run the
-cost of the checkpoints is told too.
+drawn from the time between its first checkpoint (before the first frame) and the end of the
+undisturbed run, and resumed. Of the undisturbed run the cost of the checkpoints is told too.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 
 COMPARED = ("trajectory.txt", "keyframes.txt", "landmarks.ply", "graph", "map")
@@ -32,17 +33,16 @@ class Kill:
     """One run that was killed.
 
     Attributes:
-        after_s: seconds after the program was started.
+        after_s: seconds after the first checkpoint.
         frames: lines of frames.csv at the kill.
-        checkpoint: frames of the last checkpoint; None: the run had not begun, and was started
-            again.
+        checkpoint: frames of the last checkpoint.
         was: the last line of the log at the kill.
         same: whether all that is left is that of the undisturbed run.
     """
 
     after_s: float
     frames: int
-    checkpoint: int | None
+    checkpoint: int
     was: str
     same: bool
 
@@ -67,27 +67,22 @@ def kill_once(
     """A run that is killed after so many seconds and then resumed."""
     shutil.rmtree(out, ignore_errors=True)
     process = program(*options, "--out", out)
+    while not (out / "checkpoint").exists():
+        time.sleep(0.01)
     try:
         process.wait(after_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-    log = (out / "log.txt").read_text() if (out / "log.txt").exists() else ""
-    frames = len(frame_rows(out))
-    checkpoints = [int(found[1]) for found in CHECKPOINT.finditer(log)]
-    if (out / "checkpoint").exists() or (out / "metrics.json").exists():
-        finish("--resume", out)
-    else:
-        finish(*options, "--out", out, "--overwrite")
-    last = log.splitlines()[-1].split(": ", 1)[-1] if log else "not begun"
-    reached = checkpoints[-1] if checkpoints else None
+    log, frames = (out / "log.txt").read_text(), len(frame_rows(out))
+    reached = max([0, *(int(found[1]) for found in CHECKPOINT.finditer(log))])
+    finish("--resume", out)
+    last = log.splitlines()[-1].split(": ", 1)[-1]
     return Kill(round(after_s, 2), frames, reached, last[:48], left_by(out) == expected)
 
 
 def frame_rows(out: Path) -> list[dict[str, str]]:
-    """The lines of frames.csv, without times; none where there is no such file yet."""
-    if not (out / "frames.csv").exists():
-        return []
+    """The lines of frames.csv, without times."""
     with (out / "frames.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     return [{k: v for k, v in row.items() if not k.endswith("_ms")} for row in rows]
@@ -97,6 +92,13 @@ def left_by(out: Path) -> dict[str, object]:
     """What a run leaves, but for times."""
     files: dict[str, object] = {name: (out / name).read_bytes() for name in COMPARED}
     return {**files, "frames.csv": frame_rows(out), "names": sorted(p.name for p in out.iterdir())}
+
+
+def logged_s(out: Path) -> float:
+    """Seconds from the first to the last line of a run's log."""
+    lines = (out / "log.txt").read_text().splitlines()
+    first, last = (datetime.fromisoformat(line[:23]) for line in (lines[0], lines[-1]))
+    return (last - first).total_seconds()
 
 
 def main() -> None:
@@ -116,9 +118,10 @@ def main() -> None:
     plain_s = finish(*options, "--out", given.work / "plain")
     options += ["--checkpoint-every", given.every]
     whole_s = finish(*options, "--out", whole)
-    expected = left_by(whole)
+    expected, tracked_s = left_by(whole), logged_s(whole)
     costs = [found.groups() for found in CHECKPOINT.finditer((whole / "log.txt").read_text())]
-    kills = [kill_once(options, out, expected, rng.uniform(0, whole_s)) for _ in range(given.kills)]
+    moments = [rng.uniform(0, tracked_s) for _ in range(given.kills)]
+    kills = [kill_once(options, out, expected, after_s) for after_s in moments]
     if given.json:
         rows = [asdict(kill) for kill in kills]
         print(json.dumps({"seconds": [plain_s, whole_s], "checkpoints": costs, "kills": rows}))
@@ -128,10 +131,9 @@ def main() -> None:
         print(f"checkpoint after {frames:>5} frames: {megabytes:>6} MB {ms:>5} ms")
     print("killed after  frames  checkpoint  same bytes  at")
     for kill in kills:
-        reached = "-" if kill.checkpoint is None else kill.checkpoint
-        print(
-            f"{kill.after_s:>10} s  {kill.frames:>6}  {reached:>10}  {kill.same!s:>10}  {kill.was}"
-        )
+        same = "yes" if kill.same else "NO"
+        columns = f"{kill.after_s:>10} s  {kill.frames:>6}  {kill.checkpoint:>10}  {same:>10}"
+        print(f"{columns}  {kill.was}")
 
 
 if __name__ == "__main__":

@@ -81,6 +81,7 @@ class Checkpoints:
         self._options = options
         self._sequence = sequence
         self._every = options.checkpoint_every
+        self._frames = -1  # of the last one
 
     def after_frame(self, system: System, tally: Tally) -> None:
         """Write one if it is due."""
@@ -88,8 +89,11 @@ class Checkpoints:
             self.write(system, tally)
 
     def write(self, system: System, tally: Tally) -> None:
-        """Write one now, over the last, which stays until the new one is whole."""
-        if self._every is None:
+        """Write one now, over the last, which stays until the new one is whole.
+
+        Nothing is written where the last one is of the same frame.
+        """
+        if self._every is None or tally.frames == self._frames:
             return
         start_s = time.perf_counter()
         system.restart()
@@ -105,6 +109,7 @@ class Checkpoints:
             system.state(),
         )
         write_checkpoint(path, checkpoint)
+        self._frames = tally.frames
         megabytes, ms = path.stat().st_size / 1e6, 1e3 * (time.perf_counter() - start_s)
         logger.info("checkpoint after %d frames: %.1f MB, %.0f ms", tally.frames, megabytes, ms)
 
@@ -135,6 +140,11 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             what it was made with.
     """
     path = folder / CHECKPOINT
+    if not path.exists():
+        raise InputError(
+            f"{folder}: holds no checkpoint, so there is nothing to resume; give the folder of a "
+            "run that was begun with --checkpoint-every, or start the run again with --overwrite"
+        )
     header, arrays = read_arrays(path, CHECKPOINT_FILE)
     config = resolve(SystemConfig, folder / "config.yaml")
     try:

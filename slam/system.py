@@ -81,7 +81,7 @@ class SlamSystem:
         self._first_keyframe = 0  # of this session
 
     def state(self) -> Arrays:
-        """All that the past has left behind, as named arrays (docs: "Checkpoints")."""
+        """All that the past has left behind, as named arrays."""
         return {
             "segment": np.array(self._segment),
             "reference": np.array(-1 if self._reference is None else self._reference.id),

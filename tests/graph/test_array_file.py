@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,14 @@ def test_what_was_written_is_read(file: Path) -> None:
         assert (arrays[name].dtype, arrays[name].shape) == (array.dtype, array.shape)
         assert arrays[name].tobytes() == array.tobytes()
     assert [path.name for path in file.parent.iterdir()] == ["box"]
+
+
+def test_a_compressed_file_is_smaller_and_says_the_same(file: Path, tmp_path: Path) -> None:
+    arrays = {**ARRAYS, "room": np.zeros((1000, 3))}
+    for kind, name in ((KIND, "plain"), (replace(KIND, compressed=True), "tight")):
+        write_arrays(tmp_path / name, kind, {}, arrays)
+        assert read_arrays(tmp_path / name, KIND)[1]["room"].shape == (1000, 3)
+    assert (tmp_path / "tight").stat().st_size < 0.2 * (tmp_path / "plain").stat().st_size
 
 
 def test_the_same_contents_are_the_same_bytes(file: Path) -> None:
