@@ -16,6 +16,7 @@ from typing import TypeAlias
 
 from graph.errors import InputError
 from slam import __version__
+from slam.commands.calibrate import add_calibrate
 from slam.commands.export import add_export
 from slam.commands.optimise import add_optimise
 from slam.commands.run import add_run
@@ -72,6 +73,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_info(commands)
     add_optimise(commands)
     add_export(commands)
+    add_calibrate(commands)
     return parser
 
 
@@ -127,6 +129,10 @@ def _add_render(commands: _Commands) -> None:
     parser.add_argument("--no-noise", action="store_true", help="exact depth and colours")
     parser.add_argument("--exposure-change", action="store_true", help="brightness that varies")
     parser.add_argument("--motion-blur", action="store_true", help="blur along the motion")
+    parser.add_argument(
+        "--depth-delay-ms", type=float, default=0.0, metavar="MS", help="depth taken so much later"
+    )
+    parser.add_argument("--sweeping", action="store_true", help="tilt and roll, as to calibrate")
     parser.add_argument("--true-depth", action="store_true", help="also write noise-free depth")
     parser.add_argument("--normals", action="store_true", help="also write surface normals")
     parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
@@ -136,8 +142,8 @@ def _render(arguments: argparse.Namespace) -> int:
     from slam.progress import console_log, counting_bar
     from slam.rendering.sequence import RenderConfig, render_sequence
 
-    names = ("name", "frames", "fps", "seed", "people")
-    flags = ("exposure_change", "motion_blur", "true_depth", "normals")
+    names = ("name", "frames", "fps", "seed", "people", "depth_delay_ms")
+    flags = ("sweeping", "exposure_change", "motion_blur", "true_depth", "normals")
     given = {name: getattr(arguments, name) for name in names + flags}
     config = RenderConfig(noise=not arguments.no_noise, **given)
     with console_log(), counting_bar(arguments.quiet) as progress:

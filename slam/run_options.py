@@ -10,7 +10,7 @@ from typing import Any
 from graph.errors import InputError
 from slam.system import SystemConfig
 
-_PATHS = ("sequence", "reference", "map")
+_PATHS = ("sequence", "camera", "reference", "map")
 _RECORDED = (*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every")
 
 
@@ -24,6 +24,7 @@ class RunOptions:
         config_name: for the name of the run folder, where ``out`` is None.
         out: the run folder; None: the first free ``runs/<sequence>[-<config_name>][-<n>]``.
         overwrite: replace the run that ``out`` holds.
+        camera: a camera.yaml to use in place of the sequence's own.
         reference: TUM file or sequence folder to compare with; None: the sequence's own, if any.
         max_frames: stop after so many frames.
         stride: take every n-th frame.
@@ -38,6 +39,7 @@ class RunOptions:
     config_name: str = ""
     out: Path | None = None
     overwrite: bool = False
+    camera: Path | None = None
     reference: Path | None = None
     max_frames: int | None = None
     stride: int = 1

@@ -77,7 +77,7 @@ def run(options: RunOptions, make_system: MakeSystem = SlamSystem) -> RunSummary
         InputError: a broken sequence, reference or map, or a run folder that cannot be used;
             nothing is left behind unless frames had been tracked before.
     """
-    sequence = open_sequence(options.sequence)
+    sequence = open_sequence(options.sequence, camera=options.camera)
     reference = find_reference(options.reference, sequence)
     name = "-".join(filter(None, (sequence.name, options.config_name)))
     with (
@@ -107,7 +107,7 @@ def resume(
         return None
     checkpoint = read_checkpoint(path)
     options = checkpoint.options.with_given(given or {})
-    sequence = open_sequence(options.sequence)
+    sequence = open_sequence(options.sequence, camera=options.camera)
     checkpoint.check_sequence(sequence)
     reference = find_reference(options.reference, sequence)
     system, tally = make_system(sequence.camera, options.config), checkpoint.tally

@@ -22,7 +22,16 @@ long runs and known places:
   bmask-slam run hall2 --map h                         another recording of the place: one map
   bmask-slam run hall3 --localise h                    only where the camera was in that map
 """
-OPTIONS = ("out", "reference", "max_frames", "stride", "checkpoint_every", "map", "localise")
+OPTIONS = (
+    "out",
+    "camera",
+    "reference",
+    "max_frames",
+    "stride",
+    "checkpoint_every",
+    "map",
+    "localise",
+)
 
 
 def add_run(commands: _Commands) -> None:
@@ -42,6 +51,7 @@ def add_run(commands: _Commands) -> None:
     parser.add_argument("--config", metavar="F", help=CONFIG_HELP)
     parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
     parser.add_argument("--print-config", action="store_true", help="print it resolved, and end")
+    parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
     parser.add_argument("--reference", type=Path, metavar="F", help="trajectory to compare to")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--stride", type=int, metavar="N", help="take every N-th frame")

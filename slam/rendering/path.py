@@ -10,6 +10,15 @@ from scipy.ndimage import gaussian_filter1d
 
 from graph.geometry import Array, make_pose, so3_exp, so3_log
 
+SWEEP = np.array(
+    [
+        *((0.20, 0.31), (0.15, 0.23), (0.50, 0.17)),
+        *((0.10, 0.29), (0.10, 0.37), (0.12, 0.21)),
+    ]
+)
+"""Amplitudes [rad, m] and frequencies [Hz] about and along x, y and z of one who calibrates: tilt,
+pan, roll, and steps aside, up and forth, on top of the path."""
+
 
 @dataclass(frozen=True)
 class CameraPath:
@@ -37,8 +46,14 @@ def look_at(eyes: Array, targets: Array) -> Array:
     return make_pose(np.stack([right, np.cross(forward, right), forward], axis=-1), eyes)
 
 
-def camera_poses(path: CameraPath, fps: float, seed: int) -> Array:
-    """All poses T_world_camera (F, 4, 4) along the path, with the tremor of a hand."""
+def camera_poses(
+    path: CameraPath, fps: float, seed: int, delay_s: float = 0.0, sweeping: bool = False
+) -> Array:
+    """All poses T_world_camera (F, 4, 4) along the path, with the tremor of a hand.
+
+    With ``delay_s`` those of the same motion that much later than each frame; ``sweeping``: see
+    SWEEP.
+    """
     fine = _at(path, np.linspace(0, 1, 4000))
     step_m = np.linalg.norm(np.diff(fine[:, :3, 3], axis=0), axis=1)
     relative = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
@@ -47,15 +62,17 @@ def camera_poses(path: CameraPath, fps: float, seed: int) -> Array:
     slowness = np.maximum(gaussian_filter1d(slowness, 60, mode="nearest"), 0.9 * slowness)
     slowness = gaussian_filter1d(slowness, 25, mode="nearest")
     time_s = np.r_[0.0, np.cumsum(slowness)]
-    stamps = np.arange(int(time_s[-1] * fps) + 1) / fps
+    stamps = np.arange(int(time_s[-1] * fps) + 1) / fps + delay_s
     share = np.interp(_eased(stamps, time_s[-1]), time_s, np.linspace(0, 1, len(fine)))
     poses = _at(path, share)
+    if sweeping:
+        poses = poses @ _sweep(stamps)
     return _shaken(poses, stamps, np.random.default_rng([seed, 7]))
 
 
 def _eased(stamps: Array, total_s: float) -> Array:
     """Start from rest within a second."""
-    start = 0.5 * np.minimum(stamps, 1.0) ** 2 + np.maximum(stamps - 1.0, 0)
+    start = 0.5 * np.clip(stamps, 0.0, 1.0) ** 2 + np.maximum(stamps - 1.0, 0)
     return np.minimum(start, total_s)
 
 
@@ -68,6 +85,14 @@ def _at(path: CameraPath, share: Array) -> Array:
     eyes = CubicSpline(knots, path.eyes_world)(share)
     targets = CubicSpline(knots, path.targets_world)(share)
     return look_at(eyes, targets)
+
+
+def _sweep(stamps: Array) -> Array:
+    """Poses (N, 4, 4) in the camera's own frame: SWEEP, beginning at rest."""
+    size, frequency = SWEEP[:, 0], SWEEP[:, 1]
+    begun = np.clip(stamps, 0.0, 1.0)[:, None] ** 2
+    motion = begun * size * np.sin(2 * np.pi * stamps[:, None] * frequency)
+    return make_pose(so3_exp(motion[:, :3]), motion[:, 3:])
 
 
 def _shaken(poses: Array, stamps: Array, rng: np.random.Generator) -> Array:

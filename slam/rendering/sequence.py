@@ -24,11 +24,11 @@ from slam.rendering.sensor import blur, exposure_gain, measure_depth, optical_fl
 from slam.rendering.writer import (
     new_folder,
     stored_depth,
-    write_camera,
     write_json,
     write_lists,
     write_png,
 )
+from slam.sequences.cameras import write_camera
 
 SCENES: dict[str, str] = {
     "office": "an office for three with desks, computers and bookcases; one round through it",
@@ -55,6 +55,9 @@ class RenderConfig:
         exposure_change: let the brightness vary slowly.
         motion_blur: blur along the image motion while the shutter is open.
         fps: frame rate in hertz.
+        depth_delay_ms: take each depth image so much later than the colour image whose stamp
+            it gets; ``camera.yaml`` does not tell.
+        sweeping: tilt, pan, roll and move the camera beside its path, as for calibrating it.
         width, height: image size in pixels; the field of view stays the Kinect's.
         true_depth: also write the noise-free depth to ``depth_true/``.
         normals: also write camera-frame normals to ``normals/`` as round(127.5 n + 127.5).
@@ -68,6 +71,8 @@ class RenderConfig:
     exposure_change: bool = False
     motion_blur: bool = False
     fps: float = 30.0
+    depth_delay_ms: float = 0.0
+    sweeping: bool = False
     width: int = 640
     height: int = 480
     true_depth: bool = False
@@ -103,19 +108,23 @@ def render_sequence(
             if progress is not None:
                 progress(len(marks), len(job.poses))
         write_lists(folder, job.stamps, job.poses)
-        write_camera(folder, job.camera)
+        write_camera(folder / "camera.yaml", job.camera)
         write_json(folder / "annotations.json", coco(marks, job.stamps, job.camera, job.scene))
     return Path(out)
 
 
 @dataclass(frozen=True)
 class _Job:
-    """Everything that stays the same from frame to frame; poses are T_world_camera (N, 4, 4)."""
+    """Everything that stays the same from frame to frame.
+
+    ``poses`` and ``depth_poses`` are T_world_camera (N, 4, 4) when colour and depth are taken.
+    """
 
     config: RenderConfig
     folder: Path
     camera: Camera
     poses: Array
+    depth_poses: Array
     stamps: list[str]
     scene: Scene
     cast: Cast
@@ -131,13 +140,15 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"people={config.people}: must not be negative")
     if not 1 <= config.fps <= 1000:
         raise InputError(f"fps={config.fps}: must be between 1 and 1000")
+    if not abs(config.depth_delay_ms) <= 1000:
+        raise InputError(f"depth delay {config.depth_delay_ms} ms: must be at most 1000 either way")
     if min(config.width, config.height) < 16:
         raise InputError(f"{config.width}x{config.height}: too small; use at least 16x16")
 
 
 def _prepare(config: RenderConfig, folder: Path) -> _Job:
     plan = importlib.import_module(f"slam.rendering.{config.name}")
-    poses = camera_poses(plan.PATH, config.fps, config.seed)
+    poses = camera_poses(plan.PATH, config.fps, config.seed, sweeping=config.sweeping)
     if config.frames is not None and config.frames > len(poses):
         raise InputError(
             f"frames={config.frames}: the path of {config.name!r} has {len(poses)} frames at "
@@ -148,6 +159,9 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
             f"people={config.people}: {config.name!r} has room for {len(plan.ROLES)}; ask for fewer"
         )
     poses = poses[: config.frames]
+    delay_s = config.depth_delay_ms / 1e3
+    depth_poses = camera_poses(plan.PATH, config.fps, config.seed, delay_s, config.sweeping)
+    depth_poses = depth_poses[: config.frames]
     builder = SceneBuilder(config.seed, detail=float(np.clip(config.width / 640, 0.25, 1.0)))
     plan.furnish(builder)
     cast = hire(builder, plan.ROLES, plan.LIGHTING, config.people)
@@ -155,7 +169,7 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]
     renderer = Renderer(camera, scene.atlas, scene.static)
-    return _Job(config, folder, camera, poses, stamps, scene, cast, renderer)
+    return _Job(config, folder, camera, poses, depth_poses, stamps, scene, cast, renderer)
 
 
 def _draw_all(job: _Job) -> Iterator[FrameMarks]:
@@ -173,23 +187,31 @@ def _draw_all(job: _Job) -> Iterator[FrameMarks]:
 def _draw(job: _Job, i: int) -> FrameMarks:
     """Draw, disturb and write frame ``i``: a function of the configuration and ``i`` alone."""
     time_s = i / job.config.fps
-    moving = job.cast.geometry(time_s, job.scene) if job.cast.parts else None
-    view = job.renderer.render(job.poses[i], moving)
+    view = _view(job, job.poses[i], time_s)
     rng = np.random.default_rng([job.config.seed, 3, i])
     rgb = _exposed(job, i, view, rng)
-    depth_m = view.depth_m
+    depth_view = view
+    if job.config.depth_delay_ms:
+        depth_view = _view(job, job.depth_poses[i], time_s + job.config.depth_delay_ms / 1e3)
+    depth_m = depth_view.depth_m
     if job.config.noise:
-        depth_m = measure_depth(view.depth_m, view.normals, job.camera, rng)
+        depth_m = measure_depth(depth_view.depth_m, depth_view.normals, job.camera, rng)
     name = f"{job.stamps[i]}.png"
     write_png(job.folder / "rgb" / name, rgb)
     write_png(job.folder / "depth" / name, stored_depth(depth_m, job.camera.depth_scale))
     write_png(job.folder / "instances" / name, view.instances)
     if job.config.true_depth:
-        true = stored_depth(view.depth_m, job.camera.depth_scale)
+        true = stored_depth(depth_view.depth_m, job.camera.depth_scale)
         write_png(job.folder / "depth_true" / name, true)
     if job.config.normals:
         write_png(job.folder / "normals" / name, to_image(127.5 * view.normals + 127.5))
     return frame_marks(view.instances)
+
+
+def _view(job: _Job, T_world_camera: Array, time_s: float) -> View:
+    """What a perfect camera sees from this pose at this time."""
+    moving = job.cast.geometry(time_s, job.scene) if job.cast.parts else None
+    return job.renderer.render(T_world_camera, moving)
 
 
 def _exposed(job: _Job, i: int, view: View, rng: np.random.Generator) -> Image:

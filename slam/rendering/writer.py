@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
 from graph.errors import InputError
 from graph.geometry import Array, quaternion_from_rotation
 
@@ -77,17 +76,6 @@ def write_lists(folder: Path, stamps: list[str], poses: Array) -> None:
     for stamp, t, q in zip(stamps, poses[:, :3, 3], quaternions, strict=True):
         lines.append(" ".join([stamp, *(f"{x:.9f}" for x in (*t, *q))]))
     (folder / "groundtruth.txt").write_text("\n".join(lines) + "\n")
-
-
-def write_camera(folder: Path, camera: Camera) -> None:
-    """Write camera.yaml."""
-    rows = {
-        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
-        "cx": camera.cx, "cy": camera.cy, "distortion": list(camera.distortion),
-        "depth_scale": camera.depth_scale, "fps": camera.fps,
-    }  # fmt: skip
-    text = "".join(f"{key}: {value}\n" for key, value in rows.items())
-    (folder / "camera.yaml").write_text(text)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """Reading RGB-D sequences in TUM layout."""
 
+from slam.sequences.cameras import read_camera, write_camera
 from slam.sequences.info import SequenceInfo, format_info, sequence_info
 from slam.sequences.sequence import Sequence, SequenceConfig, open_sequence
 
@@ -9,5 +10,7 @@ __all__ = [
     "SequenceInfo",
     "format_info",
     "open_sequence",
+    "read_camera",
     "sequence_info",
+    "write_camera",
 ]

@@ -34,18 +34,29 @@ CAMERA_EXAMPLE = (
     "distortion: [0, 0, 0, 0, 0], depth_scale: 5000, fps: 30}"
 )
 REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
-OPTIONAL = ("distortion", "fps", "stereo_bf")
+OPTIONAL = {
+    "fps": "fps",
+    "stereo_bf": "stereo_bf_px_m",
+    "depth_offset": "depth_offset_m",
+    "depth_time_offset": "depth_time_offset_s",
+}
+"""Optional numbers by the name of Camera's attribute."""
+KEYS = (*REQUIRED, "distortion", *OPTIONAL)
+LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0}
+"""Largest magnitude, in metres and seconds: beyond, it is another unit."""
 
 
-def find_camera(folder: Path) -> tuple[Camera, str]:
-    """The camera of a sequence and where it came from: camera.yaml wins over the folder's name.
+def find_camera(folder: Path, given: Path | None = None) -> tuple[Camera, str]:
+    """The camera of a sequence and where it came from.
+
+    A file that is given wins over the folder's camera.yaml, and that over the folder's name.
 
     Raises:
         InputError: a broken camera.yaml, or none and a folder name that is not TUM's.
     """
-    path = folder / "camera.yaml"
+    path = given or folder / "camera.yaml"
     match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", folder.resolve().name.lower())
-    if path.is_file():
+    if given or path.is_file():
         camera, source = read_camera(path), str(path)
     elif match:
         name = f"freiburg{match.group(1)}"
@@ -57,42 +68,67 @@ def find_camera(folder: Path) -> tuple[Camera, str]:
             f"TUM's (freiburg1, 2, 3); write a camera.yaml such as {CAMERA_EXAMPLE}"
         )
     logger.info(
-        "camera: %s; fx %.3f fy %.3f cx %.3f cy %.3f, depth scale %g to the metre",
-        source, camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale,
+        "camera: %s; fx %.3f fy %.3f cx %.3f cy %.3f, "
+        "depth scale %g to the metre, offsets %g m and %g s",
+        source, camera.fx, camera.fy, camera.cx, camera.cy,
+        camera.depth_scale, camera.depth_offset_m, camera.depth_time_offset_s,
     )  # fmt: skip
     return camera, source
 
 
 def read_camera(path: Path) -> Camera:
-    """Read camera.yaml: width, height, fx, fy, cx, cy, depth_scale; distortion, fps, stereo_bf.
+    """Read camera.yaml: the keys are REQUIRED, ``distortion`` and OPTIONAL.
 
     Raises:
         InputError: naming the key, its value and the cure.
     """
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); give a camera.yaml"
+        ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not YAML ({reason}); write e.g. {CAMERA_EXAMPLE}") from error
     if not isinstance(values, dict):
         raise InputError(f"{path}: {values!r} is no mapping; write e.g. {CAMERA_EXAMPLE}")
     for key in values:
-        if key not in REQUIRED + OPTIONAL:
-            known = ", ".join(REQUIRED + OPTIONAL)
+        if key not in KEYS:
+            known = ", ".join(KEYS)
             raise InputError(f"{path}: unknown key {key!r}; the keys are {known}")
     for key in REQUIRED:
         if key not in values:
             raise InputError(f"{path}: {key} is missing; write e.g. {CAMERA_EXAMPLE}")
     numbers = {k: _number(path, k, v) for k, v in values.items() if k != "distortion"}
     _check_range(path, numbers)
-    optional = {"fps": numbers.get("fps"), "stereo_bf_px_m": numbers.get("stereo_bf")}
+    optional = {name: numbers[key] for key, name in OPTIONAL.items() if key in numbers}
     return Camera(
         width=int(numbers["width"]),
         height=int(numbers["height"]),
         **{key: numbers[key] for key in ("fx", "fy", "cx", "cy", "depth_scale")},
         distortion=_distortion(path, values.get("distortion", [0, 0, 0, 0, 0])),
-        **{key: value for key, value in optional.items() if value is not None},
+        **optional,
     )
+
+
+def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
+    """Write a camera.yaml that ``read_camera`` reads back as the same camera.
+
+    ``comment`` comes first, each line after a #. The file appears whole or not at all.
+    """
+    values: dict[str, object] = {key: getattr(camera, key) for key in REQUIRED}
+    values |= {"distortion": list(camera.distortion)}
+    values |= {key: getattr(camera, name) for key, name in OPTIONAL.items()}
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    lines.append(yaml.safe_dump(values, sort_keys=False, default_flow_style=None).rstrip())
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _number(path: Path, key: str, value: object) -> float:
@@ -105,8 +141,13 @@ def _number(path: Path, key: str, value: object) -> float:
 def _check_range(path: Path, numbers: dict[str, float]) -> None:
     """Refuse sizes, focal lengths and scales that no camera has."""
     for key, value in numbers.items():
-        if key not in ("cx", "cy") and value <= 0:
+        if key not in ("cx", "cy", *LIMITS) and value <= 0:
             raise InputError(f"{path}: {key} is {value:g}; it must be positive")
+        if abs(value) > LIMITS.get(key, math.inf):
+            raise InputError(
+                f"{path}: {key} is {value:g}, more than {LIMITS[key]:g} either way; "
+                "depth_offset is in metres, depth_time_offset in seconds"
+            )
     for key in ("width", "height"):
         if numbers[key] != int(numbers[key]):
             raise InputError(f"{path}: {key} is {numbers[key]:g}; it must be a whole number")

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from graph.camera import Camera
 from graph.errors import InputError
 
+SURFACE_STEP = 0.05
+"""A pixel whose depth changes by more from one depth image to the next shows another surface."""
 _TAIL_BYTES = 4096
 
 
@@ -32,7 +34,7 @@ def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
 
 
 def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
-    """The depth image (H, W) in metres (paper eq. 9: z = d / s), NaN where the sensor saw nothing.
+    """The depth image (H, W) in metres (paper eq. 9: z = d / s, and an offset), NaN where missing.
 
     Raises:
         InputError: as for ``read_rgb``, and for anything but one channel of 16 bits.
@@ -50,8 +52,25 @@ def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
         )
     _check_size(path, stored, camera)
     depth_m = np.divide(stored, np.float32(camera.depth_scale), dtype=np.float32)
-    depth_m[stored == 0] = np.nan
+    if camera.depth_offset_m:
+        depth_m += np.float32(camera.depth_offset_m)
+    depth_m[(stored == 0) | (depth_m <= 0)] = np.nan
     return depth_m
+
+
+def depth_between(
+    near_m: NDArray[np.float32], other_m: NDArray[np.float32], share: float
+) -> NDArray[np.float32]:
+    """Depth (H, W) at a time between two depth images, ``share`` of the way to the other.
+
+    At a fixed pixel of a surface the INVERSE depth changes linearly (exactly so for a plane and a
+    small motion). Where the two do not see one surface, or one sees nothing, the nearer in time
+    stays.
+    """
+    one_surface = np.abs(near_m - other_m) < SURFACE_STEP * near_m
+    with np.errstate(divide="ignore"):
+        between = near_m * other_m / (other_m + np.float32(share) * (near_m - other_m))
+    return np.where(one_surface, between, near_m)
 
 
 def _decode(path: Path, flags: int) -> NDArray:

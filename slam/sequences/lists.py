@@ -11,9 +11,12 @@ import numpy as np
 
 from graph.errors import InputError
 from graph.geometry import Array
-from graph.trajectory import associate_stamps, check_seconds
+from graph.trajectory import Indices, associate_stamps, check_seconds
 
 logger = logging.getLogger(__name__)
+
+MAX_DEPTH_STEP_S = 0.1
+"""Nothing is interpolated between depth images that are farther apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,10 @@ class ImagePairs:
         timestamps_s: (N,) stamps of the colour images in seconds.
         rgb_files: the N colour images.
         depth_files: the N depth images.
+        lags_s: (N,) how much later than the colour image each depth image was taken.
+        neighbour_files: the depth images on the other side of the colour images' stamps, None
+            where there is none.
+        neighbour_shares: (N,) how far toward them, from 0 to 1, the colour images were taken.
         unpaired_rgb: colour images without a depth image near enough.
         unpaired_depth: depth images without a colour image near enough.
     """
@@ -39,12 +46,17 @@ class ImagePairs:
     timestamps_s: Array
     rgb_files: tuple[Path, ...]
     depth_files: tuple[Path, ...]
+    lags_s: Array
+    neighbour_files: tuple[Path | None, ...]
+    neighbour_shares: Array
     unpaired_rgb: int = 0
     unpaired_depth: int = 0
 
 
-def read_pairs(folder: Path, max_difference_s: float) -> ImagePairs:
+def read_pairs(folder: Path, max_difference_s: float, depth_time_offset_s: float) -> ImagePairs:
     """The image pairs of a TUM folder; rgb.txt and depth.txt come before associations.txt.
+
+    A depth image was taken at its stamp plus the offset, and is paired by that.
 
     Raises:
         InputError: a missing or broken list, or no two stamps within the limit.
@@ -59,20 +71,40 @@ def read_pairs(folder: Path, max_difference_s: float) -> ImagePairs:
             f"{folder / missing}: no such list; a sequence needs rgb.txt and depth.txt with lines "
             "'timestamp file', or associations.txt with 'timestamp rgb timestamp depth'"
         )
-    i, j = associate_stamps(rgb.timestamps_s, depth.timestamps_s, max_difference_s)
+    depth_s = depth.timestamps_s + depth_time_offset_s
+    i, j = associate_stamps(rgb.timestamps_s, depth_s, max_difference_s)
     if not len(i):
         raise InputError(
             f"{folder}: no colour and depth image within {max_difference_s:g} s of each other "
             f"(colour begins at {rgb.timestamps_s[0]:.6f} s, depth at "
-            f"{depth.timestamps_s[0]:.6f} s); bring both lists to the same clock"
+            f"{depth_s[0]:.6f} s); bring both lists to the same clock"
         )
+    lags_s = depth_s[j] - rgb.timestamps_s[i]
+    neighbours, shares = _neighbours(depth_s, j, lags_s)
     return ImagePairs(
         rgb.timestamps_s[i],
         tuple(rgb.files[k] for k in i),
         tuple(depth.files[k] for k in j),
+        lags_s,
+        tuple(depth.files[k] if k >= 0 else None for k in neighbours),
+        shares,
         len(rgb.files) - len(i),
         len(depth.files) - len(j),
     )
+
+
+def _neighbours(depth_s: Array, chosen: Indices, lags_s: Array) -> tuple[Indices, Array]:
+    """For each chosen depth image the one on the other side of the moment ``lags_s`` before it.
+
+    Its index, -1 where it is missing or too far away, and the share of the way to it, 0 to 1.
+    """
+    other = chosen - np.sign(lags_s).astype(np.int64)
+    there = (other >= 0) & (other < len(depth_s)) & (lags_s != 0)
+    other = np.where(there, other, chosen)
+    step_s = np.abs(depth_s[other] - depth_s[chosen])
+    there &= (step_s < MAX_DEPTH_STEP_S) & (np.abs(lags_s) < step_s)
+    shares = np.divide(np.abs(lags_s), step_s, out=np.zeros(len(other)), where=there)
+    return np.where(there, other, -1), shares
 
 
 def read_list(path: Path) -> ImageList:

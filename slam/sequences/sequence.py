@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graph.camera import Camera
 from graph.errors import InputError
@@ -16,7 +18,7 @@ from graph.geometry import Array
 from graph.trajectory import Trajectory, read_tum
 from slam.frame import Frame
 from slam.sequences.cameras import find_camera
-from slam.sequences.images import read_depth, read_rgb
+from slam.sequences.images import depth_between, read_depth, read_rgb
 from slam.sequences.lists import ImagePairs, read_pairs
 from slam.sequences.prefetch import prefetched
 
@@ -68,6 +70,7 @@ class Sequence:
         self.groundtruth = groundtruth
         self.config = config
         self._skipped: dict[int, str] = {}
+        self._read_depth = lru_cache(2)(lambda path: read_depth(path, self.camera))
 
     def __len__(self) -> int:
         return len(self.pairs.timestamps_s)
@@ -92,8 +95,21 @@ class Sequence:
             index,
             float(self.pairs.timestamps_s[index]),
             read_rgb(self.pairs.rgb_files[index], self.camera),
-            read_depth(self.pairs.depth_files[index], self.camera),
+            self._depth(index),
         )
+
+    def _depth(self, index: int) -> NDArray[np.float32]:
+        """The depth at the colour image's stamp, if the camera says when depth is taken."""
+        depth_m = self._read_depth(self.pairs.depth_files[index])
+        other = self.pairs.neighbour_files[index]
+        if self.camera.depth_time_offset_s == 0 or other is None:
+            return depth_m
+        try:
+            other_m = self._read_depth(other)
+        except InputError as error:
+            logger.warning("frame %d: its depth is not interpolated: %s", index, error)
+            return depth_m
+        return depth_between(depth_m, other_m, float(self.pairs.neighbour_shares[index]))
 
     @overload
     def frames(
@@ -157,11 +173,14 @@ class Sequence:
             )
 
 
-def open_sequence(path: Path, config: SequenceConfig | None = None) -> Sequence:
+def open_sequence(
+    path: Path, config: SequenceConfig | None = None, camera: Path | Camera | None = None
+) -> Sequence:
     """Open a folder in TUM layout, in which the order of lines never matters, only stamps.
 
     ``rgb.txt`` and ``depth.txt`` (or ``associations.txt``), optional ``groundtruth.txt`` and
-    ``camera.yaml``. Everything that can be checked without decoding all images is checked here.
+    ``camera.yaml``, in whose place another file or a camera can be given. Everything that can be
+    checked without decoding all images is checked here.
 
     Raises:
         InputError: naming the file, the value and the cure.
@@ -169,11 +188,12 @@ def open_sequence(path: Path, config: SequenceConfig | None = None) -> Sequence:
     folder, config = Path(path), config or SequenceConfig()
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder that holds rgb.txt")
-    pairs = read_pairs(folder, config.max_time_difference_s)
-    camera = find_camera(folder)
+    found = (camera, "given") if isinstance(camera, Camera) else find_camera(folder, camera)
+    offset_s = found[0].depth_time_offset_s
+    pairs = read_pairs(folder, config.max_time_difference_s, offset_s)
     truth_path = folder / "groundtruth.txt"
     truth = read_tum(truth_path) if truth_path.is_file() else None
-    sequence = Sequence(folder, camera, pairs, truth, config)
+    sequence = Sequence(folder, found, pairs, truth, config)
     _check_images(sequence)
     logger.info("%s: %d frames, ground truth: %s", folder, len(sequence), truth is not None)
     return sequence

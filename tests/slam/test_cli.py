@@ -24,7 +24,7 @@ from slam.runner import RunSummary
 from slam.system import SystemConfig
 
 ROOT = Path(__file__).resolve().parents[2]
-COMMANDS = ("run", "evaluate", "render", "info", "optimise", "export")
+COMMANDS = ("run", "evaluate", "render", "info", "optimise", "export", "calibrate")
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

@@ -6,6 +6,7 @@ import filecmp
 import json
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -196,6 +197,21 @@ def test_same_configuration_gives_the_same_bytes(sequence: Path, tmp_path: Path)
     assert files == sorted(str(p.relative_to(sequence)) for p in sequence.rglob("*") if p.is_file())
     _, different, broken = filecmp.cmpfiles(again, sequence, files, shallow=False)
     assert not different and not broken
+
+
+def test_late_depth_is_that_of_a_later_camera(tmp_path: Path) -> None:
+    """At 30 Hz, depth 33.3 ms late is the next frame's; colour stays as it is."""
+    config = {"frames": 3, "width": 160, "height": 120, "noise": False, "sweeping": True}
+    on_time, late = (
+        render_sequence(RenderConfig("office", depth_delay_ms=ms, **config), tmp_path / f"{ms:.0f}")
+        for ms in (0.0, 1000 / 30)
+    )
+    names = sorted(p.name for p in (on_time / "rgb").iterdir())
+    for now, after in pairwise(names):
+        assert (on_time / "rgb" / now).read_bytes() == (late / "rgb" / now).read_bytes()
+        shown = cv2.imread(str(late / "depth" / now), cv2.IMREAD_UNCHANGED).astype(int)
+        expected = cv2.imread(str(on_time / "depth" / after), cv2.IMREAD_UNCHANGED)
+        assert np.abs(shown - expected).max() <= 1
 
 
 def test_depth_noise_follows_the_model() -> None:

@@ -1,0 +1,75 @@
+"""``bmask-slam calibrate``: the camera of a run from what the run has seen."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TypeAlias
+
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
+
+TEXT = "calibrate the camera of a run from its own observations, and write camera.yaml"
+MORE = """\
+Focal lengths, principal point, distortion, depth offset and the time between colour and depth are
+estimated together with all poses and landmarks, each with its 95 % bounds; what the motion did not
+show is named. The depth scale needs something metric from outside: --reference, the camera's
+positions by motion capture or odometry, or --known-distance. Use the result with
+"bmask-slam run SEQUENCE --camera RUN/camera.yaml"."""
+
+
+def add_calibrate(commands: _Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser("calibrate", help=TEXT, description=f"{TEXT}. {MORE}")
+    parser.set_defaults(handler=_calibrate)
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    parser.add_argument(
+        "--out", type=Path, metavar="F", help="camera.yaml to write (default: RUN/camera.yaml)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace that file")
+    parser.add_argument(
+        "--sequence", type=Path, metavar="DIR", help="the run's images (default: where they were)"
+    )
+    parser.add_argument(
+        "--reference",
+        type=Path,
+        metavar="GT",
+        help="TUM trajectory in metres, or sequence with one",
+    )
+    parser.add_argument(
+        "--known-distance",
+        type=float,
+        nargs=3,
+        metavar=("T1", "T2", "METRES"),
+        help="how far apart the camera was at two stamps",
+    )
+    parser.add_argument(
+        "--anchor-sigma", type=float, default=0.01, metavar="M", help="of these (default: 0.01)"
+    )
+    parser.add_argument(
+        "--fix", action="append", default=[], metavar="NAME", help="keep a parameter, such as k1"
+    )
+    parser.add_argument("--k3", action="store_true", help="estimate k3 too")
+    parser.add_argument("--quiet", action="store_true", help="print only the file's path")
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from slam.calibrate import CalibrateOptions, CalibrationPriors, calibrate_run
+    from slam.calibration_report import format_calibration
+    from slam.progress import console_log
+
+    known = arguments.known_distance
+    options = CalibrateOptions(
+        run=arguments.run,
+        out=arguments.out,
+        sequence=arguments.sequence,
+        reference=arguments.reference,
+        known_distance=tuple(known) if known else None,
+        anchor_sigma_m=arguments.anchor_sigma,
+        fixed=tuple(arguments.fix),
+        priors=CalibrationPriors(k3=0.2 if arguments.k3 else 0.0),
+        overwrite=arguments.overwrite,
+    )
+    with console_log():
+        done = calibrate_run(options)
+    print(done.path if arguments.quiet else f"{format_calibration(done)}\n\nCamera  {done.path}")
+    return 0

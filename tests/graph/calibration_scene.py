@@ -1,0 +1,101 @@
+"""Exact views of small planes by a camera with distortion, wrong depth and late depth images."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from synthetic_room import make_room
+
+from graph.calibration_model import CalibrationViews
+from graph.calibration_problem import CalibrationProblem
+from graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp, transform
+
+TRUTH = np.array([525.0, 520.0, 318.5, 241.5, 0.05, -0.08, 0.001, -0.002, 0.0, 0.97, 0.012, 0.010])
+PRIORS = np.array([30.0, 30, 10, 10, 0.2, 0.4, 0.01, 0.01, 0.0, 0.05, 0.05, 0.02])
+SIZE = (640, 480)
+
+
+def project(points: Array, truth: Array) -> Array:
+    """Raw pixels (M, 2) of camera points (M, 3) by OpenCV."""
+    K = np.array([[truth[0], 0, truth[2]], [0, truth[1], truth[3]], [0, 0, 1.0]])
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, truth[4:9])[0][:, 0]
+
+
+def rays_of(pixels: Array, truth: Array) -> Array:
+    """Rays (M, 3) with z = 1 of raw pixels (M, 2) by OpenCV."""
+    K = np.array([[truth[0], 0, truth[2]], [0, truth[1], truth[3]], [0, 0, 1.0]])
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    xy = cv2.undistortPointsIter(
+        pixels[:, None].copy(), K, truth[4:9], np.eye(3), np.eye(3), criteria
+    )[:, 0]
+    return np.column_stack([xy, np.ones(len(xy))])
+
+
+def inverse_depth_of(pixels: Array, n: Array, d: Array, truth: Array) -> Array:
+    """What the depth image holds, 1 / raw (M,), at raw pixels of planes n . p = d, n (M, 3)."""
+    z = d / (n * rays_of(pixels, truth)).sum(axis=1)
+    return truth[9] / (z - truth[10])
+
+
+def make_problem(
+    seed: int = 0,
+    noise: float = 0.0,
+    truth: Array = TRUTH,
+    start: Array | None = None,
+    keyframes: int = 14,
+    points: int = 150,
+) -> tuple[CalibrationProblem, Array, Array]:
+    """A problem that starts at ``start`` (12,), and its true poses and points.
+
+    ``noise`` is a factor on sigmas of 0.3 px and 0.002 / m, which the problem states. Poses and
+    points start a little beside the truth, the first pose at it.
+    """
+    rng = np.random.default_rng(seed)
+    room = make_room(keyframes, points)
+    roll = so3_exp(rng.uniform(-1, 1, (keyframes, 3)) * [0.1, 0.1, 0.6])
+    poses = room.poses_world_camera @ make_pose(roll, np.zeros((keyframes, 3)))
+    poses[:, :3, 3] += rng.uniform(-0.5, 0.5, (keyframes, 3))
+    velocities = rng.uniform(-1, 1, (keyframes, 6)) * [0.5, 0.5, 0.5, 0.6, 0.6, 0.6]
+    k, seen_points = (i.ravel() for i in np.indices((keyframes, points)))
+    seen = transform(inverse(poses), room.points_world)[k, seen_points]
+    pixels = project(seen, truth)
+    # Planes within 60 degrees of facing the camera.
+    normals = rng.normal(0, 1, (points, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    n = np.einsum("mji,mj->mi", poses[k, :3, :3], normals[seen_points])
+    facing = np.abs((n * seen).sum(axis=1)) > 0.5 * np.linalg.norm(seen, axis=1)
+    facing &= np.abs(seen[:, :2]).max(axis=1) < 0.7 * seen[:, 2]  # beyond, distortion folds back
+    inside = (pixels > 0).all(axis=1) & (pixels < SIZE).all(axis=1) & (seen[:, 2] > 0.5) & facing
+    k, seen_points = k[inside], seen_points[inside]
+    seen, pixels, n = seen[inside], pixels[inside], n[inside]
+    pixels = pixels + noise * 0.3 * rng.standard_normal(pixels.shape)
+
+    def inverse_depth_at(time_s: float) -> Array:
+        """What the depth image holds at the pixels when it is taken so much later."""
+        T = inverse(se3_exp(velocities * time_s))[k]
+        n_then = np.einsum("mij,mj->mi", T[:, :3, :3], n)
+        point = np.einsum("mij,mj->mi", T[:, :3, :3], seen) + T[:, :3, 3]
+        return inverse_depth_of(pixels, n_then, (n_then * point).sum(axis=1), truth)
+
+    w = [inverse_depth_at(truth[11] + dt) for dt in (-1 / 30, 0, 1 / 30)]
+    views = CalibrationViews(
+        keyframes=k,
+        landmarks=seen_points,
+        pixels=pixels,
+        inverse_depth=w[1] + noise * 0.002 * rng.standard_normal(len(k)),
+        inverse_depth_rate=15 * (w[2] - w[0]),
+        lag_s=np.zeros(len(k)),
+        sigma_px=np.full(len(k), 0.3),
+        sigma_inverse=np.full(len(k), 0.002),
+    )
+    spoiled = poses @ se3_exp(rng.normal(0, [0.002] * 3 + [0.01] * 3, (keyframes, 6)))
+    spoiled[0] = poses[0]
+    problem = CalibrationProblem(
+        views,
+        spoiled,
+        room.points_world + rng.normal(0, 0.02, room.points_world.shape),
+        truth.copy() if start is None else start,
+        PRIORS,
+        np.full(6, 1e-6),
+    )
+    return problem, poses, room.points_world

@@ -1,0 +1,146 @@
+"""Self-calibration on exact scenes: the truth is found, and its uncertainty is told honestly."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from calibration_scene import PRIORS, TRUTH, make_problem
+
+from graph.calibration import calibrate
+from graph.calibration_model import FACTOR, OFFSET, PARAMETERS, TIME, linearise
+from graph.calibration_problem import Anchors, CalibrationProblem
+from graph.geometry import Array, se3_exp
+
+START = TRUTH + np.array([15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010])
+FREE_GAUGE = np.array([1.0] * 3 + [10.0] * 3)
+
+
+def anchored(problem: CalibrationProblem, poses: Array, sigma_m: float) -> CalibrationProblem:
+    """The problem with the true positions, disturbed by ``sigma_m``, and nothing else fixed."""
+    noise = sigma_m * np.random.default_rng(1).standard_normal((len(poses), 3))
+    anchors = Anchors(poses[:, :3, 3] + noise, sigma_m)
+    return dataclasses.replace(problem, anchors=anchors, pose_sigmas=FREE_GAUGE)
+
+
+def test_model_fits_exact_views() -> None:
+    problem, poses, points = make_problem()
+    residuals = linearise(problem.views, poses, points, TRUTH).residuals
+    assert len(residuals) > 500
+    assert np.abs(residuals[:, :2]).max() < 1e-6
+    assert np.abs(residuals[:, 2]).max() < 0.05  # second order in the 10 ms, a twentieth of sigma
+    on_time = np.where(np.arange(12) == TIME, 0.0, TRUTH)
+    assert np.abs(linearise(problem.views, poses, points, on_time).residuals[:, 2]).max() > 1
+
+
+def test_derivatives_are_those_of_finite_differences() -> None:
+    problem, poses, points = make_problem(keyframes=4, points=40)
+    views, h = problem.views, 1e-6
+    calibration = TRUTH + 0.03 * PRIORS
+
+    def residuals(xi: Array, shift: Array, change: Array) -> Array:
+        moved = poses @ se3_exp(np.tile(xi, (len(poses), 1)))
+        return linearise(views, moved, points + shift, calibration + change).residuals
+
+    at = linearise(views, poses, points, calibration)
+    for derivative, sizes in (
+        ("pose", (6, 0, 0)),
+        ("point", (0, 3, 0)),
+        ("calibration", (0, 0, 12)),
+    ):
+        for i in range(sum(sizes)):
+            step = h * (PRIORS[i] or 1.0) if derivative == "calibration" else h
+            one = [
+                np.eye(n)[i] * step if n else np.zeros(k)
+                for n, k in zip(sizes, (6, 3, 12), strict=True)
+            ]
+            two = residuals(*one) - residuals(*(-x for x in one))
+            got = getattr(at, derivative)[..., i]
+            np.testing.assert_allclose(
+                got, two / (2 * step), rtol=1e-4, atol=1e-3 * np.abs(got).max()
+            )
+
+
+def test_everything_is_found_with_an_anchor() -> None:
+    problem, poses, _ = make_problem(start=START)
+    result = calibrate(anchored(problem, poses, 1e-4))
+    assert result.converged
+    error = np.abs(result.calibration - TRUTH)
+    assert (error[:4] < 0.02).all(), error
+    assert (error[4:9] < [3e-4, 6e-4, 2e-5, 2e-5, 1e-9]).all(), error
+    assert error[FACTOR] < 3e-4 and error[OFFSET] < 3e-4 and error[TIME] < 1e-4
+
+
+def test_without_an_anchor_the_scale_keeps_its_prior_and_all_else_is_found() -> None:
+    problem, _, _ = make_problem(start=START, noise=0.1)
+    result = calibrate(problem)
+    sigma = np.sqrt(np.diag(result.covariance))
+    assert sigma[FACTOR] > 0.9 * PRIORS[FACTOR]
+    others = (PRIORS > 0) & (np.arange(12) != FACTOR)
+    assert (sigma[others] < 0.2 * PRIORS[others]).all()
+    # A world 3 % too large, with its depths, fits as well: only offset / factor is told.
+    assert result.calibration[FACTOR] == pytest.approx(START[FACTOR], abs=0.01)
+    ratio, true_ratio = (
+        result.calibration[OFFSET] / result.calibration[FACTOR],
+        TRUTH[OFFSET] / TRUTH[FACTOR],
+    )
+    assert ratio == pytest.approx(true_ratio, abs=2e-3)
+    assert np.abs(result.calibration - TRUTH)[:4].max() < 0.5
+
+
+def test_one_known_distance_is_an_anchor() -> None:
+    problem, poses, _ = make_problem(start=START)
+    arms = np.array([[[0.02, 0.01, 0.03], [-0.01, 0.0, 0.05]]])
+    ends = np.einsum("eij,ej->ei", poses[[1, 9], :3, :3], arms[0]) + poses[[1, 9], :3, 3]
+    distance = np.linalg.norm(ends[1] - ends[0])
+    anchors = Anchors(
+        np.full((len(poses), 3), np.nan), 0.01, np.array([[1, 9]]), arms, np.array([distance]), 1e-3
+    )
+    result = calibrate(dataclasses.replace(problem, anchors=anchors))
+    assert result.calibration[FACTOR] == pytest.approx(TRUTH[FACTOR], abs=1e-3)
+    assert np.sqrt(result.covariance[FACTOR, FACTOR]) == pytest.approx(
+        TRUTH[FACTOR] * 1e-3 / distance, rel=0.3
+    )
+
+
+def test_what_is_held_fixed_stays() -> None:
+    fixed = [PARAMETERS.index(name) for name in ("k1", "k2", "time_offset_s")]
+    problem, _, _ = make_problem(start=START, noise=0.1)
+    sigmas = PRIORS.copy()
+    sigmas[fixed] = 0.0
+    result = calibrate(dataclasses.replace(problem, prior_sigmas=sigmas))
+    np.testing.assert_array_equal(result.calibration[fixed], START[fixed])
+    assert not result.covariance[fixed].any() and not result.covariance[:, fixed].any()
+
+
+def test_a_fifth_of_wrong_matches_does_little() -> None:
+    problem, _, _ = make_problem(start=START, noise=0.5)
+    views, rng = problem.views, np.random.default_rng(5)
+    wrong = rng.random(len(views.pixels)) < 0.2
+    pixels = views.pixels + wrong[:, None] * rng.uniform(-40, 40, views.pixels.shape)
+    result = calibrate(
+        dataclasses.replace(problem, views=dataclasses.replace(views, pixels=pixels))
+    )
+    sigma = np.sqrt(np.diag(result.covariance))
+    assert (np.abs(result.calibration - TRUTH)[:4] < 4 * sigma[:4]).all()
+    assert sigma[:4].max() < 0.6
+
+
+def test_stated_uncertainty_is_honest() -> None:
+    """NEES over noisy scenes: normalised errors of every parameter have about unit variance."""
+    z, nees = [], []
+    free = np.flatnonzero(PRIORS > 0)
+    for seed in range(10):
+        problem, poses, _ = make_problem(seed=seed, noise=1.0, keyframes=10, points=90)
+        rng = np.random.default_rng(100 + seed)
+        start = TRUTH + PRIORS * rng.standard_normal(12)
+        problem = dataclasses.replace(anchored(problem, poses, 0.01), calibration=start)
+        result = calibrate(problem)
+        error = (result.calibration - TRUTH)[free]
+        covariance = result.covariance[np.ix_(free, free)]
+        z.append(error / np.sqrt(np.diag(covariance)))
+        nees.append(error @ np.linalg.solve(covariance, error))
+    assert 0.55 < np.sqrt(np.mean(np.square(z))) < 1.2
+    assert np.abs(z).max() < 4
+    assert 0.5 * len(free) < np.mean(nees) < 1.5 * len(free)

@@ -1,0 +1,145 @@
+"""``bmask-slam calibrate``: from a run folder and its images to the camera.yaml of the next run."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration_run import camera_path, make_run, room_depth
+
+from graph.calibration_model import TIME
+from graph.camera import Camera
+from graph.errors import InputError
+from slam import cli
+from slam.calibrate import CalibrateOptions, calibrate_run, sequence_of
+from slam.calibration_report import format_calibration
+from slam.calibration_views import raw_pixels, smooth_value
+from slam.features import undistort
+from slam.sequences import open_sequence, read_camera, write_camera
+
+TRUTH = Camera(320, 240, 262.0, 260.0, 158.0, 121.0, depth_scale=5000.0, depth_offset_m=0.015)
+WRONG = dataclasses.replace(
+    TRUTH, fx=270.0, fy=268.0, cx=161.0, cy=118.0, depth_scale=5150.0, depth_offset_m=0.0
+)
+DELAY_S = 0.010
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return make_run(tmp_path_factory.mktemp("calibrate"), TRUTH, WRONG, DELAY_S)
+
+
+def test_wrong_camera_and_late_depth_are_found(made: tuple[Path, Path], tmp_path: Path) -> None:
+    sequence, run = made
+    out = tmp_path / "camera.yaml"
+    options = CalibrateOptions(run, out, reference=sequence, anchor_sigma_m=0.002)
+    done = calibrate_run(options)
+    found = read_camera(out)
+    assert found == done.camera
+    assert found.fx == pytest.approx(TRUTH.fx, rel=0.003)
+    assert found.fy == pytest.approx(TRUTH.fy, rel=0.003)
+    assert (found.cx, found.cy) == pytest.approx((TRUTH.cx, TRUTH.cy), abs=0.5)
+    assert found.depth_scale == pytest.approx(TRUTH.depth_scale, rel=0.003)
+    assert found.depth_offset_m == pytest.approx(TRUTH.depth_offset_m, abs=0.003)
+    assert found.depth_time_offset_s == pytest.approx(DELAY_S, abs=0.001)
+    truth = [262, 260, 158, 121, 0, 0, 0, 0, 0, 1.03, 0.015, DELAY_S]
+    error = done.result.calibration - truth
+    second_order = np.where(np.arange(12) == TIME, 1e-4, 1e-9)  # in the 10 ms
+    assert (np.abs(error) <= 3.5 * done.sigmas + second_order).all()
+    assert "not observable" not in format_calibration(done)
+
+
+def test_without_an_anchor_the_scale_stays_and_is_said_to_be_unobservable(
+    made: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, run = made
+    assert cli.main(["calibrate", str(run), "--fix", "k1", "--fix", "k2"]) == 0
+    text = capsys.readouterr().out
+    assert "The depth scale is not observable: images and depths fit a world of any size" in text
+    assert "held fixed" in text
+    found = read_camera(run / "camera.yaml")
+    assert found.depth_scale == pytest.approx(WRONG.depth_scale, rel=0.01)
+    assert found.depth_time_offset_s == pytest.approx(DELAY_S, abs=0.001)
+    assert cli.main(["calibrate", str(run)]) == 1
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_a_known_distance_gives_the_scale(made: tuple[Path, Path], tmp_path: Path) -> None:
+    _, run = made
+    times_s = np.array([0.1, 1.5])
+    distance_m = float(np.linalg.norm(np.diff(camera_path(times_s)[:, :3, 3], axis=0)))
+    known = (0.1, 1.5, distance_m)
+    done = calibrate_run(
+        CalibrateOptions(run, tmp_path / "c.yaml", known_distance=known, anchor_sigma_m=1e-3)
+    )
+    assert done.camera.depth_scale == pytest.approx(TRUTH.depth_scale, rel=0.005)
+
+
+def test_the_next_run_reads_what_was_written(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """Scale, offset and time: the depth images become those of the colour images' moments."""
+    sequence, _ = made
+    right = dataclasses.replace(TRUTH, depth_time_offset_s=DELAY_S)
+    write_camera(tmp_path / "camera.yaml", right, "a comment\nof two lines")
+    assert read_camera(tmp_path / "camera.yaml") == right
+    opened = open_sequence(sequence, camera=tmp_path / "camera.yaml")
+    v, u = np.mgrid[:240, :320]
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+
+    def typical_error_m(index: int, camera: Camera) -> float:
+        T = camera_path(opened.timestamps_s[[index]])[0]
+        depth_m = open_sequence(sequence, camera=camera).load(index).depth_m
+        return float(np.median(np.abs(depth_m - room_depth(T, TRUTH, pixels).reshape(240, 320))))
+
+    for index in (7, 22, 40):
+        assert typical_error_m(index, right) < 0.0015
+        assert typical_error_m(index, TRUTH) > 0.0025
+
+
+# --- parts ----------------------------------------------------------------------------------------
+
+
+def test_raw_pixels_undo_the_undistortion() -> None:
+    distortion = (0.26, -0.95, -0.005, 0.0026, 1.16)
+    camera = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, distortion=distortion)
+    raw = np.random.default_rng(0).uniform([30, 30], [610, 450], (200, 2))
+    np.testing.assert_allclose(raw_pixels(undistort(camera, raw), camera), raw, atol=0.01)
+
+
+def test_a_plane_is_read_between_pixels_and_an_edge_is_refused() -> None:
+    v, u = np.mgrid[:60, :80].astype(float)
+    image = 0.5 + 0.002 * u - 0.001 * v
+    pixels = np.array([[20.3, 30.7], [41.8, 12.2], [1.0, 1.0]])
+    planes, rms = smooth_value(image, pixels, 0.01)
+    value = planes[:, 0]
+    expected = 0.5 + 0.002 * pixels[:2, 0] - 0.001 * pixels[:2, 1]
+    np.testing.assert_allclose(value[:2], expected, atol=1e-9)
+    assert (rms[:2] < 1e-9).all() and np.isnan(value[2])  # most of its window is outside
+    image[:, 40:] *= 0.8
+    assert np.isnan(smooth_value(image, pixels, 0.01)[0][1]).all()
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fixed": ("focal",)}, "--fix focal: is no parameter"),
+        ({"anchor_sigma_m": 0.0}, "--anchor-sigma 0.0: must be positive"),
+        ({"known_distance": (0.1, 99.0, 1.0)}, "--known-distance 0.1 99 1: give two different"),
+        ({"sequence": Path("/nowhere")}, "/nowhere: no such folder"),
+    ],
+)
+def test_impossible_wishes(made, tmp_path, changes, words) -> None:
+    with pytest.raises(InputError, match=words):
+        calibrate_run(CalibrateOptions(made[1], tmp_path / "camera.yaml", **changes))
+    assert not (tmp_path / "camera.yaml").exists()
+
+
+def test_the_sequence_of_a_run_is_named_by_its_configuration(made, tmp_path) -> None:
+    assert sequence_of(made[1]) == made[0]
+    (tmp_path / "config.yaml").write_text("# bmask-slam 0.1.0, sequence /nowhere, stride 2\n")
+    with pytest.raises(InputError, match="names '/nowhere', which is not there; give the folder"):
+        sequence_of(tmp_path)
