@@ -1,0 +1,110 @@
+"""Self-calibration where the truth is known: started wrong, what is found, and what it brings.
+
+    python benchmarks/calibration.py --out runs/bench/calibration
+
+Renders an office with a sweeping camera and late depth, runs on it with focal lengths and depth
+scale 3 % off, the principal point 6 px off and the delay unknown, calibrates (reference: the exact
+trajectory), runs again, and prints tables in Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from graph.calibration_model import PARAMETERS, parameters_of
+from graph.camera import Camera
+from slam.calibrate import CalibrateOptions, calibrate_run
+from slam.calibration_report import NORMAL_95, Calibrated
+from slam.rendering.sequence import RenderConfig, render_sequence
+from slam.runner import RunOptions, run
+from slam.sequences import read_camera, write_camera
+
+DELAY_S = 0.010
+FOCAL_SHARE, CENTRE_PX, DEPTH_SHARE = 0.03, 6.0, 0.03
+ERRORS = ("ate_rmse", "rpe_trans_rmse_second", "rpe_rot_rmse_second")
+
+
+def main() -> None:
+    """Render, run, calibrate, run again, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("runs/bench/calibration"))
+    parser.add_argument("--scene", default="office")
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--steady", action="store_true", help="without the sweeping motion")
+    arguments = parser.parse_args()
+    out = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    sequence = out / ("steady" if arguments.steady else "sweeping")
+    if not sequence.is_dir():
+        config = RenderConfig(
+            arguments.scene,
+            arguments.frames,
+            depth_delay_ms=1e3 * DELAY_S,
+            sweeping=not arguments.steady,
+        )
+        render_sequence(config, sequence)
+    truth = dataclasses.replace(read_camera(sequence / "camera.yaml"), depth_time_offset_s=DELAY_S)
+    write_camera(out / "true.yaml", truth)
+    write_camera(out / "wrong.yaml", spoiled(truth))
+    errors = {name: errors_of(sequence, out, name) for name in ("true", "wrong")}
+    done = calibrate_run(
+        CalibrateOptions(out / "wrong", out / "found.yaml", reference=sequence, overwrite=True)
+    )
+    errors["found"] = errors_of(sequence, out, "found")
+    print(table_of_parameters(done, truth))
+    print()
+    print(table_of_errors(errors))
+
+
+def spoiled(truth: Camera) -> Camera:
+    """The camera from which the calibration starts."""
+    return dataclasses.replace(
+        truth,
+        fx=truth.fx * (1 + FOCAL_SHARE),
+        fy=truth.fy * (1 + FOCAL_SHARE),
+        cx=truth.cx + CENTRE_PX,
+        cy=truth.cy - CENTRE_PX,
+        depth_scale=truth.depth_scale * (1 + DEPTH_SHARE),
+        depth_time_offset_s=0.0,
+    )
+
+
+def errors_of(sequence: Path, out: Path, name: str) -> dict[str, float]:
+    """ERRORS of a run with the camera ``name``.yaml."""
+    options = RunOptions(
+        sequence, camera=out / f"{name}.yaml", out=out / name, overwrite=True, quiet=True
+    )
+    return {row.name: row.value for row in run(options).rows if row.name in ERRORS}
+
+
+def table_of_parameters(done: Calibrated, truth: Camera) -> str:
+    """Truth, start, result, error and 95 % bound of each parameter, in its own unit."""
+    true = parameters_of(truth, done.before.depth_scale)
+    start = parameters_of(done.before, done.before.depth_scale)
+    found = done.result.calibration
+    lines = [
+        "| parameter | truth | start | found | error | 95 % bound | inside |",
+        "|" + " --- |" * 7,
+    ]
+    for i in np.flatnonzero(done.prior_sigmas > 0):
+        error, bound = found[i] - true[i], NORMAL_95 * done.sigmas[i]
+        numbers = " | ".join(f"{x:.5g}" for x in (true[i], start[i], found[i], error, bound))
+        inside = "yes" if abs(error) <= bound else "no"
+        lines.append(f"| {PARAMETERS[i]} | {numbers} | {inside} |")
+    return "\n".join(lines)
+
+
+def table_of_errors(errors: dict[str, dict[str, float]]) -> str:
+    """ATE and RPE of the runs with each camera."""
+    lines = ["| camera | ATE [m] | RPE a second [m] | [deg] |", "| --- | --- | --- | --- |"]
+    for name, values in errors.items():
+        lines.append(f"| {name} | " + " | ".join(f"{values[e]:.4f}" for e in ERRORS) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
