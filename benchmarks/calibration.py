@@ -78,7 +78,7 @@ def errors_of(sequence: Path, out: Path, name: str) -> dict[str, float]:
     options = RunOptions(
         sequence, camera=out / f"{name}.yaml", out=out / name, overwrite=True, quiet=True
     )
-    return {row.name: row.value for row in run(options).rows if row.name in ERRORS}
+    return {row["name"]: row["value"] for row in run(options).rows if row["name"] in ERRORS}
 
 
 def table_of_parameters(done: Calibrated, truth: Camera) -> str:
