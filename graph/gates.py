@@ -201,7 +201,11 @@ def _repeated(observations: Observations, shadow: Shadow) -> Mask:
     repeated = np.zeros(len(observations), bool)
     pairs = zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
     for i, pair in enumerate(pairs):
-        repeated[i] = pair in seen or shadow.observations.row(*pair) is not None
+        repeated[i] = (
+            pair in seen
+            or shadow.observations.row(*pair) is not None
+            or shadow.archive.holds(*pair)
+        )
         seen.add(pair)
     return repeated
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graph.archive import Archive
 from graph.geometry import Array
 from graph.updates import IntArray, Observations, PosePrior, RelativePose
 
@@ -180,7 +181,10 @@ class PoseFactor:
 
 
 class Shadow:
-    """Values, observations and pose factors (relative poses and priors, by running number)."""
+    """Values, observations and pose factors (relative poses and priors, by running number).
+
+    Observations of retired landmarks are in the archive; the pose factors stand for them.
+    """
 
     def __init__(self) -> None:
         self.keyframes = ValueTable(4, 4)
@@ -188,6 +192,7 @@ class Shadow:
         self.observations = ObservationTable()
         self.pose_factors: dict[int, PoseFactor] = {}
         self.pose_factors_of: dict[int, set[int]] = {}
+        self.archive = Archive()
         self._next_number = 0
 
     def __len__(self) -> int:

@@ -6,8 +6,7 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,80 +15,39 @@ from graph.admission import Admitted, admit
 from graph.array_file import Arrays
 from graph.camera import Camera
 from graph.covariances import Marginals
-from graph.gates import describe, relative_pose_errors, reprojection
+from graph.gates import relative_pose_errors, reprojection
 from graph.geometry import Array
 from graph.holding import anchor_components, release_bridges
 from graph.pruning import Removal, remove
-from graph.recovery import Repair, repair
+from graph.recovery import repair
+from graph.retirement import (
+    Retirement,
+    forget,
+    note_retracted,
+    note_returned,
+    reinstate,
+    retire,
+    returning,
+)
 from graph.shadow import Shadow, ValueTable, ids_array
 from graph.smoother_config import SmootherConfig
-from graph.solver import Change, Solver, SolverError, Variable
+from graph.solver import Change, Solver, SolverError
 from graph.storage import graph_arrays, read_graph, shadow_of, write_graph
 from graph.support import diagonal_covariance
+from graph.update_report import UpdateReport
 from graph.updates import (
-    NO_LANDMARK,
     GraphEstimate,
     GraphUpdate,
     IntArray,
     ObservationErrors,
     PosePrior,
-    RefusalReason,
-    Refusals,
-    RefusedFactor,
     RelativePose,
     RelativePoseErrors,
-    RemovalReport,
+    RemovalPolicy,
 )
 
 __all__ = ["Smoother", "SmootherConfig"]
 logger = logging.getLogger(__name__)
-
-
-@dataclass
-class _Report:
-    """What one update did beyond its orders, collected on the way."""
-
-    refused: Refusals = field(default_factory=Refusals)
-    refused_factors: tuple[RefusedFactor, ...] = ()
-    removal: RemovalReport = field(default_factory=RemovalReport)
-    landmarks: set[int] = field(default_factory=set)
-    keyframes: set[int] = field(default_factory=set)
-    bridged: set[int] = field(default_factory=set)
-    rebuilt: bool = False
-    failed: Variable | None = None
-
-    @property
-    def failed_variable(self) -> str:
-        """The variable that ISAM2 named last, in words."""
-        return "" if self.failed is None else "{} {}".format(*self.failed)
-
-    def add_removal(self, removal: Removal) -> None:
-        self.landmarks.update(removal.dropped_landmarks.tolist())
-        self.bridged.update(removal.bridged_keyframes.tolist())
-
-    def refuse_all(self, admitted: Admitted) -> None:
-        """Refuse everything that had been admitted, as SOLVER_FAILED."""
-        seen, keyframes = admitted.observations, admitted.keyframe_ids
-        nothing = np.full(len(keyframes), NO_LANDMARK)
-        self.refused = Refusals(
-            np.concatenate([self.refused.keyframe_ids, seen.keyframe_ids, keyframes]),
-            np.concatenate([self.refused.landmark_ids, seen.landmark_ids, nothing]),
-            np.concatenate(
-                [
-                    self.refused.reasons,
-                    np.full(len(seen) + len(keyframes), RefusalReason.SOLVER_FAILED),
-                ]
-            ),
-        )
-        self.refused_factors += tuple(
-            RefusedFactor(*describe(factor), RefusalReason.SOLVER_FAILED)
-            for factor in admitted.pose_factors
-        )
-
-    def add_repair(self, repair: Repair) -> None:
-        self.landmarks.update(repair.dropped_landmarks.tolist())
-        self.keyframes.update(repair.dropped_keyframes.tolist())
-        self.bridged.update(repair.bridged_keyframes.tolist())
 
 
 class Smoother:
@@ -110,11 +68,15 @@ class Smoother:
         """Remove, add, optimise one step, and read everything back."""
         started_s = time.perf_counter()
         self._solver.elapsed_s = 0.0
-        removal = remove(update, self._shadow, self._config)
-        admitted = admit(self._with_first_prior(update), self._shadow, self._camera, self._config)
-        report = _Report(admitted.refused, admitted.refused_factors, removal.report)
+        model = self._shadow, self._camera, self._config
+        update = self._with_first_prior(update)
+        forgotten, removal = self._remove(update)
+        note_retracted(removal.dropped_landmarks, self._shadow.archive)
+        retired = retire(update.retire_landmarks, *model)
+        admitted = admit(returning(update, self._shadow, self._camera), *model)
+        report = UpdateReport(admitted.refused, admitted.refused_factors, removal.report)
         report.add_removal(removal)
-        entered = self._enter(admitted, removal, report)
+        entered = self._enter(admitted, [forgotten, removal, retired], report)
         change = dataclasses.replace(entered, max_iterations=update.max_iterations)
         try:
             self._solver.update(self._shadow, change)
@@ -127,12 +89,15 @@ class Smoother:
     def optimise_batch(self, max_iterations: int = 100) -> GraphEstimate:
         """Full bundle adjustment (Levenberg-Marquardt, with the kernels) of the whole graph.
 
+        Retired landmarks come back with all their observations, and stay until they are
+        retired again.
         ISAM2 is thrown away and made anew from the result if another update comes. A failure
         is repaired as in an update; if it cannot be, the values stay and the costs are NaN.
         """
         started_s = time.perf_counter()
         self._solver.elapsed_s = 0.0
-        report, costs = _Report(), [(math.nan, math.nan)]
+        reinstate(self._shadow, self._camera, self._config)
+        report, costs = UpdateReport(), [(math.nan, math.nan)]
 
         def solve(shadow: Shadow) -> None:
             costs.append(self._solver.optimise_batch(shadow, max_iterations))
@@ -148,7 +113,7 @@ class Smoother:
 
     def estimate(self) -> GraphEstimate:
         """The current estimate, without optimising."""
-        return self._estimate(_Report(), time.perf_counter())
+        return self._estimate(UpdateReport(), time.perf_counter())
 
     def observation_errors(self) -> ObservationErrors:
         """Chi-square of every observation at the current estimate, to find outliers by."""
@@ -236,12 +201,28 @@ class Smoother:
         )
         return dataclasses.replace(update, priors=(prior,))
 
-    def _enter(self, admitted: Admitted, removal: Removal, report: _Report) -> Change:
+    def _remove(self, update: GraphUpdate) -> tuple[Retirement, Removal]:
+        """Carry out the removals on the archive and on the graph, or refuse them on both.
+
+        The archive comes first, so that what stands for the rest of it holds the keyframes.
+        """
+        model = self._shadow, self._camera, self._config
+        if update.removal_policy is RemovalPolicy.DROP:
+            return forget(update, *model), remove(update, self._shadow, self._config)
+        removal = remove(update, self._shadow, self._config)
+        refused = len(removal.report.refused) > 0
+        return (Retirement() if refused else forget(update, *model)), removal
+
+    def _enter(
+        self, admitted: Admitted, left: Sequence[Removal | Retirement], report: UpdateReport
+    ) -> Change:
         """Put what was admitted into the shadow, and say what ISAM2 must be told."""
         self._shadow.keyframes.insert(admitted.keyframe_ids, admitted.poses_world_camera)
         self._shadow.landmarks.insert(admitted.landmark_ids, admitted.points_world)
         rows = self._shadow.observations.add(admitted.observations)
-        numbers = [*removal.pose_factors, *self._shadow.add_pose_factors(admitted.pose_factors)]
+        note_returned(admitted.landmark_ids, self._shadow.archive)
+        numbers = [number for done in left for number in done.pose_factors]
+        numbers += self._shadow.add_pose_factors(admitted.pose_factors)
         free, slots = release_bridges(admitted.observations, self._shadow, self._config)
         report.bridged.difference_update(free.tolist())
         return Change(
@@ -249,14 +230,14 @@ class Smoother:
             [number for number in numbers if number in self._shadow.pose_factors],
             admitted.keyframe_ids,
             admitted.landmark_ids,
-            [*removal.slots, *slots],
+            sorted([*slots, *(slot for done in left for slot in done.slots)]),
         )
 
     def _recover(
         self,
         failure: SolverError,
         new_keyframes: IntArray,
-        report: _Report,
+        report: UpdateReport,
         solve: Callable[[Shadow], None],
     ) -> bool:
         """Repair the shadow and solve anew until it works; whether it did.
@@ -270,6 +251,7 @@ class Smoother:
             named = failure.variable if attempt else None
             done = repair(named, new_keyframes, self._shadow, self._camera, self._config)
             report.add_repair(done)
+            note_retracted(done.dropped_landmarks, self._shadow.archive)
             try:
                 solve(self._shadow)
                 return True
@@ -279,7 +261,7 @@ class Smoother:
                     break
         return False
 
-    def _retract(self, admitted: Admitted, change: Change, report: _Report) -> None:
+    def _retract(self, admitted: Admitted, change: Change, report: UpdateReport) -> None:
         """Take the whole update out again, refused as SOLVER_FAILED."""
         seen = admitted.observations
         pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
@@ -289,6 +271,7 @@ class Smoother:
             remove_observations=pairs,
         )
         report.add_removal(remove(undo, self._shadow, self._config))
+        note_retracted(admitted.landmark_ids, self._shadow.archive)
         present = [n for n in change.numbers if n in self._shadow.pose_factors]
         self._shadow.remove_pose_factors(present)
         anchor_components(self._shadow, self._config)
@@ -298,7 +281,7 @@ class Smoother:
         except SolverError as failure:
             logger.error("ISAM2 cannot solve the graph (%s); values stay as they were", failure)
 
-    def _estimate(self, report: _Report, started_s: float) -> GraphEstimate:
+    def _estimate(self, report: UpdateReport, started_s: float) -> GraphEstimate:
         return GraphEstimate(
             self._shadow.keyframes.ids,
             self._shadow.keyframes.values,

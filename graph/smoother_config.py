@@ -32,6 +32,10 @@ class SmootherConfig:
         prior_sigma_rotation_rad, prior_sigma_translation_m: of the prior on the first pose.
         bridge_sigma_rotation_rad, bridge_sigma_translation_m: of the loose relative pose that
             holds a keyframe when a removal took its support.
+        marginal_keyframes: landmarks that retire in one update are split into groups that so
+            many keyframes see; each group becomes relative poses of its own.
+        base_share: a keyframe that shares a smaller part of its retired landmarks with any
+            base becomes one (`graph.sparsification`).
         max_recoveries: attempts to rebuild after failures before the update is given up.
     """
 
@@ -52,4 +56,6 @@ class SmootherConfig:
     prior_sigma_translation_m: float = 1e-4
     bridge_sigma_rotation_rad: float = 0.05
     bridge_sigma_translation_m: float = 0.1
+    marginal_keyframes: int = 24
+    base_share: float = 0.25
     max_recoveries: int = 10

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from graph.archive_storage import SHAPES, archive_arrays, read_archive
 from graph.array_file import Arrays, FileKind, Header, read_arrays, write_arrays
 from graph.camera import Camera
 from graph.errors import InputError
 from graph.shadow import Shadow
 from graph.updates import Observations, PosePrior, RelativePose
 
-GRAPH_FILE = FileKind("graph", 2)
+GRAPH_FILE = FileKind("graph", 3)
 _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "keyframe_ids": ("keyframe", ()),
     "poses_world_camera": ("keyframe", (4, 4)),
@@ -32,6 +33,7 @@ _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "pose_factor_covariances": ("pose factor", (6, 6)),
     "pose_factor_kinds": ("pose factor", ()),
     "pose_factor_robust": ("pose factor", ()),
+    **SHAPES,
 }
 _PRIOR = "prior"
 
@@ -69,6 +71,7 @@ def graph_arrays(shadow: Shadow) -> Arrays:
         ).reshape(-1, 6, 6),
         "pose_factor_kinds": np.array([getattr(f, "kind", _PRIOR) for f in factors], np.str_),
         "pose_factor_robust": np.array([getattr(f, "robust", "") or "" for f in factors], np.str_),
+        **archive_arrays(shadow),
     }
 
 
@@ -92,7 +95,15 @@ def _check(arrays: Arrays, path: Path) -> None:
         if counts.setdefault(what, len(array)) != len(array):
             raise InputError(f"{path}: array {name!r} has {len(array)} rows; save it again")
     for ids, references in (
-        ("keyframe_ids", ("observation_keyframe_ids", "pose_factor_keyframes")),
+        (
+            "keyframe_ids",
+            (
+                "observation_keyframe_ids",
+                "pose_factor_keyframes",
+                "archived_keyframe_ids",
+                "summary_keyframe_ids",
+            ),
+        ),
         ("landmark_ids", ("observation_landmark_ids",)),
     ):
         if (np.diff(arrays[ids]) <= 0).any():
@@ -133,6 +144,7 @@ def shadow_of(arrays: Arrays, path: Path) -> Shadow:
         if kind != _PRIOR:
             factor = RelativePose(a, b, T, covariance, robust or None, kind)
         shadow.add_pose_factors([factor])
+    shadow.archive = read_archive(arrays)
     return shadow
 
 

@@ -8,7 +8,8 @@ thing at a time, and an id that was removed can be used again.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -95,6 +96,15 @@ class Observations:
         )
 
 
+def concatenate(parts: Sequence[Observations]) -> Observations:
+    """One table of several."""
+    if not parts:
+        return Observations()
+    return Observations(
+        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Observations))
+    )
+
+
 @dataclass(frozen=True)
 class RelativePose:
     """A measured pose of keyframe b in the frame of keyframe a.
@@ -104,7 +114,8 @@ class RelativePose:
         T_a_b: (4, 4) measurement, ``p_a = T_a_b @ p_b``.
         covariance: (6, 6) of the tangent ``[rotation rad, translation m]`` at b (right side).
         robust: None, "huber", "cauchy" or "dcs".
-        kind: where it comes from: "odometry", "loop", "dense", "bridge" (made by the smoother).
+        kind: where it comes from: "odometry", "loop", "dense"; made by the smoother: "bridge",
+            "marginal" (stands for retired landmarks).
     """
 
     keyframe_a: int
@@ -143,6 +154,10 @@ class GraphUpdate:
         removal_policy: for what the removals, taken together, leave underconstrained.
         max_iterations: further steps that ISAM2 may take until nothing moves any more, for a
             change that moves much of the graph, such as a loop.
+        retire_landmarks: (N,) ids; the variables go, and relative poses take over what their
+            factors said of the keyframes. An id in ``landmark_ids`` that was retired comes
+            back (`graph.retirement` states the rule), where its keyframe carries it:
+            ``points_world`` is not read for it, and only new observations enter.
 
     Ids to remove that the graph does not hold are passed over.
     """
@@ -160,6 +175,7 @@ class GraphUpdate:
     remove_relative_poses: tuple[RelativePoseName, ...] = ()
     removal_policy: RemovalPolicy = RemovalPolicy.DROP
     max_iterations: int = 0
+    retire_landmarks: IntArray = field(default_factory=_no_ids)
 
 
 @dataclass(frozen=True)

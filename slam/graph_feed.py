@@ -8,9 +8,9 @@ import numpy as np
 
 from graph.array_file import Arrays
 from graph.geometry import Array
-from graph.updates import GraphEstimate, GraphUpdate, Observations, PosePrior
+from graph.updates import GraphEstimate, GraphUpdate, Observations, PosePrior, concatenate
 from slam.features import Features, spread_order
-from slam.landmarks import Ints
+from slam.landmarks import Ints, Mask
 from slam.world_map import Keyframe, WorldMap
 
 
@@ -18,12 +18,18 @@ from slam.world_map import Keyframe, WorldMap
 class GraphFeedConfig:
     """The graph's size decides its cost: measurements are capped per keyframe.
 
-    A landmark enters when ``min_views`` keyframes see it, with all its observations so far.
+    A landmark enters when ``min_views`` keyframes see it, with all its observations so far. It
+    retires (`graph.retirement`) when none of the ``window_keyframes`` that share most with the
+    newest one sees it, and as soon as ``retire_batch`` wait for it; it comes back when it is
+    seen again. 0 keyframes: the graph keeps every landmark.
     """
 
     max_observations: int = 200
     min_views: int = 2
     bucket_px: int = 60
+    window_keyframes: int = 0
+    window_min_shared: int = 15
+    retire_batch: int = 100
 
 
 class GraphFeed:
@@ -60,18 +66,32 @@ class GraphFeed:
         inside = world.landmarks.in_graph[ids]
         new_ids = self._promoted(world, keyframe, keypoints[~inside], ids[~inside], inside.sum())
         world.landmarks.in_graph[new_ids] = True
+        retired = self._outside_window(world, ids)
+        world.landmarks.in_graph[retired] = False
         begins = world.in_segment(keyframe.segment) == [keyframe]
         return replace(
-            self.map_update(world),
+            self._changes(world),
             keyframe_ids=np.array([keyframe.id]),
             poses_world_camera=keyframe.T_world_camera[None],
             landmark_ids=new_ids,
             points_world=world.landmarks.points_world[new_ids],
             priors=(segment_prior(keyframe),) if begins else (),
+            retire_landmarks=retired,
         )
 
     def map_update(self, world: WorldMap) -> GraphUpdate:
-        """The update of what changed in the map, no keyframe being new: fused, forgotten."""
+        """The update of what changed in the map, no keyframe being new: fused, forgotten.
+
+        Retired landmarks that were given observations come back with them.
+        """
+        again = np.flatnonzero(was_sent(world) & ~world.landmarks.in_graph & world.landmarks.alive)
+        unsent = [k.landmark_ids[k.sent_ids != k.landmark_ids] for k in world.keyframes.values()]
+        again = np.intersect1d(again, np.concatenate([np.zeros(0, np.int64), *unsent]))
+        world.landmarks.in_graph[again] = True
+        points = world.landmarks.points_world[again]
+        return replace(self._changes(world), landmark_ids=again, points_world=points)
+
+    def _changes(self, world: WorldMap) -> GraphUpdate:
         update = GraphUpdate(
             observations=self._unsent_observations(world),
             remove_landmarks=np.concatenate([np.zeros(0, np.int64), *self._removed]),
@@ -85,7 +105,7 @@ class GraphFeed:
         self._removed, self._removed_keyframes = [], []
         keyframes = list(world.keyframes.values())
         landmarks = world.landmarks
-        landmarks.in_graph &= landmarks.alive
+        landmarks.in_graph[:] = (landmarks.in_graph | was_sent(world)) & landmarks.alive
         first = {k.segment: k for k in reversed(keyframes)}
         for keyframe in keyframes:
             keyframe.sent_ids[:] = -1
@@ -111,6 +131,19 @@ class GraphFeed:
         bucket = (pixels[:, 1] * 1000 + pixels[:, 0]).astype(np.int64)
         return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
 
+    def _outside_window(self, world: WorldMap, seen_ids: Ints) -> Ints:
+        """Landmarks in the graph that no keyframe of the active window sees, once enough wait."""
+        count, landmarks = self.config.window_keyframes, world.landmarks
+        if not count:
+            return np.zeros(0, np.int64)
+        near = [k for _, k in world.covisible(seen_ids, self.config.window_min_shared)[:count]]
+        active = np.zeros(len(landmarks) + 1, bool)  # the last entry answers for id -1
+        active[seen_ids] = True
+        for keyframe in near:
+            active[keyframe.landmark_ids] = True
+        waiting = np.flatnonzero(landmarks.in_graph & landmarks.alive & ~active[:-1])
+        return waiting if len(waiting) >= self.config.retire_batch else waiting[:0]
+
     def _unsent_observations(self, world: WorldMap) -> Observations:
         """Every observation of a landmark in the graph that was not sent yet, in all keyframes.
 
@@ -125,6 +158,14 @@ class GraphFeed:
                 parts.append(observations_of(keyframe, rows, ids[rows]))
                 keyframe.sent_ids[rows] = ids[rows]
         return concatenate(parts)
+
+
+def was_sent(world: WorldMap) -> Mask:
+    """Mask (N,) of the landmarks of which the graph was given observations, retired ones too."""
+    sent = np.zeros(len(world.landmarks) + 1, bool)  # the last entry answers for id -1
+    for keyframe in world.keyframes.values():
+        sent[keyframe.sent_ids] = True
+    return sent[:-1]
 
 
 def segment_prior(keyframe: Keyframe) -> PosePrior:
@@ -152,18 +193,6 @@ def stereo_measurements(features: Features, keypoints: Ints) -> Array:
     """(N, 3) of u_left, v, u_right = u_left - disparity; u_right NaN without depth."""
     pixels = features.pixels[keypoints]
     return np.column_stack([pixels, pixels[:, 0] - features.disparity_px[keypoints]])
-
-
-def concatenate(parts: list[Observations]) -> Observations:
-    """One table of several."""
-    if not parts:
-        return Observations()
-    return Observations(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("keyframe_ids", "landmark_ids", "measurements", "sigmas_px")
-        )
-    )
 
 
 def read_back(world: WorldMap, estimate: GraphEstimate) -> None:

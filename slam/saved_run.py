@@ -13,6 +13,7 @@ from graph.camera import Camera
 from graph.errors import InputError
 from graph.geometry import Array
 from graph.ply import read_ply
+from graph.retirement import reinstate
 from graph.shadow import Shadow
 from graph.smoother_config import SmootherConfig
 from graph.storage import read_graph
@@ -30,7 +31,8 @@ class SavedRun:
 
     Attributes:
         path: the folder.
-        shadow, camera: its graph; config: what that was made with.
+        shadow, camera: its graph, with all landmarks that were retired; config: what that was
+            made with.
         keyframe_stamps_s: (K,) of the graph's keyframes; NaN for one of another run.
         trajectories: by file name, each map segment; trajectory.txt, the largest, is first.
         keyframes: what keyframes.txt holds.
@@ -57,12 +59,14 @@ def read_run(path: Path) -> SavedRun:
         raise InputError(f"{path}: holds no graph; give the folder of a run that came to its end")
     shadow, camera = read_graph(path / "graph")
     config = path / "config.yaml"
+    graph_config = resolve(SmootherConfig, config if config.is_file() else None, section="graph")
+    reinstate(shadow, camera, graph_config)
     names = ["trajectory.txt", *sorted(p.name for p in path.glob("trajectory_segment_*.txt"))]
     run = SavedRun(
         path,
         shadow,
         camera,
-        resolve(SmootherConfig, config if config.is_file() else None, section="graph"),
+        graph_config,
         _keyframe_stamps(path / "frames.csv", shadow.keyframes.ids),
         {name: read_tum(path / name) for name in names},
         read_tum(path / "keyframes.txt"),

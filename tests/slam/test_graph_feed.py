@@ -283,3 +283,75 @@ def test_the_smoother_brings_spoiled_poses_back(whole: bool) -> None:
     for k, keyframe in world.keyframes.items():
         assert np.abs(se3_log(inverse(pose_of(k)) @ keyframe.T_world_camera)).max() < 1e-4
     np.testing.assert_allclose(world.landmarks.points_world, points, atol=1e-3)
+
+
+def windowed_world(config: GraphFeedConfig) -> tuple[WorldMap, GraphFeed, Smoother]:
+    """Six keyframes of one wall, then three that share nothing with them, through the graph."""
+    world, points = make_world(0)
+    feed, smoother = GraphFeed(config), Smoother(CAMERA)
+    walls = [(points, 6), (points_before(np.eye(4), COUNT, RNG), 3)]
+    for wall, (points, keyframes) in enumerate(walls):
+        T_away = se3_exp(np.array([0, 0, 0, 30.0 * wall, 0, 0]))
+        for k in range(keyframes):
+            T = T_away @ pose_of(k)
+            features = make_features(pose_of(k), points, random_descriptors(COUNT, RNG))
+            keyframe = add_keyframe(world, T, features)
+            ids = wall * COUNT + np.arange(COUNT)
+            if k == 0:
+                world.make_landmarks(keyframe, np.arange(COUNT), transform(T_away, points))
+            else:
+                world.attach(keyframe, np.arange(COUNT), ids)
+            keyframe.segment = wall
+            read_back(world, smoother.update(feed.keyframe_update(world, keyframe)))
+    return world, feed, smoother
+
+
+WINDOWED = GraphFeedConfig(window_keyframes=3, retire_batch=20)
+
+
+def test_landmarks_outside_the_window_retire_and_come_back_when_seen() -> None:
+    world, feed, smoother = windowed_world(WINDOWED)
+    old, new = np.arange(COUNT), COUNT + np.arange(COUNT)
+    assert not world.landmarks.in_graph[old].any()
+    assert world.landmarks.in_graph[new].all()
+    assert world.landmarks.alive.all()
+    assert smoother.estimate().landmark_ids.tolist() == new.tolist()
+    features = make_features(
+        pose_of(6), world.landmarks.points_world[old], random_descriptors(COUNT, RNG)
+    )
+    keyframe = add_keyframe(world, pose_of(6), features)
+    world.attach(keyframe, old, old)
+    update = feed.keyframe_update(world, keyframe)
+    assert update.landmark_ids.tolist() == old.tolist()
+    assert pairs(update) == {(keyframe.id, i) for i in old.tolist()}
+    assert update.retire_landmarks.tolist() == new.tolist()
+    estimate = smoother.update(update)
+    assert len(estimate.refused) == 0
+    read_back(world, estimate)
+    error = se3_log(inverse(pose_of(6)) @ keyframe.T_world_camera)
+    assert np.abs(error).max() < 1e-6
+    assert world.landmarks.in_graph[old].all()
+
+
+def test_a_retired_landmark_that_is_given_observations_comes_back_at_once() -> None:
+    """As fusing does after a loop: what a newer landmark held, an old one now holds."""
+    world, feed, _ = windowed_world(WINDOWED)
+    gone = world.replace_landmarks(np.array([COUNT + 3]), np.array([4]))
+    feed.forget_landmarks(gone)
+    update = feed.map_update(world)
+    assert update.landmark_ids.tolist() == [4]
+    assert pairs(update) == {(6, 4), (7, 4), (8, 4)}
+    assert world.landmarks.in_graph[4]
+
+
+def test_the_whole_map_holds_the_retired_landmarks_too() -> None:
+    world, feed, _ = windowed_world(WINDOWED)
+    update = feed.whole_update(world)
+    assert update.landmark_ids.tolist() == list(range(2 * COUNT))
+    assert pairs(update) == pairs_of(world)
+
+
+def test_no_window_keeps_every_landmark() -> None:
+    world, _, smoother = windowed_world(GraphFeedConfig())
+    assert world.landmarks.in_graph.all()
+    assert smoother.estimate().landmark_ids.tolist() == list(range(2 * COUNT))

@@ -56,8 +56,11 @@ def system() -> SlamSystem:
     system = at_checkpoint()
     first, second = list(system.mapper.world.keyframes)[:2]
     loop = RelativePose(first, second, np.eye(4), np.eye(6), robust="dcs", kind="loop")
-    system.mapper.smoother.update(GraphUpdate(relative_poses=(loop,)))
-    system.mapper.smoother.restart()
+    smoother = system.mapper.smoother
+    old = smoother.estimate().landmark_ids[:40]
+    smoother.update(GraphUpdate(relative_poses=(loop,), retire_landmarks=old))
+    smoother.update(GraphUpdate(landmark_ids=old[:5], points_world=np.zeros((5, 3))))
+    smoother.restart()
     system.mapper._feed.forget_landmarks(np.array([5, 8]))  # none wait between two frames so far
     loops, pairs = system.mapper.loops, np.array([[3, 7], [4, 9]])
     loops.waiting = [
