@@ -166,7 +166,10 @@ def test_what_is_compared_by_contents_has_no_other_attributes(system: SlamSystem
     """One that is added here must be added to ``graph_arrays`` or the table's columns, too."""
     shadow, table = system.mapper.smoother._shadow, system.mapper.world.landmarks
     pose_factors = {"pose_factors", "pose_factors_of", "_next_number"}
-    assert vars(shadow).keys() == {"keyframes", "landmarks", "observations", *pose_factors}
+    assert vars(shadow).keys() == {
+        *("keyframes", "landmarks", "observations", "archive"),
+        *pose_factors,
+    }
     rows = {"of_keyframe", "of_landmark", "_free", "_columns", "_slots", "_used"}
     assert vars(shadow.observations).keys() == rows
     assert vars(table).keys() == {"_size", "_store", *table._store}
