@@ -106,6 +106,23 @@ def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
     return TrainedNetwork(model.eval(), labels)
 
 
+def load_mobilenet(model: MaskRCNN, path: Path) -> None:
+    """Give a light network the body of an ImageNet classifier; its last layers are not needed.
+
+    Raises:
+        InputError: the file is not a MobileNetV2 with batch norm folded into its weights.
+    """
+    state, _ = read_state(path)
+    wanted = model.backbone.body.state_dict()
+    different = sorted(k for k, v in wanted.items() if k not in state or state[k].shape != v.shape)
+    if different:
+        raise InputError(
+            f"{path}: not a folded MobileNetV2; {len(different)} of {len(wanted)} parameters are "
+            f"missing or of another shape, such as {different[0]}"
+        )
+    model.backbone.body.load_state_dict({k: state[k] for k in wanted})
+
+
 def save_network(network: TrainedNetwork, path: Path, half: bool = True) -> None:
     """Write weights, configuration and class names; in half precision unless told otherwise."""
     state = {}

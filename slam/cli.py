@@ -17,9 +17,12 @@ from typing import TypeAlias
 from graph.errors import InputError
 from slam import __version__
 from slam.commands.calibrate import add_calibrate
+from slam.commands.evaluate_segmentation import add_evaluate_segmentation
 from slam.commands.export import add_export
 from slam.commands.optimise import add_optimise
 from slam.commands.run import add_run
+from slam.commands.segment import add_segment
+from slam.commands.train import add_train
 
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
 EPILOG = """\
@@ -74,6 +77,9 @@ def make_parser() -> argparse.ArgumentParser:
     add_optimise(commands)
     add_export(commands)
     add_calibrate(commands)
+    add_segment(commands)
+    add_train(commands)
+    add_evaluate_segmentation(commands)
     return parser
 
 

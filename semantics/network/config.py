@@ -96,3 +96,17 @@ RESNET50 = NetworkConfig()
 RESNET50_V2 = NetworkConfig(norm="batch", rpn_convs=2, box_convs=4)
 """torchvision's maskrcnn_resnet50_fpn_v2."""
 RESNET101 = NetworkConfig(backbone="resnet101")
+LIGHT = NetworkConfig(
+    classes=81,
+    backbone="mobilenet_v2",
+    channels=64,
+    norm="none",
+    box_hidden=512,
+    mask_channels=80,
+    maskiou_channels=80,
+    maskiou_hidden=256,
+    image=ImageConfig(480, 800, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
+    proposals=ProposalConfig(before_nms=300, after_nms=100),
+    detections=DetectionConfig(max_count=30),
+)
+"""For robots without a GPU: MobileNetV2 and narrow heads; 640x480 is not enlarged."""

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from graph.camera import Camera
 from graph.errors import InputError
+from semantics.image_files import decode_image, read_colour
 
 SURFACE_STEP = 0.05
 """A pixel whose depth changes by more from one depth image to the next shows another surface."""
-_TAIL_BYTES = 4096
 
 
 def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
@@ -23,14 +23,9 @@ def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
         InputError: a missing, truncated or unreadable file, more than 8 bits a channel, or
             another size than the camera's.
     """
-    bgr = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    if bgr.dtype != np.uint8:
-        raise InputError(
-            f"{path}: {8 * bgr.dtype.itemsize} bits a channel where colour is expected; "
-            "list 8-bit colour images (are rgb and depth swapped?)"
-        )
-    _check_size(path, bgr, camera)
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+    rgb = read_colour(path)
+    _check_size(path, rgb, camera)
+    return rgb
 
 
 def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
@@ -39,7 +34,7 @@ def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
     Raises:
         InputError: as for ``read_rgb``, and for anything but one channel of 16 bits.
     """
-    stored = _decode(path, cv2.IMREAD_UNCHANGED)
+    stored = decode_image(path, cv2.IMREAD_UNCHANGED)
     if stored.ndim == 3:
         raise InputError(
             f"{path}: {stored.shape[2]} channels where depth is expected; "
@@ -71,26 +66,6 @@ def depth_between(
     with np.errstate(divide="ignore"):
         between = near_m * other_m / (other_m + np.float32(share) * (near_m - other_m))
     return np.where(one_surface, between, near_m)
-
-
-def _decode(path: Path, flags: int) -> NDArray:
-    """The decoded image; a truncated file is refused, where OpenCV would fill it up with grey."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        reason = "no such image" if not path.exists() else f"cannot be read ({error.strerror})"
-        raise InputError(f"{path}: {reason}; restore it or correct the list") from error
-    if not data:
-        raise InputError(f"{path}: the image is empty (0 bytes); restore it or correct the list")
-    tail = data[-_TAIL_BYTES:]
-    truncated = (data.startswith(b"\xff\xd8") and b"\xff\xd9" not in tail) or (
-        data.startswith(b"\x89PNG") and b"IEND" not in tail
-    )
-    image = None if truncated else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if image is None:
-        reason = "truncated" if truncated else "not a readable image"
-        raise InputError(f"{path}: {reason} ({len(data)} bytes); restore it or correct the list")
-    return image
 
 
 def _check_size(path: Path, image: NDArray, camera: Camera) -> None:

@@ -1,0 +1,66 @@
+"""What a segmentation says about an image: one ``Instance`` an object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One object in an image.
+
+    Attributes:
+        mask: (H, W) bool, its visible pixels.
+        box: (4,) x1, y1, x2, y2 in pixels, the edges of a box around it.
+        label: its class in the segmenter's label set, never 0.
+        distribution: (C,) probability of each class, background first; sums to 1.
+        class_score: probability of the label.
+        mask_score: class score times predicted IoU of the mask (Huang et al. 2019): how far the
+            mask can be trusted. Equal to the class score where nobody predicted an IoU.
+    """
+
+    mask: NDArray[np.bool_]
+    box: NDArray[np.float32]
+    label: int
+    distribution: NDArray[np.float32]
+    class_score: float
+    mask_score: float
+
+
+def mask_box(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The box (4,) around the pixels of a mask that has at least one."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float32)
+
+
+def certain(label: int, classes: int, score: float = 1.0) -> NDArray[np.float32]:
+    """The distribution (classes,) of a label with a score and no word about the others.
+
+    What is left goes to the background: "something else".
+    """
+    distribution = np.zeros(classes, np.float32)
+    distribution[0] = 1.0 - score
+    distribution[label] = score
+    return distribution
+
+
+def as_annotation(instance: Instance) -> dict[str, Any]:
+    """COCO's form of an instance, without its ids; the mask as compressed run lengths."""
+    from pycocotools import mask as coco_mask  # noqa: PLC0415  # only where masks are coded
+
+    coded = coco_mask.encode(np.asfortranarray(instance.mask.astype(np.uint8)))
+    x1, y1, x2, y2 = (round(float(v), 3) for v in instance.box)
+    return {
+        "category_id": instance.label,
+        "bbox": [x1, y1, round(x2 - x1, 3), round(y2 - y1, 3)],
+        "area": int(instance.mask.sum()),
+        "segmentation": {"size": list(instance.mask.shape), "counts": coded["counts"].decode()},
+        "iscrowd": 0,
+        "score": round(instance.mask_score, 6),
+        "class_score": round(instance.class_score, 6),
+        "distribution": [round(float(p), 5) for p in instance.distribution],
+    }

@@ -1,0 +1,72 @@
+"""The network as a ``Segmenter``."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from semantics.checkpoints import TrainedNetwork
+from semantics.instances import Instance
+from semantics.network.model import Detections
+from semantics.network.paste import paste
+from semantics.segmenter import Image, check_image
+from semantics.yolox import YoloxDetector
+
+MASK_THRESHOLD = 0.5
+
+
+class NetworkSegmenter:
+    """Mask (Scoring) R-CNN on one image after the other.
+
+    Args:
+        network: weights and class names.
+        min_score: class score below which a detection is dropped.
+        detector: finds the boxes instead of the network's own RPN and box head.
+        device: "cpu", "cuda", or None for CUDA where there is any.
+    """
+
+    def __init__(
+        self,
+        network: TrainedNetwork,
+        min_score: float = 0.5,
+        detector: YoloxDetector | None = None,
+        device: str | None = None,
+    ) -> None:
+        self.labels = network.labels
+        self._device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        self._model = network.model.to(self._device)
+        self._min_score = min_score
+        self._detector = detector
+
+    @torch.inference_mode()
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """Instances in an image (H, W, 3), best mask score first; none in an empty scene."""
+        check_image(image, name)
+        tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1).float() / 255
+        if self._detector is None:
+            detections = self._model([tensor])[0]
+        else:
+            boxes = self._detector.detect(image, self.labels).to(self._device)
+            detections = self._model.segment([tensor], [boxes])[0]
+        return as_instances(detections, (image.shape[0], image.shape[1]), self._min_score)
+
+
+def as_instances(found: Detections, size: tuple[int, int], min_score: float) -> list[Instance]:
+    """Detections as instances with masks of (height, width); without those whose mask is empty."""
+    keep = found.found.scores >= min_score
+    boxes = found.found.boxes[keep]
+    masks = (paste(found.masks[keep], boxes, size) > MASK_THRESHOLD).cpu().numpy()
+    scores = found.found.scores[keep].cpu().numpy()
+    mask_scores = scores * found.mask_ious[keep].cpu().numpy()
+    labels = found.found.labels[keep].tolist()
+    distributions = found.found.distributions[keep].cpu().numpy().astype(np.float32)
+    box_array = boxes.cpu().numpy().astype(np.float32)
+    order = np.argsort(-mask_scores, kind="stable")
+    return [
+        Instance(
+            masks[k], box_array[k], labels[k], distributions[k], float(scores[k]),
+            float(mask_scores[k]),
+        )
+        for k in order.tolist()
+        if masks[k].any()
+    ]  # fmt: skip

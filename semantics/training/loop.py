@@ -1,0 +1,214 @@
+"""The training loop: batches, optimiser, curves, and checkpoints that it resumes from."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from graph.errors import InputError
+from semantics.checkpoints import TrainedNetwork, save_network
+from semantics.training.dataset import AugmentConfig, Dataset, as_tensors, augmented
+from semantics.training.losses import Losses, network_losses
+from semantics.training.targets import Target
+
+STATE = "training.pt"
+CURVES = "losses.csv"
+WEIGHTS = "weights.safetensors"
+MASKIOU = "maskiou"
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How to train.
+
+    Attributes:
+        steps: batches in all.
+        batch: images in a batch.
+        optimiser: "adamw", or "sgd" with momentum 0.9.
+        rate: learning rate after the warm-up; it falls to nothing along a half cosine.
+        warm_up: steps over which the rate rises.
+        decay: weight decay.
+        max_gradient: gradients longer than this are shortened.
+        freeze: beginnings of names of parameters that stay as they are.
+        only: "maskiou" trains the MaskIoU head alone; "" all.
+        rois: where masks are learnt: in the RPN's proposals, or around the objects, for a
+            network whose boxes come from another detector.
+        save_every: steps between checkpoints.
+        seed: of batches, samples and augmentation.
+    """
+
+    steps: int = 2000
+    batch: int = 2
+    optimiser: Literal["adamw", "sgd"] = "adamw"
+    rate: float = 5e-4
+    warm_up: int = 100
+    decay: float = 1e-4
+    max_gradient: float = 10.0
+    freeze: tuple[str, ...] = ()
+    only: Literal["", "maskiou"] = ""
+    rois: Literal["proposals", "objects"] = "proposals"
+    save_every: int = 200
+    seed: int = 0
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.batch < 1 or self.rate <= 0:
+            raise ValueError("steps and batch must be at least 1, the rate above 0")
+
+
+def train(
+    network: TrainedNetwork,
+    data: Dataset,
+    out: Path,
+    config: TrainingConfig,
+    progress: Callable[[int, int], None],
+) -> Path:
+    """Train and write weights, loss curves and a checkpoint; goes on from the one in ``out``.
+
+    Returns:
+        the weights file.
+
+    Raises:
+        InputError: ``out`` holds a training with another configuration, or a loss that is no
+            number.
+    """
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = network.model.to(device).train()
+    parameters = trainable(model, config)
+    optimiser = _optimiser(parameters, config)
+    scaler = torch.amp.GradScaler(device, enabled=device == "cuda")
+    out.mkdir(parents=True, exist_ok=True)
+    first = _resume(out, model, optimiser, config)
+    with (out / CURVES).open("a", newline="") as file:
+        writer = csv.writer(file)
+        for step in range(first, config.steps):
+            _set_rate(optimiser, step, config)
+            losses = _step_losses(model, data, step, config, device)
+            total = sum(losses.values(), torch.zeros((), device=device))
+            if not math.isfinite(value := float(total.detach())):
+                raise InputError(f"step {step}: the loss is {value}; lower the rate {config.rate}")
+            optimiser.zero_grad(set_to_none=True)
+            scaler.scale(total).backward()
+            scaler.unscale_(optimiser)
+            nn.utils.clip_grad_norm_(parameters, config.max_gradient)
+            scaler.step(optimiser)
+            scaler.update()
+            _log(writer, step, losses)
+            if (step + 1) % config.save_every == 0 or step + 1 == config.steps:
+                file.flush()
+                _save(out, model, optimiser, step + 1, config)
+            progress(step + 1, config.steps)
+    save_network(TrainedNetwork(model.eval(), network.labels), out / WEIGHTS)
+    return out / WEIGHTS
+
+
+def trainable(model: nn.Module, config: TrainingConfig) -> list[nn.Parameter]:
+    """The parameters that are trained; the others get no gradient.
+
+    Raises:
+        InputError: a name to freeze that no parameter begins with, or nothing left to train.
+    """
+    names = [name for name, _ in model.named_parameters()]
+    for prefix in config.freeze:
+        if not any(name.startswith(prefix) for name in names):
+            raise InputError(f"--freeze {prefix}: no parameter begins with it; one is {names[0]}")
+    for name, parameter in model.named_parameters():
+        frozen = any(name.startswith(prefix) for prefix in config.freeze)
+        parameter.requires_grad_(not frozen and (not config.only or f".{MASKIOU}" in name))
+    chosen = [p for p in model.parameters() if p.requires_grad]
+    if not chosen:
+        raise InputError("training: every parameter is frozen; freeze less, or add a MaskIoU head")
+    return chosen
+
+
+def _optimiser(parameters: list[nn.Parameter], config: TrainingConfig) -> torch.optim.Optimizer:
+    if config.optimiser == "sgd":
+        return torch.optim.SGD(parameters, config.rate, momentum=0.9, weight_decay=config.decay)
+    return torch.optim.AdamW(parameters, config.rate, weight_decay=config.decay)
+
+
+def _set_rate(optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig) -> None:
+    """Linear warm-up, then half a cosine down to nothing."""
+    warm = min((step + 1) / max(config.warm_up, 1), 1.0)
+    cosine = 0.5 * (1 + math.cos(math.pi * step / config.steps))
+    for group in optimiser.param_groups:
+        group["lr"] = config.rate * warm * cosine
+
+
+def _step_losses(
+    model: Any, data: Dataset, step: int, config: TrainingConfig, device: str
+) -> Losses:
+    """The losses of a step's batch, which depends on the seed and the step alone."""
+    rng = np.random.default_rng([config.seed, step])
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    images, targets = zip(*_batch(data, rng, config, device), strict=True)
+    with torch.autocast(device, enabled=device == "cuda"):
+        losses = network_losses(model, images, targets, generator, config.rois)
+    return {k: v for k, v in losses.items() if k == MASKIOU} if config.only else losses
+
+
+def _batch(
+    data: Dataset, rng: np.random.Generator, config: TrainingConfig, device: str
+) -> Iterator[tuple[Tensor, Target]]:
+    for index in rng.integers(len(data), size=config.batch).tolist():
+        other = data.load(int(rng.integers(len(data))))
+        image, target = as_tensors(augmented(data.load(index), other, config.augment, rng))
+        moved = Target(*(t.to(device) for t in (target.boxes, target.labels, target.masks)))
+        yield image.to(device), moved
+
+
+def _log(writer: Any, step: int, losses: Losses) -> None:
+    """A line a step and loss: step, name, value."""
+    for name, value in losses.items():
+        writer.writerow([step, name, f"{float(value.detach()):.6g}"])
+
+
+def _save(
+    out: Path, model: nn.Module, optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig
+) -> None:
+    content = {
+        "model": model.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "step": step,
+        "config": _comparable(config),
+    }
+    temporary = out / f"{STATE}.tmp"
+    torch.save(content, temporary)
+    os.replace(temporary, out / STATE)
+
+
+def _resume(
+    out: Path, model: nn.Module, optimiser: torch.optim.Optimizer, config: TrainingConfig
+) -> int:
+    """The step to go on from: 0, or after the checkpoint, whose curves are cut to fit."""
+    if not (out / STATE).is_file():
+        (out / CURVES).write_text("step,loss,value\n")
+        return 0
+    content = torch.load(out / STATE, map_location="cpu", weights_only=True)
+    if content["config"] != _comparable(config):
+        before, now = content["config"], _comparable(config)
+        key = next(k for k in now if before.get(k) != now[k])
+        raise InputError(
+            f"{out}: holds a training with {key} {before.get(key)}, now it is {now[key]}; "
+            "choose another --out or delete it"
+        )
+    model.load_state_dict(content["model"])
+    optimiser.load_state_dict(content["optimiser"])
+    step = int(content["step"])
+    lines = (out / CURVES).read_text().splitlines()
+    kept = [line for line in lines[1:] if int(line.split(",")[0]) < step]
+    (out / CURVES).write_text("\n".join([lines[0], *kept]) + "\n")
+    return step
+
+
+def _comparable(config: TrainingConfig) -> dict[str, str]:
+    return {key: str(value) for key, value in asdict(config).items()}

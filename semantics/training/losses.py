@@ -1,0 +1,201 @@
+"""The losses: L = L_rpn + L_cls + L_box + L_mask + L_maskiou (paper eq. 10, corrected)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from semantics.network import boxes as box_ops
+from semantics.network import mask_heads
+from semantics.network.anchors import make_anchors
+from semantics.network.config import ProposalConfig
+from semantics.network.images import ImageBatch, prepare
+from semantics.network.mask_heads import of_class
+from semantics.network.model import ROI_LEVELS, MaskRCNN
+from semantics.network.roi_align import FeatureTable, feature_table, roi_align
+from semantics.network.rpn import select_proposals
+from semantics.training.targets import (
+    BOX_RULE,
+    RPN_RULE,
+    Target,
+    draw_samples,
+    iou_targets,
+    mask_targets,
+    match,
+)
+
+SMOOTH_L1_BETA = 1 / 9
+TRAINING_PROPOSALS = ProposalConfig(before_nms=2000, after_nms=2000)
+JITTERS = 4
+"""Boxes drawn around each object where no detector is trained."""
+JITTER_SHARE = 0.1
+"""Their corners move by up to this share of the box's size."""
+
+Losses = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Rois:
+    """Positive boxes of a batch, for the mask heads.
+
+    Attributes:
+        boxes: (R_b, 4) of each image, in pixels of the batch.
+        owners: (R_b,) each one's object.
+    """
+
+    boxes: list[Tensor]
+    owners: list[Tensor]
+
+
+def network_losses(
+    model: MaskRCNN,
+    images: Sequence[Tensor],
+    targets: Sequence[Target],
+    generator: torch.Generator,
+    rois: Literal["proposals", "objects"] = "proposals",
+) -> Losses:
+    """Every loss of a batch; their sum is what training minimises.
+
+    With ``rois`` "objects" the masks are learnt in boxes around the objects themselves, and the
+    RPN and the box head are not trained: for a network whose boxes come from another detector.
+    """
+    batch = prepare(images, model.config.image)
+    scaled = [
+        box_ops.rescale(t.boxes, old, new)
+        for t, old, new in zip(targets, batch.original_sizes, batch.sizes, strict=True)
+    ]
+    levels = model.backbone(batch.tensor)
+    table = feature_table(levels[:ROI_LEVELS], batch.size[0])
+    losses: Losses = {}
+    if rois == "objects":
+        found = around_objects(scaled, batch, generator)
+    else:
+        rpn, proposals = rpn_losses(model, levels, batch, scaled, generator)
+        box, found = box_losses(model, table, proposals, scaled, targets, generator)
+        losses |= rpn | box
+    return losses | mask_losses(model, table, found, targets, batch)
+
+
+def rpn_losses(
+    model: MaskRCNN,
+    levels: Sequence[Tensor],
+    batch: ImageBatch,
+    objects: Sequence[Tensor],
+    generator: torch.Generator,
+) -> tuple[Losses, list[Tensor]]:
+    """Losses of objectness and anchor offsets over drawn anchors; and the proposals."""
+    logits, offsets = model.rpn.head(levels)
+    anchors = make_anchors(levels, batch.size)
+    every, all_logits, all_offsets = torch.cat(anchors), torch.cat(logits, 1), torch.cat(offsets, 1)
+    judged, moved, wanted, truth = [], [], [], []
+    for b, boxes in enumerate(objects):
+        matched = match(every, boxes, RPN_RULE)
+        positive, negative = draw_samples(matched, RPN_RULE, generator)
+        judged.append(all_logits[b, torch.cat([positive, negative])])
+        truth.append(torch.cat([torch.ones(len(positive)), torch.zeros(len(negative))]))
+        moved.append(all_offsets[b, positive])
+        wanted.append(
+            box_ops.encode(boxes[matched[positive]], every[positive].float(), box_ops.RPN_WEIGHTS)
+        )
+    scores = torch.cat(judged)
+    objectness = F.binary_cross_entropy_with_logits(scores, torch.cat(truth).to(scores))
+    box = _smooth_l1(torch.cat(moved), torch.cat(wanted), len(scores))
+    proposals = select_proposals(anchors, logits, offsets, batch.sizes, TRAINING_PROPOSALS)
+    return {"objectness": objectness, "rpn_box": box}, proposals
+
+
+def box_losses(
+    model: MaskRCNN,
+    table: FeatureTable,
+    proposals: Sequence[Tensor],
+    objects: Sequence[Tensor],
+    targets: Sequence[Target],
+    generator: torch.Generator,
+) -> tuple[Losses, Rois]:
+    """Losses of class and box over drawn proposals, the objects themselves among them."""
+    chosen, labels, wanted, positives = [], [], [], Rois([], [])
+    for found, boxes, target in zip(proposals, objects, targets, strict=True):
+        candidates = torch.cat([found, boxes])
+        matched = match(candidates, boxes, BOX_RULE)
+        positive, negative = draw_samples(matched, BOX_RULE, generator)
+        owner = matched[positive]
+        chosen.append(candidates[torch.cat([positive, negative])])
+        labels.append(torch.cat([target.labels[owner], torch.zeros_like(negative)]))
+        offsets = box_ops.encode(boxes[owner], candidates[positive], box_ops.BOX_WEIGHTS)
+        wanted.append(torch.cat([offsets, offsets.new_zeros(len(negative), 4)]))
+        positives.boxes.append(candidates[positive])
+        positives.owners.append(owner)
+    logits, predicted = model.roi_heads.boxes(table, chosen)
+    label, offset = torch.cat(labels), torch.cat(wanted)
+    is_object = label > 0
+    box = _smooth_l1(of_class(predicted, label)[is_object], offset[is_object], len(label))
+    return {"class": F.cross_entropy(logits, label), "box": box}, positives
+
+
+def around_objects(
+    objects: Sequence[Tensor], batch: ImageBatch, generator: torch.Generator
+) -> Rois:
+    """Boxes near each object, as an imperfect detector would give them."""
+    found = Rois([], [])
+    for boxes, size in zip(objects, batch.sizes, strict=True):
+        owner = torch.arange(len(boxes), device=boxes.device).repeat(JITTERS)
+        near = boxes[owner]
+        noise = torch.rand(near.shape, generator=generator).to(near) * 2 - 1
+        sides = (near[:, 2:] - near[:, :2]).repeat(1, 2)
+        moved = box_ops.clip(near + noise * JITTER_SHARE * sides, size)
+        kept = box_ops.at_least(moved, 1.0)
+        found.boxes.append(moved[kept])
+        found.owners.append(owner[kept])
+    return found
+
+
+def mask_losses(
+    model: MaskRCNN,
+    table: FeatureTable,
+    found: Rois,
+    targets: Sequence[Target],
+    batch: ImageBatch,
+) -> Losses:
+    """Losses of the masks, and of the predicted IoUs, on the object's own class (eq. 11)."""
+    heads = model.roi_heads
+    if sum(len(o) for o in found.owners) == 0:
+        nothing = table.rows.sum() * 0
+        return {"mask": nothing} | ({"maskiou": nothing} if heads.maskiou_head else {})
+    features = roi_align(table, found.boxes, mask_heads.BINS)
+    every = heads.mask_predictor(heads.mask_head(features))
+    labels = torch.cat([t.labels[o] for t, o in zip(targets, found.owners, strict=True)])
+    logits = of_class(every, labels)
+    wanted, object_px, box_px = _wanted_masks(found, targets, batch, logits.shape[-1])
+    losses = {"mask": F.binary_cross_entropy_with_logits(logits, wanted.to(logits))}
+    if heads.maskiou_head is not None:
+        masks = logits.detach().sigmoid()
+        ious = of_class(heads.maskiou_head(features, masks), labels)
+        truth = iou_targets(masks, wanted, object_px, box_px).to(ious)
+        losses["maskiou"] = 0.5 * F.mse_loss(ious, truth)
+    return losses
+
+
+def _wanted_masks(
+    found: Rois, targets: Sequence[Target], batch: ImageBatch, bins: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mask targets (R, bins, bins), areas (R,) of objects and boxes in the images' own pixels."""
+    wanted, object_px, box_px = [], [], []
+    for b, (boxes, owner, target) in enumerate(
+        zip(found.boxes, found.owners, targets, strict=True)
+    ):
+        own = box_ops.rescale(boxes, batch.sizes[b], batch.original_sizes[b])
+        wanted.append(mask_targets(target.masks, owner, own, bins))
+        object_px.append(target.masks.sum(dim=(1, 2))[owner].float())
+        box_px.append(box_ops.area(own))
+    return torch.cat(wanted), torch.cat(object_px), torch.cat(box_px)
+
+
+def _smooth_l1(found: Tensor, wanted: Tensor, count: int) -> Tensor:
+    """Sum over the boxes' offsets, divided by the number of all drawn boxes."""
+    total = F.smooth_l1_loss(found, wanted.to(found), beta=SMOOTH_L1_BETA, reduction="sum")
+    return total / max(count, 1)

@@ -1,0 +1,105 @@
+"""A training from files: which network, which data, and the picture of its curves."""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib.figure
+import numpy as np
+import torch
+
+from graph.errors import InputError
+from semantics.checkpoints import TrainedNetwork, find_weights, load_mobilenet, load_network
+from semantics.coco_files import read_coco
+from semantics.labels import LabelSet, read_label_set
+from semantics.network.config import LIGHT
+from semantics.network.model import MaskRCNN
+from semantics.training.dataset import Dataset, split
+from semantics.training.loop import CURVES, TrainingConfig, train
+from semantics.training.transfer import transferred
+
+SMOOTHING_STEPS = 25
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """What to train, on what.
+
+    Attributes:
+        data, images: COCO file and the folder of its images.
+        out: folder of the results.
+        weights: to start from; None: a new light network ...
+        backbone: ... with this ImageNet MobileNetV2 as its body.
+        labels: label set to learn, by name or file.
+        held_out: share of the images that is left for testing.
+        freeze: parameters that stay, by the beginning of their names.
+        settings: other values of ``TrainingConfig``.
+    """
+
+    data: Path
+    images: Path
+    out: Path
+    weights: str | None = None
+    backbone: Path | None = None
+    labels: str = "coco"
+    held_out: float = 0.0
+    freeze: tuple[str, ...] = ()
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def run_training(run: TrainingRun, progress: Callable[[int, int], None]) -> Path:
+    """Train and draw the losses; returns the weights file.
+
+    Raises:
+        InputError: data, weights or options that do not go together.
+    """
+    if not 0 <= run.held_out < 1:
+        raise InputError(f"--held-out {run.held_out}: a share of the images, from 0 to below 1")
+    try:
+        config = TrainingConfig(freeze=run.freeze, **run.settings)
+    except ValueError as error:
+        raise InputError(f"training: {error}") from error
+    labels = read_label_set(run.labels)
+    training, _ = split(read_coco(run.data), run.held_out, config.seed)
+    dataset = Dataset(training, run.images, labels)
+    weights = train(_start(run, labels, config.seed), dataset, run.out, config, progress)
+    draw_losses(run.out / CURVES, run.out / "losses.png")
+    return weights
+
+
+def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork:
+    """The network to begin with."""
+    torch.manual_seed(seed)
+    if run.weights is not None:
+        return transferred(load_network(find_weights(run.weights)), labels)
+    model = MaskRCNN(replace(LIGHT, classes=len(labels)))
+    if run.backbone is None:
+        raise InputError(
+            "training: give --weights to start from, or --backbone for a light network"
+        )
+    load_mobilenet(model, run.backbone)
+    return TrainedNetwork(model, labels)
+
+
+def draw_losses(curves: Path, picture: Path) -> None:
+    """Each loss against the step, smoothed (the paper's Fig. 8)."""
+    values: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    with curves.open(newline="") as file:
+        for row in csv.DictReader(file):
+            values[row["loss"]].append((int(row["step"]), float(row["value"])))
+    figure = matplotlib.figure.Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.add_subplot()
+    for name, points in values.items():
+        step, value = np.array(points).T
+        width = min(SMOOTHING_STEPS, len(step))
+        smooth = np.convolve(value, np.full(width, 1 / width), mode="valid")
+        axes.plot(step[width - 1 :], smooth, label=name)
+    axes.set(xlabel="step", ylabel="loss", yscale="log")
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.savefig(picture, dpi=120)

@@ -1,0 +1,137 @@
+"""Boxes from a YOLOX detector (Ge et al. 2021) in an ONNX file, run by OpenCV."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from graph.errors import InputError
+from semantics.labels import LabelSet, read_label_set
+from semantics.network.box_head import ClassifiedBoxes
+from semantics.network.nms import grouped_nms
+from semantics.segmenter import Image
+
+STRIDES = (8, 16, 32)
+SIZES_PX = (416, 640)
+"""Input sizes of the published networks: Nano and Tiny, and the larger ones."""
+PAD_VALUE = 114
+GEOMETRY = 5
+"""x, y, width, height and objectness come before the class probabilities."""
+
+
+@dataclass(frozen=True)
+class YoloxConfig:
+    """Which boxes are kept."""
+
+    min_score: float = 0.05
+    nms_iou: float = 0.65
+    max_count: int = 100
+
+
+class YoloxDetector:
+    """A COCO detector whose classes are matched to a label set by name.
+
+    Raises:
+        InputError: no such file, or a network of another kind.
+    """
+
+    def __init__(self, path: Path, config: YoloxConfig | None = None) -> None:
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; give a YOLOX network in ONNX")
+        try:
+            self._network = cv2.dnn.readNetFromONNX(str(path))
+        except cv2.error as error:
+            raise InputError(f"{path}: OpenCV cannot read it as ONNX; export it again") from error
+        self._path = path
+        self._config = config or YoloxConfig()
+        self._classes = read_label_set("coco")
+        self._side_px = self._find_side()
+
+    def detect(self, image: Image, labels: LabelSet) -> ClassifiedBoxes:
+        """Boxes in an image (H, W, 3), red first, of the classes that ``labels`` knows."""
+        blob, factor = letterbox(image, self._side_px)
+        self._network.setInput(blob)
+        boxes, probabilities = decode(self._network.forward()[0], self._side_px)
+        height, width = image.shape[:2]
+        boxes = np.clip(boxes / factor, 0, [width, height, width, height])
+        numbers = np.array([labels.number(name) for name in self._classes.names[1:]])
+        return self._select(boxes, probabilities, numbers, len(labels))
+
+    def _select(
+        self, boxes: NDArray, probabilities: NDArray, numbers: NDArray, classes: int
+    ) -> ClassifiedBoxes:
+        """The best boxes (N, 4) after suppression, from (P, 4) and (P, 80)."""
+        known = np.flatnonzero(numbers > 0)
+        distribution = np.zeros((len(boxes), classes), np.float32)
+        distribution[:, numbers[known]] = probabilities[:, known]
+        label, score = distribution.argmax(axis=1), distribution.max(axis=1)
+        sizes = boxes[:, 2:] - boxes[:, :2]
+        chosen = np.flatnonzero((score > self._config.min_score) & (sizes > 1).all(axis=1))
+        distribution = distribution[chosen]
+        total = distribution.sum(axis=1, keepdims=True)
+        distribution /= np.maximum(total, 1)
+        distribution[:, 0] = 1 - distribution.sum(axis=1)
+        box_tensor = torch.from_numpy(boxes[chosen].astype(np.float32))
+        score_tensor = torch.from_numpy(score[chosen])
+        label_tensor = torch.from_numpy(label[chosen])
+        keep = grouped_nms(box_tensor, score_tensor, label_tensor, self._config.nms_iou)
+        keep = keep[: self._config.max_count]
+        return ClassifiedBoxes(
+            box_tensor[keep], label_tensor[keep], score_tensor[keep],
+            torch.from_numpy(distribution)[keep],
+        )  # fmt: skip
+
+    def _find_side(self) -> int:
+        """The input size, by trying: the file's shapes are not shown by OpenCV."""
+        for side in SIZES_PX:
+            self._network.setInput(np.zeros((1, 3, side, side), np.float32))
+            try:
+                output = self._network.forward()
+            except cv2.error:
+                continue
+            cells = sum((side // stride) ** 2 for stride in STRIDES)
+            if output.shape == (1, cells, GEOMETRY + len(self._classes) - 1):
+                return side
+        raise InputError(
+            f"{self._path}: not a YOLOX network for COCO's 80 classes at one of {SIZES_PX} pixels; "
+            "give such a one"
+        )
+
+
+def letterbox(image: Image, side_px: int) -> tuple[NDArray[np.float32], float]:
+    """The network's input (1, 3, side, side), blue first in 0..255, and the factor of its scale.
+
+    The image fills the upper left; the rest is grey.
+    """
+    height, width = image.shape[:2]
+    factor = min(side_px / height, side_px / width)
+    size = (max(int(width * factor), 1), max(int(height * factor), 1))
+    resized = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+    padded = np.full((side_px, side_px, 3), PAD_VALUE, np.uint8)
+    padded[: size[1], : size[0]] = resized
+    blob = padded[:, :, ::-1].transpose(2, 0, 1)[None].astype(np.float32)
+    return np.ascontiguousarray(blob), factor
+
+
+def decode(output: NDArray, side_px: int) -> tuple[NDArray, NDArray]:
+    """Boxes (P, 4) in pixels of the input, and class probabilities (P, 80) times objectness.
+
+    Row (x, y, w, h, o, c...) of a cell (column, row) of stride s: centre (x + column, y + row) s,
+    size (exp(w), exp(h)) s; rows in the order of the strides, then of rows and columns.
+    """
+    cells, strides = [], []
+    for stride in STRIDES:
+        n = side_px // stride
+        grid = np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2)
+        cells.append(grid)
+        strides.append(np.full((n * n, 1), stride))
+    cell, step = np.concatenate(cells), np.concatenate(strides)
+    centre = (output[:, :2] + cell) * step
+    half = 0.5 * np.exp(output[:, 2:4]) * step
+    boxes = np.concatenate([centre - half, centre + half], axis=1)
+    return boxes, output[:, GEOMETRY - 1 : GEOMETRY] * output[:, GEOMETRY:]

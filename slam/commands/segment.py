@@ -1,0 +1,64 @@
+"""``bmask-slam segment``: masks of a sequence's images, made once and kept."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TypeAlias
+
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
+
+TEXT = "find the objects in a sequence's images and keep their masks"
+MORE = """\
+--out gets annotations.json (COCO's format, masks as run lengths, both scores and the class
+distribution of every instance), a file an image in images/, and pictures in overlays/. Images
+that are done are not done again."""
+
+
+def add_segment(commands: _Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser("segment", help=TEXT, description=f"{TEXT}. {MORE}")
+    parser.set_defaults(handler=_segment)
+    parser.add_argument("source", type=Path, metavar="INPUT", help="sequence, or folder of images")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for masks")
+    parser.add_argument(
+        "--segmenter",
+        default="light",
+        metavar="NAME",
+        help="light (default), mask-scoring-rcnn, precomputed, truth or none",
+    )
+    parser.add_argument("--weights", metavar="F", help="weights file, or torchvision:NAME")
+    parser.add_argument(
+        "--proposals", type=Path, metavar="F", help="YOLOX network in ONNX that finds the boxes"
+    )
+    parser.add_argument(
+        "--masks", type=Path, metavar="F", help="of precomputed: COCO file or folder of label PNGs"
+    )
+    parser.add_argument("--labels", metavar="F", help="label set: file, or coco, coco91, paper")
+    parser.add_argument(
+        "--min-score", type=float, default=0.5, metavar="S", help="class score (default: 0.5)"
+    )
+    parser.add_argument("--no-overlays", action="store_true", help="masks only, no pictures")
+    parser.add_argument("--quiet", action="store_true", help="print only the file's path")
+
+
+def _segment(arguments: argparse.Namespace) -> int:
+    from semantics.segmenter_table import SegmenterOptions
+    from slam.progress import console_log, counting_bar
+    from slam.segmentation import segment_folder
+
+    names = ("weights", "proposals", "masks", "labels", "min_score")
+    given = {name: getattr(arguments, name) for name in names}
+    options = SegmenterOptions(arguments.segmenter, **given)
+    with console_log(), counting_bar(arguments.quiet) as progress:
+        result = segment_folder(
+            arguments.source, arguments.out, options, not arguments.no_overlays, progress
+        )
+    if arguments.quiet:
+        print(result.file)
+        return 0
+    print(f"{result.instances} instances in {result.images} images, {result.reused} of them reused")
+    if result.broken:
+        print(f"{result.broken} broken images were left out")
+    print(f"Masks       {result.file}")
+    return 0

@@ -1,0 +1,231 @@
+"""Segmenters: those that look masks up, the table of names, the network behind the same call."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from graph.errors import InputError
+from semantics.checkpoints import TrainedNetwork, save_network
+from semantics.instances import Instance, as_annotation, certain, mask_box
+from semantics.labels import label_set
+from semantics.mask_cache import ANNOTATIONS, CacheOptions, cache_masks
+from semantics.network.box_head import ClassifiedBoxes
+from semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
+from semantics.network.model import Detections, MaskRCNN
+from semantics.network_segmenter import NetworkSegmenter, as_instances
+from semantics.overlay import draw
+from semantics.segmenter import (
+    CocoSegmenter,
+    Image,
+    LabelImageSegmenter,
+    NoSegmenter,
+    Segmenter,
+    check_image,
+)
+from semantics.segmenter_table import NAMES, SegmenterOptions, make_segmenter
+
+LABELS = label_set(["cup", "mouse"])
+TINY = NetworkConfig(
+    classes=3, backbone="mobilenet_v2", norm="none", channels=16, box_hidden=8, mask_channels=8,
+    maskiou_channels=8, maskiou_hidden=8, image=ImageConfig(96, 128),
+    detections=DetectionConfig(min_score=0.0, max_count=20),
+)  # fmt: skip
+
+
+def rectangle(x: int, y: int, w: int, h: int, size: tuple[int, int] = (40, 60)) -> np.ndarray:
+    mask = np.zeros(size, bool)
+    mask[y : y + h, x : x + w] = True
+    return mask
+
+
+class Drawer:
+    """Two instances in every image."""
+
+    labels = LABELS
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        check_image(image, name)
+        self.calls += 1
+        masks = [rectangle(5, 6, 20, 10), rectangle(30, 20, 8, 8)]
+        return [
+            Instance(masks[0], mask_box(masks[0]), 1, certain(1, 3, 0.9), 0.9, 0.63),
+            Instance(masks[1], mask_box(masks[1]), 2, certain(2, 3, 0.6), 0.6, 0.5),
+        ]
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> list[tuple[str, Path]]:
+    """Three images in a folder."""
+    files = []
+    for k in range(3):
+        path = tmp_path / "rgb" / f"{k}.25.png"
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), np.full((40, 60, 3), 50 * k, np.uint8))
+        files.append((f"rgb/{path.name}", path))
+    return files
+
+
+def quiet(done: int, total: int) -> None:
+    assert 0 < done <= total
+
+
+def test_cached_masks_come_back_as_they_were(tmp_path: Path, images: list) -> None:
+    out = tmp_path / "masks"
+    drawer = Drawer()
+    result = cache_masks(drawer, images, CacheOptions(out, {"name": "x"}), quiet)
+    assert (result.images, result.instances, result.reused, result.broken) == (3, 6, 0, 0)
+    overlay = cv2.imread(str(out / "overlays/rgb/0.25.jpg"))
+    assert overlay[10, 15].max() > 60  # inside a mask of a black image
+    assert overlay[35, 5].max() < 20
+    again = CocoSegmenter(out / ANNOTATIONS)
+    assert again.labels == LABELS
+    image = np.zeros((40, 60, 3), np.uint8)
+    for found, given in zip(again.segment(image, "rgb/1.25.png"), drawer.segment(image, ""),
+                            strict=True):  # fmt: skip
+        assert np.array_equal(found.mask, given.mask)
+        assert found.box.tolist() == given.box.tolist()
+        assert (found.label, found.class_score, found.mask_score) == pytest.approx(
+            (given.label, given.class_score, given.mask_score)
+        )
+        assert found.distribution == pytest.approx(given.distribution, abs=1e-5)
+    with pytest.raises(InputError, match=r"has no image rgb/9\.png"):
+        again.segment(image, "rgb/9.png")
+    with pytest.raises(InputError, match="60x40 pixels there, but 30x40 here"):
+        again.segment(image[:, :30], "rgb/1.25.png")
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path, images: list) -> None:
+    options = CacheOptions(tmp_path / "masks", {"name": "x"}, overlays=False)
+    drawer = Drawer()
+    cache_masks(drawer, images[:2], options, quiet)
+    before = (tmp_path / "masks" / ANNOTATIONS).read_bytes()
+    result = cache_masks(drawer, images, options, quiet)
+    assert drawer.calls == 3
+    assert result.reused == 2
+    cache_masks(drawer, images[:2], options, quiet)
+    assert (tmp_path / "masks" / ANNOTATIONS).read_bytes() == before
+    with pytest.raises(InputError, match="made with name x, now it is y"):
+        cache_masks(drawer, images, replace(options, settings={"name": "y"}), quiet)
+    with pytest.raises(InputError, match="no folder of masks"):
+        cache_masks(drawer, images, replace(options, out=tmp_path / "rgb"), quiet)
+
+
+def test_a_broken_image_is_left_out_but_not_the_first(tmp_path: Path, images: list) -> None:
+    images[1][1].write_bytes(b"\x89PNG cut")
+    options = CacheOptions(tmp_path / "masks", {}, overlays=False)
+    result = cache_masks(Drawer(), images, options, quiet)
+    assert (result.images, result.broken) == (2, 1)
+    images[0][1].write_bytes(b"")
+    with pytest.raises(InputError, match="0 bytes"):
+        cache_masks(Drawer(), images, replace(options, out=tmp_path / "other"), quiet)
+
+
+def test_label_images_of_any_tool(tmp_path: Path) -> None:
+    values = np.zeros((40, 60), np.uint16)
+    values[2:6, 3:9] = 2  # every mouse in one
+    values[10:20, 10:20], values[10:20, 30:40] = 1001, 1002  # two cups
+    cv2.imwrite(str(tmp_path / "a.png"), values)
+    image = np.zeros((40, 60, 3), np.uint8)
+    found = LabelImageSegmenter(tmp_path, LABELS).segment(image, "rgb/a.jpg")
+    assert [i.label for i in found] == [2, 1, 1]
+    assert found[0].box.tolist() == [3, 2, 9, 6]
+    assert found[1].mask.sum() == found[2].mask.sum() == 100
+    assert found[0].distribution.tolist() == [0, 0, 1]
+    values[0, 0] = 7
+    cv2.imwrite(str(tmp_path / "a.png"), values)
+    with pytest.raises(InputError, match="value 7 means label 7, but the label set ends at 2"):
+        LabelImageSegmenter(tmp_path, LABELS).segment(image, "a.png")
+    with pytest.raises(InputError, match="no such image"):
+        LabelImageSegmenter(tmp_path, LABELS).segment(image, "b.png")
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((4, 5), np.uint8),
+        np.zeros((4, 5, 1), np.uint8),
+        np.zeros((0, 5, 3), np.uint8),
+        np.zeros((4, 5, 3), np.float32),
+    ],
+)
+def test_what_is_no_colour_image_is_refused(image: np.ndarray) -> None:
+    torch.manual_seed(0)
+    network = NetworkSegmenter(TrainedNetwork(MaskRCNN(TINY).eval(), LABELS), device="cpu")
+    segmenters: list[Segmenter] = [NoSegmenter(), network]
+    for segmenter in segmenters:
+        with pytest.raises(InputError, match=r"x\.png: an image of shape"):
+            segmenter.segment(image, "x.png")
+
+
+def test_the_network_finds_instances_and_nothing_above_an_impossible_score() -> None:
+    torch.manual_seed(0)
+    network = TrainedNetwork(MaskRCNN(TINY).eval(), LABELS)
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (60, 80, 3), np.uint8)
+    found = NetworkSegmenter(network, 0.0, device="cpu").segment(image, "a")
+    assert len(found) > 0
+    for instance in found:
+        assert instance.mask.shape == (60, 80)
+        assert instance.mask.any()
+        assert instance.distribution.sum() == pytest.approx(1, abs=1e-5)
+        assert instance.distribution[instance.label] == pytest.approx(instance.class_score)
+        assert 0 <= instance.mask_score <= instance.class_score
+    scores = [i.mask_score for i in found]
+    assert scores == sorted(scores, reverse=True)
+    strict = NetworkSegmenter(network, 1.1, device="cpu")
+    assert strict.segment(np.zeros((1, 1, 3), np.uint8), "one pixel") == []
+
+
+def test_mask_scores_reorder_detections_and_empty_masks_go() -> None:
+    boxes = torch.tensor([[2.0, 2.0, 20.0, 20.0], [5.0, 5.0, 30.0, 30.0], [1.0, 1.0, 9.0, 9.0]])
+    masks = torch.stack([torch.full((28, 28), p) for p in (0.9, 0.9, 0.1)])
+    found = ClassifiedBoxes(
+        boxes, torch.tensor([1, 2, 1]), torch.tensor([0.9, 0.8, 0.7]), torch.full((3, 3), 1 / 3)
+    )
+    instances = as_instances(Detections(found, masks, torch.tensor([0.5, 0.9, 1.0])), (40, 40), 0.0)
+    assert [i.label for i in instances] == [2, 1]
+    assert [i.mask_score for i in instances] == pytest.approx([0.72, 0.45])
+    assert instances[1].class_score == pytest.approx(0.9)
+
+
+def test_annotations_hold_both_scores_and_drawing_changes_only_its_copy() -> None:
+    image = np.zeros((40, 60, 3), np.uint8)
+    instance = Drawer().segment(image, "a")[0]
+    annotation = as_annotation(instance)
+    assert annotation["bbox"] == [5, 6, 20, 10]
+    assert annotation["area"] == 200
+    assert (annotation["score"], annotation["class_score"]) == (0.63, 0.9)
+    assert draw(image, [instance], LABELS).any()
+    assert not image.any()
+
+
+def test_the_table_of_names(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    save_network(TrainedNetwork(MaskRCNN(TINY).eval(), LABELS), tmp_path / "w.safetensors")
+    weights = str(tmp_path / "w.safetensors")
+    light = make_segmenter(SegmenterOptions("light", weights), tmp_path)
+    assert light.labels == LABELS
+    with pytest.raises(InputError, match="a mobilenet_v2 network, which is not"):
+        make_segmenter(SegmenterOptions("mask-scoring-rcnn", weights), tmp_path)
+    assert isinstance(make_segmenter(SegmenterOptions("none"), tmp_path), NoSegmenter)
+    for name, words in {
+        "light": "--weights",
+        "mask-scoring-rcnn": "--weights",
+        "precomputed": "--masks",
+        "truth": r"annotations\.json: no such file",
+        "yolact": f"there are: {', '.join(NAMES)}",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            make_segmenter(SegmenterOptions(name), tmp_path)
+    folder = make_segmenter(SegmenterOptions("precomputed", masks=tmp_path), tmp_path)
+    assert isinstance(folder, LabelImageSegmenter)
+    assert len(folder.labels) == 81

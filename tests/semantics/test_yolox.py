@@ -1,0 +1,79 @@
+"""YOLOX boxes: decoding against the definition, and the real network on real photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from graph.errors import InputError
+from semantics.coco_files import read_coco
+from semantics.image_files import read_colour
+from semantics.labels import label_set, read_label_set
+from semantics.network.boxes import iou
+from semantics.yolox import STRIDES, YoloxDetector, decode, letterbox
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+ONNX = SHARED / "weights" / "yolox_nano.onnx"
+
+
+def test_decoding_against_a_loop_over_cells() -> None:
+    rng = np.random.default_rng(0)
+    side = 64
+    cells = [(s, r, c) for s in STRIDES for r in range(side // s) for c in range(side // s)]
+    output = rng.uniform(0, 1, (len(cells), 7)).astype(np.float32)
+    boxes, probabilities = decode(output, side)
+    for k, (stride, row, column) in enumerate(cells):
+        x, y, w, h, objectness = output[k, :5]
+        u, v = (x + column) * stride, (y + row) * stride
+        half = np.array([np.exp(w), np.exp(h)]) * stride / 2
+        assert boxes[k] == pytest.approx([u - half[0], v - half[1], u + half[0], v + half[1]])
+        assert probabilities[k] == pytest.approx(objectness * output[k, 5:])
+
+
+def test_the_letterbox_keeps_proportions() -> None:
+    image = np.zeros((30, 60, 3), np.uint8)
+    image[..., 0] = 200  # red
+    blob, factor = letterbox(image, 416)
+    assert factor == pytest.approx(416 / 60)
+    assert blob.shape == (1, 3, 416, 416)
+    assert blob[0, :, 100, 100].tolist() == [0, 0, 200]  # blue first
+    assert blob[0, :, 300, 100].tolist() == [114, 114, 114]
+
+
+def test_the_real_network_finds_large_objects_in_real_photographs() -> None:
+    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    detector = YoloxDetector(ONNX)
+    hits = total = 0
+    for image in content.images[:12]:
+        pixels = read_colour(SHARED / "coco_excerpt" / "images" / image.file_name)
+        found = detector.detect(pixels, content.labels)
+        torch.testing.assert_close(found.distributions.sum(1), torch.ones(len(found.boxes)))
+        large = [o for o in image.objects if not o.crowd and o.mask().mean() > 0.05]
+        for o in large:
+            total += 1
+            same = (found.labels == o.label) & (found.scores > 0.3)
+            overlap = iou(torch.tensor([o.box]), found.boxes[same])
+            hits += bool((overlap > 0.6).any())
+    assert total > 10
+    assert hits / total > 0.6
+
+
+def test_only_classes_of_the_label_set_are_found() -> None:
+    detector = YoloxDetector(ONNX)
+    image = read_colour(sorted((SHARED / "coco_excerpt" / "images").iterdir())[0])
+    assert len(detector.detect(image, label_set(["drone"])).boxes) == 0
+    paper = read_label_set("paper")
+    assert paper.number("tv") == 18
+    assert set(detector.detect(image, paper).labels.tolist()) <= set(range(1, 24))
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.onnx"
+    bad.write_bytes(b"no network")
+    with pytest.raises(InputError, match="cannot read it as ONNX"):
+        YoloxDetector(bad)
+    with pytest.raises(InputError, match="no such file"):
+        YoloxDetector(tmp_path / "none.onnx")
