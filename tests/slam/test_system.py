@@ -160,7 +160,7 @@ def test_graph_is_saved_with_every_keyframe(tmp_path: Path) -> None:
 
     system = SlamSystem(CAMERA)
     feed(system, path(15))
-    system.save_graph(tmp_path / "graph")
+    system.files()["graph"](tmp_path / "graph")
     estimate = Smoother.load(tmp_path / "graph").estimate()
     keyframes = system.keyframe_trajectory().poses_world_camera
     assert np.allclose(estimate.poses_world_camera, keyframes)
