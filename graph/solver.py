@@ -128,6 +128,8 @@ class Solver:
 
     def marginals(self, shadow: Shadow, landmarks: IntArray) -> Marginals:
         """Covariances of every keyframe and of some landmarks at the shadow's current values."""
+        if not len(shadow.keyframes.ids):
+            return Marginals(shadow.keyframes.ids, np.zeros((0, 6, 6)))
         try:
             return marginals_of(*self._everything(shadow), shadow.keyframes.ids, landmarks)
         except RuntimeError as error:

@@ -9,6 +9,7 @@ frames.csv            one line a frame: status, matches, inliers, milliseconds a
 landmarks.ply         x y z (world, metres), red green blue, observations, id
 graph                 the saved factor graph and values, one file that loads again
 map                   keyframes, landmarks and graph, for ``run --map`` and ``run --localise``
+covariances.txt       with ``--covariances``: of every keyframe's pose, see `slam.covariances`
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference
 log.txt               what the program had to say
@@ -48,6 +49,7 @@ FILES = (
     "landmarks.ply",
     "graph",
     "map",
+    "covariances.txt",
     "metrics.json",
     "trajectory.png",
     "log.txt",

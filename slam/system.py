@@ -16,8 +16,9 @@ from graph.array_file import Arrays, check_like, nested, part
 from graph.camera import Camera
 from graph.geometry import Array
 from graph.smoother_config import SmootherConfig
+from graph.solver import SolverError
 from graph.trajectory import Trajectory
-from slam.covariances import KeyframeCovariances
+from slam.covariances import COVARIANCES, KeyframeCovariances, write_covariances
 from slam.features import BriskExtractor, FeatureConfig, Features
 from slam.frame import Frame
 from slam.graph_feed import GraphFeedConfig
@@ -39,7 +40,8 @@ logger = logging.getLogger(__name__)
 class SystemConfig:
     """Everything that can be configured; YAML files hold only what differs from these defaults.
 
-    ``final_adjustment``: a full bundle adjustment ends the run.
+    ``final_adjustment``: a full bundle adjustment ends the run. ``covariances``: those of all
+    keyframes are written with its results.
     """
 
     features: FeatureConfig = field(default_factory=FeatureConfig)
@@ -51,6 +53,7 @@ class SystemConfig:
     graph: SmootherConfig = field(default_factory=SmootherConfig)
     loops: LoopClosingConfig = field(default_factory=LoopClosingConfig)
     final_adjustment: bool = True
+    covariances: bool = False
 
 
 @dataclass(frozen=True)
@@ -202,7 +205,23 @@ class SlamSystem:
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """What it saves so that it loads again: a function that writes a file, by its name."""
-        return {"graph": self.mapper.smoother.save, MAP: self.save_map}
+        found: dict[str, Callable[[Path], None]] = {
+            "graph": self.mapper.smoother.save,
+            MAP: self.save_map,
+        }
+        if self.config.covariances:
+            found[COVARIANCES] = self.save_covariances
+        return found
+
+    def save_covariances(self, path: Path) -> None:
+        """Write the covariances of the keyframes; none, and a line in the log, if GTSAM fails."""
+        try:
+            found = self.keyframe_covariances()
+        except SolverError as error:
+            logger.error("no covariances, the graph is singular (%s)", error)
+            nothing = np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 6, 6))
+            found = KeyframeCovariances(*nothing)
+        write_covariances(path, found)
 
     def save_map(self, path: Path) -> None:
         """Write all that was learned, but no times: the same run gives the same bytes."""

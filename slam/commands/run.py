@@ -66,6 +66,13 @@ def add_run(commands: _Commands) -> None:
     parser.add_argument(
         "--localise", type=Path, metavar="MAP", help="only find the frames in a map, unchanged"
     )
+    parser.add_argument(
+        "--covariances",
+        dest="set",
+        action="append_const",
+        const="covariances=true",
+        help="also write covariances.txt: how sure the graph is of each keyframe",
+    )
     parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
 
 

@@ -87,6 +87,16 @@ def test_run_prints_table_folder_and_picture(capsys, sequence: Path, tmp_path: P
     assert {"tracked_share", "frames_per_second", "peak_rss_mb"} <= {row["name"] for row in rows}
 
 
+def test_covariances_are_written_on_request(capsys, sequence: Path, tmp_path: Path) -> None:
+    """Nothing is tracked here, so there are none, and the run ends well all the same."""
+    out = tmp_path / "out"
+    assert call(capsys, "run", sequence, "--out", out, "--covariances", "--quiet")[0] == 0
+    assert (out / "covariances.txt").read_text().startswith("# covariances of keyframe poses")
+    assert "covariances: true" in (out / "config.yaml").read_text()
+    assert call(capsys, "run", sequence, "--out", out, "--overwrite", "--quiet")[0] == 0
+    assert not (out / "covariances.txt").exists()
+
+
 def test_quiet_run_prints_only_the_folder(capsys, sequence: Path, tmp_path: Path) -> None:
     found = call(capsys, "run", sequence, "--out", tmp_path / "out", "--quiet", "--max-frames", 3)
     assert found[:2] == (0, f"{tmp_path / 'out'}\n")
