@@ -38,6 +38,7 @@ from typing import IO, Any
 
 from graph.errors import InputError
 from graph.trajectory import Trajectory, write_tum
+from slam.covariances import COVARIANCES
 from slam.results import FrameResult
 
 STAGES = ("features", "tracking", "keyframe", "graph", "loops")
@@ -49,12 +50,12 @@ FILES = (
     "landmarks.ply",
     "graph",
     "map",
-    "covariances.txt",
     "metrics.json",
     "trajectory.png",
     "log.txt",
 )
 CHECKPOINT = "checkpoint"
+SOMETIMES = (CHECKPOINT, COVARIANCES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("graph", "semantics", "mapping", "slam")
 COLUMNS = (
@@ -145,7 +146,7 @@ class RunFolder:
         self._log.close()
         self._frames.close()
         if isinstance(error, InputError) and not self._begun:
-            _remove(self.path, (CHECKPOINT, *FILES))
+            _remove(self.path, (*SOMETIMES, *FILES))
             _remove_empty(self._made)
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             raise InputError(
@@ -208,7 +209,7 @@ class RunFolder:
 
 def _clear(path: Path, overwrite: bool) -> None:
     """Remove the run that a folder holds, its checkpoint first. Raises InputError."""
-    held = [name for name in (CHECKPOINT, *FILES) if os.path.lexists(path / name)]
+    held = [name for name in (*SOMETIMES, *FILES) if os.path.lexists(path / name)]
     if held and not overwrite:
         cure = "go on with --resume, " if held[0] == CHECKPOINT else ""
         raise InputError(
