@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from graph.camera import Camera
 from graph.errors import InputError
 from graph.factors import FactorMaker, make_graph, make_values, read_values
-from graph.gates import reprojection
+from graph.gates import wrong_observations
 from graph.geometry import Array
 from graph.graduation import first_mu, graduate
 from graph.iteration import Progress, iterate
@@ -218,27 +218,14 @@ class _Adjuster:
 
     def drop_wrong_observations(self) -> tuple[IntArray, IntArray]:
         """Pairs (N, 2) of the observations that left, and the landmarks (N,) with them."""
-        pairs = self._wrong_observations()
+        probability = self._config.observation_probability
+        pairs = wrong_observations(self._shadow, self._camera, probability)
         if not (len(pairs) and self._config.drop_observations):
             return np.zeros((0, 2), np.int64), ids_array([])
         update = GraphUpdate(remove_observations=pairs)
         removal = remove(update, self._shadow, self._smoother_config)
         self.optimise("inliers")
         return pairs, removal.dropped_landmarks
-
-    def _wrong_observations(self) -> IntArray:
-        """Keyframe and landmark ids (N, 2) of observations beyond the chi-square bound.
-
-        3 degrees of freedom with depth, 2 without; taken without the kernel.
-        """
-        table = self._shadow.observations
-        seen = table.select(table.all_rows())
-        poses = self._shadow.keyframes.get(seen.keyframe_ids)
-        points = self._shadow.landmarks.get(seen.landmark_ids)
-        _, chi_squares = reprojection(seen, poses, points, self._camera)
-        degrees = np.where(np.isfinite(seen.measurements[:, 2]), 3, 2)
-        wrong = ~(chi_squares <= chi2.ppf(self._config.observation_probability, degrees))
-        return np.stack([seen.keyframe_ids[wrong], seen.landmark_ids[wrong]], axis=1)
 
     def _loop(self, number: int) -> RelativePose:
         """A loop edge without its kernel."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse, se3_log
@@ -175,6 +176,20 @@ def reprojection(
     whitened[mono, 2] = 0.0
     with np.errstate(over="ignore", invalid="ignore"):
         return points_camera[:, 2], np.sum(whitened**2, axis=1)
+
+
+def wrong_observations(shadow: Shadow, camera: Camera, probability: float) -> IntArray:
+    """Keyframe and landmark ids (N, 2) of observations beyond their chi-square bound.
+
+    3 degrees of freedom with depth, 2 without; taken without the kernel.
+    """
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    poses = shadow.keyframes.get(seen.keyframe_ids)
+    points = shadow.landmarks.get(seen.landmark_ids)
+    _, chi_squares = reprojection(seen, poses, points, camera)
+    degrees = np.where(np.isfinite(seen.measurements[:, 2]), 3, 2)
+    wrong = ~(chi_squares <= chi2.ppf(probability, degrees))
+    return np.stack([seen.keyframe_ids[wrong], seen.landmark_ids[wrong]], axis=1)
 
 
 def relative_pose_errors(

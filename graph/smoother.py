@@ -15,7 +15,7 @@ from graph.admission import Admitted, admit
 from graph.array_file import Arrays
 from graph.camera import Camera
 from graph.covariances import Marginals
-from graph.gates import relative_pose_errors, reprojection
+from graph.gates import relative_pose_errors, reprojection, wrong_observations
 from graph.geometry import Array
 from graph.holding import anchor_components, release_bridges
 from graph.pruning import Removal, remove
@@ -47,6 +47,7 @@ from graph.updates import (
 )
 
 __all__ = ["Smoother", "SmootherConfig"]
+OUTLIER_PROBABILITY = 0.95
 logger = logging.getLogger(__name__)
 
 
@@ -86,9 +87,13 @@ class Smoother:
                 self._retract(admitted, change, report)
         return self._estimate(report, started_s)
 
-    def optimise_batch(self, max_iterations: int = 100) -> GraphEstimate:
+    def optimise_batch(
+        self, max_iterations: int = 100, drop_outliers: bool = False
+    ) -> GraphEstimate:
         """Full bundle adjustment (Levenberg-Marquardt, with the kernels) of the whole graph.
 
+        With ``drop_outliers`` observations beyond the 95 % bound of chi-square, taken without the
+        kernel, then leave the graph, and it is optimised again.
         Retired landmarks come back with all their observations, and stay until they are
         retired again.
         ISAM2 is thrown away and made anew from the result if another update comes. A failure
@@ -102,11 +107,17 @@ class Smoother:
         def solve(shadow: Shadow) -> None:
             costs.append(self._solver.optimise_batch(shadow, max_iterations))
 
-        try:
-            solve(self._shadow)
-        except SolverError as failure:
-            if not self._recover(failure, ids_array([]), report, solve):
-                logger.error("batch optimisation failed; the values stay as they were")
+        for last in (False, True) if drop_outliers else (True,):
+            try:
+                solve(self._shadow)
+            except SolverError as failure:
+                if not self._recover(failure, ids_array([]), report, solve):
+                    logger.error("batch optimisation failed; the values stay as they were")
+                    break
+            if not last:
+                wrong = wrong_observations(self._shadow, self._camera, OUTLIER_PROBABILITY)
+                update = GraphUpdate(remove_observations=wrong)
+                report.add_removal(remove(update, self._shadow, self._config))
         before, after = costs[-1]
         estimate = self._estimate(report, started_s)
         return dataclasses.replace(estimate, cost_before=before, cost_after=after)

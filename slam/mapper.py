@@ -156,9 +156,9 @@ class Mapper:
         return MapPruner(self.world, self.smoother, self.camera)
 
     def finish(self) -> None:
-        """Full bundle adjustment of the graph; the map is then final."""
+        """Full bundle adjustment of the graph, then without outliers; the map is then final."""
         if self.world.keyframes:
-            self._apply(self.smoother.optimise_batch(), timed=False)
+            self._apply(self.smoother.optimise_batch(drop_outliers=True), timed=False)
 
     def _apply(self, estimate: GraphEstimate, timed: bool = True) -> None:
         if timed:
