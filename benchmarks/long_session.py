@@ -28,13 +28,13 @@ from graph.geometry import Array, inverse, se3_exp, transform
 from graph.metrics import align
 from graph.smoother import Smoother
 from graph.updates import GraphEstimate, GraphUpdate, IntArray, Observations, RelativePose
+from slam.graph_feed import GraphFeedConfig
 
 SIGMAS_PX = np.array([1.0, 1.0, 0.2])
 """Of u, v and disparity: about what the red kitchen's frames ask for (docs/architecture.md)."""
 STEP_SIGMAS = np.array([0.001] * 3 + [0.003] * 3)
 LOOP_SIGMAS = np.array([0.002] * 3 + [0.01] * 3)
-WINDOW, MIN_SHARED, BATCH = 20, 15, 100
-"""The defaults of ``slam.graph_feed.GraphFeedConfig``."""
+FEED = GraphFeedConfig()
 GAP = 40
 """Keyframes after which a landmark counts as seen before rather than tracked."""
 FOUND = 0.8
@@ -111,10 +111,10 @@ class FrontEnd:
         mine = np.zeros(len(self.points), bool)
         mine[self.seen[-1]] = True
         shared = np.array([np.count_nonzero(mine[ids]) for ids in self.seen])
-        near = np.lexsort((-np.arange(len(shared)), -shared))[:WINDOW]
-        active = [self.seen[i] for i in near.tolist() if shared[i] >= MIN_SHARED]
+        near = np.lexsort((-np.arange(len(shared)), -shared))[: FEED.window_keyframes]
+        active = [self.seen[i] for i in near.tolist() if shared[i] >= FEED.window_min_shared]
         waiting = np.setdiff1d(in_graph, np.concatenate([self.seen[-1], *active]))
-        return waiting if len(waiting) >= BATCH else waiting[:0]
+        return waiting if len(waiting) >= FEED.retire_batch else waiting[:0]
 
     def _initial_pose(self, k: int, estimate: GraphEstimate | None) -> Array:
         if estimate is None:

@@ -20,14 +20,16 @@ class GraphFeedConfig:
 
     A landmark enters when ``min_views`` keyframes see it, with all its observations so far. It
     retires (`graph.retirement`) when none of the ``window_keyframes`` that share most with the
-    newest one sees it, and as soon as ``retire_batch`` wait for it; it comes back when it is
-    seen again. 0 keyframes: the graph keeps every landmark.
+    newest one sees it, and as soon as ``retire_batch`` wait for it, at most twice as many at once;
+    it comes back when it is seen again. A map of up to ``full_keyframes`` keeps every landmark in
+    the graph: that is more accurate, and fast enough. 0 window keyframes: so does every map.
     """
 
     max_observations: int = 200
     min_views: int = 2
     bucket_px: int = 60
-    window_keyframes: int = 0
+    full_keyframes: int = 300
+    window_keyframes: int = 20
     window_min_shared: int = 15
     retire_batch: int = 100
 
@@ -132,9 +134,12 @@ class GraphFeed:
         return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
 
     def _outside_window(self, world: WorldMap, seen_ids: Ints) -> Ints:
-        """Landmarks in the graph that no keyframe of the active window sees, once enough wait."""
+        """Landmarks in the graph that no keyframe of the active window sees, once enough wait.
+
+        Those that were not seen for longest come first.
+        """
         count, landmarks = self.config.window_keyframes, world.landmarks
-        if not count:
+        if not count or len(world.keyframes) <= self.config.full_keyframes:
             return np.zeros(0, np.int64)
         near = [k for _, k in world.covisible(seen_ids, self.config.window_min_shared)[:count]]
         active = np.zeros(len(landmarks) + 1, bool)  # the last entry answers for id -1
@@ -142,7 +147,11 @@ class GraphFeed:
         for keyframe in near:
             active[keyframe.landmark_ids] = True
         waiting = np.flatnonzero(landmarks.in_graph & landmarks.alive & ~active[:-1])
-        return waiting if len(waiting) >= self.config.retire_batch else waiting[:0]
+        batch = self.config.retire_batch
+        if len(waiting) < batch:
+            return waiting[:0]
+        oldest = np.argsort(landmarks.last_keyframe[waiting], kind="stable")[: 2 * batch]
+        return np.sort(waiting[oldest])
 
     def _unsent_observations(self, world: WorldMap) -> Observations:
         """Every observation of a landmark in the graph that was not sent yet, in all keyframes.

@@ -306,7 +306,7 @@ def windowed_world(config: GraphFeedConfig) -> tuple[WorldMap, GraphFeed, Smooth
     return world, feed, smoother
 
 
-WINDOWED = GraphFeedConfig(window_keyframes=3, retire_batch=20)
+WINDOWED = GraphFeedConfig(full_keyframes=0, window_keyframes=3, retire_batch=20)
 
 
 def test_landmarks_outside_the_window_retire_and_come_back_when_seen() -> None:
