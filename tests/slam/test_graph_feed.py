@@ -1,5 +1,7 @@
 """What enters the graph, and how its answer comes back, with the real smoother in between."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic_view import (
@@ -306,7 +308,22 @@ def windowed_world(config: GraphFeedConfig) -> tuple[WorldMap, GraphFeed, Smooth
     return world, feed, smoother
 
 
-WINDOWED = GraphFeedConfig(full_keyframes=0, window_keyframes=3, retire_batch=20)
+WINDOWED = GraphFeedConfig(full_keyframes=0, window_keyframes=3, retire_batch=COUNT // 2)
+
+
+def test_a_small_map_keeps_every_landmark_in_the_graph() -> None:
+    world, _, smoother = windowed_world(replace(WINDOWED, full_keyframes=100))
+    assert world.landmarks.in_graph.all()
+    assert len(smoother.estimate().landmark_ids) == 2 * COUNT
+
+
+def test_two_batches_retire_at_once_at_most() -> None:
+    config = replace(WINDOWED, retire_batch=5)
+    world, feed, _ = windowed_world(replace(config, full_keyframes=100))
+    feed.config = config
+    features = make_features(pose_of(5), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
+    update = feed.keyframe_update(world, add_keyframe(world, pose_of(5), features))
+    assert len(update.retire_landmarks) == 10
 
 
 def test_landmarks_outside_the_window_retire_and_come_back_when_seen() -> None:
