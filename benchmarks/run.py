@@ -61,6 +61,7 @@ def plan(folders: dict[str, Path], quick: bool) -> list[Job]:
         jobs.append(Job("redkitchen", KITCHEN, "every 3rd frame", ("--stride", "3")))
     for name, folder in folders.items():
         jobs.append(Job(name, folder, "without sub-pixel registration", WITHOUT_SUBPIXEL))
+        jobs.append(Job(name, folder, "no loop closed", ("--set", "loops.enabled=false")))
     return jobs
 
 
