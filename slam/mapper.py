@@ -182,7 +182,8 @@ class Mapper:
         return {
             pair
             for pair, believed in self.loops.closed.items()
-            if not (inside.get(pair, False) or (believed and pair in inside))
+            if self.world.keyframes.keys() >= set(pair)  # else it left with a culled keyframe
+            and not (inside.get(pair, False) or (believed and pair in inside))
         }
 
     def _remove_loops(self, refuted: set[tuple[int, int]], fresh: set[tuple[int, int]]) -> None:

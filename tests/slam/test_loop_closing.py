@@ -238,3 +238,18 @@ def test_an_old_loop_that_no_longer_fits_goes_with_what_it_fused(
     assert ring.step()[1] == [extra]
     assert list(closer.closed) == [extra.ends]
     assert len(np.intersect1d(*(ring.mapper.world.observed(k)[1] for k in (a, b)))) < 10
+
+
+def test_a_loop_that_left_with_its_keyframe_is_not_refuted() -> None:
+    ring = Ring()
+    loops = ring.run(ONCE_ROUND)
+    mapper = ring.mapper
+    assert mapper._refuted_loops() == set()
+    gone = loops[-1].keyframe_a
+    mapper.world.remove_keyframe(mapper.world.keyframes[gone], mapper.world.keyframes[gone + 1])
+    mapper._feed.forget_keyframe(gone)
+    mapper.loops.remove(gone)
+    ring.step()
+    in_graph = mapper.smoother.relative_pose_errors("loop")
+    assert gone not in in_graph.keyframe_a
+    assert mapper._refuted_loops() == set()
