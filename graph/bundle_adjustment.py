@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from graph.camera import Camera
 from graph.errors import InputError
 from graph.factors import FactorMaker, make_graph, make_values, read_values
-from graph.gates import wrong_observations
+from graph.gates import OBSERVATION_PROBABILITY, wrong_observations
 from graph.geometry import Array
 from graph.graduation import first_mu, graduate
 from graph.iteration import Progress, iterate
@@ -48,7 +48,7 @@ class AdjustmentConfig:
     max_iterations: int = 100
     relative_tolerance: float = 1e-7
     loop_probability: float = 0.999
-    observation_probability: float = 0.95
+    observation_probability: float = OBSERVATION_PROBABILITY
     gnc_step: float = 2.0
     gnc_inner_iterations: int = 2
     drop_observations: bool = True

@@ -20,6 +20,7 @@ from graph.smoother_config import SmootherConfig
 from graph.updates import (
     GraphUpdate,
     IntArray,
+    ObservationErrors,
     Observations,
     PosePrior,
     RefusalReason,
@@ -29,6 +30,7 @@ from graph.updates import (
 )
 
 Mask = NDArray[np.bool_]
+OBSERVATION_PROBABILITY = 0.95
 _ROBUST = (None, "huber", "cauchy", "dcs")
 
 
@@ -178,18 +180,26 @@ def reprojection(
         return points_camera[:, 2], np.sum(whitened**2, axis=1)
 
 
-def wrong_observations(shadow: Shadow, camera: Camera, probability: float) -> IntArray:
+def observation_errors(shadow: Shadow, camera: Camera) -> ObservationErrors:
+    """Chi-square of every observation at the shadow's values."""
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    poses = shadow.keyframes.get(seen.keyframe_ids)
+    points = shadow.landmarks.get(seen.landmark_ids)
+    depth_m, chi_squares = reprojection(seen, poses, points, camera)
+    is_stereo = np.isfinite(seen.measurements[:, 2])
+    return ObservationErrors(seen.keyframe_ids, seen.landmark_ids, chi_squares, depth_m, is_stereo)
+
+
+def wrong_observations(
+    shadow: Shadow, camera: Camera, probability: float = OBSERVATION_PROBABILITY
+) -> IntArray:
     """Keyframe and landmark ids (N, 2) of observations beyond their chi-square bound.
 
     3 degrees of freedom with depth, 2 without; taken without the kernel.
     """
-    seen = shadow.observations.select(shadow.observations.all_rows())
-    poses = shadow.keyframes.get(seen.keyframe_ids)
-    points = shadow.landmarks.get(seen.landmark_ids)
-    _, chi_squares = reprojection(seen, poses, points, camera)
-    degrees = np.where(np.isfinite(seen.measurements[:, 2]), 3, 2)
-    wrong = ~(chi_squares <= chi2.ppf(probability, degrees))
-    return np.stack([seen.keyframe_ids[wrong], seen.landmark_ids[wrong]], axis=1)
+    errors = observation_errors(shadow, camera)
+    wrong = ~(errors.chi2 <= chi2.ppf(probability, np.where(errors.is_stereo, 3, 2)))
+    return np.stack([errors.keyframe_ids[wrong], errors.landmark_ids[wrong]], axis=1)
 
 
 def relative_pose_errors(

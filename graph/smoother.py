@@ -15,7 +15,7 @@ from graph.admission import Admitted, admit
 from graph.array_file import Arrays
 from graph.camera import Camera
 from graph.covariances import Marginals
-from graph.gates import relative_pose_errors, reprojection, wrong_observations
+from graph.gates import observation_errors, relative_pose_errors, wrong_observations
 from graph.geometry import Array
 from graph.holding import anchor_components, release_bridges
 from graph.pruning import Removal, remove
@@ -47,7 +47,6 @@ from graph.updates import (
 )
 
 __all__ = ["Smoother", "SmootherConfig"]
-OUTLIER_PROBABILITY = 0.95
 logger = logging.getLogger(__name__)
 
 
@@ -115,7 +114,7 @@ class Smoother:
                     logger.error("batch optimisation failed; the values stay as they were")
                     break
             if not last:
-                wrong = wrong_observations(self._shadow, self._camera, OUTLIER_PROBABILITY)
+                wrong = wrong_observations(self._shadow, self._camera)
                 update = GraphUpdate(remove_observations=wrong)
                 report.add_removal(remove(update, self._shadow, self._config))
         before, after = costs[-1]
@@ -128,13 +127,7 @@ class Smoother:
 
     def observation_errors(self) -> ObservationErrors:
         """Chi-square of every observation at the current estimate, to find outliers by."""
-        table = self._shadow.observations
-        seen = table.select(table.all_rows())
-        poses = self._shadow.keyframes.get(seen.keyframe_ids)
-        points = self._shadow.landmarks.get(seen.landmark_ids)
-        depth_m, chi2 = reprojection(seen, poses, points, self._camera)
-        is_stereo = np.isfinite(seen.measurements[:, 2])
-        return ObservationErrors(seen.keyframe_ids, seen.landmark_ids, chi2, depth_m, is_stereo)
+        return observation_errors(self._shadow, self._camera)
 
     def relative_pose_errors(self, kind: str) -> RelativePoseErrors:
         """Chi-square of every relative pose of a kind at the current estimate."""

@@ -79,7 +79,7 @@ class LoopCloser:
         self.recogniser = PlaceRecogniser(self.index, config.places)
         self.waiting: list[LoopConstraint] = []
         self.closed: dict[tuple[int, int], bool] = {}
-        """Ends of the loops in the graph, and whether each is believed against it."""
+        """Ends of the loops closed so far, and whether each is believed against the graph."""
         self._camera = camera
 
     def state(self) -> Arrays:
@@ -138,17 +138,20 @@ class LoopCloser:
             _, ids = world.observed(world.keyframes[keyframe_id])
             return [k.id for _, k in world.covisible(ids, 1) if k.id != keyframe_id]
 
+        descriptors = keyframe.features.descriptors
+        candidates = self.recogniser.query(keyframe.id, descriptors, covisible)
+        if not candidates:
+            return []
         found: list[LoopConstraint] = []
-        excluded = self.recogniser.excluded(keyframe.id, covisible)
+        tried = self.recogniser.excluded(keyframe.id, covisible)
         view = loop_view(keyframe, world)
-        for candidate in self.recogniser.query(
-            keyframe.id, keyframe.features.descriptors, covisible
-        ):
-            others = [k for k in covisible(candidate.keyframe_id) if k not in excluded]
+        for candidate in candidates:
+            others = [k for k in covisible(candidate.keyframe_id) if k not in tried]
             others = others[: self.config.neighbours]
             for other in (candidate.keyframe_id, *others):
-                if world.keyframes[other].segment != keyframe.segment:
+                if other in tried or world.keyframes[other].segment != keyframe.segment:
                     break
+                tried.add(other)
                 old = loop_view(world.keyframes[other], world)
                 result = verify_loop(old, view, self._camera, self.config.verification)
                 if isinstance(result, NoLoop):
@@ -172,7 +175,8 @@ class LoopCloser:
         confirmed = [loops[k] for k in chosen] if supported else []
         if len({loop.keyframe_b for loop in confirmed}) < 2:
             confirmed = []
-        self.waiting = [loop for loop in loops if loop not in confirmed]
+        entering = {loop.ends for loop in confirmed}
+        self.waiting = [loop for loop in loops if loop.ends not in entering]
         return confirmed
 
     def is_strong(self, loops: list[LoopConstraint]) -> bool:
