@@ -55,7 +55,7 @@ def as_instances(found: Detections, size: tuple[int, int], min_score: float) -> 
     """Detections as instances with masks of (height, width); without those whose mask is empty."""
     keep = found.found.scores >= min_score
     boxes = found.found.boxes[keep]
-    masks = (paste(found.masks[keep], boxes, size) > MASK_THRESHOLD).cpu().numpy()
+    masks = (paste(found.masks[keep], found.mask_boxes[keep], size) > MASK_THRESHOLD).cpu().numpy()
     scores = found.found.scores[keep].cpu().numpy()
     mask_scores = scores * found.mask_ious[keep].cpu().numpy()
     labels = found.found.labels[keep].tolist()

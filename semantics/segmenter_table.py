@@ -78,7 +78,7 @@ def _network(options: SegmenterOptions) -> Segmenter:
         raise InputError(f"segmenter {options.name!r}: give --weights, a file or torchvision:NAME")
     from semantics.checkpoints import find_weights, load_network  # noqa: PLC0415
     from semantics.network_segmenter import NetworkSegmenter  # noqa: PLC0415
-    from semantics.yolox import YoloxDetector  # noqa: PLC0415
+    from semantics.yolox import YoloxConfig, YoloxDetector  # noqa: PLC0415
 
     labels = read_label_set(options.labels) if options.labels else None
     network = load_network(find_weights(options.weights), labels)
@@ -89,5 +89,8 @@ def _network(options: SegmenterOptions) -> Segmenter:
         raise InputError(
             f"{options.weights}: a {kind} network, which is not {options.name!r}; take {other!r}"
         )
-    detector = YoloxDetector(options.proposals) if options.proposals else None
+    detector = None
+    if options.proposals:
+        config = YoloxConfig(min_score=max(options.min_score, YoloxConfig.min_score))
+        detector = YoloxDetector(options.proposals, config)
     return NetworkSegmenter(network, options.min_score, detector)

@@ -28,7 +28,7 @@ GEOMETRY = 5
 class YoloxConfig:
     """Which boxes are kept."""
 
-    min_score: float = 0.05
+    min_score: float = 0.01
     nms_iou: float = 0.65
     max_count: int = 100
 

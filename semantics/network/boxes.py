@@ -54,6 +54,14 @@ def clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.minimum(boxes.clamp(min=0), upper)
 
 
+def enlarged(boxes: Tensor, factor: float) -> Tensor:
+    """Boxes (N, 4) grown by a factor about their centres, also beyond the image."""
+    if factor == 1.0:
+        return boxes
+    grow = (boxes[:, 2:] - boxes[:, :2]) * (0.5 * (factor - 1))
+    return torch.cat([boxes[:, :2] - grow, boxes[:, 2:] + grow], dim=1)
+
+
 def at_least(boxes: Tensor, min_px: float) -> Tensor:
     """Which boxes (N, 4) are at least so wide and high; (N,) bool."""
     return ((boxes[:, 2:] - boxes[:, :2]) >= min_px).all(dim=1)

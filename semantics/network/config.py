@@ -68,6 +68,10 @@ class NetworkConfig:
         mask_channels: channels of the mask head's four 3x3 convolutions.
         maskiou_channels: the same of the MaskIoU head; 0: there is no such head.
         maskiou_hidden: width of its two hidden layers.
+        class_agnostic: one mask and one IoU a box instead of one for each class (He et al. 2017,
+            section 4.2); so all objects teach the same mask, where those of a class are few.
+        mask_context: boxes are enlarged by this factor about their centres for masks and IoUs, so
+            that a mask can reach beyond a box that was found too small.
     """
 
     classes: int = 91
@@ -82,9 +86,16 @@ class NetworkConfig:
     mask_channels: int = 256
     maskiou_channels: int = 0
     maskiou_hidden: int = 1024
+    class_agnostic: bool = False
+    mask_context: float = 1.0
     image: ImageConfig = ImageConfig()
     proposals: ProposalConfig = ProposalConfig()
     detections: DetectionConfig = DetectionConfig()
+
+    @property
+    def mask_outputs(self) -> int:
+        """Masks, and IoUs, that are predicted for each box."""
+        return 1 if self.class_agnostic else self.classes
 
     def with_maskiou(self) -> NetworkConfig:
         """The same network with a MaskIoU head as wide as the mask head."""
@@ -105,6 +116,8 @@ LIGHT = NetworkConfig(
     mask_channels=80,
     maskiou_channels=80,
     maskiou_hidden=256,
+    class_agnostic=True,
+    mask_context=1.2,
     image=ImageConfig(480, 800, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
     proposals=ProposalConfig(before_nms=300, after_nms=100),
     detections=DetectionConfig(max_count=30),

@@ -22,20 +22,20 @@ def make_mask_head(config: NetworkConfig) -> nn.Sequential:
 
 
 class MaskPredictor(nn.Module):
-    """Doubles the size and gives one mask a class."""
+    """Doubles the size and gives one mask a class, or one in all."""
 
-    def __init__(self, channels: int, classes: int) -> None:
+    def __init__(self, channels: int, outputs: int) -> None:
         super().__init__()
         self.conv5_mask = nn.ConvTranspose2d(channels, channels, 2, 2)
-        self.mask_fcn_logits = nn.Conv2d(channels, classes, 1)
+        self.mask_fcn_logits = nn.Conv2d(channels, outputs, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(R, channels, 14, 14) to logits (R, classes, 28, 28)."""
+        """(R, channels, 14, 14) to logits (R, outputs, 28, 28)."""
         return self.mask_fcn_logits(F.relu_(self.conv5_mask(x)))
 
 
 class MaskIoUHead(nn.Module):
-    """Predicts the IoU of a mask with the whole object, one value a class.
+    """Predicts the IoU of a mask with the whole object, one value a class, or one in all.
 
     Input is the RoI's feature from before the mask head, with the mask as one channel more.
     """
@@ -50,10 +50,10 @@ class MaskIoUHead(nn.Module):
         self.convs = nn.Sequential(convs)
         self.maskiou_fc1 = nn.Linear(width * (BINS // 2) ** 2, hidden)
         self.maskiou_fc2 = nn.Linear(hidden, hidden)
-        self.maskiou = nn.Linear(hidden, config.classes)
+        self.maskiou = nn.Linear(hidden, config.mask_outputs)
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
-        """IoUs (R, classes) of mask probabilities (R, 28, 28) with features (R, C, 14, 14)."""
+        """IoUs (R, outputs) of mask probabilities (R, 28, 28) with features (R, C, 14, 14)."""
         x = torch.cat([features, F.max_pool2d(masks[:, None], 2)], dim=1)
         for conv in self.convs:
             x = F.relu_(conv(x))
@@ -62,5 +62,7 @@ class MaskIoUHead(nn.Module):
 
 
 def of_class(values: Tensor, labels: Tensor) -> Tensor:
-    """values[r, labels[r]]: what belongs to each RoI's own class."""
+    """values[r, labels[r]]: what belongs to each RoI's own class; or the only one there is."""
+    if values.shape[1] == 1:
+        return values[:, 0]
     return values[torch.arange(len(labels), device=values.device), labels]

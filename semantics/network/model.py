@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from semantics.network import box_head, mask_heads
 from semantics.network.box_head import BoxPredictor, ClassifiedBoxes, classify, make_box_head
-from semantics.network.boxes import rescale
+from semantics.network.boxes import enlarged, rescale
 from semantics.network.config import NetworkConfig
 from semantics.network.images import ImageBatch, prepare
 from semantics.network.mask_heads import MaskIoUHead, MaskPredictor, make_mask_head, of_class
@@ -28,12 +28,14 @@ class Detections:
 
     Attributes:
         found: boxes in pixels of the original image, labels, scores, class distributions.
-        masks: (N, 28, 28) probabilities inside the boxes, of each one's label.
+        masks: (N, 28, 28) probabilities inside ``mask_boxes``, of each one's label.
+        mask_boxes: (N, 4) the boxes, enlarged by the network's ``mask_context``.
         mask_ious: (N,) predicted IoU of the mask, in 0..1; ones without a MaskIoU head.
     """
 
     found: ClassifiedBoxes
     masks: Tensor
+    mask_boxes: Tensor
     mask_ious: Tensor
 
 
@@ -45,7 +47,7 @@ class RoIHeads(nn.Module):
         self.box_head = make_box_head(config)
         self.box_predictor = BoxPredictor(config.box_hidden, config.classes)
         self.mask_head = make_mask_head(config)
-        self.mask_predictor = MaskPredictor(config.mask_channels, config.classes)
+        self.mask_predictor = MaskPredictor(config.mask_channels, config.mask_outputs)
         self.maskiou_head = MaskIoUHead(config) if config.maskiou_channels else None
 
     def boxes(self, table: FeatureTable, proposals: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -111,11 +113,13 @@ class MaskRCNN(nn.Module):
         """Masks added, boxes back in pixels of the original images."""
         counts = [len(f.boxes) for f in found]
         labels = torch.cat([f.labels for f in found])
-        masks, ious = self.roi_heads.masks(table, [f.boxes for f in found], labels)
-        parts = zip(found, masks.split(counts), ious.split(counts), strict=True)
+        around = [enlarged(f.boxes, self.config.mask_context) for f in found]
+        masks, ious = self.roi_heads.masks(table, around, labels)
+        parts = zip(found, around, masks.split(counts), ious.split(counts), strict=True)
+        sizes = zip(batch.sizes, batch.original_sizes, strict=True)
         return [
-            Detections(_moved(f, batch.sizes[k], batch.original_sizes[k]), m, i)
-            for k, (f, m, i) in enumerate(parts)
+            Detections(_moved(f, *size), m, rescale(a, *size), i)
+            for (f, a, m, i), size in zip(parts, sizes, strict=True)
         ]
 
 

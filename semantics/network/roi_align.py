@@ -91,7 +91,7 @@ def roi_align(table: FeatureTable, boxes: Sequence[Tensor], bins: int) -> Tensor
         mode="sum",
         per_sample_weights=weight.reshape(-1, taps).to(table.rows.dtype),
     )
-    return bags.reshape(len(every), bins, bins, -1).permute(0, 3, 1, 2)
+    return bags.reshape(len(every), bins, bins, table.rows.shape[1]).permute(0, 3, 1, 2)
 
 
 def axis_taps(low: Tensor, high: Tensor, limit: Tensor, bins: int) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,6 +95,22 @@ class Dataset:
 
     def _objects(self, image: CocoImage) -> list[CocoObject]:
         return [o for o in image.objects if not o.crowd and self._number[o.label] > 0]
+
+
+class JoinedDatasets:
+    """Several data sets, one after the other, as one."""
+
+    def __init__(self, parts: Sequence[Dataset]) -> None:
+        self._parts = parts
+        self._ends = np.cumsum([len(part) for part in parts])
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    def load(self, index: int) -> Sample:
+        """One image with its objects. Raises InputError."""
+        k = int(np.searchsorted(self._ends, index, side="right"))
+        return self._parts[k].load(index - int(self._ends[k]) + len(self._parts[k]))
 
 
 def split(content: CocoFile, share: float, seed: int) -> tuple[CocoFile, CocoFile]:

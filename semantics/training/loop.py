@@ -16,14 +16,22 @@ from torch import Tensor, nn
 
 from graph.errors import InputError
 from semantics.checkpoints import TrainedNetwork, save_network
-from semantics.training.dataset import AugmentConfig, Dataset, as_tensors, augmented
-from semantics.training.losses import Losses, network_losses
+from semantics.training.dataset import (
+    AugmentConfig,
+    Dataset,
+    JoinedDatasets,
+    as_tensors,
+    augmented,
+)
+from semantics.training.losses import Losses, MaskRois, network_losses
 from semantics.training.targets import Target
 
 STATE = "training.pt"
 CURVES = "losses.csv"
 WEIGHTS = "weights.safetensors"
 MASKIOU = "maskiou"
+Only = Literal["", "masks", "maskiou"]
+BOX_PARTS = ("rpn.", "roi_heads.box_")
 
 
 @dataclass(frozen=True)
@@ -39,9 +47,10 @@ class TrainingConfig:
         decay: weight decay.
         max_gradient: gradients longer than this are shortened.
         freeze: beginnings of names of parameters that stay as they are.
-        only: "maskiou" trains the MaskIoU head alone; "" all.
-        rois: where masks are learnt: in the RPN's proposals, or around the objects, for a
-            network whose boxes come from another detector.
+        only: "masks": the RPN and the box head are not trained, for a network whose boxes come
+            from another detector; "maskiou": the MaskIoU head alone is; "": all are.
+        rois: where masks are learnt: in the RPN's proposals, or in boxes around the objects.
+        precision: "float32", or "mixed": float16 on a GPU, bfloat16 on a CPU.
         save_every: steps between checkpoints.
         seed: of batches, samples and augmentation.
     """
@@ -54,8 +63,9 @@ class TrainingConfig:
     decay: float = 1e-4
     max_gradient: float = 10.0
     freeze: tuple[str, ...] = ()
-    only: Literal["", "maskiou"] = ""
-    rois: Literal["proposals", "objects"] = "proposals"
+    only: Only = ""
+    rois: MaskRois = "proposals"
+    precision: Literal["float32", "mixed"] = "mixed"
     save_every: int = 200
     seed: int = 0
     augment: AugmentConfig = field(default_factory=AugmentConfig)
@@ -67,7 +77,7 @@ class TrainingConfig:
 
 def train(
     network: TrainedNetwork,
-    data: Dataset,
+    data: Dataset | JoinedDatasets,
     out: Path,
     config: TrainingConfig,
     progress: Callable[[int, int], None],
@@ -85,7 +95,8 @@ def train(
     model = network.model.to(device).train()
     parameters = trainable(model, config)
     optimiser = _optimiser(parameters, config)
-    scaler = torch.amp.GradScaler(device, enabled=device == "cuda")
+    halves = device == "cuda" and config.precision == "mixed"
+    scaler = torch.amp.GradScaler(device, enabled=halves)
     out.mkdir(parents=True, exist_ok=True)
     first = _resume(out, model, optimiser, config)
     with (out / CURVES).open("a", newline="") as file:
@@ -123,11 +134,18 @@ def trainable(model: nn.Module, config: TrainingConfig) -> list[nn.Parameter]:
             raise InputError(f"--freeze {prefix}: no parameter begins with it; one is {names[0]}")
     for name, parameter in model.named_parameters():
         frozen = any(name.startswith(prefix) for prefix in config.freeze)
-        parameter.requires_grad_(not frozen and (not config.only or f".{MASKIOU}" in name))
+        parameter.requires_grad_(not frozen and _learns(name, config.only))
     chosen = [p for p in model.parameters() if p.requires_grad]
     if not chosen:
         raise InputError("training: every parameter is frozen; freeze less, or add a MaskIoU head")
     return chosen
+
+
+def _learns(name: str, only: Only) -> bool:
+    """Whether the parameter of this name takes part where only some heads are trained."""
+    if only == MASKIOU:
+        return f".{MASKIOU}" in name
+    return only != "masks" or not name.startswith(BOX_PARTS)
 
 
 def _optimiser(parameters: list[nn.Parameter], config: TrainingConfig) -> torch.optim.Optimizer:
@@ -145,19 +163,20 @@ def _set_rate(optimiser: torch.optim.Optimizer, step: int, config: TrainingConfi
 
 
 def _step_losses(
-    model: Any, data: Dataset, step: int, config: TrainingConfig, device: str
+    model: Any, data: Dataset | JoinedDatasets, step: int, config: TrainingConfig, device: str
 ) -> Losses:
     """The losses of a step's batch, which depends on the seed and the step alone."""
     rng = np.random.default_rng([config.seed, step])
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     images, targets = zip(*_batch(data, rng, config, device), strict=True)
-    with torch.autocast(device, enabled=device == "cuda"):
-        losses = network_losses(model, images, targets, generator, config.rois)
-    return {k: v for k, v in losses.items() if k == MASKIOU} if config.only else losses
+    kind = torch.float16 if device == "cuda" else torch.bfloat16
+    with torch.autocast(device, kind, enabled=config.precision == "mixed"):
+        losses = network_losses(model, images, targets, generator, config.rois, not config.only)
+    return {k: v.float() for k, v in losses.items() if k == MASKIOU or config.only != MASKIOU}
 
 
 def _batch(
-    data: Dataset, rng: np.random.Generator, config: TrainingConfig, device: str
+    data: Dataset | JoinedDatasets, rng: np.random.Generator, config: TrainingConfig, device: str
 ) -> Iterator[tuple[Tensor, Target]]:
     for index in rng.integers(len(data), size=config.batch).tolist():
         other = data.load(int(rng.integers(len(data))))

@@ -31,12 +31,13 @@ from semantics.training.targets import (
 
 SMOOTH_L1_BETA = 1 / 9
 TRAINING_PROPOSALS = ProposalConfig(before_nms=2000, after_nms=2000)
-JITTERS = 4
-"""Boxes drawn around each object where no detector is trained."""
-JITTER_SHARE = 0.1
+JITTERS = 3
+"""Boxes drawn around each object, if masks are learnt there."""
+JITTER_SHARE = 0.12
 """Their corners move by up to this share of the box's size."""
 
 Losses = dict[str, Tensor]
+MaskRois = Literal["proposals", "objects"]
 
 
 @dataclass(frozen=True)
@@ -57,12 +58,15 @@ def network_losses(
     images: Sequence[Tensor],
     targets: Sequence[Target],
     generator: torch.Generator,
-    rois: Literal["proposals", "objects"] = "proposals",
+    rois: MaskRois = "proposals",
+    boxes: bool = True,
 ) -> Losses:
     """Every loss of a batch; their sum is what training minimises.
 
-    With ``rois`` "objects" the masks are learnt in boxes around the objects themselves, and the
-    RPN and the box head are not trained: for a network whose boxes come from another detector.
+    Args:
+        rois: where masks are learnt: in the RPN's proposals, or in boxes around the objects.
+        boxes: the RPN and the box head learn as well; they need not where boxes come from another
+            detector.
     """
     batch = prepare(images, model.config.image)
     scaled = [
@@ -72,11 +76,11 @@ def network_losses(
     levels = model.backbone(batch.tensor)
     table = feature_table(levels[:ROI_LEVELS], batch.size[0])
     losses: Losses = {}
-    if rois == "objects":
-        found = around_objects(scaled, batch, generator)
-    else:
+    found = around_objects(scaled, batch, generator)
+    if boxes or rois == "proposals":
         rpn, proposals = rpn_losses(model, levels, batch, scaled, generator)
-        box, found = box_losses(model, table, proposals, scaled, targets, generator)
+        box, positives = box_losses(model, table, proposals, scaled, targets, generator)
+        found = positives if rois == "proposals" else found
         losses |= rpn | box
     return losses | mask_losses(model, table, found, targets, batch)
 
@@ -102,7 +106,7 @@ def rpn_losses(
         wanted.append(
             box_ops.encode(boxes[matched[positive]], every[positive].float(), box_ops.RPN_WEIGHTS)
         )
-    scores = torch.cat(judged)
+    scores = torch.cat(judged).float()
     objectness = F.binary_cross_entropy_with_logits(scores, torch.cat(truth).to(scores))
     box = _smooth_l1(torch.cat(moved), torch.cat(wanted), len(scores))
     proposals = select_proposals(anchors, logits, offsets, batch.sizes, TRAINING_PROPOSALS)
@@ -134,7 +138,7 @@ def box_losses(
     label, offset = torch.cat(labels), torch.cat(wanted)
     is_object = label > 0
     box = _smooth_l1(of_class(predicted, label)[is_object], offset[is_object], len(label))
-    return {"class": F.cross_entropy(logits, label), "box": box}, positives
+    return {"class": F.cross_entropy(logits.float(), label), "box": box}, positives
 
 
 def around_objects(
@@ -163,18 +167,20 @@ def mask_losses(
 ) -> Losses:
     """Losses of the masks, and of the predicted IoUs, on the object's own class (eq. 11)."""
     heads = model.roi_heads
+    context = model.config.mask_context
+    found = Rois([box_ops.enlarged(b, context) for b in found.boxes], found.owners)
     if sum(len(o) for o in found.owners) == 0:
         nothing = table.rows.sum() * 0
         return {"mask": nothing} | ({"maskiou": nothing} if heads.maskiou_head else {})
     features = roi_align(table, found.boxes, mask_heads.BINS)
     every = heads.mask_predictor(heads.mask_head(features))
     labels = torch.cat([t.labels[o] for t, o in zip(targets, found.owners, strict=True)])
-    logits = of_class(every, labels)
+    logits = of_class(every, labels).float()
     wanted, object_px, box_px = _wanted_masks(found, targets, batch, logits.shape[-1])
     losses = {"mask": F.binary_cross_entropy_with_logits(logits, wanted.to(logits))}
     if heads.maskiou_head is not None:
         masks = logits.detach().sigmoid()
-        ious = of_class(heads.maskiou_head(features, masks), labels)
+        ious = of_class(heads.maskiou_head(features, masks), labels).float()
         truth = iou_targets(masks, wanted, object_px, box_px).to(ious)
         losses["maskiou"] = 0.5 * F.mse_loss(ious, truth)
     return losses
@@ -197,5 +203,5 @@ def _wanted_masks(
 
 def _smooth_l1(found: Tensor, wanted: Tensor, count: int) -> Tensor:
     """Sum over the boxes' offsets, divided by the number of all drawn boxes."""
-    total = F.smooth_l1_loss(found, wanted.to(found), beta=SMOOTH_L1_BETA, reduction="sum")
+    total = F.smooth_l1_loss(found.float(), wanted.float(), beta=SMOOTH_L1_BETA, reduction="sum")
     return total / max(count, 1)

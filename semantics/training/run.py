@@ -19,7 +19,7 @@ from semantics.coco_files import read_coco
 from semantics.labels import LabelSet, read_label_set
 from semantics.network.config import LIGHT
 from semantics.network.model import MaskRCNN
-from semantics.training.dataset import Dataset, split
+from semantics.training.dataset import Dataset, JoinedDatasets, split
 from semantics.training.loop import CURVES, TrainingConfig, train
 from semantics.training.transfer import transferred
 
@@ -31,18 +31,17 @@ class TrainingRun:
     """What to train, on what.
 
     Attributes:
-        data, images: COCO file and the folder of its images.
+        data: COCO files, each with the folder of its images.
         out: folder of the results.
         weights: to start from; None: a new light network ...
         backbone: ... with this ImageNet MobileNetV2 as its body.
         labels: label set to learn, by name or file.
-        held_out: share of the images that is left for testing.
+        held_out: share of each file's images that is left for testing.
         freeze: parameters that stay, by the beginning of their names.
         settings: other values of ``TrainingConfig``.
     """
 
-    data: Path
-    images: Path
+    data: tuple[tuple[Path, Path], ...]
     out: Path
     weights: str | None = None
     backbone: Path | None = None
@@ -65,9 +64,12 @@ def run_training(run: TrainingRun, progress: Callable[[int, int], None]) -> Path
     except ValueError as error:
         raise InputError(f"training: {error}") from error
     labels = read_label_set(run.labels)
-    training, _ = split(read_coco(run.data), run.held_out, config.seed)
-    dataset = Dataset(training, run.images, labels)
-    weights = train(_start(run, labels, config.seed), dataset, run.out, config, progress)
+    parts = [
+        Dataset(split(read_coco(file), run.held_out, config.seed)[0], images, labels)
+        for file, images in run.data
+    ]
+    network = _start(run, labels, config.seed)
+    weights = train(network, JoinedDatasets(parts), run.out, config, progress)
     draw_losses(run.out / CURVES, run.out / "losses.png")
     return weights
 

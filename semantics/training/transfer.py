@@ -40,7 +40,7 @@ def transferred(network: TrainedNetwork, labels: LabelSet) -> TrainedNetwork:
         layer = name.rpartition(".")[0]
         if name not in old:
             continue
-        if layer in PER_CLASS:
+        if layer in PER_CLASS and len(old[name]) > 1:
             _copy_rows(value, old[name], pairs, PER_CLASS[layer])
         else:
             value.copy_(old[name])

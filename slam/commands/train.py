@@ -18,8 +18,10 @@ def add_train(commands: _Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("train", help=TEXT, description=f"{TEXT}. {MORE}")
     parser.set_defaults(handler=_train)
-    parser.add_argument("--data", type=Path, required=True, metavar="F", help="COCO file")
-    parser.add_argument("--images", type=Path, required=True, metavar="DIR", help="its images")
+    parser.add_argument("--data", type=Path, required=True, action="append", metavar="F",
+                        help="COCO file; may be repeated")  # fmt: skip
+    parser.add_argument("--images", type=Path, required=True, action="append", metavar="DIR",
+                        help="the file's images, one folder for each --data")  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to make")
     parser.add_argument("--weights", metavar="F", help="weights to start from, or torchvision:NAME")
     parser.add_argument(
@@ -34,12 +36,15 @@ def add_train(commands: _Commands) -> None:
     parser.add_argument("--freeze", action="append", default=[], metavar="NAME",
                         help="parameters to keep, by the beginning of their names, such as "
                         "backbone.body; may be repeated")  # fmt: skip
-    parser.add_argument("--only", choices=("maskiou",), default="", help="train this head alone")
+    parser.add_argument(
+        "--only", choices=("masks", "maskiou"), default="",
+        help="masks: not the boxes, for use with --proposals FILE.onnx; maskiou: this head alone",
+    )  # fmt: skip
     parser.add_argument(
         "--rois",
         choices=("proposals", "objects"),
         default="proposals",
-        help="where masks are learnt; objects: masks alone, for use with --proposals FILE.onnx",
+        help="where masks are learnt; objects: in boxes around the objects themselves",
     )
     parser.add_argument("--optimiser", choices=("adamw", "sgd"), default="adamw")
     parser.add_argument("--steps", type=int, default=2000, metavar="N", help="batches (2000)")
@@ -52,14 +57,21 @@ def add_train(commands: _Commands) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
+    from graph.errors import InputError
     from semantics.training.run import TrainingRun, run_training
     from slam.progress import console_log, counting_bar
 
-    names = ("data", "images", "out", "weights", "backbone", "labels", "held_out")
+    if len(arguments.data) != len(arguments.images):
+        raise InputError(
+            f"--data is given {len(arguments.data)} times, --images {len(arguments.images)} times; "
+            "give one folder of images for each file"
+        )
+    data = tuple(zip(arguments.data, arguments.images, strict=True))
+    names = ("out", "weights", "backbone", "labels", "held_out")
     given = {name: getattr(arguments, name) for name in names}
     numbers = ("only", "rois", "optimiser", "steps", "batch", "rate", "seed")
     settings = {name: getattr(arguments, name) for name in numbers}
-    run = TrainingRun(**given, freeze=tuple(arguments.freeze), settings=settings)
+    run = TrainingRun(data, **given, freeze=tuple(arguments.freeze), settings=settings)
     with console_log(), counting_bar(arguments.quiet) as progress:
         weights = run_training(run, progress)
     print(weights if arguments.quiet else f"Weights     {weights}")

@@ -185,13 +185,38 @@ def test_the_network_finds_instances_and_nothing_above_an_impossible_score() -> 
     assert strict.segment(np.zeros((1, 1, 3), np.uint8), "one pixel") == []
 
 
+def test_an_image_without_any_detection_gives_an_empty_list() -> None:
+    torch.manual_seed(0)
+    impossible = replace(TINY, detections=DetectionConfig(min_score=1.1))
+    network = NetworkSegmenter(TrainedNetwork(MaskRCNN(impossible).eval(), LABELS), device="cpu")
+    assert network.segment(np.zeros((60, 80, 3), np.uint8), "black") == []
+
+
+def test_a_mask_of_an_enlarged_box_reaches_beyond_the_box() -> None:
+    torch.manual_seed(0)
+    config = replace(TINY, class_agnostic=True, mask_context=1.5)
+    model = MaskRCNN(config).eval()
+    with torch.no_grad():
+        model.roi_heads.mask_predictor.mask_fcn_logits.bias.fill_(50.0)  # everything is object
+    box = torch.tensor([[30.0, 20.0, 50.0, 40.0]])
+    given = ClassifiedBoxes(box, torch.tensor([2]), torch.tensor([0.9]), torch.full((1, 3), 1 / 3))
+    with torch.inference_mode():
+        found = model.segment([torch.zeros(3, 60, 80)], [given])[0]
+    torch.testing.assert_close(found.found.boxes, box)
+    torch.testing.assert_close(found.mask_boxes, torch.tensor([[25.0, 15.0, 55.0, 45.0]]))
+    rows, columns = np.nonzero(as_instances(found, (60, 80), 0.0)[0].mask)
+    assert (columns.min(), rows.min()) == pytest.approx((25, 15), abs=1)
+    assert (columns.max(), rows.max()) == pytest.approx((55, 45), abs=1)
+
+
 def test_mask_scores_reorder_detections_and_empty_masks_go() -> None:
     boxes = torch.tensor([[2.0, 2.0, 20.0, 20.0], [5.0, 5.0, 30.0, 30.0], [1.0, 1.0, 9.0, 9.0]])
     masks = torch.stack([torch.full((28, 28), p) for p in (0.9, 0.9, 0.1)])
     found = ClassifiedBoxes(
         boxes, torch.tensor([1, 2, 1]), torch.tensor([0.9, 0.8, 0.7]), torch.full((3, 3), 1 / 3)
     )
-    instances = as_instances(Detections(found, masks, torch.tensor([0.5, 0.9, 1.0])), (40, 40), 0.0)
+    detections = Detections(found, masks, boxes, torch.tensor([0.5, 0.9, 1.0]))
+    instances = as_instances(detections, (40, 40), 0.0)
     assert [i.label for i in instances] == [2, 1]
     assert [i.mask_score for i in instances] == pytest.approx([0.72, 0.45])
     assert instances[1].class_score == pytest.approx(0.9)

@@ -110,7 +110,8 @@ def test_losses_are_finite_also_without_objects(rois: str) -> None:
     empty = Target(target.boxes[:0], target.labels[:0], target.masks[:0])
     generator = torch.Generator().manual_seed(0)
     for targets in ([target, empty],) if rois == "proposals" else ([empty, empty],):
-        losses = network_losses(model, [image, image], targets, generator, rois)  # type: ignore[arg-type]
+        boxes = rois == "proposals"
+        losses = network_losses(model, [image, image], targets, generator, rois, boxes)  # type: ignore[arg-type]
         names = {"mask", "maskiou"}
         names |= {"objectness", "rpn_box", "class", "box"} if rois == "proposals" else set()
         assert set(losses) == names
@@ -134,7 +135,7 @@ def descend(model: MaskRCNN, steps: int, rois: Literal["proposals", "objects"]) 
     optimiser = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], 3e-3)
     totals = []
     for _ in range(steps):
-        losses = network_losses(model, [image], [target], generator, rois)
+        losses = network_losses(model, [image], [target], generator, rois, rois == "proposals")
         total = sum(losses.values(), torch.zeros(()))
         optimiser.zero_grad()
         total.backward()

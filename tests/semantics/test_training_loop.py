@@ -22,6 +22,7 @@ from semantics.network.model import MaskRCNN
 from semantics.training.dataset import (
     AugmentConfig,
     Dataset,
+    JoinedDatasets,
     Sample,
     as_tensors,
     augmented,
@@ -30,7 +31,7 @@ from semantics.training.dataset import (
     scaled,
     split,
 )
-from semantics.training.loop import CURVES, STATE, TrainingConfig, train, trainable
+from semantics.training.loop import CURVES, STATE, Only, TrainingConfig, train, trainable
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 LABELS = label_set(["cup", "mouse"])
@@ -38,7 +39,9 @@ TINY = NetworkConfig(
     classes=3, backbone="mobilenet_v2", norm="none", channels=8, box_hidden=8, mask_channels=8,
     maskiou_channels=8, maskiou_hidden=8, image=ImageConfig(64, 96),
 )  # fmt: skip
-CONFIG = TrainingConfig(steps=4, batch=1, save_every=2, rois="objects", rate=1e-3, warm_up=1)
+CONFIG = TrainingConfig(
+    steps=4, batch=1, save_every=2, rois="objects", only="masks", rate=1e-3, warm_up=1
+)
 
 
 def painted(seed: int) -> Sample:
@@ -193,3 +196,27 @@ def test_the_body_of_an_imagenet_classifier(tmp_path: Path) -> None:
     torch.save({"features.0.1.weight": torch.zeros(3)}, tmp_path / "w.pth")
     with pytest.raises(InputError, match="not a folded MobileNetV2"):
         load_mobilenet(model, tmp_path / "w.pth")
+
+
+def test_joined_data_sets_follow_each_other(data: tuple[CocoFile, Path]) -> None:
+    content, folder = data
+    one = Dataset(content, folder, LABELS)
+    first = Dataset(replace(content, images=content.images[:1]), folder, LABELS)
+    joined = JoinedDatasets([first, one])
+    assert len(joined) == len(one) + 1
+    pairs = [(0, one.load(0)), *((k + 1, one.load(k)) for k in range(len(one)))]
+    for k, sample in pairs:
+        assert np.array_equal(joined.load(k).masks, sample.masks)
+        assert np.array_equal(joined.load(k).image, sample.image)
+
+
+@pytest.mark.parametrize("only", ["", "masks", "maskiou"])
+def test_each_training_changes_its_parameters_alone(only: Only) -> None:
+    model = MaskRCNN(TINY)
+    trainable(model, replace(CONFIG, only=only, freeze=("backbone.body",)))
+    learning = {n for n, p in model.named_parameters() if p.requires_grad}
+    assert not any(n.startswith("backbone.body") for n in learning)
+    assert "roi_heads.maskiou_head.maskiou.weight" in learning
+    assert ("roi_heads.mask_predictor.conv5_mask.weight" in learning) == (only != "maskiou")
+    assert ("roi_heads.box_predictor.cls_score.weight" in learning) == (only == "")
+    assert ("rpn.head.cls_logits.weight" in learning) == (only == "")
