@@ -16,8 +16,9 @@ from graph.errors import InputError
 from graph.geometry import Array, inverse
 from slam.rendering.annotations import FrameMarks, coco, frame_marks
 from slam.rendering.builder import Image, SceneBuilder
-from slam.rendering.path import camera_poses
-from slam.rendering.people import Cast, hire
+from slam.rendering.lighting import Lighting
+from slam.rendering.path import CameraPath, camera_poses
+from slam.rendering.people import Cast, Role, hire
 from slam.rendering.raycast import Renderer, View, to_image
 from slam.rendering.scene import Scene, build_scene
 from slam.rendering.sensor import blur, exposure_gain, measure_depth, optical_flow
@@ -34,6 +35,7 @@ SCENES: dict[str, str] = {
     "office": "an office for three with desks, computers and bookcases; one round through it",
     "living_room": "a living room with sofa, television, dining table and bookcase; one round",
     "corridor": "a square corridor, a loop of 30 m that ends where it began",
+    "room": "a room drawn at random from the seed: size, walls, light, furniture and round",
 }
 """Names and one-line descriptions of the scenes."""
 
@@ -49,7 +51,7 @@ class RenderConfig:
     Attributes:
         name: one of SCENES.
         frames: number of frames from the start of the path; None for the whole path.
-        seed: of people, noise, textures and the hand's tremor.
+        seed: of people, noise, textures and the hand's tremor, and of a random room.
         people: how many people stand, sit, walk and carry things in the scene.
         noise: apply the Kinect's depth noise and holes, and image noise of 2 grey levels.
         exposure_change: let the brightness vary slowly.
@@ -138,34 +140,54 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"frames={config.frames}: must be at least 1")
     if config.people < 0:
         raise InputError(f"people={config.people}: must not be negative")
-    if not 1 <= config.fps <= 1000:
-        raise InputError(f"fps={config.fps}: must be between 1 and 1000")
+    if not 0.1 <= config.fps <= 1000:
+        raise InputError(f"fps={config.fps}: must be between 0.1 and 1000")
     if not abs(config.depth_delay_ms) <= 1000:
         raise InputError(f"depth delay {config.depth_delay_ms} ms: must be at most 1000 either way")
     if min(config.width, config.height) < 16:
         raise InputError(f"{config.width}x{config.height}: too small; use at least 16x16")
 
 
+@dataclass(frozen=True)
+class _Plan:
+    """A scene before it is built."""
+
+    path: CameraPath
+    roles: tuple[Role, ...]
+    lighting: Lighting
+    furnish: Callable[[SceneBuilder], None]
+
+
+def _plan(name: str, seed: int) -> _Plan:
+    if name == "room":
+        from slam.rendering.random_room import draw_room
+
+        room = draw_room(seed)
+        return _Plan(room.path, room.roles, room.lighting, room.furnish)
+    module = importlib.import_module(f"slam.rendering.{name}")
+    return _Plan(module.PATH, module.ROLES, module.LIGHTING, module.furnish)
+
+
 def _prepare(config: RenderConfig, folder: Path) -> _Job:
-    plan = importlib.import_module(f"slam.rendering.{config.name}")
-    poses = camera_poses(plan.PATH, config.fps, config.seed, sweeping=config.sweeping)
+    plan = _plan(config.name, config.seed)
+    poses = camera_poses(plan.path, config.fps, config.seed, sweeping=config.sweeping)
     if config.frames is not None and config.frames > len(poses):
         raise InputError(
             f"frames={config.frames}: the path of {config.name!r} has {len(poses)} frames at "
             f"{config.fps:g} Hz; ask for at most as many"
         )
-    if config.people > len(plan.ROLES):
+    if config.people > len(plan.roles):
         raise InputError(
-            f"people={config.people}: {config.name!r} has room for {len(plan.ROLES)}; ask for fewer"
+            f"people={config.people}: {config.name!r} has room for {len(plan.roles)}; ask for fewer"
         )
     poses = poses[: config.frames]
     delay_s = config.depth_delay_ms / 1e3
-    depth_poses = camera_poses(plan.PATH, config.fps, config.seed, delay_s, config.sweeping)
+    depth_poses = camera_poses(plan.path, config.fps, config.seed, delay_s, config.sweeping)
     depth_poses = depth_poses[: config.frames]
     builder = SceneBuilder(config.seed, detail=float(np.clip(config.width / 640, 0.25, 1.0)))
     plan.furnish(builder)
-    cast = hire(builder, plan.ROLES, plan.LIGHTING, config.people)
-    scene = build_scene(builder, plan.LIGHTING, cast.parts, config.seed)
+    cast = hire(builder, plan.roles, plan.lighting, config.people)
+    scene = build_scene(builder, plan.lighting, cast.parts, config.seed)
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]
     renderer = Renderer(camera, scene.atlas, scene.static)
