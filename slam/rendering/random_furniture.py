@@ -20,6 +20,13 @@ from slam.rendering.surfaces import Colour, wood
 SEAT_M = (-0.15, -1.07)
 """Where the chair of a workplace stands, in the workplace's frame."""
 
+DEVICES: dict[str, Callable[[SceneBuilder], None]] = {
+    "air conditioner": f.air_conditioner,
+    "switchbox": o.switchbox,
+    "jackboard": o.jackboard,
+}
+"""What hangs on walls and has a class, by its name."""
+
 _WOODS: tuple[Colour, ...] = (f.OAK, f.WALNUT, (206, 196, 180), (142, 104, 70), (88, 66, 52))
 _THINGS = ("cup", "bottle", "cell phone", "book", "books", "trophy", "plant", "drone", "sheet")
 _ODDS = np.array([0.18, 0.15, 0.14, 0.15, 0.09, 0.08, 0.06, 0.06, 0.09])
@@ -47,14 +54,9 @@ def add_piece(b: SceneBuilder, kind: Kind) -> None:
 
 def add_hanging(b: SceneBuilder, hanging: Hanging) -> None:
     """Build what hangs on a wall, in a frame at the middle of its foot, front along -y."""
-    devices = {
-        "air conditioner": f.air_conditioner,
-        "switchbox": o.switchbox,
-        "jackboard": o.jackboard,
-    }
-    if hanging.name in devices:
+    if hanging.name in DEVICES:
         with b.at(np.eye(4), hanging.name):
-            devices[hanging.name](b)
+            DEVICES[hanging.name](b)
         return
     prints = {"poster": poster, "painting": painting, "window": window, "whiteboard": whiteboard,
               "notice board": notice_board}  # fmt: skip
@@ -75,7 +77,7 @@ def scatter(b: SceneBuilder, width: float, depth: float, count: int, taken: list
         half = np.array([width, depth]) / 2 - radius
         if half.min() <= 0:
             continue
-        for _ in range(12):
+        for _ in range(30):
             x, y = (b.rng.uniform(-1, 1, 2) * half).tolist()
             if all(np.hypot(x - u, y - v) > radius + r for u, v, r in discs):
                 discs.append((x, y, radius))
@@ -128,7 +130,7 @@ def _workplace(b: SceneBuilder, width: float) -> None:
             f.desk(b, width, 0.75, _wood(b))
         with b.at(pose(0, 0, 0.74)):
             taken = _computer(b)
-            scatter(b, width, 0.75, int(rng.integers(3, 8)), taken)
+            scatter(b, width, 0.75, int(rng.integers(5, 11)), taken)
     with b.at(pose(*SEAT_M, 0, 180 + rng.uniform(-35, 35)), "chair"):
         _chair(b, 0.75)
 

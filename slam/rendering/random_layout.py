@@ -118,7 +118,7 @@ class Layout:
         return False
 
     def stand_free(self, kind: Kind, turns_deg: tuple[float, ...] = ()) -> bool:
-        """Stand a piece anywhere, with one of the given yaws or with any; whether there was room."""
+        """Stand a piece anywhere, at one of the given yaws or at any; whether there was room."""
         for _ in range(_TRIES):
             x, y = self.rng.uniform((0.2, 0.2), (self.room.width - 0.2, self.room.depth - 0.2))
             yaw = self.rng.choice(turns_deg) if turns_deg else self.rng.uniform(0, 360)

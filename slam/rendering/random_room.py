@@ -12,12 +12,13 @@ from slam.rendering.builder import Painter, SceneBuilder
 from slam.rendering.lighting import Lamp, Lighting
 from slam.rendering.path import CameraPath
 from slam.rendering.people import Role
-from slam.rendering.random_furniture import SEAT_M, add_hanging, add_piece, dull_colour
+from slam.rendering.random_furniture import DEVICES, SEAT_M, add_hanging, add_piece, dull_colour
 from slam.rendering.random_layout import Kind, Layout, Piece, Rect, distance_m
 from slam.rendering.room import Room, ceiling_lamps, shell
 from slam.rendering.surfaces import bricks, carpet, planks, plaster, tiles, wallpaper
 
 _STOPS = 24
+_FEWEST_PIECES = 12
 _LOADS = ("", "suitcase", "cup", "book", "cell phone", "umbrella")
 
 
@@ -52,7 +53,7 @@ def draw_room(seed: int) -> RandomRoom:
     layout = Layout(room, _walked(eyes), rng)
     _stand_large_things(layout)
     rounds = [layout.keep_free(1.4, 0.9)]
-    stands = [layout.keep_free(0.55, 0.55) for _ in range(2)]
+    stands = [layout.keep_free(0.7, 0.7) for _ in range(2)]
     _stand_small_things(layout)
     _hang_things(layout)
     path = CameraPath(eyes, _targets(layout, eyes, rng), speed_m_s=0.42, turn_deg_s=24.0)
@@ -93,17 +94,23 @@ def _targets(layout: Layout, eyes: Array, rng: np.random.Generator) -> Array:
     knots = np.r_[0.0, np.cumsum(sides)] / sides.sum()
     share = np.mod(rng.random() + rng.choice((-1, 1)) * np.linspace(0, 2, _STOPS + 1), 1.0)
     xy = np.stack([np.interp(share, knots, column) for column in corners.T], -1)
-    height = np.array([_interest(layout.pieces, point) for point in xy])
-    height += rng.uniform(-0.12, 0.12, len(height))
+    height = np.array([_interest(layout, point) for point in xy])
     height[-1] = height[0]
-    return np.c_[xy, np.minimum(height, eyes[:, 2] - 0.1)]
+    return np.c_[xy, np.minimum(height, eyes[:, 2] + 0.3)]
 
 
-def _interest(pieces: list[Piece], point: Array) -> float:
-    """The height worth looking at near a point (2,)."""
-    away = [min(distance_m(r, point[None])[0] for r in piece.rects_world) for piece in pieces]
+def _interest(layout: Layout, point: Array) -> float:
+    """The height worth looking at near a point (2,): of furniture, or of a device on the wall."""
+    rng = layout.rng
+    away = [min(distance_m(r, point[None])[0] for r in p.rects_world) for p in layout.pieces]
     nearest = int(np.argmin(away))
-    return pieces[nearest].kind.focus_m if away[nearest] < 0.6 else 1.15
+    height = layout.pieces[nearest].kind.focus_m if away[nearest] < 0.6 else 1.15
+    for hanging in layout.hangings:
+        foot = hanging.T_world_hanging[:3, 3]
+        near = float(np.hypot(*(foot[:2] - point))) < 0.8
+        if near and hanging.name in DEVICES and rng.random() < 0.6:
+            height = (height + 2 * float(foot[2])) / 3
+    return height + rng.uniform(-0.12, 0.12)
 
 
 # --- furniture -----------------------------------------------------------------------------------
@@ -186,7 +193,7 @@ def _stand_small_things(layout: Layout) -> None:
             layout.stand_free(kind)
     for place in rng.permutation(len(at_wall)):
         chance, kind = at_wall[place]
-        if rng.random() < chance:
+        if len(layout.pieces) < _FEWEST_PIECES or rng.random() < chance:
             layout.stand_at_wall(kind)
 
 

@@ -19,6 +19,7 @@ from slam.rendering.builder import Image, SceneBuilder
 from slam.rendering.lighting import Lighting
 from slam.rendering.path import CameraPath, camera_poses
 from slam.rendering.people import Cast, Role, hire
+from slam.rendering.random_room import draw_room
 from slam.rendering.raycast import Renderer, View, to_image
 from slam.rendering.scene import Scene, build_scene
 from slam.rendering.sensor import blur, exposure_gain, measure_depth, optical_flow
@@ -160,8 +161,6 @@ class _Plan:
 
 def _plan(name: str, seed: int) -> _Plan:
     if name == "room":
-        from slam.rendering.random_room import draw_room
-
         room = draw_room(seed)
         return _Plan(room.path, room.roles, room.lighting, room.furnish)
     module = importlib.import_module(f"slam.rendering.{name}")
