@@ -10,6 +10,8 @@ from graph.data_files import data_path
 from graph.errors import InputError
 
 BACKGROUND = "background"
+UNKNOWN = "unknown"
+"""What label 0 means of a thing in the map: on no object that the set has a name for."""
 UNUSED = "N/A"
 """Name of a number that stands for no class."""
 
@@ -22,6 +24,10 @@ class LabelSet:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def of_thing(self, label: int) -> str:
+        """The name of a label of something in the map."""
+        return self.names[label] if label else UNKNOWN
 
     def number(self, name: str) -> int:
         """The label of a class; 0 if the set does not have it."""

@@ -30,7 +30,7 @@ from slam.system_interface import System
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_FILE = FileKind("checkpoint", 1)
+CHECKPOINT_FILE = FileKind("checkpoint", 2)
 
 
 @dataclass(frozen=True)

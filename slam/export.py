@@ -23,7 +23,7 @@ from graph.trajectory_formats import (
     write_times,
 )
 from graph.updates import IntArray
-from slam.run_results import LANDMARKS_COMMENT
+from slam.landmark_cloud import LANDMARKS_COMMENT
 
 ExportFormat = Literal["tum", "kitti", "euroc", "g2o", "ply"]
 POSITIONS_COMMENT = "bmask-slam camera positions, world frame, metres, seconds"

@@ -17,9 +17,11 @@ class Frame:
         timestamp_s: stamp of the colour image in seconds.
         rgb: (H, W, 3) uint8, red first.
         depth_m: (H, W) float32 z-depth in metres, NaN where missing.
+        name: file name of the colour image relative to its sequence, for looking up its masks.
     """
 
     index: int
     timestamp_s: float
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
+    name: str = ""

@@ -51,6 +51,10 @@ class FrameHistory:
             for segment in sorted(stamps)
         }
 
+    def heir(self, keyframe_id: int) -> tuple[int, Array]:
+        """The keyframe that stands for one now, and T_heir_keyframe; itself if it has no heir."""
+        return self._resolve(keyframe_id, np.eye(4))
+
     def state(self) -> Arrays:
         """All entries, and who inherited whose frames, as arrays."""
         entries, heirs = self._entries, list(self._parent.values())

@@ -12,7 +12,8 @@ from graph.trajectory import Trajectory
 from slam.features import Features
 from slam.frame import Frame
 from slam.results import FrameResult, TrackingStatus
-from slam.system import SlamSystem, StageClock
+from slam.stage_clock import StageClock
+from slam.system import SlamSystem
 from slam.tracker import Tracked
 
 REFRESH_FRAMES = 5  # a sixth of a second at 30 Hz

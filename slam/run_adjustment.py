@@ -31,8 +31,9 @@ from slam.evaluation import (
     read_reference,
 )
 from slam.evaluation.plot import plot_trajectory
+from slam.landmark_cloud import LANDMARKS_COMMENT
 from slam.run_folder import RunFolder
-from slam.run_results import EVALUATION_ROWS, LANDMARKS_COMMENT
+from slam.run_results import EVALUATION_ROWS
 from slam.saved_run import SavedRun, read_run
 
 logger = logging.getLogger(__name__)

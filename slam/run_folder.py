@@ -9,6 +9,7 @@ frames.csv            one line a frame: status, matches, inliers, milliseconds a
 landmarks.ply         x y z (world, metres), red green blue, observations, id
 graph                 the saved factor graph and values, one file that loads again
 map                   keyframes, landmarks and graph, for ``run --map`` and ``run --localise``
+labels.csv            with a segmenter: label, probability, entropy, views of every landmark
 covariances.txt       with ``--covariances``: of every keyframe's pose, see `slam.covariances`
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference
@@ -40,8 +41,9 @@ from graph.errors import InputError
 from graph.trajectory import Trajectory, write_tum
 from slam.covariances import COVARIANCES
 from slam.results import FrameResult
+from slam.semantic_files import SEMANTIC_FILES
 
-STAGES = ("features", "tracking", "keyframe", "graph", "loops")
+STAGES = ("features", "tracking", "keyframe", "graph", "loops", "semantics")
 FILES = (
     "config.yaml",
     "trajectory.txt",
@@ -55,7 +57,7 @@ FILES = (
     "log.txt",
 )
 CHECKPOINT = "checkpoint"
-SOMETIMES = (CHECKPOINT, COVARIANCES)
+SOMETIMES = (CHECKPOINT, COVARIANCES, *SEMANTIC_FILES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("graph", "semantics", "mapping", "slam")
 COLUMNS = (

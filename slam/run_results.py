@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from graph.errors import InputError
-from graph.ply import write_ply
 from graph.trajectory import Trajectory
 from slam.evaluation import Row, evaluate_trajectory, format_json
 from slam.evaluation.plot import plot_trajectory
+from slam.landmark_cloud import write_landmarks
 from slam.memory import peak_rss_mb
 from slam.results import FrameResult, TrackingStatus
 from slam.run_folder import RunFolder
-from slam.system import LandmarkCloud
 from slam.system_interface import System
 
 logger = logging.getLogger(__name__)
 
-LANDMARKS_COMMENT = "bmask-slam landmarks, world frame, metres"
 EVALUATION_ROWS = (
     "ate_rmse",
     "rpe_trans_rmse_frame",
@@ -114,13 +111,3 @@ def save(
     for name in system.files():
         size_mb = (folder.path / name).stat().st_size / 1e6
         logger.info("%s: %.1f MB", name, size_mb)
-
-
-def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:
-    """Landmarks as PLY: position in the world in metres, colour, number of keyframes, id."""
-    x, y, z = cloud.points_world.T.astype(np.float32)
-    red, green, blue = cloud.colours.T.astype(np.uint8)
-    columns = {"x": x, "y": y, "z": z, "red": red, "green": green, "blue": blue}
-    columns["observations"] = cloud.observations.astype(np.int32)
-    columns["id"] = cloud.ids.astype(np.int32)
-    write_ply(path, columns, LANDMARKS_COMMENT)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from graph.camera import Camera
 from graph.errors import InputError
 from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from graph.trajectory_formats import read_trajectory
+from semantics.segmenter import NoSegmenter
+from semantics.segmenter_table import make_segmenter
 from slam import __version__
 from slam.checkpoint import Checkpoints, read_checkpoint
 from slam.configuration import dump
@@ -67,7 +70,7 @@ class RunSummary:
 MakeSystem = Callable[[Camera, SystemConfig], System]
 
 
-def run(options: RunOptions, make_system: MakeSystem = SlamSystem) -> RunSummary:
+def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummary:
     """Run the system over a sequence and fill the run folder.
 
     SIGINT and SIGTERM end it after the current frame; what was tracked so far is then finished
@@ -85,14 +88,14 @@ def run(options: RunOptions, make_system: MakeSystem = SlamSystem) -> RunSummary
         StopRequest() as stop,
     ):
         describe_run(folder, options, sequence)
-        system = start_system(options, sequence, make_system)
+        system = start_system(options, sequence, make_system or _with_segmenter(options, sequence))
         tally = Tally()
         track((system, tally), sequence, folder, options, stop)
         return conclude((system, tally), (sequence, reference), folder, options, stop)
 
 
 def resume(
-    path: Path, given: Mapping[str, Any] | None = None, make_system: MakeSystem = SlamSystem
+    path: Path, given: Mapping[str, Any] | None = None, make_system: MakeSystem | None = None
 ) -> RunSummary | None:
     """Go on with a run that was killed, from its last checkpoint; None if it is finished.
 
@@ -110,7 +113,8 @@ def resume(
     sequence = open_sequence(options.sequence, camera=options.camera)
     checkpoint.check_sequence(sequence)
     reference = find_reference(options.reference, sequence)
-    system, tally = make_system(sequence.camera, options.config), checkpoint.tally
+    make = make_system or _with_segmenter(options, sequence)
+    system, tally = make(sequence.camera, options.config), checkpoint.tally
     system.restore(checkpoint.state, path / CHECKPOINT)
     with RunFolder(path, resume_bytes=checkpoint.frames_bytes) as folder, StopRequest() as stop:
         logger.info("resumed after %d frames: %s", tally.frames, shlex.join(sys.argv))
@@ -155,6 +159,13 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
     logger.info("%d frames; %s without a partner", len(sequence), unpaired)
     for index, reason in sequence.skipped:  # found while opening, before there was a log
         logger.info("frame %d is broken: %s", index, reason)
+
+
+def _with_segmenter(options: RunOptions, sequence: Sequence) -> MakeSystem:
+    """The real system, with the segmenter of its configuration. Raises InputError."""
+    chosen = options.config.semantics.segmenter
+    segmenter = NoSegmenter() if options.localise else make_segmenter(chosen, sequence.folder)
+    return partial(SlamSystem, segmenter=segmenter)
 
 
 def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSystem) -> System:

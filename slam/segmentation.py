@@ -8,7 +8,7 @@ from pathlib import Path
 from graph.errors import InputError
 from semantics.mask_cache import CacheOptions, CacheResult, cache_masks
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
-from slam.sequences.lists import read_associations, read_list
+from slam.sequences.lists import image_name, read_associations, read_list
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -47,9 +47,4 @@ def colour_images(source: Path) -> list[tuple[str, Path]]:
         raise InputError(f"{source}: no such folder; give a sequence or a folder of images")
     if not files:
         raise InputError(f"{source}: no image in it; give a sequence or a folder of png or jpg")
-    return [(_relative(path, source), path) for path in files]
-
-
-def _relative(path: Path, folder: Path) -> str:
-    inside = path.is_relative_to(folder)
-    return (path.relative_to(folder) if inside else Path(path.name)).as_posix()
+    return [(image_name(path, source), path) for path in files]

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph.array_file import Arrays, check_like, nested, part
 from graph.camera import Camera
@@ -18,11 +15,13 @@ from graph.geometry import Array
 from graph.smoother_config import SmootherConfig
 from graph.solver import SolverError
 from graph.trajectory import Trajectory
+from semantics.segmenter import Segmenter
 from slam.covariances import COVARIANCES, KeyframeCovariances, write_covariances
 from slam.features import BriskExtractor, FeatureConfig, Features
 from slam.frame import Frame
 from slam.graph_feed import GraphFeedConfig
 from slam.keyframes import KeyframeConfig, KeyframeEvidence, keyframe_reason
+from slam.landmark_cloud import LandmarkCloud
 from slam.local_mapping import MappingConfig
 from slam.localiser import Localiser
 from slam.loop_closing import LoopClosingConfig
@@ -30,6 +29,9 @@ from slam.map_file import MAP, write_map
 from slam.mapper import Mapper
 from slam.relocalisation import RelocalisationConfig
 from slam.results import FrameResult, TrackingStatus
+from slam.semantic_files import LABELS, write_labels
+from slam.semantic_mapping import SemanticMapper, SemanticsConfig
+from slam.stage_clock import StageClock
 from slam.tracker import Tracked, Tracker, TrackingConfig, lost, untracked
 from slam.world_map import Keyframe
 
@@ -52,24 +54,20 @@ class SystemConfig:
     feed: GraphFeedConfig = field(default_factory=GraphFeedConfig)
     graph: SmootherConfig = field(default_factory=SmootherConfig)
     loops: LoopClosingConfig = field(default_factory=LoopClosingConfig)
+    semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     final_adjustment: bool = True
     covariances: bool = False
-
-
-@dataclass(frozen=True)
-class LandmarkCloud:
-    """The living landmarks: ids (N,), points_world (N, 3) m, colours (N, 3), observations (N,)."""
-
-    ids: NDArray[np.int64]
-    points_world: Array
-    colours: NDArray[np.uint8]
-    observations: NDArray[np.int64]
 
 
 class SlamSystem:
     """RGB-D frames in, poses out; the map and the graph grow on the way."""
 
-    def __init__(self, camera: Camera, config: SystemConfig | None = None):
+    def __init__(
+        self,
+        camera: Camera,
+        config: SystemConfig | None = None,
+        segmenter: Segmenter | None = None,
+    ):
         self.camera = camera
         self.config = config = config or SystemConfig()
         self.extractor = BriskExtractor(camera, config.features)
@@ -78,6 +76,7 @@ class SlamSystem:
         self.mapper = Mapper(camera, tracker, rules)
         places = self.mapper.loops.index
         self.localiser = Localiser(tracker, places, (config.relocalisation, config.mapping))
+        self.semantics = SemanticMapper(camera, config.semantics, segmenter)
         self._segment = 0
         self._reference: Keyframe | None = None
         self._frames_since_keyframe = 0
@@ -90,7 +89,11 @@ class SlamSystem:
             "reference": np.array(-1 if self._reference is None else self._reference.id),
             "frames_since_keyframe": np.array(self._frames_since_keyframe),
             "first_keyframe": np.array(self._first_keyframe),
-            **nested(mapper=self.mapper.state(), localiser=self.localiser.state()),
+            **nested(
+                mapper=self.mapper.state(),
+                localiser=self.localiser.state(),
+                semantics=self.semantics.state(),
+            ),
         }
 
     def restore(self, state: Arrays, path: Path) -> None:
@@ -98,6 +101,7 @@ class SlamSystem:
         check_like(state, self.state(), path)
         self.mapper.restore(part(state, "mapper"), path)
         self.localiser.restore(part(state, "localiser"))
+        self.semantics.restore(part(state, "semantics"), path)
         self._segment = int(state["segment"])
         self._reference = self.mapper.world.keyframes.get(int(state["reference"]))
         self._frames_since_keyframe = int(state["frames_since_keyframe"])
@@ -145,6 +149,9 @@ class SlamSystem:
             if keyframe:
                 self.mapper.close_loops(keyframe)
                 self._refer_to(keyframe)
+        with clock.stage("semantics"):
+            if keyframe:
+                self.semantics.observe(frame, keyframe, self.mapper)
         return FrameResult(
             index=frame.index,
             timestamp_s=frame.timestamp_s,
@@ -199,9 +206,9 @@ class SlamSystem:
         chosen = self.mapper.world.in_segment(largest(self.segments()))
         hosts = [k.id for k in chosen]
         ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
-        return LandmarkCloud(
-            ids, table.points_world[ids], table.colours[ids], table.observations[ids]
-        )
+        labels = self.semantics.landmark_labels(ids)
+        columns = table.points_world[ids], table.colours[ids], table.observations[ids]
+        return LandmarkCloud(ids, *columns, labels)
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """What it saves so that it loads again: a function that writes a file, by its name."""
@@ -209,6 +216,8 @@ class SlamSystem:
             "graph": self.mapper.smoother.save,
             MAP: self.save_map,
         }
+        if self.semantics.enabled:
+            found[LABELS] = lambda path: write_labels(path, self.landmarks())
         if self.config.covariances:
             found[COVARIANCES] = self.save_covariances
         return found
@@ -305,17 +314,3 @@ class SlamSystem:
 def largest(segments: dict[int, Trajectory]) -> int:
     """The segment with most frames, the older of equal ones; 0 where there is none."""
     return max(segments, key=lambda s: (len(segments[s]), -s), default=0)
-
-
-class StageClock:
-    """Wall time of named stages in milliseconds."""
-
-    def __init__(self) -> None:
-        self.stage_ms: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time what is done inside, under this name."""
-        started_s = time.perf_counter()
-        yield
-        self.stage_ms[name] = 1e3 * (time.perf_counter() - started_s)

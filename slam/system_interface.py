@@ -9,8 +9,8 @@ from typing import Any, Protocol
 from graph.array_file import Arrays
 from graph.trajectory import Trajectory
 from slam.frame import Frame
+from slam.landmark_cloud import LandmarkCloud
 from slam.results import FrameResult
-from slam.system import LandmarkCloud
 
 
 class System(Protocol):

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TypeAlias
 
+from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
 TEXT = "compare a segmenter's masks with annotated images"
@@ -21,15 +23,7 @@ def add_evaluate_segmentation(commands: _Commands) -> None:
     parser.set_defaults(handler=_evaluate)
     parser.add_argument("--data", type=Path, required=True, metavar="F", help="COCO file")
     parser.add_argument("--images", type=Path, required=True, metavar="DIR", help="its images")
-    parser.add_argument("--segmenter", default="light", metavar="NAME", help="as of segment")
-    parser.add_argument("--weights", metavar="F", help="weights file, or torchvision:NAME")
-    parser.add_argument(
-        "--proposals", type=Path, metavar="F", help="YOLOX network in ONNX that finds the boxes"
-    )
-    parser.add_argument(
-        "--masks", type=Path, metavar="F", help="of precomputed: COCO file or folder of label PNGs"
-    )
-    parser.add_argument("--labels", metavar="F", help="label set: file, or coco, coco91, paper")
+    add_segmenter_arguments(parser, "light")
     parser.add_argument(
         "--held-out", type=float, metavar="S", help="only the share that train --held-out S left"
     )
@@ -49,9 +43,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from semantics.training.dataset import split
     from slam.progress import console_log, counting_bar
 
-    names = ("weights", "proposals", "masks", "labels")
-    given = {name: getattr(arguments, name) for name in names}
-    options = SegmenterOptions(arguments.segmenter, **given, min_score=0.0)
+    options = segmenter_options(arguments, SegmenterOptions(min_score=0.0))
     with console_log(), counting_bar(arguments.quiet) as progress:
         truth = read_coco(arguments.data)
         if arguments.held_out is not None:

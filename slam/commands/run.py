@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from graph.errors import InputError
+from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
 
 if TYPE_CHECKING:
     from slam.runner import RunSummary
@@ -73,6 +75,7 @@ def add_run(commands: _Commands) -> None:
         const="covariances=true",
         help="also write covariances.txt: how sure the graph is of each keyframe",
     )
+    add_segmenter_arguments(parser, "none")
     parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
 
 
@@ -83,7 +86,9 @@ def _run(arguments: argparse.Namespace) -> int:
     from slam.system import SystemConfig
 
     file = find_config(arguments.config) if arguments.config else None
-    config = resolve(SystemConfig, file, arguments.set)
+    plain = resolve(SystemConfig, file, arguments.set)
+    segmenter = segmenter_options(arguments, plain.semantics.segmenter)
+    config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
     if arguments.print_config:
         print(dump(config), end="")
         return 0
@@ -92,7 +97,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.sequence:
         given["sequence"] = arguments.sequence
     if arguments.resume:
-        if file or arguments.set:
+        if file or arguments.set or config != plain:
             given["config"] = config
         if arguments.overwrite:
             raise InputError("--overwrite: would delete what --resume needs; give one of the two")

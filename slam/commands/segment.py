@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TypeAlias
 
+from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
 TEXT = "find the objects in a sequence's images and keep their masks"
@@ -21,20 +23,7 @@ def add_segment(commands: _Commands) -> None:
     parser.set_defaults(handler=_segment)
     parser.add_argument("source", type=Path, metavar="INPUT", help="sequence, or folder of images")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for masks")
-    parser.add_argument(
-        "--segmenter",
-        default="light",
-        metavar="NAME",
-        help="light (default), mask-scoring-rcnn, precomputed, truth or none",
-    )
-    parser.add_argument("--weights", metavar="F", help="weights file, or torchvision:NAME")
-    parser.add_argument(
-        "--proposals", type=Path, metavar="F", help="YOLOX network in ONNX that finds the boxes"
-    )
-    parser.add_argument(
-        "--masks", type=Path, metavar="F", help="of precomputed: COCO file or folder of label PNGs"
-    )
-    parser.add_argument("--labels", metavar="F", help="label set: file, or coco, coco91, paper")
+    add_segmenter_arguments(parser, "light")
     parser.add_argument(
         "--min-score", type=float, default=0.5, metavar="S", help="class score (default: 0.5)"
     )
@@ -47,9 +36,7 @@ def _segment(arguments: argparse.Namespace) -> int:
     from slam.progress import console_log, counting_bar
     from slam.segmentation import segment_folder
 
-    names = ("weights", "proposals", "masks", "labels", "min_score")
-    given = {name: getattr(arguments, name) for name in names}
-    options = SegmenterOptions(arguments.segmenter, **given)
+    options = segmenter_options(arguments, SegmenterOptions(min_score=arguments.min_score))
     with console_log(), counting_bar(arguments.quiet) as progress:
         result = segment_folder(
             arguments.source, arguments.out, options, not arguments.no_overlays, progress

@@ -53,6 +53,12 @@ class ImagePairs:
     unpaired_depth: int = 0
 
 
+def image_name(path: Path, folder: Path) -> str:
+    """An image's name relative to a folder; the bare file name of one outside."""
+    inside = path.is_relative_to(folder)
+    return (path.relative_to(folder) if inside else Path(path.name)).as_posix()
+
+
 def read_pairs(folder: Path, max_difference_s: float, depth_time_offset_s: float) -> ImagePairs:
     """The image pairs of a TUM folder; rgb.txt and depth.txt come before associations.txt.
 

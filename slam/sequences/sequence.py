@@ -19,7 +19,7 @@ from graph.trajectory import Trajectory, read_tum
 from slam.frame import Frame
 from slam.sequences.cameras import find_camera
 from slam.sequences.images import depth_between, read_depth, read_rgb
-from slam.sequences.lists import ImagePairs, read_pairs
+from slam.sequences.lists import ImagePairs, image_name, read_pairs
 from slam.sequences.prefetch import prefetched
 
 logger = logging.getLogger(__name__)
@@ -96,6 +96,7 @@ class Sequence:
             float(self.pairs.timestamps_s[index]),
             read_rgb(self.pairs.rgb_files[index], self.camera),
             self._depth(index),
+            image_name(self.pairs.rgb_files[index], self.folder),
         )
 
     def _depth(self, index: int) -> NDArray[np.float32]:

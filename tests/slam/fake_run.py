@@ -14,8 +14,9 @@ from graph.array_file import Arrays
 from graph.camera import Camera
 from graph.trajectory import Trajectory, write_tum
 from slam.frame import Frame
+from slam.landmark_cloud import LandmarkCloud
 from slam.results import FrameResult, TrackingStatus
-from slam.system import LandmarkCloud, SystemConfig
+from slam.system import SystemConfig
 
 CAMERA = "{width: 32, height: 24, fx: 30, fy: 31, cx: 15, cy: 12, depth_scale: 1000, fps: 10}\n"
 FPS_HZ = 10.0

@@ -18,6 +18,9 @@ from graph.geometry import Array, se3_exp
 from graph.shadow import Shadow
 from graph.storage import graph_arrays
 from graph.updates import GraphUpdate, RelativePose
+from semantics.instances import Instance, certain, mask_box
+from semantics.labels import label_set
+from semantics.segmenter import Image
 from slam.configuration import resolve
 from slam.frame import Frame
 from slam.landmarks import LandmarkTable
@@ -47,6 +50,20 @@ def view(pose: Array | None, index: int) -> Frame:
     return Frame(index, index / 30.0, black, np.full((480, 640), np.nan, np.float32))
 
 
+class Halves:
+    """The left half of every image is a thing, the right half another."""
+
+    labels = label_set(("left", "right"))
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        left = np.zeros(image.shape[:2], bool)
+        left[:, : image.shape[1] // 2] = True
+        return [
+            Instance(m, mask_box(m), k, certain(k, 3, 0.8), 0.8, 0.7)
+            for k, m in ((1, left), (2, ~left))
+        ]
+
+
 FRAMES = [view(pose, index) for index, pose in enumerate(poses(14))]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
 
@@ -67,6 +84,7 @@ def system() -> SlamSystem:
         LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
         for k in range(2)
     ]
+    system.semantics.expect(first, FRAMES[3].depth_m)
     loops.closed = {(first, second): True, (first, second + 1): False}
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
     return system
@@ -74,7 +92,7 @@ def system() -> SlamSystem:
 
 def at_checkpoint() -> SlamSystem:
     """After 20 frames."""
-    system = SlamSystem(CAMERA, CONFIG)
+    system = SlamSystem(CAMERA, CONFIG, Halves())
     for frame in FRAMES[:20]:
         system.process(frame)
     system.restart()
@@ -82,7 +100,7 @@ def at_checkpoint() -> SlamSystem:
 
 
 def restored(state: Arrays) -> SlamSystem:
-    system = SlamSystem(CAMERA, CONFIG)
+    system = SlamSystem(CAMERA, CONFIG, Halves())
     system.restore({name: array.copy() for name, array in state.items()}, FILE)
     return system
 

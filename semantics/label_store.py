@@ -1,0 +1,178 @@
+"""What is known of the class of many things at once: landmarks or objects, by their ids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.array_file import Arrays
+from graph.geometry import Array
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float32]
+_FIRST_CAPACITY = 1024
+
+
+@dataclass(frozen=True)
+class LabelStoreConfig:
+    """How views are fused.
+
+    Views of one thing by one network err together, so that each counts for less than a view of
+    its own: ``power`` of its likelihood. No class becomes less likely than the likeliest one by
+    more than ``max_log_odds``, so that a wrong belief can be overcome.
+    """
+
+    power: float = 1.0
+    max_log_odds: float = 9.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.power <= 1 or not 1 <= self.max_log_odds < np.inf:
+            raise ValueError("power must be in (0, 1], max_log_odds at least 1")
+
+
+@dataclass(frozen=True)
+class LabelEstimates:
+    """Labels (N,), their probability (N,), entropy (N,) in nats, number of views (N,)."""
+
+    labels: Ints
+    probability: Array
+    entropy: Array
+    views: Ints
+
+
+class LabelStore:
+    """A categorical distribution over C labels for every id from 0 on; label 0 is "unknown".
+
+    Kept in log space, uniform before the first view. Beside it are kept Dirichlet counts, which
+    tell a thing that was seen often from one that was seen once.
+    """
+
+    def __init__(self, classes: int, config: LabelStoreConfig | None = None) -> None:
+        self.classes = classes
+        self.config = config or LabelStoreConfig()
+        self._clear()
+
+    def __len__(self) -> int:
+        """One more than the largest id that had a view."""
+        seen = np.flatnonzero(self._views)
+        return int(seen[-1]) + 1 if len(seen) else 0
+
+    def update(self, ids: Ints, distributions: Floats, weights: Floats) -> None:
+        """Views of things ids (N,), each by a distribution (N, C) that is right with probability
+        weight (N,) and else says nothing: L(z | c) = w p(c) + (1 - w) / C. An id may repeat.
+        """
+        if not len(ids):
+            return
+        self._reserve(int(ids.max()) + 1)
+        weighted = weights[:, None] * distributions
+        likelihood = weighted + (1 - weights[:, None]) / np.float32(self.classes)
+        floor = np.float32(np.exp(-self.config.max_log_odds))
+        gained = np.float32(self.config.power) * np.log(np.maximum(likelihood, floor))
+        self._add(ids, gained, weighted, np.ones(len(ids), np.int32))
+
+    def move(self, from_ids: Ints, to_ids: Ints) -> None:
+        """What is known of from_ids (N,) is known of to_ids (N,) as well; both are one thing."""
+        if not len(from_ids):
+            return
+        self._reserve(int(max(from_ids.max(), to_ids.max())) + 1)
+        gained, counts = self._log_p[from_ids], self._counts[from_ids]
+        views = self._views[from_ids]
+        self.drop(from_ids)
+        self._add(to_ids, gained, counts, views)
+
+    def drop(self, ids: Ints) -> None:
+        """Forget things (N,)."""
+        ids = ids[ids < len(self._views)]
+        self._log_p[ids] = self._counts[ids] = 0.0
+        self._views[ids] = 0
+        self._resize(len(self))
+
+    def known(self) -> Ints:
+        """Ids (N,) of which there was a view, rising."""
+        return np.flatnonzero(self._views)
+
+    def probabilities(self, ids: Ints) -> Array:
+        """(N, C) for any ids (N,); uniform where there was no view."""
+        inside = ids < len(self._views)
+        log_p = np.zeros((len(ids), self.classes))
+        log_p[inside] = self._log_p[ids[inside]]
+        p = np.exp(log_p - log_p.max(axis=1, keepdims=True, initial=-np.inf))
+        return p / p.sum(axis=1, keepdims=True)
+
+    def dirichlet(self, ids: Ints) -> Array:
+        """Concentrations (N, C) of any ids (N,): 1 / C and the weighted sum of distributions."""
+        inside = ids < len(self._views)
+        alpha = np.full((len(ids), self.classes), 1.0 / self.classes)
+        alpha[inside] += self._counts[ids[inside]]
+        return alpha
+
+    def estimates(self, ids: Ints) -> LabelEstimates:
+        """The likeliest label of each of any ids (N,), and how sure that is."""
+        p = self.probabilities(ids)
+        labels = p.argmax(axis=1) if len(ids) else np.zeros(0, np.int64)
+        entropy = -(p * np.log(np.maximum(p, 1e-30))).sum(axis=1)
+        views = np.zeros(len(ids), np.int64)
+        inside = ids < len(self._views)
+        views[inside] = self._views[ids[inside]]
+        return LabelEstimates(labels, p[np.arange(len(ids)), labels], entropy, views)
+
+    def state(self) -> Arrays:
+        """What is known, as named arrays with one row for each id that had a view."""
+        ids = self.known()
+        return {
+            "ids": ids,
+            "log_p": self._log_p[ids].ravel(),
+            "counts": self._counts[ids].ravel(),
+            "views": self._views[ids],
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the store of a state."""
+        ids = state["ids"]
+        self._clear()
+        self._reserve(int(ids.max(initial=-1)) + 1)
+        self._log_p[ids] = state["log_p"].reshape(len(ids), self.classes)
+        self._counts[ids] = state["counts"].reshape(len(ids), self.classes)
+        self._views[ids] = state["views"]
+        self._resize(len(self))
+
+    def _add(self, ids: Ints, gained: Floats, counts: Floats, views: NDArray[np.int32]) -> None:
+        if len(np.unique(ids)) == len(ids):
+            self._log_p[ids] += gained
+            self._counts[ids] += counts
+            self._views[ids] += views
+        else:
+            np.add.at(self._log_p, ids, gained)
+            np.add.at(self._counts, ids, counts)
+            np.add.at(self._views, ids, views)
+        log_p = self._log_p[ids]
+        log_p -= log_p.max(axis=1, keepdims=True)
+        self._log_p[ids] = np.maximum(log_p, np.float32(-self.config.max_log_odds))
+
+    def _clear(self) -> None:
+        self._log_p: Floats = np.zeros((_FIRST_CAPACITY, self.classes), np.float32)
+        self._counts: Floats = np.zeros((_FIRST_CAPACITY, self.classes), np.float32)
+        self._views: NDArray[np.int32] = np.zeros(_FIRST_CAPACITY, np.int32)
+
+    def _reserve(self, size: int) -> None:
+        if size > len(self._views):
+            self._resize(size)
+
+    def _resize(self, size: int) -> None:
+        """Room for a number of ids: the next power of two, so that it depends on that alone."""
+        capacity = max(_FIRST_CAPACITY, 1 << max(size - 1, 0).bit_length())
+        if len(self._views) != capacity:
+            self._log_p = _resized(self._log_p, capacity)
+            self._counts = _resized(self._counts, capacity)
+            self._views = _resized(self._views, capacity)
+
+
+def _resized(table: NDArray[Any], rows: int) -> NDArray[Any]:
+    """A table with so many rows, zeros where it had none."""
+    found = np.zeros((rows, *table.shape[1:]), table.dtype)
+    kept = min(rows, len(table))
+    found[:kept] = table[:kept]
+    return found

@@ -1,0 +1,198 @@
+"""From a keyframe's instances to labelled landmarks: Algorithm 3 of the paper, made robust."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.errors import InputError
+from graph.geometry import Array
+from semantics.instances import Instance
+from semantics.labels import LabelSet
+
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+NOBODY = -1
+_MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True)
+class VoteConfig:
+    """Which pixels of a mask are believed.
+
+    Nearer than ``border_px`` to another mask or to the mask's edge nothing is said: segmentation
+    errs there. A depth belongs to the mask's surface if it is within ``depth_sigmas`` robust
+    standard deviations, and ``depth_margin_m`` at 1 m that grows with the square of the depth,
+    of the median in the mask. What no mask covers is "unknown" with a weight of
+    ``background_weight``: a network misses things, so this is less than a mask's word.
+    """
+
+    border_px: int = 2
+    depth_sigmas: float = 3.5
+    depth_margin_m: float = 0.03
+    background_weight: float = 0.3
+
+    def __post_init__(self) -> None:
+        if self.border_px < 0 or self.depth_sigmas <= 0 or self.depth_margin_m < 0:
+            raise ValueError("border_px, depth_sigmas and depth_margin_m must not be negative")
+        if not 0 <= self.background_weight < 1:
+            raise ValueError("background_weight must be in [0, 1)")
+
+
+@dataclass(frozen=True, eq=False)
+class Claims:
+    """Who owns the pixels of a keyframe.
+
+    Attributes:
+        instances: in the order of their mask scores, the best first.
+        owner: (H, W) int16, the instance that a pixel belongs to, -1 for none.
+        inner: (H, W) bool, not near the border between two owners.
+        depth_range_m: (K, 2) nearest and farthest depth of each instance's surface; NaN for one
+            without depth.
+    """
+
+    instances: tuple[Instance, ...]
+    owner: NDArray[np.int16]
+    inner: Mask
+    depth_range_m: Array
+
+    def on_surface(self, owners: Ints, z_m: Array) -> Mask:
+        """Whether depths (N,) belong to the surfaces of instances (N,); unknown depths do."""
+        near, far = self.depth_range_m[owners].T
+        return ~((z_m < near) | (z_m > far))
+
+
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """What a keyframe's masks say about landmarks.
+
+    Attributes:
+        rows: (M,) which of the landmarks.
+        instances: (M,) the instance that each is on, -1 for none.
+        distributions: (M, C).
+        weights: (M,) how likely the distribution is meant for this landmark.
+    """
+
+    rows: Ints
+    instances: Ints
+    distributions: NDArray[np.float32]
+    weights: NDArray[np.float32]
+
+
+def check_instances(
+    instances: Sequence[Instance], size: tuple[int, int], labels: LabelSet, name: str
+) -> None:
+    """Refuse instances that are not of an image of this (height, width) or of this label set.
+
+    Raises:
+        InputError: a mask of another size, a label or distribution outside the set.
+    """
+    for instance in instances:
+        if instance.mask.shape != size or instance.mask.dtype != bool:
+            raise InputError(
+                f"{name}: a mask of shape {instance.mask.shape}, {instance.mask.dtype}, but the "
+                f"images have {size}; give masks of these images"
+            )
+        if not 0 < instance.label < len(labels) or len(instance.distribution) != len(labels):
+            raise InputError(
+                f"{name}: label {instance.label} of {len(instance.distribution)}, but the label "
+                f"set has {len(labels)}; give the label set of these masks"
+            )
+        finite = np.isfinite(instance.distribution).all()
+        if not finite or not 0 <= instance.mask_score <= 1:
+            raise InputError(
+                f"{name}: mask score {instance.mask_score} or a class probability is not between "
+                "0 and 1; make the masks again"
+            )
+
+
+def claim_pixels(
+    instances: Sequence[Instance],
+    depth_m: NDArray[np.float32],
+    size: tuple[int, int],
+    config: VoteConfig,
+) -> Claims:
+    """Give each pixel to the instance with the best mask score that covers it.
+
+    ``size`` is the image's (H, W); ``depth_m`` (H / s, W / s) may be every s-th pixel of the
+    depth image in both directions.
+    """
+    ranked = tuple(sorted(instances, key=lambda i: -i.mask_score))
+    owner = np.full(size, NOBODY, np.int16)
+    for k in reversed(range(len(ranked))):  # the best is painted last
+        x1, y1, x2, y2 = _window(ranked[k])
+        owner[y1:y2, x1:x2][ranked[k].mask[y1:y2, x1:x2]] = k
+    inner = np.ones(size, bool)
+    if config.border_px and ranked:
+        side = 2 * config.border_px + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        inner = cv2.erode(owner, disc) == cv2.dilate(owner, disc)
+    return Claims(ranked, owner, inner, _surfaces(owner, inner, depth_m, len(ranked), config))
+
+
+def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteConfig) -> Votes:
+    """The votes of a keyframe about the landmarks that it observes (paper, Algorithm 3).
+
+    For each landmark, at ``pixels`` (N, 2) in the image and with z-depth ``z_m`` (N,) in the
+    camera, NaN if unknown: the instance that owns its pixel, unless the pixel is near a border or
+    the landmark is not on the instance's surface, votes with its class distribution, weighted by
+    its mask score. Where there is no instance, the background votes.
+    """
+    height, width = claims.owner.shape
+    columns, rows = np.rint(pixels).astype(np.int64).reshape(-1, 2).T
+    columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
+    owners = claims.owner[rows, columns].astype(np.int64)
+    votes = claims.inner[rows, columns]
+    covered = owners != NOBODY
+    votes[covered] &= claims.on_surface(owners[covered], z_m[covered])
+    chosen = np.flatnonzero(votes)
+    if not config.background_weight:
+        chosen = chosen[covered[chosen]]
+    background = np.eye(1, classes, dtype=np.float32)[0]
+    table = np.array([*(i.distribution for i in claims.instances), background], np.float32)
+    scores = [*(i.mask_score for i in claims.instances), config.background_weight]
+    owners = owners[chosen]  # NOBODY, -1, is the last row of both
+    return Votes(chosen, owners, table[owners], np.array(scores, np.float32)[owners])
+
+
+def _window(instance: Instance) -> tuple[int, int, int, int]:
+    """x1, y1, x2, y2 of whole pixels around a mask's box, and some: boxes may be too tight."""
+    rows = np.flatnonzero(instance.mask.any(axis=1))
+    columns = np.flatnonzero(instance.mask.any(axis=0))
+    if not len(rows):
+        return 0, 0, 0, 0
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def _surfaces(
+    owner: NDArray[np.int16],
+    inner: Mask,
+    depth_m: NDArray[np.float32],
+    count: int,
+    config: VoteConfig,
+) -> Array:
+    """Depth range (K, 2) of each instance's surface, by median and MAD of its inner pixels."""
+    step = owner.shape[0] // max(depth_m.shape[0], 1)
+    seen = owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
+    usable = inner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]] & (seen != NOBODY)
+    usable &= np.isfinite(depth_m[: seen.shape[0], : seen.shape[1]])
+    owners, depths = seen[usable].astype(np.int64), depth_m[usable].astype(float)
+    middle = grouped_median(depths, owners, count)
+    spread = grouped_median(np.abs(depths - middle[owners]), owners, count)
+    reach = config.depth_sigmas * _MAD_TO_SIGMA * spread + config.depth_margin_m * middle**2
+    return np.stack([middle - reach, middle + reach], axis=1)
+
+
+def grouped_median(values: Array, groups: Ints, count: int) -> Array:
+    """The upper median (count,) of the values (N,) of each group (N,); NaN for an empty one."""
+    order = np.lexsort((values, groups))
+    sizes = np.bincount(groups, minlength=count)
+    middle = np.cumsum(sizes) - sizes + sizes // 2
+    found = np.full(count, np.nan)
+    some = sizes > 0
+    found[some] = values[order][middle[some]]
+    return found

@@ -1,0 +1,127 @@
+"""The label store against Bayes' rule written out, and through fusion, culling and storage."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from semantics.label_store import LabelStore, LabelStoreConfig
+
+C = 5
+NO_LIMIT = LabelStoreConfig(max_log_odds=60.0)
+
+
+def views(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Distributions (count, C) and weights (count,)."""
+    p = rng.dirichlet(np.full(C, 0.7), count).astype(np.float32)
+    return p, rng.uniform(0.2, 0.95, count).astype(np.float32)
+
+
+def posterior(p: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Bayes' rule for one thing, view by view, from a uniform prior."""
+    belief = np.full(C, 1 / C)
+    for distribution, weight in zip(p, weights, strict=True):
+        likelihood = weight * distribution + (1 - weight) / C
+        belief = belief * likelihood / (belief * likelihood).sum()
+    return belief
+
+
+def test_many_things_at_once_equal_bayes_one_by_one() -> None:
+    rng = np.random.default_rng(1)
+    store, ids = LabelStore(C, NO_LIMIT), np.array([3, 0, 1500])
+    seen = [views(3, rng) for _ in range(6)]
+    for p, weights in seen:
+        store.update(ids, p, weights)
+    for row, i in enumerate(ids):
+        expected = posterior(*(np.array([part[row] for part in v]) for v in zip(*seen)))  # noqa: B905
+        assert np.allclose(store.probabilities(np.array([i]))[0], expected, atol=1e-5)
+        counts = sum(w[row] * p[row] for p, w in seen) + 1 / C
+        assert np.allclose(store.dirichlet(np.array([i]))[0], counts, atol=1e-5)
+    assert store.estimates(ids).views.tolist() == [6, 6, 6]
+
+
+def test_nothing_is_known_before_the_first_view() -> None:
+    store = LabelStore(C)
+    found = store.estimates(np.array([0, 7, 99999]))
+    assert found.labels.tolist() == [0, 0, 0]
+    assert np.allclose(found.probability, 1 / C)
+    assert np.allclose(found.entropy, np.log(C))
+    assert found.views.tolist() == [0, 0, 0]
+    assert len(store.estimates(np.zeros(0, np.int64)).labels) == 0
+
+
+def test_one_view_is_believed_as_far_as_its_mask() -> None:
+    store = LabelStore(C)
+    sure = np.eye(C, dtype=np.float32)[[2, 2]]
+    store.update(np.array([0, 1]), sure, np.array([0.8, 0.0], np.float32))
+    p = store.probabilities(np.array([0, 1]))
+    assert p[0, 2] == pytest.approx(0.8 + 0.2 / C)
+    assert np.allclose(p[1], 1 / C)  # a mask without any worth says nothing
+
+
+def test_the_order_of_views_and_repeated_ids_do_not_matter() -> None:
+    p, weights = views(4, np.random.default_rng(2))
+    a, b, c = (LabelStore(C, NO_LIMIT) for _ in range(3))
+    for k in (0, 1, 2, 3):
+        a.update(np.array([5]), p[k : k + 1], weights[k : k + 1])
+    for k in (2, 0, 3, 1):
+        b.update(np.array([5]), p[k : k + 1], weights[k : k + 1])
+    c.update(np.array([5, 5, 5, 5]), p, weights)
+    five = np.array([5])
+    assert np.allclose(a.probabilities(five), b.probabilities(five), atol=1e-6)
+    assert np.allclose(a.probabilities(five), c.probabilities(five), atol=1e-6)
+    assert np.allclose(a.dirichlet(five), c.dirichlet(five))
+
+
+def test_a_fused_thing_keeps_both_histories() -> None:
+    p, weights = views(4, np.random.default_rng(3))
+    store, whole = LabelStore(C, NO_LIMIT), LabelStore(C, NO_LIMIT)
+    store.update(np.array([1, 1]), p[:2], weights[:2])
+    store.update(np.array([2, 2]), p[2:], weights[2:])
+    store.move(np.array([1]), np.array([2]))
+    whole.update(np.array([2, 2, 2, 2]), p, weights)
+    ids = np.array([1, 2])
+    assert np.allclose(store.probabilities(ids), whole.probabilities(ids), atol=1e-6)
+    assert np.allclose(store.dirichlet(ids), whole.dirichlet(ids))
+    assert store.estimates(ids).views.tolist() == [0, 4]
+    store.drop(ids)
+    assert store.known().tolist() == []
+
+
+def test_a_wrong_belief_can_be_overcome() -> None:
+    store, one = LabelStore(C), np.array([0])
+    wrong, right = np.eye(C, dtype=np.float32)[[1]], np.eye(C, dtype=np.float32)[[2]]
+    weight = np.array([0.9], np.float32)
+    for _ in range(1000):
+        store.update(one, wrong, weight)
+    for _ in range(4):
+        store.update(one, right, weight)
+    assert store.estimates(one).labels[0] == 2
+
+
+def test_a_store_becomes_the_same_from_its_state() -> None:
+    p, weights = views(3, np.random.default_rng(4))
+    store = LabelStore(C)
+    store.update(np.array([2, 5000, 7]), p, weights)
+    store.drop(np.array([7]))
+    twin = LabelStore(C)
+    twin.restore(store.state())
+    for name, table in vars(store).items():
+        assert np.array_equal(table, vars(twin)[name]), name
+
+
+def test_a_keyframe_takes_at_most_two_milliseconds() -> None:
+    rng = np.random.default_rng(5)
+    for classes in (24, 81):
+        store, ids = LabelStore(classes), rng.permutation(20000)[:1000]
+        p = rng.dirichlet(np.ones(classes), 1000).astype(np.float32)
+        weights = rng.uniform(0, 1, 1000).astype(np.float32)
+        store.update(np.array([19999]), p[:1], weights[:1])
+        took_s = []
+        for _ in range(9):
+            start_s = time.perf_counter()
+            store.update(ids, p, weights)
+            took_s.append(time.perf_counter() - start_s)
+        assert min(took_s) < 2e-3, classes

@@ -1,0 +1,233 @@
+"""Masks reach the landmarks of the map: at once, late, twice, for a culled keyframe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane
+
+from graph.errors import InputError
+from graph.geometry import se3_exp
+from semantics.instances import Instance, certain, mask_box
+from semantics.label_store import LabelEstimates
+from semantics.labels import LabelSet, label_set
+from semantics.segmenter import Image
+from slam.configuration import resolve
+from slam.frame import Frame
+from slam.landmark_cloud import write_landmarks
+from slam.semantic_files import read_labels, write_labels
+from slam.system import SlamSystem, SystemConfig
+
+FILE = Path("run/checkpoint")
+EDGE_M = 0.1  # world x: left of it on the plane is one thing, right of it another
+MANY_KEYFRAMES = [  # and most of them culled again
+    *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),
+    *("mapping.redundant_share=0.3", "mapping.redundant_views=2"),
+]
+
+
+def frames(count: int) -> list[Frame]:
+    x = np.concatenate([np.arange(count), np.arange(count)[::-1]]) * 0.03
+    poses = [se3_exp(np.array([0, 0.02 * np.sin(40 * a), 0, a - 0.2, 0, 0])) for a in x]
+    return [named(render_plane(pose, k), k) for k, pose in enumerate(poses)]
+
+
+def named(frame: Frame, number: int) -> Frame:
+    return Frame(frame.index, frame.timestamp_s, frame.rgb, frame.depth_m, f"rgb/{number}.png")
+
+
+class Sides:
+    """Knows the plane: left and right of an edge in the world, from the poses of the frames."""
+
+    labels: LabelSet = label_set(("left", "right"))
+
+    def __init__(self, system_frames: list[Frame], late: bool = False) -> None:
+        self.count = len(system_frames) // 2
+        self.late = late
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        if self.late:
+            raise InputError(f"{name}: still being segmented")
+        return self.instances(int(Path(name).stem))
+
+    def instances(self, number: int) -> list[Instance]:
+        x = np.concatenate([np.arange(self.count), np.arange(self.count)[::-1]])[number] * 0.03
+        T_first_camera = se3_exp(np.array([0, 0.02 * np.sin(40 * x), 0, x, 0, 0]))
+        columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
+        rays = CAMERA.backproject(np.stack([columns, rows], -1), np.array(1.0))
+        rays = rays @ T_first_camera[:3, :3].T
+        x_world = T_first_camera[0, 3] + rays[..., 0] / rays[..., 2] * 2.0
+        left = x_world < EDGE_M
+        sides = ((1, left), (2, ~left))
+        return [Instance(m, mask_box(m), k, certain(k, 3, 0.9), 0.9, 0.8) for k, m in sides]
+
+
+FRAMES = frames(10)
+
+
+def run(segmenter: Sides, settings: list[str] | None = None) -> SlamSystem:
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, settings or []), segmenter)
+    for frame in FRAMES:
+        system.process(frame)
+    return system
+
+
+@pytest.fixture(scope="module")
+def at_once() -> SlamSystem:
+    return run(Sides(FRAMES), MANY_KEYFRAMES)
+
+
+def estimates(system: SlamSystem) -> LabelEstimates:
+    found = system.landmarks().labels
+    assert found is not None
+    return found.estimates
+
+
+def right_share(system: SlamSystem) -> float:
+    """Of the landmarks that are known to be something, how many are what they are."""
+    cloud, found = system.landmarks(), estimates(system)
+    known = found.labels > 0
+    truth = np.where(cloud.points_world[:, 0] < EDGE_M, 1, 2)
+    assert known.mean() > 0.9
+    return float((found.labels == truth)[known].mean())
+
+
+def test_landmarks_get_the_label_of_what_they_are_on(at_once: SlamSystem) -> None:
+    assert right_share(at_once) > 0.995
+    assert np.median(estimates(at_once).probability) > 0.97
+    assert estimates(at_once).views.max() > 5
+
+
+def late_system() -> SlamSystem:
+    segmenter = Sides(FRAMES, late=True)
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, MANY_KEYFRAMES), segmenter)
+    system.semantics._done.add(-1)  # so that a segmenter's refusal is no reason to end the run
+    for frame in FRAMES:
+        system.process(frame)
+    return system
+
+
+def test_late_masks_in_any_order_say_the_same(at_once: SlamSystem) -> None:
+    system = late_system()
+    world, culled = system.mapper.world, system.mapper.world.culled
+    assert len(culled) > 2
+    numbers = {k: keyframe_number(system, k) for k in (*world.keyframes, *culled)}
+    order = np.random.default_rng(0).permutation(sorted(numbers))
+    for k in order.tolist():
+        instances = system.semantics.segmenter.instances(numbers[k])  # type: ignore[attr-defined]
+        done = system.semantics.attach(k, instances, system.mapper)
+        assert done.refused == ""
+        assert len(done.landmark_ids) > (0 if k in culled else 100)
+    assert right_share(system) > 0.995
+    same = estimates(system).labels == estimates(at_once).labels
+    assert same.mean() > 0.99
+    assert system.semantics._waiting == {}
+
+
+def keyframe_number(system: SlamSystem, keyframe_id: int) -> int:
+    """Every frame is a keyframe."""
+    assert system.mapper.world.next_keyframe_id == len(FRAMES)
+    return keyframe_id
+
+
+def test_masks_that_come_twice_count_once(at_once: SlamSystem) -> None:
+    semantics, before = at_once.semantics, at_once.semantics.state()
+    for k in (3, *list(at_once.mapper.world.culled)[:2]):
+        done = semantics.attach(k, Sides(FRAMES).instances(k), at_once.mapper)
+        assert "already" in done.refused
+    unknown = semantics.attach(4711, Sides(FRAMES).instances(0), at_once.mapper)
+    assert "not in the map" in unknown.refused
+    after = semantics.state()
+    assert all(np.array_equal(after[name], before[name]) for name in before)
+
+
+def test_masks_of_another_size_are_refused_and_change_nothing() -> None:
+    system = late_system()
+    small = np.ones((10, 10), bool)
+    bad = Instance(small, mask_box(small), 1, certain(1, 3), 1.0, 1.0)
+    with pytest.raises(InputError, match="shape"):
+        system.semantics.attach(3, [bad], system.mapper)
+    assert system.semantics.labels.known().tolist() == []
+    assert system.semantics.attach(3, Sides(FRAMES).instances(3), system.mapper).refused == ""
+
+
+def test_fused_and_culled_landmarks_are_followed(at_once: SlamSystem) -> None:
+    """No label is kept of what is not in the map any more."""
+    semantics, landmarks = at_once.semantics, at_once.mapper.world.landmarks
+    semantics.follow(at_once.mapper)
+    assert landmarks.alive[semantics.labels.known()].all()
+    a, b, gone = semantics.labels.known()[[3, 8, 12]]
+    both = semantics.labels.estimates(np.array([a, b])).views.sum()
+    world = at_once.mapper.world
+    world.replace_landmarks(np.array([a]), np.array([b]))
+    landmarks.remove(np.array([gone]))
+    semantics.follow(at_once.mapper)
+    assert semantics.labels.estimates(np.array([a, b, gone])).views.tolist() == [0, both, 0]
+
+
+def test_the_estimate_is_the_same_with_and_without_masks(at_once: SlamSystem) -> None:
+    without = SlamSystem(CAMERA, resolve(SystemConfig, None, MANY_KEYFRAMES))
+    for frame in FRAMES:
+        without.process(frame)
+    poses = [s.trajectory().poses_world_camera for s in (without, at_once)]
+    assert np.array_equal(*poses)
+    assert without.landmarks().labels is None
+    assert without.semantics.state()["labels.ids"].size == 0
+
+
+def test_the_first_keyframe_must_have_masks_the_others_may_lack_them() -> None:
+    class Sometimes(Sides):
+        def segment(self, image: Image, name: str) -> list[Instance]:
+            if name == "rgb/3.png":
+                raise InputError(f"{name}: not there")
+            return super().segment(image, name)
+
+    system = run(Sometimes(FRAMES), MANY_KEYFRAMES)
+    assert 3 in system.semantics._waiting
+    with pytest.raises(InputError, match="still being"):
+        run(Sides(FRAMES, late=True))
+
+
+def test_a_map_goes_on_with_its_own_labels_or_without_masks() -> None:
+    system = run(Sides(FRAMES))
+    state = system.state()
+
+    class Others(Sides):
+        labels = label_set(("up", "down"))
+
+    with pytest.raises(InputError, match="take the segmenter that it was made with"):
+        SlamSystem(CAMERA, SystemConfig(), Others(FRAMES)).restore(state, FILE)
+    silent = SlamSystem(CAMERA, SystemConfig())
+    silent.restore(state, FILE)
+    assert np.array_equal(estimates(silent).labels, estimates(system).labels)
+    silent.begin_session()
+    silent.process(FRAMES[0])
+    assert np.array_equal(estimates(silent).views, estimates(system).views)
+    unlabelled = SlamSystem(CAMERA, SystemConfig())
+    for frame in FRAMES[:3]:
+        unlabelled.process(frame)
+    fresh = SlamSystem(CAMERA, SystemConfig(), Sides(FRAMES))
+    fresh.restore(unlabelled.state(), FILE)
+    for frame in FRAMES[3:]:
+        fresh.process(frame)
+    assert right_share(fresh) > 0.99
+
+
+def test_files(at_once: SlamSystem, tmp_path: Path) -> None:
+    from graph.ply import read_ply
+
+    cloud = at_once.landmarks()
+    write_labels(tmp_path / "labels.csv", cloud)
+    write_landmarks(tmp_path / "landmarks.ply", cloud)
+    table, points = read_labels(tmp_path), read_ply(tmp_path / "landmarks.ply")
+    assert np.array_equal(table.ids, points["id"])
+    assert set(table.labels) <= {"unknown", "left", "right"}
+    names = ("unknown", "left", "right")
+    assert [names[k] for k in points["label"]] == list(table.labels)
+    assert np.allclose(table.probability, points["probability"], atol=1e-5)
+    assert np.allclose(table.entropy, points["entropy"], atol=1e-5)
+    (tmp_path / "labels.csv").write_text("id,label\n")
+    with pytest.raises(InputError, match="columns"):
+        read_labels(tmp_path)
