@@ -169,12 +169,12 @@ class SemanticMapper:
     def state(self) -> Arrays:
         """All that was learned, as named arrays."""
         waiting = list(self._waiting.values())
-        shape = (self.camera.height // DEPTH_STEP, self.camera.width // DEPTH_STEP)
         return {
             "names": np.array(self.names.names),
             "done": np.array(sorted(self._done), np.int64),
             "waiting": np.array(list(self._waiting), np.int64),
-            "waiting_depth_m": np.array(waiting, np.float32).reshape(-1, *shape),
+            "waiting_shape": np.array([depth_m.shape for depth_m in waiting], np.int64).ravel(),
+            "waiting_depth_m": np.array(waiting, np.float32).ravel(),
             **nested(labels=self.labels.state()),
         }
 
@@ -196,7 +196,14 @@ class SemanticMapper:
         if len(names) == len(self.names):
             self.labels.restore(part(state, "labels"))
         self._done = set(state["done"].tolist())
-        self._waiting = dict(zip(state["waiting"].tolist(), state["waiting_depth_m"], strict=True))
+        waiting = state["waiting"].tolist()
+        shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
+        depths_m = state["waiting_depth_m"].reshape(len(waiting), *shape)
+        self._waiting = dict(zip(waiting, depths_m, strict=True))
+
+    def begin_session(self) -> None:
+        """Masks of keyframes of an earlier recording are not waited for."""
+        self._waiting = {}
 
     def _view(self, keyframe_id: int, mapper: Mapper) -> _View | None:
         world = mapper.world

@@ -123,6 +123,7 @@ class SlamSystem:
         self._frames_since_keyframe = 0
         self._first_keyframe = world.next_keyframe_id
         self.mapper.begin_session()
+        self.semantics.begin_session()
         self.localiser.forget(self.config.relocalisation.patience_frames)
 
     def prepare(self, frame: Frame) -> Features:
