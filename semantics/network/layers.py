@@ -83,6 +83,15 @@ class ConvBlock(nn.Sequential):
         return F.relu_(y) if self.relu else y
 
 
+def keep_variance(module: nn.Module) -> None:
+    """Draw all weights inside so that ReLU layers keep the variance (He et al. 2015)."""
+    for part in module.modules():
+        if isinstance(part, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
+            nn.init.kaiming_normal_(part.weight, nonlinearity="relu")
+            if part.bias is not None:
+                nn.init.zeros_(part.bias)
+
+
 def conv_stack(channels: int, width: int, count: int, norm: NormKind) -> list[ConvBlock]:
     """3x3 blocks one after the other, the first from ``channels`` to ``width``."""
     inputs = [channels, *[width] * (count - 1)]

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from semantics.network.config import NetworkConfig
-from semantics.network.layers import ConvBlock, NormKind, conv_stack
+from semantics.network.layers import ConvBlock, NormKind, conv_stack, keep_variance
 
 BINS = 14
 """RoIAlign bins of both heads; masks have twice as many."""
@@ -18,7 +18,9 @@ BINS = 14
 def make_mask_head(config: NetworkConfig) -> nn.Sequential:
     """Four 3x3 convolutions: (R, C, 14, 14) to (R, mask_channels, 14, 14)."""
     norm: NormKind = "batch" if config.norm == "batch" else "none"
-    return nn.Sequential(*conv_stack(config.channels, config.mask_channels, 4, norm))
+    head = nn.Sequential(*conv_stack(config.channels, config.mask_channels, 4, norm))
+    keep_variance(head)
+    return head
 
 
 class MaskPredictor(nn.Module):
@@ -28,6 +30,7 @@ class MaskPredictor(nn.Module):
         super().__init__()
         self.conv5_mask = nn.ConvTranspose2d(channels, channels, 2, 2)
         self.mask_fcn_logits = nn.Conv2d(channels, outputs, 1)
+        keep_variance(self)
 
     def forward(self, x: Tensor) -> Tensor:
         """(R, channels, 14, 14) to logits (R, outputs, 28, 28)."""
@@ -51,6 +54,7 @@ class MaskIoUHead(nn.Module):
         self.maskiou_fc1 = nn.Linear(width * (BINS // 2) ** 2, hidden)
         self.maskiou_fc2 = nn.Linear(hidden, hidden)
         self.maskiou = nn.Linear(hidden, config.mask_outputs)
+        keep_variance(self)
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
         """IoUs (R, outputs) of mask probabilities (R, 28, 28) with features (R, C, 14, 14)."""

@@ -21,6 +21,9 @@ class FeaturePyramid(nn.Module):
         self.inner_blocks = nn.ModuleList(inner)
         layer = [ConvBlock((channels, channels), 3, norm, relu=False) for _ in inputs]
         self.layer_blocks = nn.ModuleList(layer)
+        for conv in self.modules():
+            if isinstance(conv, nn.Conv2d):
+                nn.init.kaiming_uniform_(conv.weight, a=1)
 
     def forward(self, features: Sequence[Tensor]) -> list[Tensor]:
         """Levels (B, channels, H_l, W_l), finest first; one more than there are features."""

@@ -25,6 +25,9 @@ class RPNHead(nn.Module):
         self.conv = nn.Sequential(*conv_stack(channels, channels, convs, "none"))
         self.cls_logits = nn.Conv2d(channels, len(RATIOS), 1)
         self.bbox_pred = nn.Conv2d(channels, 4 * len(RATIOS), 1)
+        for conv in self.modules():
+            if isinstance(conv, nn.Conv2d):
+                nn.init.normal_(conv.weight, std=0.01)
 
     def forward(self, levels: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Logits (B, A_l) and offsets (B, A_l, 4) of each level, in the anchors' order."""

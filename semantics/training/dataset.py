@@ -76,6 +76,11 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.images)
 
+    @property
+    def upright(self) -> NDArray[np.bool_]:
+        """Which images are higher than wide."""
+        return np.array([image.height > image.width for image in self.images])
+
     def load(self, index: int) -> Sample:
         """One image with its objects.
 
@@ -106,6 +111,11 @@ class JoinedDatasets:
 
     def __len__(self) -> int:
         return int(self._ends[-1])
+
+    @property
+    def upright(self) -> NDArray[np.bool_]:
+        """Which images are higher than wide."""
+        return np.concatenate([part.upright for part in self._parts])
 
     def load(self, index: int) -> Sample:
         """One image with its objects. Raises InputError."""

@@ -31,6 +31,7 @@ CURVES = "losses.csv"
 WEIGHTS = "weights.safetensors"
 MASKIOU = "maskiou"
 Only = Literal["", "masks", "maskiou"]
+BODY = "backbone.body."
 BOX_PARTS = ("rpn.", "roi_heads.box_")
 
 
@@ -43,6 +44,7 @@ class TrainingConfig:
         batch: images in a batch.
         optimiser: "adamw", or "sgd" with momentum 0.9.
         rate: learning rate after the warm-up; it falls to nothing along a half cosine.
+        body_rate: factor on the rate for the body, which has learnt before.
         warm_up: steps over which the rate rises.
         decay: weight decay.
         max_gradient: gradients longer than this are shortened.
@@ -59,6 +61,7 @@ class TrainingConfig:
     batch: int = 2
     optimiser: Literal["adamw", "sgd"] = "adamw"
     rate: float = 5e-4
+    body_rate: float = 0.2
     warm_up: int = 100
     decay: float = 1e-4
     max_gradient: float = 10.0
@@ -94,7 +97,7 @@ def train(
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = network.model.to(device).train()
     parameters = trainable(model, config)
-    optimiser = _optimiser(parameters, config)
+    optimiser = _optimiser(model, config)
     halves = device == "cuda" and config.precision == "mixed"
     scaler = torch.amp.GradScaler(device, enabled=halves)
     out.mkdir(parents=True, exist_ok=True)
@@ -148,10 +151,17 @@ def _learns(name: str, only: Only) -> bool:
     return only != "masks" or not name.startswith(BOX_PARTS)
 
 
-def _optimiser(parameters: list[nn.Parameter], config: TrainingConfig) -> torch.optim.Optimizer:
+def _optimiser(model: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
+    """Over what is trained, in groups that say their share of the rate."""
+    learning = [(n, p) for n, p in model.named_parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for n, p in learning if n.startswith(BODY)], "share": config.body_rate},
+        {"params": [p for n, p in learning if not n.startswith(BODY)], "share": 1.0},
+    ]
+    groups = [group for group in groups if group["params"]]
     if config.optimiser == "sgd":
-        return torch.optim.SGD(parameters, config.rate, momentum=0.9, weight_decay=config.decay)
-    return torch.optim.AdamW(parameters, config.rate, weight_decay=config.decay)
+        return torch.optim.SGD(groups, config.rate, momentum=0.9, weight_decay=config.decay)
+    return torch.optim.AdamW(groups, config.rate, weight_decay=config.decay)
 
 
 def _set_rate(optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig) -> None:
@@ -159,7 +169,7 @@ def _set_rate(optimiser: torch.optim.Optimizer, step: int, config: TrainingConfi
     warm = min((step + 1) / max(config.warm_up, 1), 1.0)
     cosine = 0.5 * (1 + math.cos(math.pi * step / config.steps))
     for group in optimiser.param_groups:
-        group["lr"] = config.rate * warm * cosine
+        group["lr"] = config.rate * warm * cosine * group["share"]
 
 
 def _step_losses(
@@ -178,7 +188,9 @@ def _step_losses(
 def _batch(
     data: Dataset | JoinedDatasets, rng: np.random.Generator, config: TrainingConfig, device: str
 ) -> Iterator[tuple[Tensor, Target]]:
-    for index in rng.integers(len(data), size=config.batch).tolist():
+    first = int(rng.integers(len(data)))  # the others are as wide or as high: little padding
+    alike = np.flatnonzero(data.upright == data.upright[first])
+    for index in [first, *rng.choice(alike, config.batch - 1).tolist()]:
         other = data.load(int(rng.integers(len(data))))
         image, target = as_tensors(augmented(data.load(index), other, config.augment, rng))
         moved = Target(*(t.to(device) for t in (target.boxes, target.labels, target.masks)))
