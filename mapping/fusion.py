@@ -1,0 +1,173 @@
+"""Step 4: a keyframe's map fused with what its neighbours know of the same surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from graph.camera import Camera
+from graph.geometry import inverse
+from mapping.inverse_depth import COMPATIBLE, InverseDepthMap
+from mapping.regularisation import set_order
+from mapping.warping import View, hypothesis, image_grid, moved, project
+
+MAX_NEIGHBOURS = 6
+MAX_COLOUR_STEP = 15.0
+MEDIAN_CHI2 = 0.455
+SAMPLE_STEP, MIN_SAMPLE = 4, 200
+MAX_FACTOR = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """What Step 4 makes of a keyframe.
+
+    Attributes:
+        map: the fused estimates.
+        views: (H, W) uint8, how many keyframes each rests on, its own among them.
+    """
+
+    map: InverseDepthMap
+    views: Tensor
+
+
+def fuse(
+    own: InverseDepthMap,
+    neighbours: Sequence[View],
+    camera: Camera,
+    image: Tensor | None = None,
+) -> Fused:
+    """Fuse a map with up to six neighbours' by paper eq. (8) over compatible hypotheses.
+
+    Each neighbour gives one hypothesis a pixel (`mapping.warping.hypothesis`) about the point at
+    rho_0: the own estimate, or where there is none the nearest surface that the neighbours see
+    there. Of the own estimate and the hypotheses the largest mutually compatible set is fused,
+    rho = sum(rho_j / sigma_j^2) / sum(1 / sigma_j^2) and sigma^2 = 1 / sum(1 / sigma_j^2), since
+    these are independent views. An own estimate that nobody shares stays, unless a neighbour
+    sees through it; a surface that only one neighbour shows is not taken, nor, where there are
+    images (3, H, W), one that has another colour there.
+    """
+    views = neighbours[:MAX_NEIGHBOURS]
+    seeds = seeded(own, views, camera)
+    empty = ~own.known
+    hypotheses = [hypothesis(torch.where(empty, seeds, own.rho), v, camera) for v in views]
+    own_scale, scaled = honest(own, hypotheses)
+    rho, weight = [torch.nan_to_num(own.rho)], [_weight(own.variance * own_scale)]
+    through = torch.zeros_like(empty)
+    for view, (mean, variance) in zip(views, scaled, strict=True):
+        if image is not None and view.image is not None:
+            drop_other_colours(seeds, variance, (image, view), camera)
+        weight.append(_weight(variance))
+        rho.append(torch.nan_to_num(mean))
+        through |= (rho[-1] < rho[0]) & (weight[-1] > 0)
+    members = compatible_members(rho, weight)
+    alone = (members == 0) & ~empty & ~through
+    members = torch.where(alone, 1, members)
+    total, norm = torch.zeros_like(seeds), torch.zeros_like(seeds)
+    count = torch.zeros_like(members)
+    for k, (rho_k, weight_k) in enumerate(zip(rho, weight, strict=True)):
+        used = (members >> k) & 1
+        count += used
+        weight_k = weight_k * used
+        norm += weight_k
+        total += weight_k.mul_(rho_k)
+    fused = InverseDepthMap(total / norm, 1 / norm).where(members > 0)
+    return Fused(fused, count.to(torch.uint8))
+
+
+def honest(
+    own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Tensor]]
+) -> tuple[float, list[tuple[Tensor, Tensor]]]:
+    """A factor for the own variance, and the hypotheses with variances that agree with the data.
+
+    The squared differences of two views have a mean of sigma_0^2 + sigma_j^2 if the variances are
+    right, and their median is 0.455 times that. What they really are says that of each pair:
+    Step 3 states the least variance of correlated neighbours, which is too large, and an error
+    of the relative pose makes it too small. The own factor is the least of all pairs.
+    """
+    factors = []
+    for mean, variance in hypotheses:
+        step = (slice(None, None, SAMPLE_STEP),) * 2
+        ratio = (own.rho[step] - mean[step]) ** 2 / (own.variance[step] + variance[step])
+        ratio = ratio[torch.isfinite(ratio)]
+        factor = float(ratio.median()) / MEDIAN_CHI2 if len(ratio) >= MIN_SAMPLE else 1.0
+        factors.append(min(max(factor, 1 / MAX_FACTOR), MAX_FACTOR))
+    least = min(factors, default=1.0)
+    base = torch.nan_to_num(own.variance)
+    return least, [
+        (mean, variance * factor + base * (factor - least))
+        for (mean, variance), factor in zip(hypotheses, factors, strict=True)
+    ]
+
+
+def drop_other_colours(
+    seeds: Tensor, variance: Tensor, images: tuple[Tensor, View], camera: Camera
+) -> None:
+    """Make the hypotheses NaN in place whose surface has another colour in the neighbour."""
+    own, view = images
+    assert view.image is not None
+    rows, columns = torch.nonzero(torch.isfinite(seeds) & torch.isfinite(variance)).unbind(-1)
+    pixels = (columns.to(torch.float32), rows.to(torch.float32))
+    u, v, _ = project(seeds[rows, columns], inverse(view.T_own_neighbour), camera, pixels)
+    height, width = seeds.shape
+    u, v = u.round().clamp(0, width - 1).long(), v.round().clamp(0, height - 1).long()
+    apart = (own[:, rows, columns] - view.image[:, v, u]).abs().amax(0)
+    other = apart > MAX_COLOUR_STEP
+    variance[rows[other], columns[other]] = torch.nan
+
+
+def _weight(variance: Tensor) -> Tensor:
+    """1 / sigma^2, 0 where nothing is known."""
+    return torch.nan_to_num(1 / variance, nan=0.0, posinf=0.0)
+
+
+def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tensor:
+    """Inverse depth (H, W) of the nearest surface that neighbours see where ``own`` has none."""
+    height, width = own.rho.shape
+    seeds = torch.zeros(height * width, dtype=torch.float32, device=own.rho.device)
+    empty = ~own.known.reshape(-1)
+    for view in views:
+        u, v, ahead = project(view.map.rho, view.T_own_neighbour, camera)
+        column, row = u.round_(), v.round_()
+        inside = ahead & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        target = torch.where(inside, row * width + column, 0).to(torch.int64)
+        chosen = torch.nonzero(inside & empty[target])
+        rows, columns = chosen.unbind(-1)
+        pixels = (columns.to(torch.float32), rows.to(torch.float32))
+        rho, _ = moved(view.map.rho[rows, columns], view.T_own_neighbour, camera, pixels)
+        seeds.scatter_reduce_(0, target[rows, columns], rho, "amax")
+    seeds = seeds.reshape(height, width)
+    return torch.where(seeds > 0, seeds, torch.nan)
+
+
+def compatible_members(rho: Sequence[Tensor], weight: Sequence[Tensor]) -> Tensor:
+    """Bit masks (H, W) int64 of the largest mutually compatible sets of two or more estimates.
+
+    ``rho`` and ``weight`` hold one (H, W) for each of up to seven keyframes; the weight is 0 where
+    it says nothing. 0 where no two are compatible; of equal sets the one with early members.
+    """
+    pairs = list(combinations(range(len(rho)), 2))
+    code = torch.zeros(rho[0].shape, dtype=torch.int32, device=rho[0].device)
+    for k, (i, j) in enumerate(pairs):
+        distance = (rho[i] - rho[j]).square_().mul_(weight[i] + weight[j])
+        agree = (distance < COMPATIBLE) & (weight[i] > 0) & (weight[j] > 0)
+        code |= agree.to(torch.int32) << k
+    return _largest_sets(len(rho)).to(code.device)[code.to(torch.int64)].to(torch.int64)
+
+
+@cache
+def _largest_sets(n: int) -> Tensor:
+    """For every set of compatible pairs, as a bit mask, the largest set of members."""
+    pairs = list(combinations(range(n), 2))
+    codes = np.arange(1 << len(pairs), dtype=np.int32)
+    table = np.zeros(len(codes), np.uint8)
+    for subset in reversed(set_order(n)):
+        needed = sum(1 << k for k, (i, j) in enumerate(pairs) if subset >> i & subset >> j & 1)
+        table[codes & needed == needed] = subset
+    return torch.from_numpy(table)

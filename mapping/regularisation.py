@@ -1,0 +1,104 @@
+"""Steps 3 and 5: outliers of a map removed and its holes filled by the eight neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mapping.inverse_depth import COMPATIBLE, InverseDepthMap
+
+OFFSETS = tuple((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0))
+MIN_SUPPORT = 2
+DISSENT = 0
+
+
+def regularise(given: InverseDepthMap, fill: bool = True) -> InverseDepthMap:
+    """A map smoothed, cleaned and, where ``fill``, completed at the rims of its holes.
+
+    Neighbours x and y are compatible where (rho_x - rho_y)^2 (1/sigma_x^2 + 1/sigma_y^2) < 5.99. A
+    pixel with fewer than two compatible neighbours is dropped; else it and they are fused by
+    paper eq. (7), corrected: rho = sum(rho_j / sigma_j^2) / sum(1 / sigma_j^2). The variance is the
+    least of the set, since neighbours are correlated. An empty pixel is filled in the same way
+    from the largest set of mutually compatible neighbours, if that has two at least.
+    """
+    rho = torch.nan_to_num(given.rho)
+    weight = torch.where(given.known, 1 / given.variance, torch.zeros_like(rho))
+    rhos, weights = _padded(rho), _padded(weight)
+    count = torch.zeros_like(rho)
+    total, norm, best = rho * weight, weight.clone(), weight.clone()
+    for offset in OFFSETS:
+        rho_j, weight_j = _shifted(rhos, offset), _shifted(weights, offset)
+        distance = (rho - rho_j).square_().mul_(weight + weight_j)
+        agreeing = ((distance < COMPATIBLE) & (weight_j > 0)).to(rho.dtype)
+        count += agreeing
+        weight_j = agreeing.mul_(weight_j)
+        norm += weight_j
+        total += weight_j.mul(rho_j)
+        torch.maximum(best, weight_j, out=best)
+    cleaned = InverseDepthMap(total / norm, 1 / best).where(given.known & (count >= MIN_SUPPORT))
+    return _filled(given, cleaned) if fill else cleaned
+
+
+def _padded(values: Tensor) -> Tensor:
+    """With a rim of zeros one pixel wide."""
+    return torch.nn.functional.pad(values, (1, 1, 1, 1))
+
+
+def _shifted(padded: Tensor, offset: tuple[int, int]) -> Tensor:
+    """The view (H, W) of every pixel's neighbour at an offset (rows, columns)."""
+    height, width = padded.shape[0] - 2, padded.shape[1] - 2
+    dy, dx = offset
+    return padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+
+
+def _filled(given: InverseDepthMap, cleaned: InverseDepthMap) -> InverseDepthMap:
+    """``cleaned``, with what was empty in ``given`` filled from its neighbours there."""
+    known = given.known
+    around = torch.nn.functional.avg_pool2d(
+        known[None].to(torch.float32), 3, 1, 1, divisor_override=1
+    )[0]
+    rows, columns = torch.nonzero(~known & (around >= MIN_SUPPORT), as_tuple=True)
+    rho_j, variance_j = (
+        torch.stack(
+            [_shifted(_padded(values), offset)[rows, columns] for offset in OFFSETS], dim=-1
+        )
+        for values in (torch.nan_to_num(given.rho), torch.nan_to_num(given.variance))
+    )
+    members = largest_compatible_set(rho_j, torch.where(variance_j > 0, 1 / variance_j, 0.0))
+    weight_j = torch.where(members, 1 / variance_j, 0.0)
+    enough = (members.sum(-1) >= MIN_SUPPORT) & (members.sum(-1) >= (variance_j > 0).sum(-1) - DISSENT)
+    rows, columns, weight_j, rho_j = (a[enough] for a in (rows, columns, weight_j, rho_j))
+    rho, variance = cleaned.rho.clone(), cleaned.variance.clone()
+    rho[rows, columns] = (weight_j * rho_j).sum(-1) / weight_j.sum(-1)
+    variance[rows, columns] = 1 / weight_j.amax(-1)
+    return InverseDepthMap(rho, variance)
+
+
+def largest_compatible_set(rho: Tensor, weight: Tensor) -> Tensor:
+    """Members (N, 8) bool of the largest set of mutually compatible estimates in each row.
+
+    ``rho`` (N, 8) with weights 1 / sigma^2 (N, 8), 0 where there is none. Of equally large sets
+    the first in the order of `set_order` is taken; one alone is no set.
+    """
+    n = rho.shape[-1]
+    distance = (rho[:, :, None] - rho[:, None]) ** 2 * (weight[:, :, None] + weight[:, None])
+    there = weight > 0
+    pairs = (distance < COMPATIBLE) & there[:, :, None] & there[:, None]
+    bits = 1 << torch.arange(n, device=rho.device)
+    clashing = (~pairs * bits).sum(-1) & ~bits  # (N, n): who cannot be with member i
+    clean = [torch.ones(len(rho), dtype=torch.bool, device=rho.device)]
+    chosen = torch.zeros(len(rho), dtype=torch.int64, device=rho.device)
+    for subset in range(1, 1 << n):
+        lowest = (subset & -subset).bit_length() - 1
+        clean.append(clean[subset & (subset - 1)] & ((clashing[:, lowest] & subset) == 0))
+    for subset in set_order(n):
+        chosen = torch.where((chosen == 0) & clean[subset], subset, chosen)
+    return (chosen[:, None] & bits) != 0
+
+
+def set_order(n: int) -> list[int]:
+    """Sets of two to n members as bit masks: larger ones first, then those of early members."""
+    subsets = [s for s in range(1, 1 << n) if s.bit_count() > 1]
+    return sorted(subsets, key=lambda s: (-s.bit_count(), [-(s >> i & 1) for i in range(n)]))
