@@ -13,7 +13,7 @@ from torch import Tensor
 
 from graph.camera import Camera
 from graph.geometry import inverse
-from mapping.inverse_depth import COMPATIBLE, InverseDepthMap
+from mapping.inverse_depth import COMPATIBLE, InverseDepthMap, squared_gradient
 from mapping.regularisation import set_order
 from mapping.warping import View, hypothesis, image_grid, moved, project
 
@@ -21,7 +21,10 @@ MAX_NEIGHBOURS = 6
 MAX_COLOUR_STEP = 15.0
 MEDIAN_CHI2 = 0.455
 SAMPLE_STEP, MIN_SAMPLE = 4, 200
-MAX_FACTOR = 20.0
+FACTOR_RANGE = (0.1, 20.0)
+BLUR_PX = 0.45
+RIM_STEP = 1.05
+"""Next to a surface that is nearer by more, nothing is seeded: it may be its rim."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +34,12 @@ class Fused:
     Attributes:
         map: the fused estimates.
         views: (H, W) uint8, how many keyframes each rests on, its own among them.
+        factor: see ``variance_factor``.
     """
 
     map: InverseDepthMap
     views: Tensor
+    factor: float
 
 
 def fuse(
@@ -57,10 +62,10 @@ def fuse(
     seeds = seeded(own, views, camera)
     empty = ~own.known
     hypotheses = [hypothesis(torch.where(empty, seeds, own.rho), v, camera) for v in views]
-    own_scale, scaled = honest(own, hypotheses)
-    rho, weight = [torch.nan_to_num(own.rho)], [_weight(own.variance * own_scale)]
+    factor = variance_factor(own, hypotheses)
+    rho, weight = [torch.nan_to_num(own.rho)], [_weight(own.variance)]
     through = torch.zeros_like(empty)
-    for view, (mean, variance) in zip(views, scaled, strict=True):
+    for view, (mean, variance) in zip(views, hypotheses, strict=True):
         if image is not None and view.image is not None:
             drop_other_colours(seeds, variance, (image, view), camera)
         weight.append(_weight(variance))
@@ -78,32 +83,33 @@ def fuse(
         norm += weight_k
         total += weight_k.mul_(rho_k)
     fused = InverseDepthMap(total / norm, 1 / norm).where(members > 0)
-    return Fused(fused, count.to(torch.uint8))
+    return Fused(fused, count.to(torch.uint8), factor)
 
 
-def honest(
-    own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Tensor]]
-) -> tuple[float, list[tuple[Tensor, Tensor]]]:
-    """A factor for the own variance, and the hypotheses with variances that agree with the data.
+def variance_factor(own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Tensor]]) -> float:
+    """By how much the variances (H, W) that views state must be multiplied to agree with them.
 
-    The squared differences of two views have a mean of sigma_0^2 + sigma_j^2 if the variances are
-    right, and their median is 0.455 times that. What they really are says that of each pair:
-    Step 3 states the least variance of correlated neighbours, which is too large, and an error
-    of the relative pose makes it too small. The own factor is the least of all pairs.
+    The squared difference of two views over sigma_0^2 + sigma_j^2 has the median 0.455 if both are
+    right. Step 3 states the least variance of correlated neighbours, which is too large, an error
+    of the relative pose makes it too small. The median of all neighbours' factors.
     """
-    factors = []
+    factors, step = [], (slice(None, None, SAMPLE_STEP),) * 2
     for mean, variance in hypotheses:
-        step = (slice(None, None, SAMPLE_STEP),) * 2
         ratio = (own.rho[step] - mean[step]) ** 2 / (own.variance[step] + variance[step])
         ratio = ratio[torch.isfinite(ratio)]
-        factor = float(ratio.median()) / MEDIAN_CHI2 if len(ratio) >= MIN_SAMPLE else 1.0
-        factors.append(min(max(factor, 1 / MAX_FACTOR), MAX_FACTOR))
-    least = min(factors, default=1.0)
-    base = torch.nan_to_num(own.variance)
-    return least, [
-        (mean, variance * factor + base * (factor - least))
-        for (mean, variance), factor in zip(hypotheses, factors, strict=True)
-    ]
+        if len(ratio) >= MIN_SAMPLE:
+            factors.append(float(ratio.median()) / MEDIAN_CHI2)
+    return float(np.clip(np.median(factors), *FACTOR_RANGE)) if factors else 1.0
+
+
+def stated(final: InverseDepthMap, factor: float) -> InverseDepthMap:
+    """A map with its honest variance: the factor's, and what smoothing did to it.
+
+    Steps 3 and 5 and the reading between pixels move a depth in the image by BLUR_PX, which adds
+    (BLUR_PX |grad rho|)^2.
+    """
+    blur = BLUR_PX**2 * squared_gradient(final.rho)
+    return InverseDepthMap(final.rho, factor * final.variance + blur)
 
 
 def drop_other_colours(
@@ -143,7 +149,8 @@ def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tenso
         rho, _ = moved(view.map.rho[rows, columns], view.T_own_neighbour, camera, pixels)
         seeds.scatter_reduce_(0, target[rows, columns], rho, "amax")
     seeds = seeds.reshape(height, width)
-    return torch.where(seeds > 0, seeds, torch.nan)
+    around = torch.nn.functional.max_pool2d(torch.nan_to_num(own.rho)[None], 3, 1, 1)[0]
+    return torch.where((seeds > 0) & (around < RIM_STEP * seeds), seeds, torch.nan)
 
 
 def compatible_members(rho: Sequence[Tensor], weight: Sequence[Tensor]) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -11,20 +9,21 @@ from mapping.inverse_depth import COMPATIBLE, InverseDepthMap
 
 OFFSETS = tuple((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0))
 MIN_SUPPORT = 2
-DISSENT = 0
+FILL_SUPPORT = 5
+"""The paper's 2 also fills the rim of silhouettes, from whichever side has more pixels."""
 
 
-def regularise(given: InverseDepthMap, fill: bool = True) -> InverseDepthMap:
-    """A map smoothed, cleaned and, where ``fill``, completed at the rims of its holes.
+def regularise(given: InverseDepthMap, fill_support: int = FILL_SUPPORT) -> InverseDepthMap:
+    """A map smoothed, cleaned and completed at the rims of its holes.
 
     Neighbours x and y are compatible where (rho_x - rho_y)^2 (1/sigma_x^2 + 1/sigma_y^2) < 5.99. A
     pixel with fewer than two compatible neighbours is dropped; else it and they are fused by
     paper eq. (7), corrected: rho = sum(rho_j / sigma_j^2) / sum(1 / sigma_j^2). The variance is the
     least of the set, since neighbours are correlated. An empty pixel is filled in the same way
-    from the largest set of mutually compatible neighbours, if that has two at least.
+    from the largest set of mutually compatible neighbours, if that has ``fill_support``.
     """
     rho = torch.nan_to_num(given.rho)
-    weight = torch.where(given.known, 1 / given.variance, torch.zeros_like(rho))
+    weight = _weight(given)
     rhos, weights = _padded(rho), _padded(weight)
     count = torch.zeros_like(rho)
     total, norm, best = rho * weight, weight.clone(), weight.clone()
@@ -38,7 +37,7 @@ def regularise(given: InverseDepthMap, fill: bool = True) -> InverseDepthMap:
         total += weight_j.mul(rho_j)
         torch.maximum(best, weight_j, out=best)
     cleaned = InverseDepthMap(total / norm, 1 / best).where(given.known & (count >= MIN_SUPPORT))
-    return _filled(given, cleaned) if fill else cleaned
+    return _filled(given, cleaned, fill_support)
 
 
 def _padded(values: Tensor) -> Tensor:
@@ -53,27 +52,30 @@ def _shifted(padded: Tensor, offset: tuple[int, int]) -> Tensor:
     return padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
 
 
-def _filled(given: InverseDepthMap, cleaned: InverseDepthMap) -> InverseDepthMap:
+def _filled(given: InverseDepthMap, cleaned: InverseDepthMap, support: int) -> InverseDepthMap:
     """``cleaned``, with what was empty in ``given`` filled from its neighbours there."""
     known = given.known
     around = torch.nn.functional.avg_pool2d(
         known[None].to(torch.float32), 3, 1, 1, divisor_override=1
     )[0]
-    rows, columns = torch.nonzero(~known & (around >= MIN_SUPPORT), as_tuple=True)
-    rho_j, variance_j = (
-        torch.stack(
-            [_shifted(_padded(values), offset)[rows, columns] for offset in OFFSETS], dim=-1
-        )
-        for values in (torch.nan_to_num(given.rho), torch.nan_to_num(given.variance))
+    rows, columns = torch.nonzero(~known & (around >= support)).unbind(-1)
+    rho_j, weight_j = (
+        torch.stack([_shifted(padded, offset)[rows, columns] for offset in OFFSETS], dim=-1)
+        for padded in (_padded(torch.nan_to_num(given.rho)), _padded(_weight(given)))
     )
-    members = largest_compatible_set(rho_j, torch.where(variance_j > 0, 1 / variance_j, 0.0))
-    weight_j = torch.where(members, 1 / variance_j, 0.0)
-    enough = (members.sum(-1) >= MIN_SUPPORT) & (members.sum(-1) >= (variance_j > 0).sum(-1) - DISSENT)
+    members = largest_compatible_set(rho_j, weight_j)
+    weight_j = weight_j * members
+    enough = members.sum(-1) >= support
     rows, columns, weight_j, rho_j = (a[enough] for a in (rows, columns, weight_j, rho_j))
     rho, variance = cleaned.rho.clone(), cleaned.variance.clone()
     rho[rows, columns] = (weight_j * rho_j).sum(-1) / weight_j.sum(-1)
     variance[rows, columns] = 1 / weight_j.amax(-1)
     return InverseDepthMap(rho, variance)
+
+
+def _weight(given: InverseDepthMap) -> Tensor:
+    """1 / sigma^2, 0 where nothing is known."""
+    return torch.nan_to_num(1 / given.variance)
 
 
 def largest_compatible_set(rho: Tensor, weight: Tensor) -> Tensor:
