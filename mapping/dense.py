@@ -1,0 +1,153 @@
+"""Algorithm 1 over a stream of keyframes: Steps 1 to 6, the fusion delayed until neighbours exist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from graph.camera import Camera
+from graph.geometry import Array, inverse
+from mapping.fusion import MAX_NEIGHBOURS, fuse, stated
+from mapping.inverse_depth import DepthNoise, InverseDepthMap, from_sensor
+from mapping.regularisation import regularise
+from mapping.warping import View
+
+WINDOW = 6
+"""Keyframes on either side among which neighbours are chosen."""
+
+
+@dataclass(frozen=True, eq=False)
+class DenseKeyframe:
+    """What dense mapping needs of a keyframe.
+
+    Attributes:
+        id: its number in the map.
+        T_world_camera: (4, 4).
+        rgb: (H, W, 3) uint8, red first, undistorted.
+        depth_m: (H, W) float32 of the sensor, undistorted, NaN where missing.
+        landmark_ids: (L,) landmarks that it observes.
+        landmark_depths_m: (L,) their z in its camera.
+    """
+
+    id: int
+    T_world_camera: Array
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    landmark_ids: NDArray[np.int64]
+    landmark_depths_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FusedKeyframe:
+    """A keyframe after Step 5.
+
+    Attributes:
+        keyframe: what it was made of.
+        map: inverse depth with its honest variance.
+        views: (H, W) uint8, keyframes that each estimate rests on; 0 where Step 5 filled.
+    """
+
+    keyframe: DenseKeyframe
+    map: InverseDepthMap
+    views: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class DenseConfig:
+    """How keyframes are fused.
+
+    Attributes:
+        noise: of the depth sensor.
+        neighbours: at most so many are fused with a keyframe.
+        device: torch's name of where it is computed.
+    """
+
+    noise: DepthNoise = DepthNoise()
+    neighbours: int = MAX_NEIGHBOURS
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A keyframe after Step 3."""
+
+    keyframe: DenseKeyframe
+    map: InverseDepthMap
+    image: Tensor
+
+
+class DenseMapper:
+    """Takes keyframes one after the other and gives each back, fused, once six more came.
+
+    Memory is bounded: thirteen keyframes are held.
+    """
+
+    def __init__(self, camera: Camera, config: DenseConfig | None = None) -> None:
+        self.camera = camera
+        self.config = config or DenseConfig()
+        self._held: list[_Prepared] = []
+        self._done = 0  # of those held, counted from the oldest
+
+    def push(self, keyframe: DenseKeyframe) -> list[FusedKeyframe]:
+        """Take a keyframe in; the one for which all neighbours exist by that comes back."""
+        self._held.append(prepared(keyframe, self.camera, self.config))
+        return self._finished(len(self._held) - WINDOW)
+
+    def flush(self) -> list[FusedKeyframe]:
+        """What still waits for neighbours that will not come."""
+        return self._finished(len(self._held))
+
+    def _finished(self, end: int) -> list[FusedKeyframe]:
+        """Fuse those held up to ``end`` and let go of what nobody needs any more."""
+        results = [self._fuse(k) for k in range(self._done, end)]
+        self._done = max(self._done, end)
+        stale = max(self._done - WINDOW, 0)
+        del self._held[:stale]
+        self._done -= stale
+        return results
+
+    def _fuse(self, k: int) -> FusedKeyframe:
+        own = self._held[k]
+        window = self._held[max(k - WINDOW, 0) : k + WINDOW + 1]
+        others = {p.keyframe.id: p for p in window if p is not own}
+        chosen = neighbours(
+            own.keyframe, [p.keyframe for p in others.values()], self.config.neighbours
+        )
+        return fused(own, [others[n.id] for n in chosen], self.camera, self.config)
+
+
+def prepared(keyframe: DenseKeyframe, camera: Camera, config: DenseConfig) -> _Prepared:
+    """Steps 2 and 3 of a keyframe with sensor depth."""
+    measured = from_sensor(keyframe.depth_m, camera, config.noise, config.device)
+    blurred = np.ascontiguousarray(cv2.blur(keyframe.rgb, (3, 3)).transpose(2, 0, 1))
+    image = torch.from_numpy(blurred).to(config.device, torch.float32)
+    return _Prepared(keyframe, regularise(measured), image)
+
+
+def fused(
+    own: _Prepared, others: list[_Prepared], camera: Camera, config: DenseConfig
+) -> FusedKeyframe:
+    """Steps 4 and 5 of a keyframe with its neighbours."""
+    T_own_world = inverse(own.keyframe.T_world_camera)
+    views = [
+        View(other.map, T_own_world @ other.keyframe.T_world_camera, other.image)
+        for other in others
+    ]
+    result = fuse(own.map, views, camera, own.image)
+    final = stated(regularise(result.map), result.factor)
+    return FusedKeyframe(own.keyframe, final, result.views.cpu().numpy())
+
+
+def neighbours(
+    own: DenseKeyframe, others: list[DenseKeyframe], count: int
+) -> list[DenseKeyframe]:
+    """The keyframes that share most landmarks with one, the nearer in order first of equals."""
+    shared = [len(np.intersect1d(own.landmark_ids, o.landmark_ids)) for o in others]
+    order = sorted(range(len(others)), key=lambda k: (-shared[k], abs(others[k].id - own.id)))
+    return [others[k] for k in order[:count]]
