@@ -1,9 +1,8 @@
-"""Algorithm 1 over a stream of keyframes: Steps 1 to 6, the fusion delayed until neighbours exist."""
+"""Algorithm 1 over a stream of keyframes, the fusion delayed until neighbours exist."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -33,6 +32,7 @@ class DenseKeyframe:
         depth_m: (H, W) float32 of the sensor, undistorted, NaN where missing.
         landmark_ids: (L,) landmarks that it observes.
         landmark_depths_m: (L,) their z in its camera.
+        instances: (H, W) uint16, number of the instance that each pixel shows, 0 for none; or None.
     """
 
     id: int
@@ -41,6 +41,7 @@ class DenseKeyframe:
     depth_m: NDArray[np.float32]
     landmark_ids: NDArray[np.int64]
     landmark_depths_m: Array
+    instances: NDArray[np.uint16] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,7 @@ class DenseConfig:
         device: torch's name of where it is computed.
     """
 
-    noise: DepthNoise = DepthNoise()
+    noise: DepthNoise = field(default_factory=DepthNoise)
     neighbours: int = MAX_NEIGHBOURS
     device: str = "cpu"
 
@@ -92,11 +93,17 @@ class DenseMapper:
         self.camera = camera
         self.config = config or DenseConfig()
         self._held: list[_Prepared] = []
+        self._unwanted: set[int] = set()
         self._done = 0  # of those held, counted from the oldest
 
-    def push(self, keyframe: DenseKeyframe) -> list[FusedKeyframe]:
-        """Take a keyframe in; the one for which all neighbours exist by that comes back."""
+    def push(self, keyframe: DenseKeyframe, wanted: bool = True) -> list[FusedKeyframe]:
+        """Take a keyframe in; the one for which all neighbours exist by that comes back.
+
+        One that is not ``wanted`` serves its neighbours only.
+        """
         self._held.append(prepared(keyframe, self.camera, self.config))
+        if not wanted:
+            self._unwanted.add(keyframe.id)
         return self._finished(len(self._held) - WINDOW)
 
     def flush(self) -> list[FusedKeyframe]:
@@ -105,7 +112,10 @@ class DenseMapper:
 
     def _finished(self, end: int) -> list[FusedKeyframe]:
         """Fuse those held up to ``end`` and let go of what nobody needs any more."""
-        results = [self._fuse(k) for k in range(self._done, end)]
+        wanted = [
+            k for k in range(self._done, end) if self._held[k].keyframe.id not in self._unwanted
+        ]
+        results = [self._fuse(k) for k in wanted]
         self._done = max(self._done, end)
         stale = max(self._done - WINDOW, 0)
         del self._held[:stale]
@@ -144,9 +154,7 @@ def fused(
     return FusedKeyframe(own.keyframe, final, result.views.cpu().numpy())
 
 
-def neighbours(
-    own: DenseKeyframe, others: list[DenseKeyframe], count: int
-) -> list[DenseKeyframe]:
+def neighbours(own: DenseKeyframe, others: list[DenseKeyframe], count: int) -> list[DenseKeyframe]:
     """The keyframes that share most landmarks with one, the nearer in order first of equals."""
     shared = [len(np.intersect1d(own.landmark_ids, o.landmark_ids)) for o in others]
     order = sorted(range(len(others)), key=lambda k: (-shared[k], abs(others[k].id - own.id)))

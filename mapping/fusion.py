@@ -15,7 +15,7 @@ from graph.camera import Camera
 from graph.geometry import inverse
 from mapping.inverse_depth import COMPATIBLE, InverseDepthMap, squared_gradient
 from mapping.regularisation import set_order
-from mapping.warping import View, hypothesis, image_grid, moved, project
+from mapping.warping import View, hypothesis, moved, project
 
 MAX_NEIGHBOURS = 6
 MAX_COLOUR_STEP = 15.0
@@ -79,9 +79,9 @@ def fuse(
     for k, (rho_k, weight_k) in enumerate(zip(rho, weight, strict=True)):
         used = (members >> k) & 1
         count += used
-        weight_k = weight_k * used
-        norm += weight_k
-        total += weight_k.mul_(rho_k)
+        share = weight_k * used
+        norm += share
+        total += share.mul_(rho_k)
     fused = InverseDepthMap(total / norm, 1 / norm).where(members > 0)
     return Fused(fused, count.to(torch.uint8), factor)
 

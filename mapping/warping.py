@@ -68,9 +68,7 @@ def project(
     K = camera.K
     A = (K @ T_other_own[:3, :3] @ np.linalg.inv(K)).tolist()
     b = (K @ T_other_own[:3, 3]).tolist()
-    x, y, w = (
-        (pixels[0] * A[i][0] + A[i][2]) + pixels[1] * A[i][1] + rho * b[i] for i in range(3)
-    )
+    x, y, w = ((pixels[0] * A[i][0] + A[i][2]) + pixels[1] * A[i][1] + rho * b[i] for i in range(3))
     return x.div_(w), y.div_(w), w > 0
 
 

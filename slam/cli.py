@@ -19,6 +19,7 @@ from slam import __version__
 from slam.commands.calibrate import add_calibrate
 from slam.commands.evaluate_segmentation import add_evaluate_segmentation
 from slam.commands.export import add_export
+from slam.commands.map import add_map
 from slam.commands.optimise import add_optimise
 from slam.commands.run import add_run
 from slam.commands.segment import add_segment
@@ -77,6 +78,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_optimise(commands)
     add_export(commands)
     add_calibrate(commands)
+    add_map(commands)
     add_segment(commands)
     add_train(commands)
     add_evaluate_segmentation(commands)

@@ -1,0 +1,158 @@
+"""The map from above: what stands where, where one can walk, and what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.geometry import Array
+from mapping.cloud import Cloud
+from mapping.pictures import EMPTY, palette, with_legend
+
+FLOOR_COLOUR = (235, 230, 215)
+HEIGHTS_M = (0.1, 1.9)
+"""Above the floor: what stands between is in the way."""
+UPRIGHT_COSINE = 0.95
+BIN_M = 0.04
+
+
+def up_direction(normals: NDArray[np.floating], first_guess: Array) -> Array:
+    """The world's upward unit vector (3,): the mean of normals (N, 3) near it, nearer each time.
+
+    Floors and table tops have it, ceilings its opposite. ``first_guess`` is e.g. the cameras' mean
+    -y axis.
+    """
+    up = first_guess / np.linalg.norm(first_guess)
+    for degrees in (45, 30, 20, 10, 6, 4):
+        cosine = normals @ up
+        near = np.abs(cosine) > np.cos(np.deg2rad(degrees))
+        if near.sum() >= 100:
+            mean = (np.sign(cosine[near])[:, None] * normals[near]).sum(axis=0)
+            up = mean / np.linalg.norm(mean)
+    return np.asarray(up, float)
+
+
+def floor_height(heights_m: Array, share: float = 0.15) -> float:
+    """Height of the floor by those (N,) of upward-facing points: the lowest of the strong peaks."""
+    if not len(heights_m):
+        return 0.0
+    low = float(np.quantile(heights_m, 0.002))
+    bins = np.floor((heights_m - low) / BIN_M).astype(int)
+    count = np.bincount(np.maximum(bins, 0))
+    peak = int(np.flatnonzero(count >= share * count.max())[0])
+    near = np.abs(heights_m - (low + (peak + 0.5) * BIN_M)) < 1.5 * BIN_M
+    return float(np.median(heights_m[near]))
+
+
+@dataclass(frozen=True, eq=False)
+class PlanFrame:
+    """Axes of the plan in the world.
+
+    Attributes:
+        axes: (3, 3), rows right, forward and up.
+        floor_m: the floor's height along up.
+        cell_m: edge of a cell.
+    """
+
+    axes: Array
+    floor_m: float
+    cell_m: float
+
+
+def plan_frame(cloud_sample: Cloud, first_guess: Array, cell_m: float) -> PlanFrame:
+    """The frame by a sample of the cloud: up by the floor, right along the longest walls."""
+    up = up_direction(cloud_sample.normals, first_guess)
+    facing_up = cloud_sample.normals @ up > UPRIGHT_COSINE
+    floor_m = floor_height(cloud_sample.points[facing_up].astype(float) @ up)
+    helper = np.eye(3)[np.argmin(np.abs(up))]
+    right = np.cross(helper, up)
+    right /= np.linalg.norm(right)
+    forward = np.cross(up, right)
+    walls = cloud_sample.normals[np.abs(cloud_sample.normals @ up) < 0.1]
+    angle = np.arctan2(walls @ forward, walls @ right)
+    turn = np.angle(np.exp(4j * angle).sum()) / 4 if len(walls) else 0.0
+    right, forward = (
+        np.cos(turn) * right + np.sin(turn) * forward,
+        np.cos(turn) * forward - np.sin(turn) * right,
+    )
+    return PlanFrame(np.stack([right, forward, up]), floor_m, cell_m)
+
+
+class FloorPlan:
+    """Cells that fill as blocks of the cloud arrive."""
+
+    def __init__(self, frame: PlanFrame, classes: int) -> None:
+        self.frame = frame
+        self._classes = classes
+        self._standing: dict[tuple[int, int], Array] = {}
+        self._floor: set[tuple[int, int]] = set()
+
+    def add(self, cloud: Cloud) -> None:
+        """Take a block in."""
+        placed = cloud.points.astype(float) @ self.frame.axes.T
+        height_m = placed[:, 2] - self.frame.floor_m
+        cells = np.floor(placed[:, :2] / self.frame.cell_m).astype(int)
+        standing = (height_m > HEIGHTS_M[0]) & (height_m < HEIGHTS_M[1])
+        found, index = np.unique(cells[standing], axis=0, return_inverse=True)
+        votes = np.zeros((len(found), self._classes))
+        np.add.at(votes, (index.reshape(-1), cloud.labels[standing]), 1.0)
+        for cell, row in zip(map(tuple, found.tolist()), votes, strict=True):
+            self._standing[cell] = self._standing.get(cell, 0) + row
+        walked = cells[np.abs(height_m) < HEIGHTS_M[0] / 2]
+        self._floor.update(map(tuple, np.unique(walked, axis=0).tolist()))
+
+    def grid(self) -> tuple[NDArray[np.int16], tuple[int, int]]:
+        """Cells (rows forward from the back, columns right): label, -1 floor, -2 unseen.
+
+        Also the column and row, in cells, of the plan frame's origin.
+        """
+        cells = np.array([*self._standing, *self._floor], int).reshape(-1, 2)
+        if not len(cells):
+            return np.full((1, 1), -2, np.int16), (0, 0)
+        low, high = cells.min(axis=0), cells.max(axis=0)
+        grid = np.full(tuple((high - low + 1)[::-1]), -2, np.int16)
+        for x, y in self._floor:
+            grid[high[1] - y, x - low[0]] = -1
+        for (x, y), votes in self._standing.items():
+            grid[high[1] - y, x - low[0]] = _label(votes)
+        return grid, (int(-low[0]), int(high[1]))
+
+    def picture(self, names: Sequence[str], path_world: Array) -> NDArray[np.uint8]:
+        """The plan (H, W, 3), red first, with scale bar, legend and the camera's path (N, 3)."""
+        grid, (x0, y0) = self.grid()
+        scale = max(1, round(900 / max(grid.shape)))
+        colours = np.vstack([[[EMPTY] * 3, FLOOR_COLOUR], palette(len(names))]).astype(np.uint8)
+        small = colours[grid + 2]
+        image = np.kron(small, np.ones((scale, scale, 1), np.uint8))
+        path = path_world @ self.frame.axes.T / self.frame.cell_m
+        line = np.stack([path[:, 0] + x0, y0 + 1 - path[:, 1]], axis=1) * scale
+        cv2.polylines(image, [np.rint(line).astype(np.int32)], False, (220, 30, 30), 2, cv2.LINE_AA)
+        margin = 40
+        image = cv2.copyMakeBorder(
+            image, margin, 2 * margin, margin, margin, cv2.BORDER_CONSTANT, value=(EMPTY,) * 3
+        )
+        _scale_bar(image, scale / self.frame.cell_m, margin)
+        present = [label for label in range(len(names)) if (grid == label).any()]
+        return with_legend(image, names, present)
+
+
+def _label(votes: Array) -> int:
+    """The class of a cell: a thing before the background, if it has a fifth of the points."""
+    things = votes[1:]
+    if len(things) and things.max() > 0.2 * votes.sum():
+        return int(things.argmax()) + 1
+    return 0
+
+
+def _scale_bar(image: NDArray[np.uint8], px_per_m: float, margin: int) -> None:
+    """One metre, at the lower left."""
+    x, y, length = margin, image.shape[0] - margin // 2, round(px_per_m)
+    cv2.rectangle(image, (x, y - 6), (x + length, y), (0, 0, 0), -1)
+    cv2.putText(
+        image, "1 m", (x + length + 8, y + 1), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1,
+        cv2.LINE_AA,
+    )  # fmt: skip

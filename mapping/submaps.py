@@ -1,0 +1,119 @@
+"""Submaps: the surfaces that a keyframe sees, as points in its own frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from graph.array_file import FileKind, check_like, read_arrays, write_arrays
+from graph.camera import Camera
+from graph.geometry import Array, transform
+from mapping.backprojection import back_project, surface_normals
+from mapping.dense import FusedKeyframe
+
+SUBMAP_FILE = FileKind("submap", 1, compressed=False)
+UNLABELLED = 0
+MAX_GRAZING_COSINE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """Points in the frame of an anchor keyframe; with the anchor's pose they move rigidly.
+
+    Attributes:
+        anchor: the keyframe's id.
+        points: (N, 3) float32 metres, anchor frame.
+        normals: (N, 3) float32 unit vectors towards the camera, anchor frame.
+        colours: (N, 3) uint8 red first.
+        variances: (N,) float32 m^2 of the depth.
+        instances: (N,) uint16, number of the keyframe's instance that shows there, from 1; 0 none.
+    """
+
+    anchor: int
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    variances: NDArray[np.float32]
+    instances: NDArray[np.uint16]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def placed(self, T_world_anchor: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Points and normals (N, 3) in the world for a pose of the anchor (4, 4)."""
+        points = transform(T_world_anchor, self.points.astype(float))
+        normals = self.normals @ T_world_anchor[:3, :3].T
+        return points.astype(np.float32), normals.astype(np.float32)
+
+
+def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) -> Submap:
+    """The submap of a fused keyframe, one point a voxel of ``voxel_m``.
+
+    Points without a normal, and those seen at less
+    than 6 degrees, are left out: they are rims.
+    """
+    grid = back_project(result.map, camera)
+    normal_grid = surface_normals(grid)
+    rays = grid / torch.linalg.norm(grid, dim=-1, keepdim=True)
+    facing = -(normal_grid * rays).sum(-1) > MAX_GRAZING_COSINE
+    rows, columns = (a.cpu().numpy() for a in torch.nonzero(facing).unbind(-1))
+    points, normals = (g[facing].cpu().numpy() for g in (grid, normal_grid))
+    variances = (result.map.variance / result.map.rho**4)[facing].cpu().numpy()
+    instances = result.keyframe.instances
+    if instances is None:
+        instances = np.zeros(result.keyframe.depth_m.shape, np.uint16)
+    keep = nearest_a_voxel(points, variances, voxel_m)
+    rows, columns = rows[keep], columns[keep]
+    return Submap(
+        result.keyframe.id,
+        points[keep],
+        normals[keep],
+        result.keyframe.rgb[rows, columns],
+        variances[keep],
+        instances[rows, columns],
+    )
+
+
+def nearest_a_voxel(
+    points: NDArray[np.float32], variances: NDArray[np.float32], voxel_m: float
+) -> NDArray[np.int64]:
+    """Indices, rising, of the surest point (N, 3) in each voxel."""
+    order = np.lexsort((variances, voxel_keys(points, voxel_m)))
+    keys = voxel_keys(points, voxel_m)[order]
+    first = np.ones(len(keys), bool)
+    first[1:] = keys[1:] != keys[:-1]
+    return np.sort(order[first])
+
+
+def voxel_keys(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
+    """One number (N,) for the voxel of each point (N, 3); 21 bits an axis."""
+    index = np.floor(points / voxel_m).astype(np.int64) + (1 << 20)
+    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+
+
+def write_submap(path: Path, submap: Submap) -> None:
+    """Save a submap; it appears whole or not at all. Raises InputError where it cannot."""
+    write_arrays(path, SUBMAP_FILE, {"anchor": submap.anchor}, _arrays(submap))
+
+
+def read_submap(path: Path) -> Submap:
+    """Read a submap. Raises InputError for a missing, foreign or broken file."""
+    header, arrays = read_arrays(path, SUBMAP_FILE)
+    check_like(arrays, _arrays(_empty()), path)
+    return Submap(int(header["anchor"]), **arrays)
+
+
+def _arrays(submap: Submap) -> dict[str, NDArray]:
+    names: Sequence[str] = ("points", "normals", "colours", "variances", "instances")
+    return {name: getattr(submap, name) for name in names}
+
+
+def _empty() -> Submap:
+    rows = np.zeros((0, 3), np.float32)
+    one = np.zeros(0, np.float32)
+    return Submap(0, rows, rows, rows.astype(np.uint8), one, one.astype(np.uint16))

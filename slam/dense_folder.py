@@ -1,0 +1,130 @@
+"""The folder RUN/dense: finished keyframes of a dense map, and what they were made with.
+
+==================  ==============================================================================
+settings.json       what the keyframes were fused with; another setting begins anew
+depth/ID            fused inverse depth and its sigma, quantised
+labels/ID           log likelihoods of the keyframe's instances, one row each
+submaps/ID          its points; written last, so that a keyframe that has one is finished
+cloud.ply, .pcd     the cloud, with normals, label, probability and sigma of each point
+semantic.ply, .pcd  the same in the colours of the labels
+mesh.ply            the mesh
+plan.png            the map from above
+view_*.png          pictures of cloud and mesh
+dense.json          counts and times
+==================  ==============================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from graph.array_file import FileKind, read_arrays, write_arrays
+from graph.errors import InputError
+from mapping.inverse_depth import InverseDepthMap
+from mapping.submaps import Submap, read_submap, write_submap
+
+logger = logging.getLogger(__name__)
+
+DEPTH_FILE = FileKind("fused depth", 1)
+LABEL_FILE = FileKind("keyframe labels", 1)
+RHO_STEP, SIGMA_STEP = 1 / 16000, 1e-6
+"""Of the stored integers in 1/m; rho below 1/6 of the sensor's own step, up to 4 per metre."""
+PARTS = ("depth", "labels", "submaps")
+
+
+class DenseFolder:
+    """RUN/dense, opened for settings that are a dictionary of JSON values."""
+
+    def __init__(self, run: Path, settings: dict[str, Any]) -> None:
+        """Make the folder, or keep what it holds of the same settings.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        self.path = run / "dense"
+        try:
+            self.path.mkdir(exist_ok=True)
+            self._clear_unless(settings)
+            for name in PARTS:
+                (self.path / name).mkdir(exist_ok=True)
+            self.write_text("settings.json", json.dumps(settings, indent=1, sort_keys=True) + "\n")
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be written ({error.strerror}); free some space"
+            ) from error
+
+    def _clear_unless(self, settings: dict[str, Any]) -> None:
+        """Remove keyframes that were made with other settings."""
+        path = self.path / "settings.json"
+        before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        if before == json.loads(json.dumps(settings)):
+            return
+        if before is not None:
+            logger.warning("%s: was made with other settings; begun anew", self.path)
+        path.unlink(missing_ok=True)
+        for name in PARTS:
+            shutil.rmtree(self.path / name, ignore_errors=True)
+
+    def is_done(self, keyframe_id: int) -> bool:
+        """Whether the keyframe is finished."""
+        return self._file("submaps", keyframe_id).is_file()
+
+    def write(
+        self, submap: Submap, fused: InverseDepthMap, log_likelihoods: NDArray[np.float32]
+    ) -> None:
+        """Save a finished keyframe. Raises InputError, with nothing half written, if it cannot."""
+        arrays = {
+            "rho": _quantised(fused.rho, RHO_STEP),
+            "sigma": _quantised(torch.sqrt(fused.variance), SIGMA_STEP),
+        }
+        write_arrays(self._file("depth", submap.anchor), DEPTH_FILE, {}, arrays)
+        self.write_labels(submap.anchor, log_likelihoods)
+        write_submap(self._file("submaps", submap.anchor), submap)
+
+    def write_labels(self, keyframe_id: int, log_likelihoods: NDArray[np.float32]) -> None:
+        """Replace what is known of a keyframe's instances; nothing is fused again."""
+        arrays = {"log_likelihoods": log_likelihoods}
+        write_arrays(self._file("labels", keyframe_id), LABEL_FILE, {}, arrays)
+
+    def submap(self, keyframe_id: int) -> Submap:
+        """The points of a finished keyframe."""
+        return read_submap(self._file("submaps", keyframe_id))
+
+    def log_likelihoods(self, keyframe_id: int) -> NDArray[np.float32]:
+        """(I + 1, C) of its instances, row 0 of none."""
+        arrays = read_arrays(self._file("labels", keyframe_id), LABEL_FILE)[1]
+        return np.asarray(arrays["log_likelihoods"], np.float32)
+
+    def fused(self, keyframe_id: int) -> InverseDepthMap:
+        """The inverse depth of a finished keyframe."""
+        arrays = read_arrays(self._file("depth", keyframe_id), DEPTH_FILE)[1]
+        known = arrays["rho"] > 0
+        rho, sigma = (
+            np.where(known, arrays[name] * np.float32(step), np.float32(np.nan))
+            for name, step in (("rho", RHO_STEP), ("sigma", SIGMA_STEP))
+        )
+        return InverseDepthMap(torch.from_numpy(rho), torch.from_numpy(sigma**2))
+
+    def write_text(self, name: str, text: str) -> None:
+        """Replace a text file."""
+        temporary = self.path / f".{name}.part"
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, self.path / name)
+
+    def _file(self, kind: str, keyframe_id: int) -> Path:
+        return self.path / kind / f"{keyframe_id:06d}"
+
+
+def _quantised(values: torch.Tensor, step: float) -> NDArray[np.uint16]:
+    """Multiples of a step, at least 1, 0 where NaN."""
+    steps = torch.nan_to_num(torch.round(values / step).clamp(1, 65535))
+    return np.asarray(steps.cpu().numpy(), np.uint16)

@@ -1,0 +1,138 @@
+"""A finished run as input of dense mapping: its keyframes with their images, checked."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.array_file import part
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.geometry import inverse, transform
+from mapping.dense import DenseKeyframe
+from slam.frame import Frame
+from slam.map_file import read_map
+from slam.map_state import world_of
+from slam.sequences import Sequence, open_sequence
+from slam.world_map import Keyframe, WorldMap
+
+MAX_STAMP_ERROR_S = 1e-4
+MIN_DEPTH_SHARE = 0.01
+_ORIGIN = re.compile(r"^# .*?, sequence (?P<path>.+), stride \d+$")
+
+
+@dataclass(frozen=True, eq=False)
+class MappedRun:
+    """A run folder and its sequence.
+
+    Attributes:
+        path: the run folder.
+        world: its map.
+        keyframes: those of its largest segment, oldest first.
+        camera: whose distortion is taken out of what ``load`` returns.
+        sequence: the images.
+    """
+
+    path: Path
+    world: WorldMap
+    keyframes: list[Keyframe]
+    camera: Camera
+    sequence: Sequence
+
+
+def open_run(path: Path, sequence: Path | None = None) -> MappedRun:
+    """Open a finished run; the sequence is that of the run unless it has moved.
+
+    Raises:
+        InputError: no map in the folder, or no sequence.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder; give the folder of a finished run")
+    state, camera = read_map(path)
+    world = world_of(part(state, "mapper.world"))
+    folder = sequence or _recorded_sequence(path / "config.yaml")
+    keyframes = world.in_segment(world.largest_segment())
+    return MappedRun(path, world, keyframes, camera, open_sequence(folder, camera=camera))
+
+
+def _recorded_sequence(config: Path) -> Path:
+    """The sequence named in the first line of a run's config.yaml."""
+    try:
+        first = config.read_text(encoding="utf-8").partition("\n")[0]
+    except OSError as error:
+        raise InputError(f"{config}: cannot be read ({error.strerror}); give --sequence") from error
+    found = _ORIGIN.match(first)
+    if found is None:
+        raise InputError(f"{config}: its first line names no sequence; give --sequence")
+    folder = Path(found["path"])
+    if not folder.is_dir():
+        raise InputError(f"{folder}: the run's sequence is not there any more; give --sequence")
+    return folder
+
+
+def load(run: MappedRun, keyframe: Keyframe) -> tuple[DenseKeyframe, NDArray[np.uint8]]:
+    """A keyframe with its images, undistorted, and its colour image as it was taken.
+
+    Raises:
+        InputError: a pose that is not finite, no landmarks, an image that cannot be read or is
+            not the keyframe's, or no depth: this keyframe cannot be mapped.
+    """
+    name = f"keyframe {keyframe.id}"
+    if not np.isfinite(keyframe.T_world_camera).all():
+        raise InputError(f"{name}: its pose is not finite; run the sequence again")
+    _, landmark_ids = run.world.observed(keyframe)
+    if len(landmark_ids) == 0:
+        raise InputError(f"{name}: it observes no landmark, so its place is not known")
+    if not 0 <= keyframe.frame_index < len(run.sequence):
+        raise InputError(f"{name}: frame {keyframe.frame_index} is not in {run.sequence.folder}")
+    frame = run.sequence.load(keyframe.frame_index)
+    if abs(frame.timestamp_s - keyframe.timestamp_s) > MAX_STAMP_ERROR_S:
+        raise InputError(
+            f"{name}: frame {keyframe.frame_index} of {run.sequence.folder} is of "
+            f"{frame.timestamp_s:.6f} s, not {keyframe.timestamp_s:.6f} s; give its own --sequence"
+        )
+    if np.isfinite(frame.depth_m).mean() < MIN_DEPTH_SHARE:
+        raise InputError(f"{name}: frame {keyframe.frame_index} has no valid depth")
+    rgb, depth_m = undistorted(frame, run.camera)
+    points = run.world.landmarks.points_world[landmark_ids]
+    depths_m = transform(inverse(keyframe.T_world_camera), points)[:, 2]
+    T = keyframe.T_world_camera
+    return DenseKeyframe(keyframe.id, T, rgb, depth_m, landmark_ids, depths_m), frame.rgb
+
+
+def image_name(run: MappedRun, keyframe: Keyframe) -> str:
+    """The name of a keyframe's colour image relative to its sequence."""
+    file, folder = run.sequence.pairs.rgb_files[keyframe.frame_index], run.sequence.folder
+    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name
+
+
+def undistorted(frame: Frame, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Colour and depth of a frame as a camera without distortion sees them."""
+    if not any(camera.distortion):
+        return frame.rgb, frame.depth_m
+    maps = undistortion_maps(camera)
+    rgb = cv2.remap(frame.rgb, *maps, cv2.INTER_LINEAR)
+    outside = float("nan")
+    depth_m = cv2.remap(frame.depth_m, *maps, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, outside)
+    return rgb, depth_m
+
+
+def undistorted_labels(numbers: NDArray[np.uint16], camera: Camera) -> NDArray[np.uint16]:
+    """Numbers (H, W) of pixels as a camera without distortion sees them, 0 outside."""
+    if not any(camera.distortion):
+        return numbers
+    return np.asarray(cv2.remap(numbers, *undistortion_maps(camera), cv2.INTER_NEAREST))
+
+
+def undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where each pixel (H, W) of the undistorted image lies in the distorted one."""
+    size = (camera.width, camera.height)
+    x, y = cv2.initUndistortRectifyMap(
+        camera.K, np.array(camera.distortion), None, camera.K, size, cv2.CV_32FC1
+    )
+    return x, y
