@@ -98,8 +98,8 @@ def merge(rows: NDArray, voxel_m: float, log_likelihoods: NDArray[np.float32]) -
         voxel_keys(rows["point"], voxel_m), return_inverse=True, return_counts=True
     )
     count = len(views)
-    weight = rows["weight"].astype(float)
-    total = np.bincount(voxel, weight, count)
+    weight: Array = rows["weight"].astype(float)
+    total: Array = np.bincount(voxel, weight, count).astype(float)
     points = _mean(voxel, rows["point"], weight, total)
     normals = _mean(voxel, rows["normal"], weight, total)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
@@ -111,7 +111,7 @@ def merge(rows: NDArray, voxel_m: float, log_likelihoods: NDArray[np.float32]) -
         points.astype(np.float32),
         normals.astype(np.float32),
         np.rint(colours).astype(np.uint8),
-        1 / np.sqrt(best),
+        (1 / np.sqrt(best)).astype(np.float32),
         labels,
         probabilities,
         np.minimum(views, 65535).astype(np.uint16),

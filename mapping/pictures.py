@@ -22,7 +22,7 @@ def palette(classes: int) -> NDArray[np.uint8]:
     for k in range(1, classes):
         hue = (k * 0.618034) % 1.0  # the golden ratio spreads any number of hues
         rgb = colorsys.hsv_to_rgb(hue, (0.85, 0.6)[k % 2], (0.95, 0.75)[k // 2 % 2])
-        colours.append(tuple(round(255 * c) for c in rgb))
+        colours.append((round(255 * rgb[0]), round(255 * rgb[1]), round(255 * rgb[2])))
     return np.array(colours, np.uint8)
 
 

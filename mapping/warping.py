@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse
@@ -85,8 +86,9 @@ def moved(
 def image_grid(like: Tensor) -> tuple[Tensor, Tensor]:
     """Columns (1, W) and rows (H, 1) of an image's pixels."""
     height, width = like.shape
-    kind = {"dtype": torch.float32, "device": like.device}
-    return torch.arange(width, **kind)[None], torch.arange(height, **kind)[:, None]
+    columns = torch.arange(width, dtype=torch.float32, device=like.device)
+    rows = torch.arange(height, dtype=torch.float32, device=like.device)
+    return columns[None], rows[:, None]
 
 
 def _depth_row(T_own_other: Array, camera: Camera) -> tuple[list[float], float]:
@@ -107,9 +109,8 @@ def _sampled(view: InverseDepthMap, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
     outside = (u < -0.5) | (v < -0.5) | (u > width - 0.5) | (v > height - 0.5)
     grid = torch.stack([u * (2 / (width - 1)) - 1, v * (2 / (height - 1)) - 1], dim=-1)[None]
     stack = torch.stack([view.rho, view.variance])[None]
-    kind = {"padding_mode": "border", "align_corners": True}
-    near, variance = torch.nn.functional.grid_sample(stack, grid, mode="nearest", **kind)[0]
-    between = torch.nn.functional.grid_sample(stack[:, :1], grid, mode="bilinear", **kind)[0, 0]
+    near, variance = grid_sample(stack, grid, "nearest", "border", align_corners=True)[0]
+    between = grid_sample(stack[:, :1], grid, "bilinear", "border", align_corners=True)[0, 0]
     one_surface = (between - near).square() < JUMP_SIGMAS**2 * variance
     rho = torch.where(one_surface, between, near)
     return rho.masked_fill_(outside, torch.nan), variance.masked_fill_(outside, torch.nan)
