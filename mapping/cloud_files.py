@@ -16,6 +16,7 @@ from mapping.cloud import Cloud
 
 _PLY_NAMES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
 _PCD_NAMES = {"f": "F", "u": "U"}
+_PCD_COLUMNS = {f"n{axis}": f"normal_{axis}" for axis in "xyz"}
 _PACKED = ("blue", "green", "red", "alpha")
 
 
@@ -116,7 +117,11 @@ def _ply_header(count: int) -> str:
 
 
 def _pcd_header(count: int) -> str:
-    fields = [(n, k.itemsize, _PCD_NAMES[k.kind]) for n, k in _columns() if n not in _PACKED]
+    fields = [
+        (_PCD_COLUMNS.get(n, n), k.itemsize, _PCD_NAMES[k.kind])
+        for n, k in _columns()
+        if n not in _PACKED
+    ]
     fields.insert(6, ("rgb", 4, "U"))
     names, sizes, kinds = zip(*fields, strict=True)
     lines = [

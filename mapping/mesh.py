@@ -16,7 +16,7 @@ from mapping.open3d_loader import load_open3d
 
 View = tuple[NDArray[np.float32], NDArray[np.uint8], Array]
 """Depth (H, W) in metres, NaN where missing, colours (H, W, 3) and T_world_camera (4, 4)."""
-BLOCKS = 60_000
+BLOCK_VOXELS, BLOCKS = 8, 10_000
 MAX_DEPTH_M = 6.0
 
 
@@ -41,7 +41,7 @@ def tsdf_mesh(
         attr_dtypes=(core.float32, core.float32, core.float32),
         attr_channels=((1), (1), (3)),
         voxel_size=voxel_m,
-        block_resolution=16,
+        block_resolution=BLOCK_VOXELS,
         block_count=BLOCKS,
     )
     intrinsic = core.Tensor(camera.K)

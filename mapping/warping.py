@@ -106,7 +106,7 @@ def _sampled(view: InverseDepthMap, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
     around are not one surface the nearest is taken.
     """
     height, width = view.rho.shape
-    outside = (u < -0.5) | (v < -0.5) | (u > width - 0.5) | (v > height - 0.5)
+    outside = (u < 0) | (v < 0) | (u > width - 1) | (v > height - 1)
     grid = torch.stack([u * (2 / (width - 1)) - 1, v * (2 / (height - 1)) - 1], dim=-1)[None]
     stack = torch.stack([view.rho, view.variance])[None]
     near, variance = grid_sample(stack, grid, "nearest", "border", align_corners=True)[0]

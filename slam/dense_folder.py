@@ -62,6 +62,14 @@ class DenseFolder:
                 f"{self.path}: cannot be written ({error.strerror}); free some space"
             ) from error
 
+    @classmethod
+    def opened(cls, run: Path) -> DenseFolder:
+        """The dense map of a run, as it is. Raises InputError if there is none."""
+        path = run / "dense" / "settings.json"
+        if not path.is_file():
+            raise InputError(f"{path}: no dense map here; make it with bmask-slam map {run}")
+        return cls(run, json.loads(path.read_text(encoding="utf-8")))
+
     def _clear_unless(self, settings: dict[str, Any]) -> None:
         """Remove keyframes that were made with other settings."""
         path = self.path / "settings.json"

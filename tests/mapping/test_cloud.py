@@ -1,0 +1,119 @@
+"""The merged cloud against a loop over voxels; its files; its labels."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from graph.geometry import make_pose, se3_exp
+from graph.ply import read_ply
+from mapping.cloud import BLOCK_VOXELS, merged, spill
+from mapping.cloud_files import CloudWriter
+from mapping.labels import keyframe_labels
+from mapping.open3d_loader import load_open3d
+from mapping.pictures import palette
+from mapping.submaps import Submap
+from semantics.instances import Instance, certain, mask_box
+
+RNG = np.random.default_rng(0)
+VOXEL_M = 0.1
+
+
+def submap(anchor: int, count: int = 400, instances: int = 3) -> Submap:
+    normals = RNG.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Submap(
+        anchor,
+        RNG.uniform(-0.5, 0.5, (count, 3)).astype(np.float32),
+        normals.astype(np.float32),
+        RNG.integers(0, 255, (count, 3)).astype(np.uint8),
+        RNG.uniform(1e-4, 1e-2, count).astype(np.float32),
+        RNG.integers(0, instances, count).astype(np.uint16),
+    )
+
+
+def test_it_is_that_of_a_loop_over_voxels(tmp_path: Path) -> None:
+    table = np.log(RNG.dirichlet(np.ones(4), 6)).astype(np.float32)
+    placed = [(submap(0), se3_exp(RNG.normal(0, 0.3, 6)), 0), (submap(1), np.eye(4), 3)]
+    clouds = list(merged(spill(placed, VOXEL_M, tmp_path), VOXEL_M, table))
+    points = np.concatenate([c.points for c in clouds])
+    expected = defaultdict(list)
+    for part, T, first in placed:
+        at, _ = part.placed(T)
+        for k in range(len(part)):
+            voxel = tuple(np.floor(at[k] / VOXEL_M).astype(int))
+            expected[voxel].append((at[k], 1 / part.variances[k], first + part.instances[k]))
+    assert len(points) == len(expected)
+    for cloud in clouds:
+        for k in range(len(cloud)):
+            rows = expected[tuple(np.floor(cloud.points[k] / VOXEL_M).astype(int))]
+            weights = np.array([w for _, w, _ in rows])
+            mean = sum(p * w for p, w, _ in rows) / weights.sum()
+            np.testing.assert_allclose(cloud.points[k], mean, atol=1e-5)
+            evidence = sum(table[i] for _, _, i in rows)
+            assert cloud.labels[k] == evidence.argmax()
+            share = np.exp(evidence) / np.exp(evidence).sum()
+            assert abs(cloud.probabilities[k] - share.max()) < 1e-4
+            assert cloud.views[k] == len(rows)
+            assert abs(cloud.sigmas_m[k] - weights.max() ** -0.5) < 1e-5
+
+
+def test_blocks_do_not_share_voxels(tmp_path: Path) -> None:
+    far = make_pose(np.eye(3), np.array([BLOCK_VOXELS * VOXEL_M, 0, 0]))
+    files = spill([(submap(0), np.eye(4), 0), (submap(1), far, 0)], VOXEL_M, tmp_path)
+    assert len(files) > 2
+    table = np.zeros((3, 2), np.float32)
+    points = np.concatenate([c.points for c in merged(files, VOXEL_M, table)])
+    assert len(np.unique(np.floor(points / VOXEL_M), axis=0)) == len(points)
+
+
+def test_files_hold_what_was_written(tmp_path: Path) -> None:
+    table = np.log(np.full((3, 5), 0.2)).astype(np.float32)
+    files = spill([(submap(0), np.eye(4), 0)], VOXEL_M, tmp_path)
+    (cloud, *rest) = list(merged(files, VOXEL_M, table))
+    with CloudWriter(tmp_path / "cloud") as writer:
+        for part in (cloud, *rest):
+            writer.write(part)
+    columns = read_ply(tmp_path / "cloud.ply")
+    assert len(columns["x"]) == writer.count
+    np.testing.assert_array_equal(columns["x"][: len(cloud)], cloud.points[:, 0])
+    np.testing.assert_array_equal(columns["red"][: len(cloud)], cloud.colours[:, 0])
+    io = load_open3d().io
+    for name in ("cloud.ply", "cloud.pcd"):
+        read = io.read_point_cloud(str(tmp_path / name))
+        np.testing.assert_allclose(np.asarray(read.points)[: len(cloud)], cloud.points, atol=1e-6)
+        np.testing.assert_allclose(
+            255 * np.asarray(read.colors)[: len(cloud)], cloud.colours, atol=0.5
+        )
+        np.testing.assert_allclose(np.asarray(read.normals)[: len(cloud)], cloud.normals, atol=1e-6)
+
+
+def test_a_failure_leaves_no_file(tmp_path: Path) -> None:
+    try:
+        with CloudWriter(tmp_path / "cloud", palette(3)):
+            raise KeyError
+    except KeyError:
+        assert list(tmp_path.iterdir()) == []
+
+
+def instance(rows: slice, label: int, score: float, mask_score: float) -> Instance:
+    mask = np.zeros((6, 8), bool)
+    mask[rows] = True
+    return Instance(mask, mask_box(mask), label, certain(label, 4, score), score, mask_score)
+
+
+def test_where_masks_overlap_the_better_wins() -> None:
+    found = [instance(slice(0, 3), 1, 0.9, 0.4), instance(slice(2, 5), 2, 0.9, 0.8)]
+    labels = keyframe_labels(found, (6, 8), 4)
+    np.testing.assert_array_equal(labels.numbers[:, 0], [1, 1, 2, 2, 2, 0])
+
+
+def test_a_trusted_mask_says_more() -> None:
+    found = [instance(slice(0, 3), 1, 0.9, 0.9), instance(slice(3, 5), 1, 0.9, 0.3)]
+    table = keyframe_labels(found, (6, 8), 4).log_likelihoods
+    np.testing.assert_allclose(np.exp(table).sum(axis=1), 1, rtol=1e-5)
+    assert table[1, 1] > table[2, 1] > table[2, 2]
+    assert table[0].argmax() == 0
+    assert np.isfinite(table).all()

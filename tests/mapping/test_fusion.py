@@ -1,0 +1,185 @@
+"""Step 4 against the formulas, pixel by pixel, and on surfaces that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from surface_scene import (
+    CAMERA,
+    as_map,
+    largest_set,
+    noisy_map,
+    plane_rho,
+    poses,
+    relative,
+    weighted,
+)
+
+from graph.geometry import inverse, se3_exp, transform
+from mapping.fusion import fuse, seeded, stated, variance_factor
+from mapping.inverse_depth import InverseDepthMap, squared_gradient
+from mapping.warping import JUMP_SIGMAS, MAX_APART_PX, View, hypothesis
+
+
+def read(given: InverseDepthMap, u: float, v: float):
+    """rho and variance of a map at a pixel: between pixels if they are one surface."""
+    rho, variance = (a.numpy().astype(float) for a in (given.rho, given.variance))
+    height, width = rho.shape
+    if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+        return np.nan, np.nan
+    near = round(v), round(u)
+    u0, v0 = min(int(u), width - 2), min(int(v), height - 2)
+    a, b = u - u0, v - v0
+    block = rho[v0 : v0 + 2, u0 : u0 + 2]
+    between = np.array([1 - b, b]) @ block @ np.array([1 - a, a])
+    if (between - rho[near]) ** 2 < JUMP_SIGMAS**2 * variance[near]:
+        return between, variance[near]
+    return rho[near], variance[near]
+
+
+def say(seed: float, u: int, v: int, view: View):
+    """One neighbour's hypothesis about the point at ``seed`` on the ray of pixel (u, v)."""
+    point = CAMERA.backproject(np.array([u, v], float), np.array(1 / seed))
+    there = transform(inverse(view.T_own_neighbour), point[None])[0]
+    if there[2] <= 0:
+        return np.nan, np.nan
+    pixel = CAMERA.project(there)
+    rho, variance = read(view.map, *pixel)
+    sigma = np.sqrt(variance)
+    if not rho > sigma:
+        return np.nan, np.nan
+
+    def back(r: float):
+        at = CAMERA.backproject(pixel, np.array(1 / r))
+        return transform(view.T_own_neighbour, at[None])[0]
+
+    middle = back(rho)
+    if middle[2] <= 0 or np.linalg.norm(CAMERA.project(middle) - (u, v)) >= MAX_APART_PX:
+        return np.nan, np.nan
+    p1, p2, p3 = (1 / back(r)[2] for r in (rho + sigma, rho, rho - sigma))
+    return p2, max(abs(p1 - p2), abs(p3 - p2)) ** 2
+
+
+def reference(own: InverseDepthMap, views: list[View], seeds):
+    """Step 4 as it is written, without colours."""
+    rho0, variance0 = (a.numpy().astype(float) for a in (own.rho, own.variance))
+    out = np.full((3, *rho0.shape), np.nan)
+    for v, u in np.ndindex(*rho0.shape):
+        known = np.isfinite(rho0[v, u])
+        seed = rho0[v, u] if known else seeds[v, u]
+        if not np.isfinite(seed):
+            continue
+        said = [say(seed, u, v, view) for view in views]
+        r, s = [rho0[v, u], *(m for m, _ in said)], [variance0[v, u], *(x for _, x in said)]
+        chosen = largest_set(r, s)
+        if not chosen and known and not any(m < seed for m, _ in said):
+            chosen = [0]
+        if chosen:
+            total = sum(1 / s[k] for k in chosen)
+            out[:, v, u] = weighted(r, s, chosen), 1 / total, len(chosen)
+    return out
+
+
+def scene(seed: int, count: int):
+    rng = np.random.default_rng(seed)
+    T = poses(rng, count)
+    maps = [noisy_map(rng, pose) for pose in T]
+    return maps[0], [View(m, relative(T[0], t)) for m, t in zip(maps[1:], T[1:], strict=True)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 7])
+def test_it_follows_the_formulas(count: int) -> None:
+    own, views = scene(count, count)
+    result = fuse(own, views, CAMERA)
+    rho, variance, used = reference(own, views, seeded(own, views, CAMERA).numpy())
+    np.testing.assert_allclose(result.map.rho.numpy(), rho, rtol=1e-5)
+    np.testing.assert_allclose(result.map.variance.numpy(), variance, rtol=2e-4)
+    np.testing.assert_array_equal(result.views.numpy(), np.nan_to_num(used))
+    if count == 7:
+        assert (used >= 5).sum() > 100
+        assert (np.isfinite(rho) & ~own.known.numpy()).sum() > 20
+
+
+def test_a_neighbour_sees_the_same_plane() -> None:
+    T_a, T_b = poses(np.random.default_rng(0), 2, 0.05, 0.15)
+    truth = plane_rho(T_a)
+    view = View(as_map(plane_rho(T_b), 0.01), relative(T_a, T_b))
+    mean, variance = hypothesis(torch.tensor(truth, dtype=torch.float32), view, CAMERA)
+    seen = np.isfinite(mean.numpy())
+    assert seen.mean() > 0.6
+    np.testing.assert_allclose(mean.numpy()[seen], truth[seen], rtol=2e-5)
+    assert (variance.numpy()[seen] > 0).all()
+
+
+def test_moving_the_world_changes_nothing() -> None:
+    rng = np.random.default_rng(5)
+    T = poses(rng, 3)
+    moved = se3_exp(rng.normal(0, 1, 6))
+    maps = [noisy_map(rng, pose) for pose in T]
+    pairs = list(zip(maps[1:], T[1:], strict=True))
+    a, b = (
+        fuse(maps[0], [View(m, relative(P @ T[0], P @ t)) for m, t in pairs], CAMERA).map.rho
+        for P in (np.eye(4), moved)
+    )
+    a, b = a.numpy(), b.numpy()
+    assert np.mean(np.isfinite(a) != np.isfinite(b)) < 0.002
+    both = np.isfinite(a) & np.isfinite(b)
+    assert np.quantile(np.abs(a - b)[both], 0.998) < 1e-4
+
+
+def test_independent_views_add_up() -> None:
+    truth = np.full((30, 40), 0.5)
+    views = [View(as_map(truth, 0.01), np.eye(4)) for _ in range(3)]
+    result = fuse(as_map(truth, 0.01), views, CAMERA)
+    np.testing.assert_allclose(result.map.variance.numpy(), 0.01**2 / 4, rtol=2e-2)
+
+
+def test_what_a_neighbour_sees_through_is_not_there() -> None:
+    own = as_map(np.full((30, 40), 0.505), 0.001)
+    behind = View(as_map(np.full((30, 40), 0.5), 0.001), np.eye(4))
+    before = View(as_map(np.full((30, 40), 0.51), 0.001), np.eye(4))
+    assert not fuse(own, [behind], CAMERA).map.known.any()
+    assert fuse(own, [before], CAMERA).map.known.all()
+
+
+def test_a_hole_takes_what_two_neighbours_agree_on_in_the_right_colour() -> None:
+    rho = np.full((30, 40), 0.5)
+    holed = rho.copy()
+    holed[10:20, 10:20] = np.nan
+    grey = torch.full((3, 30, 40), 100.0)
+    views = [View(as_map(rho, 0.01), np.eye(4), grey) for _ in range(2)]
+    assert fuse(as_map(holed, 0.01), views, CAMERA, grey).map.known.all()
+    assert not fuse(as_map(holed, 0.01), views[:1], CAMERA, grey).map.known[10:20, 10:20].any()
+    other = grey.clone()
+    other[:, 10:20, 10:20] = 200.0
+    assert not fuse(as_map(holed, 0.01), views, CAMERA, other).map.known[10:20, 10:20].any()
+
+
+def test_the_rim_of_a_nearer_surface_is_not_filled_from_behind() -> None:
+    rho = np.full((30, 40), 0.5)
+    own = rho.copy()
+    own[:, :10], own[:, 10] = 1.0, np.nan
+    views = [View(as_map(rho, 0.01), np.eye(4)) for _ in range(2)]
+    assert np.isnan(seeded(as_map(own, 0.01), views, CAMERA).numpy()[:, 10]).all()
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_the_factor_finds_what_variances_lack(scale: float) -> None:
+    rng = np.random.default_rng(1)
+    maps = [as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004 / scale) for _ in range(4)]
+    said = [(m.rho, m.variance) for m in maps[1:]]
+    assert variance_factor(maps[0], said) == pytest.approx(scale**2, rel=0.1)
+
+
+def test_no_neighbours_no_factor() -> None:
+    assert variance_factor(as_map(np.full((30, 40), 0.5), 0.01), []) == 1.0
+
+
+def test_the_stated_variance_grows_with_the_slope() -> None:
+    rho = np.tile(np.linspace(0.4, 0.8, 40), (30, 1))
+    given = as_map(rho, 0.002)
+    slope = squared_gradient(given.rho).numpy()[:, 1:-1]
+    np.testing.assert_allclose(slope, (0.4 / 39) ** 2, rtol=1e-3)
+    extra = (stated(given, 0.5).variance - 0.5 * given.variance).numpy()[:, 1:-1]
+    np.testing.assert_allclose(extra, 0.45**2 * slope, rtol=1e-3)

@@ -1,0 +1,99 @@
+"""Submaps: points where the surface is, moved with their anchor, read back as written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from surface_scene import CAMERA, as_map, plane_rho, poses
+
+from graph.errors import InputError
+from graph.geometry import se3_exp, transform
+from mapping.backprojection import back_project, surface_normals
+from mapping.dense import DenseKeyframe, FusedKeyframe
+from mapping.submaps import make_submap, nearest_a_voxel, read_submap, write_submap
+
+T = poses(np.random.default_rng(2), 1, 0.2, 0.3)[0]
+NORMAL, OFFSET_M = np.array([0.2, -0.1, 1.0]), 2.0
+
+
+def fused_plane(sigma: float = 0.004) -> FusedKeyframe:
+    given = as_map(plane_rho(T, NORMAL, OFFSET_M), sigma)
+    rgb = np.arange(30 * 40 * 3, dtype=np.uint8).reshape(30, 40, 3)
+    numbers = np.tile(np.arange(40, dtype=np.uint16) // 20, (30, 1))
+    none = np.zeros(0, np.int64)
+    depth = given.depth_m()
+    keyframe = DenseKeyframe(7, T, rgb, depth, none, none.astype(float), numbers)
+    return FusedKeyframe(keyframe, given, np.ones((30, 40), np.uint8))
+
+
+def test_points_are_those_of_the_camera_model() -> None:
+    given = as_map(plane_rho(T), 0.01)
+    v, u = np.mgrid[:30, :40].astype(float)
+    expected = CAMERA.backproject(np.stack([u, v], -1), 1 / plane_rho(T))
+    np.testing.assert_allclose(back_project(given, CAMERA).numpy(), expected, rtol=1e-5)
+
+
+def test_normals_are_the_planes_and_face_the_camera() -> None:
+    normals = surface_normals(back_project(as_map(plane_rho(T), 0.01), CAMERA)).numpy()
+    expected = -(T[:3, :3].T @ NORMAL) / np.linalg.norm(NORMAL)
+    np.testing.assert_allclose(
+        normals[1:-1, 1:-1], np.broadcast_to(expected, (28, 38, 3)), atol=1e-3
+    )
+    assert np.isnan(normals[0]).all()
+
+
+def test_placed_points_lie_on_the_plane_and_follow_the_anchor() -> None:
+    submap = make_submap(fused_plane(), CAMERA, 0.01)
+    points, normals = submap.placed(T)
+    np.testing.assert_allclose(points @ NORMAL, OFFSET_M, atol=1e-4)
+    np.testing.assert_allclose(normals @ NORMAL, -np.linalg.norm(NORMAL), atol=1e-3)
+    moved = se3_exp(np.array([0.1, 0.2, -0.1, 1.0, 2.0, 3.0]))
+    again, turned = submap.placed(moved @ T)
+    np.testing.assert_allclose(again, transform(moved, points.astype(float)), atol=1e-5)
+    np.testing.assert_allclose(turned, normals @ moved[:3, :3].T, atol=1e-5)
+
+
+def test_colours_and_instances_stay_with_their_pixels() -> None:
+    result = fused_plane()
+    submap = make_submap(result, CAMERA, 1e-4)
+    pixels = np.rint(CAMERA.project(submap.points.astype(float))).astype(int)
+    np.testing.assert_array_equal(submap.colours, result.keyframe.rgb[pixels[:, 1], pixels[:, 0]])
+    np.testing.assert_array_equal(submap.instances, pixels[:, 0] // 20)
+    assert len(submap) == 28 * 38
+
+
+def test_the_variance_is_that_of_the_depth() -> None:
+    submap = make_submap(fused_plane(0.004), CAMERA, 1e-4)
+    np.testing.assert_allclose(
+        np.sqrt(submap.variances), 0.004 * submap.points[:, 2] ** 2, rtol=1e-3
+    )
+
+
+def test_one_point_a_voxel_the_surest() -> None:
+    points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [-0.1, 0.1, 0.1], [0.3, 0.3, 0.3]])
+    kept = nearest_a_voxel(points.astype(np.float32), np.array([3, 1, 2, 4], np.float32), 1.0)
+    np.testing.assert_array_equal(kept, [1, 2])
+
+
+def test_it_reads_back_as_it_was(tmp_path: Path) -> None:
+    submap = make_submap(fused_plane(), CAMERA, 0.05)
+    write_submap(tmp_path / "7", submap)
+    again = read_submap(tmp_path / "7")
+    assert again.anchor == 7
+    for name in ("points", "normals", "colours", "variances", "instances"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(submap, name))
+
+
+def test_a_broken_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "7").write_bytes(b"PK nothing")
+    with pytest.raises(InputError, match="7"):
+        read_submap(tmp_path / "7")
+
+
+def test_nothing_known_gives_no_points() -> None:
+    result = fused_plane()
+    nothing = result.map.where(torch.zeros(30, 40, dtype=torch.bool))
+    assert len(make_submap(FusedKeyframe(result.keyframe, nothing, result.views), CAMERA)) == 0

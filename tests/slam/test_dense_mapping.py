@@ -1,0 +1,221 @@
+"""``bmask-slam map`` on a small rendered room whose keyframes stand where they were."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from graph.array_file import nested
+from graph.errors import InputError
+from graph.geometry import Array, inverse, transform
+from graph.ply import read_ply
+from slam.cli import main
+from slam.dense_folder import DenseFolder
+from slam.dense_input import load, open_run
+from slam.features import BriskExtractor, FeatureConfig
+from slam.map_file import write_map
+from slam.map_state import world_state
+from slam.rendering.sequence import RenderConfig, render_sequence
+from slam.sequences import Sequence, open_sequence
+from slam.world_map import Keyframe, WorldMap
+
+FRAMES = tuple(range(0, 40, 4))
+
+
+def make_run(folder: Path, sequence: Sequence, broken: dict[int, str] | None = None) -> Path:
+    """A run folder whose map has a keyframe at the true pose of each of FRAMES."""
+    assert sequence.groundtruth is not None
+    truth = sequence.groundtruth.poses_world_camera
+    extractor = BriskExtractor(sequence.camera, FeatureConfig(border_px=12))
+    world = WorldMap()
+    for number, index in enumerate(FRAMES):
+        frame = sequence.load(index)
+        features = extractor.extract(frame)
+        T: Array = inverse(truth[0]) @ truth[index]
+        ids = np.full(len(features), -1, np.int64)
+        keyframe = Keyframe(number, index, frame.timestamp_s, 0, T, features, ids)
+        world.add_keyframe(keyframe)
+        problem = (broken or {}).get(number)
+        if problem != "no landmarks":
+            rows = np.flatnonzero(np.isfinite(features.depth_m))
+            points = sequence.camera.backproject(features.pixels[rows], features.depth_m[rows])
+            world.make_landmarks(keyframe, rows, transform(T, points))
+        if problem == "nan pose":
+            keyframe.T_world_camera[0, 3] = np.nan
+        if problem == "other image":
+            keyframe.timestamp_s += 1.0
+    folder.mkdir()
+    write_map(folder / "map", nested(mapper=nested(world=world_state(world))), sequence.camera)
+    (folder / "config.yaml").write_text(f"# bmask-slam 0, sequence {sequence.folder}, stride 1\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = RenderConfig("office", frames=40, width=160, height=120, true_depth=True)
+    return render_sequence(config, tmp_path_factory.mktemp("dense") / "office")
+
+
+@pytest.fixture(scope="module")
+def mapped(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = make_run(tmp_path_factory.mktemp("runs") / "office", open_sequence(room))
+    arguments = ["map", str(run), "--voxel", "0.02", "--masks", "truth", "--plan", "--mesh"]
+    assert main([*arguments, "--quiet"]) == 0
+    return run
+
+
+def test_it_leaves_what_it_promises(mapped: Path) -> None:
+    names = {p.name for p in (mapped / "dense").iterdir()}
+    expected = {"cloud.ply", "cloud.pcd", "semantic.ply", "mesh.ply", "plan.png", "legend.json"}
+    assert expected | {"dense.json", "view_first.png", "view_overview_semantic.png"} <= names
+    assert not [n for n in names if n.startswith(".")]
+    for name in ("plan.png", "view_first.png"):
+        image = cv2.imread(str(mapped / "dense" / name))
+        assert (image < 250).any(axis=2).mean() > 0.05
+
+
+def test_fused_depth_is_nearer_to_the_truth_than_the_sensors(mapped: Path, room: Path) -> None:
+    run = open_run(mapped)
+    folder = DenseFolder.opened(mapped)
+    before, after, chi2 = [], [], []
+    for keyframe in run.keyframes:
+        file = room / "depth_true" / run.sequence.pairs.depth_files[keyframe.frame_index].name
+        true_m = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) / run.camera.depth_scale
+        sensor_m = load(run, keyframe)[0].depth_m
+        fused = folder.fused(keyframe.id)
+        both = (true_m > 0) & np.isfinite(sensor_m) & np.isfinite(fused.depth_m())
+        before.append((sensor_m - true_m)[both])
+        after.append((fused.depth_m() - true_m)[both])
+        chi2.append(((after[-1] / fused.depth_sigma_m()[both]) ** 2)[np.abs(after[-1]) < 0.05])
+    rmse = [np.sqrt(np.mean(np.concatenate(e) ** 2)) for e in (before, after)]
+    assert rmse[1] < 0.7 * rmse[0]
+    assert 0.4 < np.concatenate(chi2).mean() < 2.0
+
+
+def test_labels_are_those_of_the_truth(mapped: Path, room: Path) -> None:
+    run = open_run(mapped)
+    cloud = read_ply(mapped / "dense" / "cloud.ply")
+    points = np.stack([cloud[c] for c in "xyz"], axis=1).astype(float)
+    keyframe = run.keyframes[4]
+    seen = transform(inverse(keyframe.T_world_camera), points)
+    pixels = np.rint(run.camera.project(seen)).astype(int)
+    true_m = cv2.imread(str(room / "depth_true" / f"{keyframe.timestamp_s:.6f}.png"), -1) / 5000
+    inside = ((pixels >= 0) & (pixels < (160, 120))).all(axis=1) & (seen[:, 2] > 0)
+    pixels, z, label = pixels[inside], seen[inside, 2], cloud["label"][inside]
+    visible = np.abs(true_m[pixels[:, 1], pixels[:, 0]] - z) < 0.05
+    import json
+
+    content = json.loads((room / "annotations.json").read_text())
+    from semantics.segmenter import CocoSegmenter
+
+    found = CocoSegmenter(room / "annotations.json").segment(
+        np.zeros((120, 160, 3), np.uint8), f"rgb/{keyframe.timestamp_s:.6f}.png"
+    )
+    truth = np.zeros((120, 160), int)
+    for instance in found:
+        truth[instance.mask] = instance.label
+    same = truth[pixels[:, 1], pixels[:, 0]] == label
+    assert content["categories"]
+    assert visible.sum() > 1000
+    assert same[visible].mean() > 0.93
+
+
+def test_again_nothing_is_fused_and_the_bytes_are_the_same(
+    mapped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (mapped / "dense" / "cloud.ply").read_bytes()
+    arguments = ["map", str(mapped), "--voxel", "0.02", "--masks", "truth", "--quiet"]
+    stamps = [p.stat().st_mtime_ns for p in sorted((mapped / "dense" / "submaps").iterdir())]
+    assert main(arguments) == 0
+    assert [
+        p.stat().st_mtime_ns for p in sorted((mapped / "dense" / "submaps").iterdir())
+    ] == stamps
+    assert (mapped / "dense" / "cloud.ply").read_bytes() == before
+
+
+def test_a_map_that_was_stopped_goes_on_to_the_same_bytes(mapped: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    for name in ("000003", "000004", "000009"):
+        (run / "dense" / "submaps" / name).unlink()
+    assert main(["map", str(run), "--voxel", "0.02", "--masks", "truth", "--quiet"]) == 0
+    for name in ("submaps/000003", "submaps/000009", "cloud.ply"):
+        assert (run / "dense" / name).read_bytes() == (mapped / "dense" / name).read_bytes()
+
+
+def test_keyframes_that_cannot_be_used_are_left_out(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = {1: "no landmarks", 2: "nan pose", 5: "other image"}
+    run = make_run(tmp_path / "run", open_sequence(room), broken)
+    assert main(["map", str(run), "--voxel", "0.05"]) == 0
+    out, err = capsys.readouterr()
+    assert "7 fused" in out and "3 left out" in out
+    for text in ("keyframe 1: it observes no landmark", "keyframe 2: its pose", "keyframe 5"):
+        assert text in err
+
+
+def test_without_depth_a_keyframe_is_left_out(room: Path, tmp_path: Path) -> None:
+    sequence = open_sequence(room)
+    run = make_run(tmp_path / "run", sequence)
+    moved = tmp_path / "office"
+    shutil.copytree(room, moved)
+    blank = np.zeros((120, 160), np.uint16)
+    cv2.imwrite(str(moved / "depth" / sequence.pairs.depth_files[FRAMES[3]].name), blank)
+    with pytest.raises(InputError, match="no valid depth"):
+        opened = open_run(run, moved)
+        load(opened, opened.keyframes[3])
+
+
+def test_a_full_disk_stops_with_what_was_written(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = make_run(tmp_path / "run", open_sequence(room))
+    import slam.dense_folder as module
+
+    write, count = module.write_submap, 0
+
+    def full(path: Path, submap: object) -> None:
+        nonlocal count
+        count += 1
+        if count == 3:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write(path, submap)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "write_submap", full)
+    assert main(["map", str(run), "--voxel", "0.05", "--quiet"]) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert len(list((run / "dense" / "submaps").iterdir())) == 2
+    monkeypatch.undo()
+    assert main(["map", str(run), "--voxel", "0.05", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--voxel", "0"], "voxel"),
+        (["--without", "elephant", "--masks", "truth"], "elephant"),
+        (["--masks", "nowhere.json"], "nowhere.json"),
+        (["--sequence", "nowhere"], "nowhere"),
+    ],
+)
+def test_bad_options_are_one_line(
+    mapped: Path, arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", str(mapped), *arguments, "--quiet"]) == 1
+    err = capsys.readouterr().err
+    assert text in err and err.startswith("error: ")
+
+
+def test_a_folder_without_a_map_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.ERROR)
+    assert main(["map", str(tmp_path)]) == 1
+    assert "no saved map" in capsys.readouterr().err
