@@ -25,7 +25,7 @@ from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.sequences import Sequence, open_sequence
 from slam.world_map import Keyframe, WorldMap
 
-FRAMES = tuple(range(0, 40, 4))
+FRAMES = tuple(range(0, 20, 2))
 
 
 def make_run(folder: Path, sequence: Sequence, broken: dict[int, str] | None = None) -> Path:
@@ -58,7 +58,7 @@ def make_run(folder: Path, sequence: Sequence, broken: dict[int, str] | None = N
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = RenderConfig("office", frames=40, width=160, height=120, true_depth=True)
+    config = RenderConfig("office", frames=20, width=160, height=120, true_depth=True)
     return render_sequence(config, tmp_path_factory.mktemp("dense") / "office")
 
 
