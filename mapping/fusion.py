@@ -21,7 +21,8 @@ MAX_NEIGHBOURS = 6
 MAX_COLOUR_STEP = 15.0
 MEDIAN_CHI2 = 0.455
 SAMPLE_STEP, MIN_SAMPLE = 4, 200
-FACTOR_RANGE = (0.1, 20.0)
+FACTOR_RANGE = (0.25, 20.0)
+"""Errors that all views share are not seen in their differences: it is never very small."""
 BLUR_PX = 0.45
 RIM_STEP = 1.05
 """Next to a surface that is nearer by more, nothing is seeded: it may be its rim."""

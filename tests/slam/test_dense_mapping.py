@@ -25,7 +25,7 @@ from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.sequences import Sequence, open_sequence
 from slam.world_map import Keyframe, WorldMap
 
-FRAMES = tuple(range(0, 20, 2))
+FRAMES = tuple(range(0, 40, 4))
 
 
 def make_run(folder: Path, sequence: Sequence, broken: dict[int, str] | None = None) -> Path:
@@ -58,7 +58,7 @@ def make_run(folder: Path, sequence: Sequence, broken: dict[int, str] | None = N
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = RenderConfig("office", frames=20, width=160, height=120, true_depth=True)
+    config = RenderConfig("office", frames=40, width=160, height=120, true_depth=True)
     return render_sequence(config, tmp_path_factory.mktemp("dense") / "office")
 
 
@@ -95,7 +95,7 @@ def test_fused_depth_is_nearer_to_the_truth_than_the_sensors(mapped: Path, room:
         chi2.append(((after[-1] / fused.depth_sigma_m()[both]) ** 2)[np.abs(after[-1]) < 0.05])
     rmse = [np.sqrt(np.mean(np.concatenate(e) ** 2)) for e in (before, after)]
     assert rmse[1] < 0.7 * rmse[0]
-    assert 0.4 < np.concatenate(chi2).mean() < 2.0
+    assert 0.4 < np.concatenate(chi2).mean() < 2.5  # coarse steps of depth are shared
 
 
 def test_labels_are_those_of_the_truth(mapped: Path, room: Path) -> None:
