@@ -24,20 +24,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from graph.array_file import FileKind, read_arrays, write_arrays
 from graph.errors import InputError
+from mapping.depth_files import read_fused, write_fused
 from mapping.inverse_depth import InverseDepthMap
 from mapping.submaps import Submap, read_submap, write_submap
 
 logger = logging.getLogger(__name__)
 
-DEPTH_FILE = FileKind("fused depth", 1)
 LABEL_FILE = FileKind("keyframe labels", 1)
-RHO_STEP, SIGMA_STEP = 1 / 16000, 1e-6
-"""Of the stored integers in 1/m; rho below 1/6 of the sensor's own step, up to 4 per metre."""
 PARTS = ("depth", "labels", "submaps")
 
 
@@ -90,11 +87,7 @@ class DenseFolder:
         self, submap: Submap, fused: InverseDepthMap, log_likelihoods: NDArray[np.float32]
     ) -> None:
         """Save a finished keyframe. Raises InputError, with nothing half written, if it cannot."""
-        arrays = {
-            "rho": _quantised(fused.rho, RHO_STEP),
-            "sigma": _quantised(torch.sqrt(fused.variance), SIGMA_STEP),
-        }
-        write_arrays(self._file("depth", submap.anchor), DEPTH_FILE, {}, arrays)
+        write_fused(self._file("depth", submap.anchor), fused)
         self.write_labels(submap.anchor, log_likelihoods)
         write_submap(self._file("submaps", submap.anchor), submap)
 
@@ -114,13 +107,7 @@ class DenseFolder:
 
     def fused(self, keyframe_id: int) -> InverseDepthMap:
         """The inverse depth of a finished keyframe."""
-        arrays = read_arrays(self._file("depth", keyframe_id), DEPTH_FILE)[1]
-        known = arrays["rho"] > 0
-        rho, sigma = (
-            np.where(known, arrays[name] * np.float32(step), np.float32(np.nan))
-            for name, step in (("rho", RHO_STEP), ("sigma", SIGMA_STEP))
-        )
-        return InverseDepthMap(torch.from_numpy(rho), torch.from_numpy(sigma**2))
+        return read_fused(self._file("depth", keyframe_id))
 
     def write_text(self, name: str, text: str) -> None:
         """Replace a text file."""
@@ -130,9 +117,3 @@ class DenseFolder:
 
     def _file(self, kind: str, keyframe_id: int) -> Path:
         return self.path / kind / f"{keyframe_id:06d}"
-
-
-def _quantised(values: torch.Tensor, step: float) -> NDArray[np.uint16]:
-    """Multiples of a step, at least 1, 0 where NaN."""
-    steps = torch.nan_to_num(torch.round(values / step).clamp(1, 65535))
-    return np.asarray(steps.cpu().numpy(), np.uint16)
