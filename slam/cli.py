@@ -21,6 +21,7 @@ from slam.commands.evaluate_segmentation import add_evaluate_segmentation
 from slam.commands.export import add_export
 from slam.commands.map import add_map
 from slam.commands.optimise import add_optimise
+from slam.commands.query import add_query
 from slam.commands.run import add_run
 from slam.commands.segment import add_segment
 from slam.commands.train import add_train
@@ -79,6 +80,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_export(commands)
     add_calibrate(commands)
     add_map(commands)
+    add_query(commands)
     add_segment(commands)
     add_train(commands)
     add_evaluate_segmentation(commands)

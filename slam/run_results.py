@@ -103,11 +103,12 @@ def save(
         if segment.timestamps_s[0] not in trajectory.timestamps_s:
             folder.write_trajectory(segment, f"trajectory_segment_{number}.txt")
     write_landmarks(folder.path / "landmarks.ply", system.landmarks())
-    for name, write in system.files().items():
+    files = system.files()
+    for name, write in files.items():
         with folder.replacing(name) as temporary:
             write(temporary)
     folder.write_text("metrics.json", format_json(rows))
     plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title)
-    for name in system.files():
+    for name in files:
         size_mb = (folder.path / name).stat().st_size / 1e6
         logger.info("%s: %.1f MB", name, size_mb)

@@ -1,4 +1,4 @@
-"""What the map's things are: keyframes' masks vote on landmarks."""
+"""What the map's things are: keyframes' masks vote on landmarks and make objects."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from graph.geometry import Array, inverse, transform
 from semantics.instances import Instance
 from semantics.label_store import LabelEstimates, LabelStore, LabelStoreConfig
 from semantics.labels import LabelSet
+from semantics.objects import KeyframeView, MapObject, ObjectConfig, ObjectMap, pixel_rays
 from semantics.segmenter import NoSegmenter, Segmenter
 from semantics.segmenter_table import SegmenterOptions
-from semantics.votes import VoteConfig, check_instances, claim_pixels, vote
+from semantics.upright import Upright
+from semantics.votes import Claims, VoteConfig, check_instances, claim_pixels, vote
 from slam.frame import Frame
 from slam.landmarks import Ints
 from slam.mapper import Mapper
@@ -40,6 +42,7 @@ class SemanticsConfig:
     segmenter: SegmenterOptions = field(default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER))
     votes: VoteConfig = field(default_factory=VoteConfig)
     labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)
+    objects: ObjectConfig = field(default_factory=ObjectConfig)
 
 
 @dataclass(frozen=True)
@@ -68,12 +71,37 @@ class LandmarkLabels:
 
 
 @dataclass(frozen=True)
-class _View:
-    """What a keyframe observes: pixels (N, 2) as detected, landmark ids (N,), and its pose."""
+class MapObjects:
+    """The objects of a map's largest segment, with labels of ``names``; ``up_world`` (3,)."""
+
+    names: LabelSet
+    objects: list[MapObject]
+    up_world: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    """What a keyframe's masks will need: its stamp and every second pixel of its depth (h, w)."""
+
+    timestamp_s: float
+    depth_m: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """Pixels (N, 2), as detected, and landmark ids (N,) of a keyframe, which may be culled.
+
+    It stands in the frame of a keyframe of the map, ``anchor``: itself or its heir.
+    """
 
     pixels: Array
     landmark_ids: Ints
-    T_world_camera: Array
+    anchor: Keyframe
+    T_anchor_camera: Array
+
+    @property
+    def T_world_camera(self) -> Array:
+        return self.anchor.T_world_camera @ self.T_anchor_camera
 
 
 class SemanticMapper:
@@ -82,16 +110,17 @@ class SemanticMapper:
     Without a segmenter and without masks it does nothing. The map is never changed.
     """
 
+    _done: set[int]
+    _waiting: dict[int, _Waiting]
+
     def __init__(
         self, camera: Camera, config: SemanticsConfig, segmenter: Segmenter | None = None
     ) -> None:
         self.camera = camera
         self.config = config
         self.segmenter = segmenter or NoSegmenter()
-        self.names = self.segmenter.labels
-        self.labels = LabelStore(len(self.names), config.labels)
-        self._done: set[int] = set()
-        self._waiting: dict[int, NDArray[np.float32]] = {}
+        self._rays = pixel_rays(camera, DEPTH_STEP)
+        self._begin(self.segmenter.labels)
 
     @property
     def enabled(self) -> bool:
@@ -99,7 +128,7 @@ class SemanticMapper:
         return len(self.names) > 1
 
     def observe(self, frame: Frame, keyframe: Keyframe, mapper: Mapper) -> None:
-        """Segment a keyframe and let its masks vote; follow what became of the map.
+        """Segment a keyframe and let its masks speak; follow what became of the map.
 
         Raises:
             InputError: the first keyframe cannot be segmented; later ones are passed over.
@@ -107,7 +136,7 @@ class SemanticMapper:
         self.follow(mapper)
         if not len(self.segmenter.labels) > 1:
             return
-        self.expect(keyframe.id, frame.depth_m)
+        self.expect(keyframe, frame.depth_m)
         try:
             instances = self.segmenter.segment(frame.rgb, frame.name)
             self.attach(keyframe.id, instances, mapper)
@@ -116,9 +145,11 @@ class SemanticMapper:
                 raise
             logger.warning("keyframe %d has no masks: %s", keyframe.id, error)
 
-    def expect(self, keyframe_id: int, depth_m: NDArray[np.float32]) -> None:
+    def expect(self, keyframe: Keyframe, depth_m: NDArray[np.float32]) -> None:
         """Keep of a keyframe what its masks will need, (H, W) z-depth in m, until they come."""
-        self._waiting[keyframe_id] = depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()
+        few = depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()
+        self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, few)
+        self._upright.add(keyframe.id, few, self._rays)
         if len(self._waiting) > MAX_WAITING:
             del self._waiting[min(self._waiting)]
 
@@ -132,39 +163,57 @@ class SemanticMapper:
         """
         size = (self.camera.height, self.camera.width)
         check_instances(instances, size, self.names, f"keyframe {keyframe_id}")
-        view = self._view(keyframe_id, mapper)
-        refused = "" if view is not None else "it is not in the map"
+        observed = _observed(keyframe_id, mapper)
+        refused = "" if observed is not None else "it is not in the map"
         if keyframe_id in self._done:
             refused = "it has its masks already"
-        if view is None or refused:
+        if observed is None or refused:
             logger.info("masks of keyframe %d are not used: %s", keyframe_id, refused)
             return Attachment(keyframe_id, len(instances), refused=refused)
         self._done.add(keyframe_id)
-        depth_m = self._waiting.pop(keyframe_id, None)
-        if depth_m is None:
-            depth_m = np.full((size[0] // DEPTH_STEP, size[1] // DEPTH_STEP), np.nan, np.float32)
-        claims = claim_pixels(instances, depth_m, size, self.config.votes)
-        points = mapper.world.landmarks.points_world[view.landmark_ids]
-        z_m = transform(inverse(view.T_world_camera), points)[:, 2]
-        votes = vote(claims, view.pixels, z_m, len(self.names), self.config.votes)
-        ids = view.landmark_ids[votes.rows]
+        nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
+        waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
+        claims = claim_pixels(instances, waiting.depth_m, size, self.config.votes)
+        points = mapper.world.landmarks.points_world[observed.landmark_ids]
+        z_m = transform(inverse(observed.T_world_camera), points)[:, 2]
+        votes = vote(claims, observed.pixels, z_m, len(self.names), self.config.votes)
+        ids = observed.landmark_ids[votes.rows]
         self.labels.update(ids, votes.distributions, votes.weights)
+        if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
+            objects = self._add_objects((keyframe_id, waiting), claims, observed, mapper)
+            on = objects[votes.instances] >= 0
+            self.objects.place_landmarks(ids[on], objects[votes.instances[on]])
         return Attachment(keyframe_id, len(instances), ids)
 
     def follow(self, mapper: Mapper) -> None:
-        """Landmarks that were fused take what was known of them along; culled ones lose it."""
-        landmarks, known = mapper.world.landmarks, self.labels.known()
-        if landmarks.alive[known].all():
-            return
+        """Keep up with the map.
+
+        Landmarks that were fused take what was known of them along, culled ones lose it; points
+        of objects in a culled keyframe's frame go on in its heir's.
+        """
+        landmarks, keyframes = mapper.world.landmarks, mapper.world.keyframes
+        known = np.union1d(self.labels.known(), self.objects.points.landmarks())
         gone = known[~landmarks.alive[known]]
-        heirs = landmarks.current(gone)
-        alive = landmarks.alive[heirs]
-        self.labels.move(gone[alive], heirs[alive])
-        self.labels.drop(gone[~alive])
+        if len(gone):
+            heirs = landmarks.current(gone)
+            alive = landmarks.alive[heirs]
+            self.labels.move(gone[alive], heirs[alive])
+            self.labels.drop(gone[~alive])
+            self.objects.points.rename_landmarks(gone, np.where(alive, heirs, -1))
+        for keyframe_id in self.objects.points.anchors():
+            if keyframe_id not in keyframes:
+                self.objects.points.hand_over(keyframe_id, *mapper.history.heir(keyframe_id))
+        self._upright.keep(keyframes.keys() | self._waiting.keys())
 
     def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
         """What landmarks (N,) are; None where nothing tells labels apart."""
         return LandmarkLabels(self.names, self.labels.estimates(ids)) if self.enabled else None
+
+    def map_objects(self, keyframes: Sequence[Keyframe]) -> MapObjects:
+        """The objects that these keyframes, all of one map segment, saw."""
+        poses = {k.id: k.T_world_camera for k in keyframes}
+        up_world = self._upright.up_world(poses)
+        return MapObjects(self.names, self.objects.objects(poses, up_world), up_world)
 
     def state(self) -> Arrays:
         """All that was learned, as named arrays."""
@@ -173,9 +222,14 @@ class SemanticMapper:
             "names": np.array(self.names.names),
             "done": np.array(sorted(self._done), np.int64),
             "waiting": np.array(list(self._waiting), np.int64),
-            "waiting_shape": np.array([depth_m.shape for depth_m in waiting], np.int64).ravel(),
-            "waiting_depth_m": np.array(waiting, np.float32).ravel(),
-            **nested(labels=self.labels.state()),
+            "waiting_s": np.array([w.timestamp_s for w in waiting], float),
+            "waiting_shape": np.array([w.depth_m.shape for w in waiting], np.int64).ravel(),
+            "waiting_depth_m": np.array([w.depth_m for w in waiting], np.float32).ravel(),
+            **nested(
+                labels=self.labels.state(),
+                objects=self.objects.state(),
+                upright=self._upright.state(),
+            ),
         }
 
     def restore(self, state: Arrays, path: Path) -> None:
@@ -190,34 +244,67 @@ class SemanticMapper:
                 f"{path}: its landmarks have {len(names) - 1} labels that are not the segmenter's "
                 f"{len(self.names) - 1}; take the segmenter that it was made with, or none"
             )
-        if len(names) > 1:
-            self.names = names
-        self.labels = LabelStore(len(self.names), self.config.labels)
-        if len(names) == len(self.names):
-            self.labels.restore(part(state, "labels"))
+        if len(names) == 1:
+            return  # nothing was learned
+        self._begin(names)
+        self.labels.restore(part(state, "labels"))
+        self.objects.restore(part(state, "objects"))
+        self._upright.restore(part(state, "upright"))
         self._done = set(state["done"].tolist())
-        waiting = state["waiting"].tolist()
         shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
-        depths_m = state["waiting_depth_m"].reshape(len(waiting), *shape)
-        self._waiting = dict(zip(waiting, depths_m, strict=True))
+        depths_m = state["waiting_depth_m"].reshape(len(state["waiting"]), *shape)
+        waiting = map(_Waiting, state["waiting_s"].tolist(), depths_m)
+        self._waiting = dict(zip(state["waiting"].tolist(), waiting, strict=True))
 
     def begin_session(self) -> None:
         """Masks of keyframes of an earlier recording are not waited for."""
         self._waiting = {}
 
-    def _view(self, keyframe_id: int, mapper: Mapper) -> _View | None:
-        world = mapper.world
-        keyframe = world.keyframes.get(keyframe_id)
-        if keyframe is not None:
-            rows, ids = world.observed(keyframe)
-            return _View(keyframe.features.image_pixels[rows], ids, keyframe.T_world_camera)
-        culled = world.culled.get(keyframe_id)
-        heir_id, T_heir_keyframe = mapper.history.heir(keyframe_id)
-        heir = world.keyframes.get(heir_id)
-        if culled is None or heir is None:
-            return None
-        rows = np.flatnonzero(culled.landmark_ids >= 0)
-        ids = world.landmarks.current(culled.landmark_ids[rows])
-        alive = world.landmarks.alive[ids]
-        pose = heir.T_world_camera @ T_heir_keyframe
-        return _View(culled.image_pixels[rows[alive]], ids[alive], pose)
+    def _begin(self, names: LabelSet) -> None:
+        """Know nothing yet."""
+        self.names = names
+        self.labels = LabelStore(len(names), self.config.labels)
+        self.objects = ObjectMap(self.camera, len(names), self.config.objects, self.config.labels)
+        self._upright = Upright()
+        self._done = set()
+        self._waiting = {}
+
+    def _add_objects(
+        self, waited: tuple[int, _Waiting], claims: Claims, observed: _Observed, mapper: Mapper
+    ) -> Ints:
+        """The object of each of the claims' instances (K,) and -1 for the last, "none"."""
+        keyframe_id, waiting = waited
+        here = mapper.world.in_segment(observed.anchor.segment)
+        T_world_camera = observed.T_world_camera
+        view = KeyframeView(
+            keyframe_id,
+            waiting.timestamp_s,
+            T_world_camera,
+            waiting.depth_m,
+            self._rays,
+            claims,
+            {k.id: k.T_world_camera for k in here} | {keyframe_id: T_world_camera},
+        )
+        objects = self.objects.add(view)
+        if keyframe_id != observed.anchor.id:
+            heir = observed.anchor.id, observed.T_anchor_camera
+            self.objects.points.hand_over(keyframe_id, *heir)
+        return np.append(objects, -1)
+
+
+def _observed(keyframe_id: int, mapper: Mapper) -> _Observed | None:
+    """What a keyframe of the map, or a culled one, sees of the landmarks that live."""
+    world = mapper.world
+    keyframe = world.keyframes.get(keyframe_id)
+    if keyframe is not None:
+        rows, ids = world.observed(keyframe)
+        return _Observed(keyframe.features.image_pixels[rows], ids, keyframe, np.eye(4))
+    culled = world.culled.get(keyframe_id)
+    heir_id, T_heir_keyframe = mapper.history.heir(keyframe_id)
+    heir = world.keyframes.get(heir_id)
+    if culled is None or heir is None:
+        return None
+    rows = np.flatnonzero(culled.landmark_ids >= 0)
+    ids = world.landmarks.current(culled.landmark_ids[rows])
+    alive = world.landmarks.alive[ids]
+    return _Observed(culled.image_pixels[rows[alive]], ids[alive], heir, T_heir_keyframe)

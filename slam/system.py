@@ -29,8 +29,8 @@ from slam.map_file import MAP, write_map
 from slam.mapper import Mapper
 from slam.relocalisation import RelocalisationConfig
 from slam.results import FrameResult, TrackingStatus
-from slam.semantic_files import LABELS, write_labels
-from slam.semantic_mapping import SemanticMapper, SemanticsConfig
+from slam.semantic_files import semantic_writers
+from slam.semantic_mapping import MapObjects, SemanticMapper, SemanticsConfig
 from slam.stage_clock import StageClock
 from slam.tracker import Tracked, Tracker, TrackingConfig, lost, untracked
 from slam.world_map import Keyframe
@@ -211,6 +211,10 @@ class SlamSystem:
         columns = table.points_world[ids], table.colours[ids], table.observations[ids]
         return LandmarkCloud(ids, *columns, labels)
 
+    def objects(self) -> MapObjects:
+        """The objects of the largest segment."""
+        return self.semantics.map_objects(self.mapper.world.in_segment(largest(self.segments())))
+
     def files(self) -> dict[str, Callable[[Path], None]]:
         """What it saves so that it loads again: a function that writes a file, by its name."""
         found: dict[str, Callable[[Path], None]] = {
@@ -218,7 +222,7 @@ class SlamSystem:
             MAP: self.save_map,
         }
         if self.semantics.enabled:
-            found[LABELS] = lambda path: write_labels(path, self.landmarks())
+            found |= semantic_writers(self.landmarks(), self.objects(), self.trajectory())
         if self.config.covariances:
             found[COVARIANCES] = self.save_covariances
         return found

@@ -218,6 +218,29 @@ def test_a_map_goes_on_with_its_own_labels_or_without_masks() -> None:
     assert right_share(fresh) > 0.99
 
 
+def test_the_two_sides_are_two_objects_with_their_landmarks(at_once: SlamSystem) -> None:
+    left, right = at_once.objects().objects
+    assert (left.label, right.label) == (1, 2)
+    assert left.centroid_world[0] < EDGE_M < right.centroid_world[0]
+    for o in (left, right):
+        assert o.centroid_world[2] == pytest.approx(2.0, abs=0.01)
+        assert len(o.keyframe_ids) == len(FRAMES)  # culled ones did see it, too
+        own = at_once.mapper.world.landmarks
+        assert own.alive[o.landmark_ids].all()
+        side = own.points_world[o.landmark_ids, 0] < EDGE_M
+        assert (side == (o is left)).mean() > 0.99
+
+
+def test_late_masks_make_the_same_objects(at_once: SlamSystem) -> None:
+    system = late_system()
+    for k in sorted((*system.mapper.world.keyframes, *system.mapper.world.culled), reverse=True):
+        system.semantics.attach(k, Sides(FRAMES).instances(k), system.mapper)
+    pairs = zip(at_once.objects().objects, system.objects().objects, strict=True)
+    for a, b in pairs:
+        assert a.label == b.label
+        assert np.allclose(a.centroid_world, b.centroid_world, atol=0.02)
+
+
 def test_files(at_once: SlamSystem, tmp_path: Path) -> None:
     from graph.ply import read_ply
 
@@ -231,6 +254,8 @@ def test_files(at_once: SlamSystem, tmp_path: Path) -> None:
     assert [names[k] for k in points["label"]] == list(table.labels)
     assert np.allclose(table.probability, points["probability"], atol=1e-5)
     assert np.allclose(table.entropy, points["entropy"], atol=1e-5)
+    at_once.files()["objects.png"](tmp_path / "objects.png")
+    assert (tmp_path / "objects.png").stat().st_size > 10_000
     (tmp_path / "labels.csv").write_text("id,label\n")
     with pytest.raises(InputError, match="columns"):
         read_labels(tmp_path)

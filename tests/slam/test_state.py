@@ -84,7 +84,7 @@ def system() -> SlamSystem:
         LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
         for k in range(2)
     ]
-    system.semantics.expect(first, FRAMES[3].depth_m)
+    system.semantics.expect(system.mapper.world.keyframes[first], FRAMES[3].depth_m)
     loops.closed = {(first, second): True, (first, second + 1): False}
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
     return system

@@ -1,0 +1,107 @@
+"""Oriented boxes and the direction of up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graph.camera import Camera
+from graph.geometry import Array, se3_exp, transform
+from semantics.boxes3d import EDGES, OrientedBox, box_around, box_iou, upright_axes
+from semantics.objects import pixel_rays
+from semantics.upright import Upright, sample_normals, up_direction
+
+T_B_A = se3_exp(np.array([0.7, -0.4, 1.9, 1.0, -2.0, 3.0]))
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def cuboid(rng: np.random.Generator, size_m: Array, count: int = 3000) -> Array:
+    """Points (N, 3) on the surface of a box at the origin."""
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    side = rng.integers(0, 3, count)
+    points[np.arange(count), side] = np.sign(points[np.arange(count), side]) / 2
+    return points * size_m
+
+
+@pytest.mark.parametrize("yaw_deg", [0, 20, 45, 77])
+def test_a_box_around_a_turned_cuboid_is_that_cuboid(yaw_deg: float) -> None:
+    rng, size_m = np.random.default_rng(1), np.array([1.2, 0.5, 0.8])
+    T = T_B_A @ se3_exp(np.array([0, 0, np.deg2rad(yaw_deg), 0.3, 0.1, -0.2]))
+    box = box_around(transform(T, cuboid(rng, size_m)), T_B_A[:3, :3] @ UP)
+    assert np.allclose(box.T_world_box[:3, 3], T[:3, 3], atol=0.01)
+    assert np.allclose(np.sort(box.size_m[:2]), [0.5, 1.2], atol=0.02)
+    assert box.size_m[2] == pytest.approx(0.8, abs=0.01)
+    assert np.allclose(box.T_world_box[:3, 2], T_B_A[:3, :3] @ UP)
+    assert np.linalg.det(box.T_world_box[:3, :3]) == pytest.approx(1.0)
+    assert box_iou(box, OrientedBox(T, size_m)) > 0.95
+
+
+def test_trimming_takes_strays_out() -> None:
+    rng = np.random.default_rng(2)
+    points = np.concatenate([cuboid(rng, np.ones(3)), rng.uniform(-3, 3, (20, 3))])
+    assert box_around(points, UP).size_m.max() > 3
+    assert np.allclose(box_around(points, UP, 0.02).size_m, 1.0, atol=0.05)
+
+
+def test_one_point_and_a_flat_thing_have_boxes() -> None:
+    assert (box_around(np.array([[1.0, 2.0, 3.0]]), UP).size_m > 0).all()
+    flat = np.random.default_rng(3).uniform(0, 1, (50, 3)) * [1, 0, 1]
+    assert box_around(flat, UP).volume_m3 > 0
+
+
+def test_iou_of_axis_parallel_boxes_is_what_one_counts_by_hand() -> None:
+    a = OrientedBox(np.eye(4), np.array([2.0, 2.0, 2.0]))
+    T = np.eye(4)
+    T[0, 3] = 1.0
+    assert box_iou(a, OrientedBox(T, a.size_m)) == pytest.approx(1 / 3, abs=0.01)
+    assert box_iou(a, a) == pytest.approx(1.0)
+    small = OrientedBox(np.eye(4), np.array([1.0, 1.0, 1.0]))
+    assert box_iou(a, small) == pytest.approx(1 / 8, abs=0.01)
+    T[0, 3] = 5.0
+    assert box_iou(a, OrientedBox(T, a.size_m)) == 0.0
+    moved = [OrientedBox(T_B_A @ b.T_world_box, b.size_m) for b in (a, small)]
+    assert box_iou(*moved) == pytest.approx(box_iou(a, small), abs=0.01)
+
+
+def test_edges_join_corners_along_the_axes() -> None:
+    box = OrientedBox(T_B_A, np.array([1.0, 2.0, 3.0]))
+    lengths = np.linalg.norm(np.diff(box.corners_world[EDGES], axis=1)[:, 0], axis=1)
+    assert sorted(np.round(lengths, 9)) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
+
+
+def test_upright_axes_are_a_rotation_with_up_last() -> None:
+    for up in np.random.default_rng(4).normal(size=(5, 3)):
+        unit = up / np.linalg.norm(up)
+        R = upright_axes(unit)
+        assert np.allclose(R @ R.T, np.eye(3))
+        assert np.linalg.det(R) == pytest.approx(1.0)
+        assert np.allclose(R[:, 2], unit)
+
+
+def test_up_is_found_although_all_cameras_look_down() -> None:
+    rng = np.random.default_rng(5)
+    up = se3_exp(np.array([0.3, 0.2, -0.1, 0, 0, 0]))[:3, :3] @ UP
+    R = upright_axes(up)
+    walls = np.array([R @ [np.cos(a), np.sin(a), 0] for a in rng.uniform(0, 6.3, 400)])
+    floor = up + 0.03 * rng.normal(size=(200, 3))
+    floor /= np.linalg.norm(floor, axis=1, keepdims=True)
+    tilted = R @ [np.sin(0.5), 0, np.cos(0.5)]  # all cameras pitched by half a radian
+    found = up_direction(np.concatenate([walls, floor]), np.tile(tilted, (5, 1)))
+    assert np.rad2deg(np.arccos(found @ up)) < 1.0
+    without = up_direction(np.zeros((0, 3)), np.tile(tilted, (5, 1)))
+    assert np.allclose(without, tilted)
+
+
+def test_normals_of_a_floor_point_up() -> None:
+    """The floor is 1.5 m below a camera pitched by 30 degrees; y_camera is down."""
+    camera = Camera(640, 480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)
+    rays, pitch = pixel_rays(camera, 2), np.deg2rad(30)
+    up_camera = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
+    depth_m = (-1.5 / (rays @ up_camera)).astype(np.float32)
+    depth_m[(depth_m < 0) | (depth_m > 6)] = np.nan
+    assert np.allclose(sample_normals(depth_m, rays), up_camera, atol=1e-4)
+    upright = Upright()
+    upright.add(4, depth_m, rays)
+    found = upright.up_world({4: T_B_A})
+    assert np.allclose(found, T_B_A[:3, :3] @ up_camera, atol=1e-4)
+    assert np.allclose(upright.up_world({}), [0, -1, 0])
