@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from graph.data_files import data_path
 from graph.errors import InputError
 from semantics.labels import read_label_set
 from semantics.segmenter import CocoSegmenter, LabelImageSegmenter, NoSegmenter, Segmenter
 
 NAMES = {
-    "light": "MobileNetV2-FPN of this project, with --weights",
+    "light": "MobileNetV2-FPN of this project, with its own weights or --weights",
     "mask-scoring-rcnn": "ResNet-FPN, with --weights",
     "precomputed": "masks that any tool made: --masks FILE.json (COCO) or a folder of label PNGs",
     "truth": "the annotations of a rendered sequence",
     "none": "no instances",
 }
+LIGHT_WEIGHTS = ("weights", "light.safetensors")
+"""Those that come with the project, in its data folder."""
 TRUTH_FILE = "annotations.json"
 
 
@@ -74,14 +77,15 @@ def _precomputed(options: SegmenterOptions) -> Segmenter:
 
 def _network(options: SegmenterOptions) -> Segmenter:
     """Imports torch, which takes a second: only for those who need it."""
-    if options.weights is None:
+    if options.weights is None and options.name != "light":
         raise InputError(f"segmenter {options.name!r}: give --weights, a file or torchvision:NAME")
     from semantics.checkpoints import find_weights, load_network  # noqa: PLC0415
     from semantics.network_segmenter import NetworkSegmenter  # noqa: PLC0415
     from semantics.yolox import YoloxConfig, YoloxDetector  # noqa: PLC0415
 
     labels = read_label_set(options.labels) if options.labels else None
-    network = load_network(find_weights(options.weights), labels)
+    path = find_weights(options.weights) if options.weights else data_path(*LIGHT_WEIGHTS)
+    network = load_network(path, labels)
     light = network.model.config.backbone == "mobilenet_v2"
     if light != (options.name == "light"):
         kind = network.model.config.backbone

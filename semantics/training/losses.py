@@ -30,11 +30,14 @@ from semantics.training.targets import (
 )
 
 SMOOTH_L1_BETA = 1 / 9
-TRAINING_PROPOSALS = ProposalConfig(before_nms=2000, after_nms=2000)
+PROPOSALS_FACTOR = 2
+"""So many times as many proposals are looked at in training."""
 JITTERS = 3
 """Boxes drawn around each object, if masks are learnt there."""
 JITTER_SHARE = 0.12
 """Their corners move by up to this share of the box's size."""
+MAX_ROIS = 64
+"""Of them at most so many are drawn from an image."""
 
 Losses = dict[str, Tensor]
 MaskRois = Literal["proposals", "objects"]
@@ -109,7 +112,11 @@ def rpn_losses(
     scores = torch.cat(judged).float()
     objectness = F.binary_cross_entropy_with_logits(scores, torch.cat(truth).to(scores))
     box = _smooth_l1(torch.cat(moved), torch.cat(wanted), len(scores))
-    proposals = select_proposals(anchors, logits, offsets, batch.sizes, TRAINING_PROPOSALS)
+    usual = model.config.proposals
+    more = ProposalConfig(
+        PROPOSALS_FACTOR * usual.before_nms, PROPOSALS_FACTOR * usual.after_nms, usual.nms_iou
+    )
+    proposals = select_proposals(anchors, logits, offsets, batch.sizes, more)
     return {"objectness": objectness, "rpn_box": box}, proposals
 
 
@@ -147,7 +154,8 @@ def around_objects(
     """Boxes near each object, as an imperfect detector would give them."""
     found = Rois([], [])
     for boxes, size in zip(objects, batch.sizes, strict=True):
-        owner = torch.arange(len(boxes), device=boxes.device).repeat(JITTERS)
+        owner = torch.arange(len(boxes)).repeat(JITTERS)
+        owner = owner[torch.randperm(len(owner), generator=generator)[:MAX_ROIS]].to(boxes.device)
         near = boxes[owner]
         noise = torch.rand(near.shape, generator=generator).to(near) * 2 - 1
         sides = (near[:, 2:] - near[:, :2]).repeat(1, 2)

@@ -27,26 +27,38 @@ SMOOTHING_STEPS = 25
 
 
 @dataclass(frozen=True)
+class Source:
+    """Images to learn from.
+
+    Attributes:
+        file, images: COCO file and the folder of its images.
+        held_out: share of the images that is left for testing.
+    """
+
+    file: Path
+    images: Path
+    held_out: float = 0.0
+
+
+@dataclass(frozen=True)
 class TrainingRun:
     """What to train, on what.
 
     Attributes:
-        data: COCO files, each with the folder of its images.
+        data: where images come from; one that stands there twice is seen twice as often.
         out: folder of the results.
         weights: to start from; None: a new light network ...
         backbone: ... with this ImageNet MobileNetV2 as its body.
         labels: label set to learn, by name or file.
-        held_out: share of each file's images that is left for testing.
         freeze: parameters that stay, by the beginning of their names.
         settings: other values of ``TrainingConfig``.
     """
 
-    data: tuple[tuple[Path, Path], ...]
+    data: tuple[Source, ...]
     out: Path
     weights: str | None = None
     backbone: Path | None = None
     labels: str = "coco"
-    held_out: float = 0.0
     freeze: tuple[str, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -57,16 +69,19 @@ def run_training(run: TrainingRun, progress: Callable[[int, int], None]) -> Path
     Raises:
         InputError: data, weights or options that do not go together.
     """
-    if not 0 <= run.held_out < 1:
-        raise InputError(f"--held-out {run.held_out}: a share of the images, from 0 to below 1")
+    for source in run.data:
+        if not 0 <= source.held_out < 1:
+            raise InputError(
+                f"--held-out {source.held_out}: a share of the images, from 0 to below 1"
+            )
     try:
         config = TrainingConfig(freeze=run.freeze, **run.settings)
     except ValueError as error:
         raise InputError(f"training: {error}") from error
     labels = read_label_set(run.labels)
     parts = [
-        Dataset(split(read_coco(file), run.held_out, config.seed)[0], images, labels)
-        for file, images in run.data
+        Dataset(split(read_coco(s.file), s.held_out, config.seed)[0], s.images, labels)
+        for s in run.data
     ]
     network = _start(run, labels, config.seed)
     weights = train(network, JoinedDatasets(parts), run.out, config, progress)

@@ -58,7 +58,7 @@ def add_train(commands: _Commands) -> None:
 
 def _train(arguments: argparse.Namespace) -> int:
     from graph.errors import InputError
-    from semantics.training.run import TrainingRun, run_training
+    from semantics.training.run import Source, TrainingRun, run_training
     from slam.progress import console_log, counting_bar
 
     if len(arguments.data) != len(arguments.images):
@@ -66,8 +66,9 @@ def _train(arguments: argparse.Namespace) -> int:
             f"--data is given {len(arguments.data)} times, --images {len(arguments.images)} times; "
             "give one folder of images for each file"
         )
-    data = tuple(zip(arguments.data, arguments.images, strict=True))
-    names = ("out", "weights", "backbone", "labels", "held_out")
+    pairs = zip(arguments.data, arguments.images, strict=True)
+    data = tuple(Source(file, images, arguments.held_out) for file, images in pairs)
+    names = ("out", "weights", "backbone", "labels")
     given = {name: getattr(arguments, name) for name in names}
     numbers = ("only", "rois", "optimiser", "steps", "batch", "rate", "seed")
     settings = {name: getattr(arguments, name) for name in numbers}

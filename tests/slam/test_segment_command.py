@@ -69,5 +69,6 @@ def test_a_folder_of_images_and_what_is_refused(
     cv2.imwrite(str(folder / "a.jpg"), np.zeros((20, 30, 3), np.uint8))
     assert main(command) == 0
     assert "0 instances in 1 images" in capsys.readouterr().out
-    assert main(["segment", str(folder), "--out", str(tmp_path / "n")]) == 1
+    network = ["--segmenter", "mask-scoring-rcnn"]
+    assert main(["segment", str(folder), *network, "--out", str(tmp_path / "n")]) == 1
     assert "give --weights" in capsys.readouterr().err

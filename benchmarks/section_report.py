@@ -1,0 +1,104 @@
+"""Run benchmarks one after the other and keep what they print in a report under docs/.
+
+    python benchmarks/section_report.py graph [--only loops,session] [--sequences runs/bench]
+
+What a benchmark prints stands in the report as it is, below the command. With ``--only`` the other
+sections stay as they were.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks.machine import describe_commit, now, processor  # noqa: E402
+
+
+@dataclass(frozen=True)
+class Report:
+    """A page of sections by name: each has a title and a command of this folder."""
+
+    path: Path
+    title: str
+    sections: dict[str, tuple[str, str]]
+
+    @property
+    def head(self) -> str:
+        """How the page begins."""
+        return (
+            f"# {self.title}\n\nWritten by `python benchmarks/section_report.py {self.path.stem}`; "
+            "each section is what its command printed.\n"
+        )
+
+
+REPORTS = {
+    "graph": Report(ROOT / "docs" / "graph.md", "What the graph reaches", {
+        "session": ("A long session with bounded cost", "long_session.py"),
+        "loops": ("Loops closed, and wrong ones survived", "loop_closing.py {sequences}/corridor"),
+        "pose-graphs": ("Pose graphs, clean and with wrong loops", "pose_graphs.py"),
+        "kills": (
+            "Killed and resumed",
+            "kill_and_resume.py {sequences}/office-300 --every 30 --kills 10 --max-frames 150",
+        ),
+        "calibration": ("Self-calibration", "calibration.py --out {sequences}/calibration"),
+        "covariances": (
+            "How honest the covariances are",
+            "covariances.py --runs 200 --sequence {sequences}/living_room",
+        ),
+    }),
+    "semantics": Report(ROOT / "docs" / "semantics.md", "What the semantics reach", {
+        "photographs": (
+            "Masks of photographs", "segmentation.py photographs --weights {sequences}/light-{{}}"
+        ),
+        "rooms": ("Masks of rendered rooms", "segmentation.py rooms --rooms {sequences}/rooms"),
+        "cost": ("Time and memory of the networks", "segmentation.py cost"),
+    }),
+}  # fmt: skip
+
+
+def section(report: Report, name: str, sequences: Path) -> str:
+    """Run a benchmark; its section."""
+    title, command = report.sections[name]
+    command = f"benchmarks/{command.format(sequences=sequences)}"
+    print(f"{title}: python {command}", flush=True)
+    begin_s = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, *command.split()], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise SystemExit(f"{command} failed:\n{done.stderr[-2000:]}")
+    wall_s = time.perf_counter() - begin_s
+    commit = describe_commit(ROOT, (str(report.path.relative_to(ROOT)),))
+    when = f"{processor()}; commit {commit}; {now()}; {wall_s:.0f} s."
+    return f"## {title}\n\n`python {command}`\n\n```\n{done.stdout.strip()}\n```\n\n{when}\n"
+
+
+def main() -> None:
+    """Write a report, or renew some of its sections."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("report", choices=REPORTS)
+    parser.add_argument("--only", help="some of its sections, such as loops,session")
+    parser.add_argument("--sequences", type=Path, default=Path("runs/bench"))
+    arguments = parser.parse_args()
+    report = REPORTS[arguments.report]
+    chosen = arguments.only.split(",") if arguments.only else list(report.sections)
+    for name in chosen:
+        new = section(report, name, arguments.sequences)
+        old = report.path.read_text() if report.path.exists() else report.head
+        parts = {part.split("\n", 1)[0]: part for part in re.split(r"(?m)^(?=## )", old)[1:]}
+        parts[new.split("\n", 1)[0]] = new.rstrip() + "\n\n"
+        titles = [f"## {title}" for title, _ in report.sections.values()]
+        body = "".join(parts[title] for title in titles if title in parts)
+        report.path.write_text(f"{report.head}\n{body.rstrip()}\n")
+
+
+if __name__ == "__main__":
+    main()

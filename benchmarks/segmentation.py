@@ -1,0 +1,139 @@
+"""What the segmentation network reaches: on photographs, in rendered rooms, in time and memory.
+
+    python benchmarks/segmentation.py photographs --weights runs/bench/light-{}
+    python benchmarks/segmentation.py rooms --rooms runs/bench/rooms
+    python benchmarks/segmentation.py cost
+
+Photographs: the part of ../shared/data/coco_excerpt that training with the same seed held out
+(`--held-out 0.28 --seed N`), boxes from YOLOX-Nano. {} in ``--weights`` stands for the seed; seed 0
+is measured with the project's own weights. Rooms: seeds that no training saw, the network's own
+boxes. Cost: a 640x480 image in a process of its own, two threads, random weights that take every
+proposal for an object, so that there are as many instances as the network gives at most.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from semantics.coco_files import CocoFile, read_coco  # noqa: E402
+from semantics.evaluation import SegmentationResult, evaluate_segmenter  # noqa: E402
+from semantics.segmenter_table import SegmenterOptions, make_segmenter  # noqa: E402
+from semantics.training.dataset import split  # noqa: E402
+
+DATA = ROOT.parent / "shared" / "data"
+HELD_OUT = 0.28
+SEEDS = (0, 1, 2)
+ROOMS = (900, 901, 902, 903, 904)
+SIZE = (480, 640)
+REPEATS = 15
+
+
+def evaluated(options: SegmenterOptions, truth: CocoFile, images: Path) -> SegmentationResult:
+    """The figures of a segmenter that drops nothing for its score."""
+    return evaluate_segmenter(make_segmenter(options, images), truth, images, lambda *_: None)
+
+
+def line(name: str, result: SegmentationResult) -> str:
+    """A row of the table."""
+    boxes, masks, rescored = result.curves
+    return (
+        f"{name:12} {result.images:6d} {boxes.ap:7.3f} {masks.ap:9.3f} "
+        f"{rescored.ap:11.3f} {100 * (rescored.ap - masks.ap):+6.2f} {masks.ap50:7.3f} "
+        f"{result.iou_correlation:9.3f}"
+    )
+
+
+HEADER = (
+    f"{'':12} {'images':>6} {'box AP':>7} {'mask AP':>9} {'x MaskIoU':>11} {'gain':>6} "
+    f"{'AP50':>7} {'IoU corr.':>9}"
+)
+
+
+def photographs(weights: str) -> None:
+    """COCO's figures of each seed's network on what its training did not see."""
+    excerpt = DATA / "coco_excerpt"
+    proposals = DATA / "weights" / "yolox_nano.onnx"
+    print(HEADER)
+    gains, aps = [], []
+    for seed in SEEDS:
+        _, truth = split(read_coco(excerpt / "instances.json"), HELD_OUT, seed)
+        file = str(Path(weights.format(seed)) / "weights.safetensors") if seed else None
+        options = SegmenterOptions("light", weights=file, proposals=proposals, min_score=0.0)
+        result = evaluated(options, truth, excerpt / "images")
+        print(line(f"seed {seed}", result), flush=True)
+        gains.append(100 * (result.curves[2].ap - result.curves[1].ap))
+        aps.append(result.curves[2].ap)
+    print(f"mean: mask AP x MaskIoU {np.mean(aps):.3f}, gain {np.mean(gains):+.2f} points")
+
+
+def rooms(folder: Path) -> None:
+    """The same in rooms that no training saw, by the network alone; AP50 by class."""
+    print(HEADER)
+    for seed in ROOMS:
+        room = folder / str(seed)
+        truth = read_coco(room / "annotations.json")
+        result = evaluated(SegmenterOptions("light", min_score=0.0), truth, room)
+        print(line(f"room {seed}", result), flush=True)
+
+
+def cost() -> None:
+    """Median time and peak memory of each network, each in a process of its own."""
+    print(f"{'':18} {'ms an image':>12} {'peak memory':>12}")
+    for name in ("light", "resnet50", "resnet50_v2"):
+        command = [sys.executable, __file__, "one", "--network", name]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        print(done.stdout.rstrip(), flush=True)
+
+
+def one(name: str) -> None:
+    """Time and memory of one network in this process."""
+    import torch  # noqa: PLC0415
+
+    from semantics.network import config  # noqa: PLC0415
+    from semantics.network.model import MaskRCNN  # noqa: PLC0415
+
+    torch.set_num_threads(2)
+    torch.manual_seed(0)
+    model = MaskRCNN(getattr(config, name.upper())).eval()
+    model.roi_heads.box_predictor.cls_score.bias.data[1] += 3
+    image = torch.rand(3, *SIZE)
+    times_s = []
+    with torch.inference_mode():
+        for _ in range(REPEATS + 2):
+            begin_s = time.perf_counter()
+            model([image])
+            times_s.append(time.perf_counter() - begin_s)
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"{name:18} {1000 * np.median(times_s[2:]):12.0f} {peak_mb:9.0f} MB")
+
+
+def main() -> None:
+    """Run one part."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("part", choices=("photographs", "rooms", "cost", "one"))
+    parser.add_argument("--weights", default="runs/bench/light-{}")
+    parser.add_argument("--rooms", type=Path, default=ROOT / "runs" / "bench" / "rooms")
+    parser.add_argument("--network", default="light")
+    arguments = parser.parse_args()
+    if arguments.part == "photographs":
+        photographs(arguments.weights)
+    elif arguments.part == "rooms":
+        rooms(arguments.rooms)
+    elif arguments.part == "cost":
+        cost()
+    else:
+        one(arguments.network)
+
+
+if __name__ == "__main__":
+    main()
