@@ -13,6 +13,8 @@ from semantics.network.layers import ConvBlock, NormKind, conv_stack, keep_varia
 
 BINS = 14
 """RoIAlign bins of both heads; masks have twice as many."""
+OUTPUT_STD = 0.01
+"""Of the last layers' weights at the beginning, so that training starts without large errors."""
 
 
 def make_mask_head(config: NetworkConfig) -> nn.Sequential:
@@ -31,6 +33,7 @@ class MaskPredictor(nn.Module):
         self.conv5_mask = nn.ConvTranspose2d(channels, channels, 2, 2)
         self.mask_fcn_logits = nn.Conv2d(channels, outputs, 1)
         keep_variance(self)
+        nn.init.normal_(self.mask_fcn_logits.weight, std=OUTPUT_STD)
 
     def forward(self, x: Tensor) -> Tensor:
         """(R, channels, 14, 14) to logits (R, outputs, 28, 28)."""
@@ -55,6 +58,7 @@ class MaskIoUHead(nn.Module):
         self.maskiou_fc2 = nn.Linear(hidden, hidden)
         self.maskiou = nn.Linear(hidden, config.mask_outputs)
         keep_variance(self)
+        nn.init.normal_(self.maskiou.weight, std=OUTPUT_STD)
 
     def forward(self, features: Tensor, masks: Tensor) -> Tensor:
         """IoUs (R, outputs) of mask probabilities (R, 28, 28) with features (R, C, 14, 14)."""
