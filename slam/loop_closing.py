@@ -116,6 +116,11 @@ class LoopCloser:
         a, b = state["ends"].T.tolist()
         self.waiting = list(map(LoopConstraint, a, b, *columns))
 
+    @property
+    def ends(self) -> set[int]:
+        """Keyframes that closed loops begin or end in."""
+        return {end for pair in self.closed for end in pair}
+
     def add(self, keyframe: Keyframe) -> None:
         """A keyframe can be recognised from now on."""
         self.index.add(keyframe.id, keyframe.features.descriptors)

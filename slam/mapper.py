@@ -226,7 +226,8 @@ class Mapper:
     def _cull_keyframe(self, newest: Keyframe) -> None:
         _, seen = self.world.observed(newest)
         strong = self.world.covisible(seen, 15)
-        old = [k for _, k in strong if k.id != 0 and k.id < newest.id - 2]
+        kept = self.loops.ends | {0}  # with a loop's end its relative pose would leave the graph
+        old = [k for _, k in strong if k.id not in kept and k.id < newest.id - 2]
         redundant = redundant_keyframe(self.world, old, self._mapping)
         if redundant is None:
             return

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, add_keyframe, make_features, random_descriptors
 
+import slam.mapper
 from graph.geometry import Array, inverse, make_pose, se3_exp, se3_log, so3_exp, transform
 from graph.smoother_config import SmootherConfig
 from graph.updates import RelativePoseErrors
@@ -253,3 +254,21 @@ def test_a_loop_that_left_with_its_keyframe_is_not_refuted() -> None:
     in_graph = mapper.smoother.relative_pose_errors("loop")
     assert gone not in in_graph.keyframe_a
     assert mapper._refuted_loops() == set()
+
+
+def test_keyframes_at_the_ends_of_loops_are_never_culled(monkeypatch: pytest.MonkeyPatch) -> None:
+    ring = Ring()
+    loops = ring.run(ONCE_ROUND)
+    offered: list[int] = []
+
+    def remember(_: WorldMap, candidates: list[Keyframe], __: MappingConfig) -> None:
+        offered.extend(k.id for k in candidates)
+
+    monkeypatch.setattr(slam.mapper, "redundant_keyframe", remember)
+    newest, _ = ring.step()
+    world = ring.mapper.world
+    ends = {end for loop in loops for end in loop.ends}
+    near = {k.id for _, k in world.covisible(world.observed(newest)[1], 15)}
+    assert ends & near - {0, newest.id - 1, newest.id - 2}
+    assert offered
+    assert not ends & set(offered)
