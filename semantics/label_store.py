@@ -20,17 +20,28 @@ _FIRST_CAPACITY = 1024
 class LabelStoreConfig:
     """How views are fused.
 
-    Views of one thing by one network err together, so that each counts for less than a view of
-    its own: ``power`` of its likelihood. No class becomes less likely than the likeliest one by
-    more than ``max_log_odds``, so that a wrong belief can be overcome.
+    Before the first view "unknown" has a probability of ``prior_unknown``, and the other labels
+    share the rest. Views of one thing by one network err together; to count each for less, take
+    its likelihood to the ``power`` of less than 1. No class becomes less likely than the
+    likeliest one by more than ``max_log_odds``, so that a wrong belief can be overcome.
     """
 
+    prior_unknown: float = 0.5
     power: float = 1.0
     max_log_odds: float = 9.0
 
     def __post_init__(self) -> None:
         if not 0 < self.power <= 1 or not 1 <= self.max_log_odds < np.inf:
             raise ValueError("power must be in (0, 1], max_log_odds at least 1")
+        if not 0 < self.prior_unknown < 1:
+            raise ValueError("prior_unknown must be between 0 and 1")
+
+    def prior(self, classes: int) -> Array:
+        """(C,) what a thing is before the first view."""
+        rest = (1 - self.prior_unknown) / max(classes - 1, 1)
+        return (
+            np.array([self.prior_unknown] + [rest] * (classes - 1)) if classes > 1 else np.ones(1)
+        )
 
 
 @dataclass(frozen=True)
@@ -46,13 +57,14 @@ class LabelEstimates:
 class LabelStore:
     """A categorical distribution over C labels for every id from 0 on; label 0 is "unknown".
 
-    Kept in log space, uniform before the first view. Beside it are kept Dirichlet counts, which
-    tell a thing that was seen often from one that was seen once.
+    Kept in log space, as what views have added to the prior. Beside it are kept Dirichlet counts,
+    which tell a thing that was seen often from one that was seen once.
     """
 
     def __init__(self, classes: int, config: LabelStoreConfig | None = None) -> None:
         self.classes = classes
         self.config = config or LabelStoreConfig()
+        self._prior = self.config.prior(classes)
         self._clear()
 
     def __len__(self) -> int:
@@ -62,13 +74,16 @@ class LabelStore:
 
     def update(self, ids: Ints, distributions: Floats, weights: Floats) -> None:
         """Views of things ids (N,), each by a distribution (N, C) that is right with probability
-        weight (N,) and else says nothing: L(z | c) = w p(c) + (1 - w) / C. An id may repeat.
+        weight (N,) and else says nothing. An id may repeat.
+
+        A network's distribution is a posterior, so the likelihood is w p(c) / prior(c) + 1 - w:
+        after one view the belief is w p + (1 - w) prior.
         """
         if not len(ids):
             return
         self._reserve(int(ids.max()) + 1)
         weighted = weights[:, None] * distributions
-        likelihood = weighted + (1 - weights[:, None]) / np.float32(self.classes)
+        likelihood = weighted / self._prior.astype(np.float32) + (1 - weights[:, None])
         floor = np.float32(np.exp(-self.config.max_log_odds))
         gained = np.float32(self.config.power) * np.log(np.maximum(likelihood, floor))
         self._add(ids, gained, weighted, np.ones(len(ids), np.int32))
@@ -95,17 +110,17 @@ class LabelStore:
         return np.flatnonzero(self._views)
 
     def probabilities(self, ids: Ints) -> Array:
-        """(N, C) for any ids (N,); uniform where there was no view."""
+        """(N, C) for any ids (N,); the prior where there was no view."""
         inside = ids < len(self._views)
-        log_p = np.zeros((len(ids), self.classes))
-        log_p[inside] = self._log_p[ids[inside]]
+        log_p = np.tile(np.log(self._prior), (len(ids), 1))
+        log_p[inside] += self._log_p[ids[inside]]
         p = np.exp(log_p - log_p.max(axis=1, keepdims=True, initial=-np.inf))
         return p / p.sum(axis=1, keepdims=True)
 
     def dirichlet(self, ids: Ints) -> Array:
-        """Concentrations (N, C) of any ids (N,): 1 / C and the weighted sum of distributions."""
+        """Concentrations (N, C) of any ids (N,): the prior and all views by their weights."""
         inside = ids < len(self._views)
-        alpha = np.full((len(ids), self.classes), 1.0 / self.classes)
+        alpha = np.tile(self._prior, (len(ids), 1))
         alpha[inside] += self._counts[ids[inside]]
         return alpha
 

@@ -27,18 +27,24 @@ class VoteConfig:
     Nearer than ``border_px`` to another mask or to the mask's edge nothing is said: segmentation
     errs there. A depth belongs to the mask's surface if it is within ``depth_sigmas`` robust
     standard deviations, and ``depth_margin_m`` at 1 m that grows with the square of the depth,
-    of the median in the mask. What no mask covers is "unknown" with a weight of
-    ``background_weight``: a network misses things, so this is less than a mask's word.
+    of the median in the mask. What is farther than ``background_border_px`` from any mask is
+    "unknown" with a weight of ``background_weight``: a network misses things, and masks are too
+    small as often as too large, so this is less than a mask's word.
     """
 
-    border_px: int = 2
+    border_px: int = 1
     depth_sigmas: float = 3.5
     depth_margin_m: float = 0.03
-    background_weight: float = 0.3
+    background_border_px: int = 8
+    background_weight: float = 0.5
 
     def __post_init__(self) -> None:
-        if self.border_px < 0 or self.depth_sigmas <= 0 or self.depth_margin_m < 0:
-            raise ValueError("border_px, depth_sigmas and depth_margin_m must not be negative")
+        if (
+            min(self.border_px, self.background_border_px) < 0
+            or self.depth_sigmas <= 0
+            or self.depth_margin_m < 0
+        ):
+            raise ValueError("borders, depth_sigmas and depth_margin_m must not be negative")
         if not 0 <= self.background_weight < 1:
             raise ValueError("background_weight must be in [0, 1)")
 
@@ -50,7 +56,7 @@ class Claims:
     Attributes:
         instances: in the order of their mask scores, the best first.
         owner: (H, W) int16, the instance that a pixel belongs to, -1 for none.
-        inner: (H, W) bool, not near the border between two owners.
+        inner: (H, W) bool, not near the border between two owners, or that of a mask and none.
         depth_range_m: (K, 2) nearest and farthest depth of each instance's surface; NaN for one
             without depth.
     """
@@ -127,10 +133,12 @@ def claim_pixels(
         x1, y1, x2, y2 = _window(ranked[k])
         owner[y1:y2, x1:x2][ranked[k].mask[y1:y2, x1:x2]] = k
     inner = np.ones(size, bool)
-    if config.border_px and ranked:
-        side = 2 * config.border_px + 1
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    if ranked:
+        disc = _disc(config.border_px)
         inner = cv2.erode(owner, disc) == cv2.dilate(owner, disc)
+        covered = (owner != NOBODY).astype(np.uint8)
+        near = cv2.dilate(covered, _disc(config.background_border_px)) > covered
+        inner &= ~near
     return Claims(ranked, owner, inner, _surfaces(owner, inner, depth_m, len(ranked), config))
 
 
@@ -157,6 +165,11 @@ def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteCo
     scores = [*(i.mask_score for i in claims.instances), config.background_weight]
     owners = owners[chosen]  # NOBODY, -1, is the last row of both
     return Votes(chosen, owners, table[owners], np.array(scores, np.float32)[owners])
+
+
+def _disc(radius_px: int) -> NDArray[np.uint8]:
+    side = 2 * radius_px + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
 
 
 def _window(instance: Instance) -> tuple[int, int, int, int]:

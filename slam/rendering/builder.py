@@ -39,7 +39,8 @@ class Part:
 class SceneBuilder:
     """A room being furnished: everything added takes the current object's pose and instance.
 
-    Instance ids count from 1 in order of creation; ``categories[id - 1]`` is the class name.
+    Instance ids count from 1 in order of creation; ``categories[id - 1]`` is the class name and
+    ``frames[id - 1]`` the pose T_world_object.
     """
 
     def __init__(self, seed: int, detail: float = 1.0) -> None:
@@ -48,6 +49,7 @@ class SceneBuilder:
         self.rng = np.random.default_rng(seed)
         self.parts: list[Part] = []
         self.categories: list[str] = []
+        self.frames: list[Array] = []
         self._T_world_object: Array = np.eye(4)
         self._instance = 0
 
@@ -58,6 +60,7 @@ class SceneBuilder:
         self._T_world_object = self._T_world_object @ T_object
         if category is not None:
             self.categories.append(category)
+            self.frames.append(self._T_world_object)
             self._instance = len(self.categories)
         try:
             yield

@@ -23,6 +23,7 @@ from slam.rendering.random_room import draw_room
 from slam.rendering.raycast import Renderer, View, to_image
 from slam.rendering.scene import Scene, build_scene
 from slam.rendering.sensor import blur, exposure_gain, measure_depth, optical_flow
+from slam.rendering.true_boxes import OBJECTS_TRUTH, true_boxes
 from slam.rendering.writer import (
     new_folder,
     stored_depth,
@@ -185,6 +186,7 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     depth_poses = depth_poses[: config.frames]
     builder = SceneBuilder(config.seed, detail=float(np.clip(config.width / 640, 0.25, 1.0)))
     plan.furnish(builder)
+    write_json(folder / OBJECTS_TRUTH, true_boxes(builder))
     cast = hire(builder, plan.roles, plan.lighting, config.people)
     scene = build_scene(builder, plan.lighting, cast.parts, config.seed)
     camera = kinect_camera(config)

@@ -10,6 +10,7 @@ import pytest
 from semantics.label_store import LabelStore, LabelStoreConfig
 
 C = 5
+PRIOR = np.array([0.5, *4 * [0.125]])
 NO_LIMIT = LabelStoreConfig(max_log_odds=60.0)
 
 
@@ -20,10 +21,10 @@ def views(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]
 
 
 def posterior(p: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Bayes' rule for one thing, view by view, from a uniform prior."""
-    belief = np.full(C, 1 / C)
+    """Bayes' rule for one thing, view by view."""
+    belief = PRIOR.copy()
     for distribution, weight in zip(p, weights, strict=True):
-        likelihood = weight * distribution + (1 - weight) / C
+        likelihood = weight * distribution / PRIOR + (1 - weight)
         belief = belief * likelihood / (belief * likelihood).sum()
     return belief
 
@@ -37,7 +38,7 @@ def test_many_things_at_once_equal_bayes_one_by_one() -> None:
     for row, i in enumerate(ids):
         expected = posterior(*(np.array([part[row] for part in v]) for v in zip(*seen)))  # noqa: B905
         assert np.allclose(store.probabilities(np.array([i]))[0], expected, atol=1e-5)
-        counts = sum(w[row] * p[row] for p, w in seen) + 1 / C
+        counts = sum(w[row] * p[row] for p, w in seen) + PRIOR
         assert np.allclose(store.dirichlet(np.array([i]))[0], counts, atol=1e-5)
     assert store.estimates(ids).views.tolist() == [6, 6, 6]
 
@@ -46,8 +47,8 @@ def test_nothing_is_known_before_the_first_view() -> None:
     store = LabelStore(C)
     found = store.estimates(np.array([0, 7, 99999]))
     assert found.labels.tolist() == [0, 0, 0]
-    assert np.allclose(found.probability, 1 / C)
-    assert np.allclose(found.entropy, np.log(C))
+    assert np.allclose(found.probability, 0.5)
+    assert np.allclose(found.entropy, -(PRIOR * np.log(PRIOR)).sum())
     assert found.views.tolist() == [0, 0, 0]
     assert len(store.estimates(np.zeros(0, np.int64)).labels) == 0
 
@@ -57,8 +58,8 @@ def test_one_view_is_believed_as_far_as_its_mask() -> None:
     sure = np.eye(C, dtype=np.float32)[[2, 2]]
     store.update(np.array([0, 1]), sure, np.array([0.8, 0.0], np.float32))
     p = store.probabilities(np.array([0, 1]))
-    assert p[0, 2] == pytest.approx(0.8 + 0.2 / C)
-    assert np.allclose(p[1], 1 / C)  # a mask without any worth says nothing
+    assert p[0, 2] == pytest.approx(0.8 + 0.2 * 0.125)
+    assert np.allclose(p[1], PRIOR)  # a mask without any worth says nothing
 
 
 def test_the_order_of_views_and_repeated_ids_do_not_matter() -> None:
