@@ -243,7 +243,6 @@ def test_the_table_of_names(tmp_path: Path) -> None:
         make_segmenter(SegmenterOptions("mask-scoring-rcnn", weights), tmp_path)
     assert isinstance(make_segmenter(SegmenterOptions("none"), tmp_path), NoSegmenter)
     for name, words in {
-        "light": "--weights",
         "mask-scoring-rcnn": "--weights",
         "precomputed": "--masks",
         "truth": r"annotations\.json: no such file",
