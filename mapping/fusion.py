@@ -64,17 +64,17 @@ def fuse(
     empty = ~own.known
     hypotheses = [hypothesis(torch.where(empty, seeds, own.rho), v, camera) for v in views]
     factor = variance_factor(own, hypotheses)
-    rho, weight = [torch.nan_to_num(own.rho)], [_weight(own.variance)]
+    rho, weight = [own.rho], [_weight(own.variance)]
     through = torch.zeros_like(empty)
     for view, (mean, variance) in zip(views, hypotheses, strict=True):
         if image is not None and view.image is not None:
             drop_other_colours(seeds, variance, (image, view), camera)
         weight.append(_weight(variance))
-        rho.append(torch.nan_to_num(mean))
-        through |= (rho[-1] < rho[0]) & (weight[-1] > 0)
+        rho.append(torch.where(weight[-1] > 0, mean, torch.nan))
+        through |= rho[-1] < own.rho
     members = compatible_members(rho, weight)
     alone = (members == 0) & ~empty & ~through
-    members = torch.where(alone, 1, members)
+    members += alone
     total, norm = torch.zeros_like(seeds), torch.zeros_like(seeds)
     count = torch.zeros_like(members)
     for k, (rho_k, weight_k) in enumerate(zip(rho, weight, strict=True)):
@@ -82,9 +82,9 @@ def fuse(
         count += used
         share = weight_k * used
         norm += share
-        total += share.mul_(rho_k)
-    fused = InverseDepthMap(total / norm, 1 / norm).where(members > 0)
-    return Fused(fused, count.to(torch.uint8), factor)
+        total.addcmul_(share, torch.nan_to_num(rho_k))
+    norm = torch.where(members > 0, norm, torch.nan)
+    return Fused(InverseDepthMap(total / norm, 1 / norm), count, factor)
 
 
 def variance_factor(own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Tensor]]) -> float:
@@ -139,34 +139,36 @@ def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tenso
     height, width = own.rho.shape
     seeds = torch.zeros(height * width, dtype=torch.float32, device=own.rho.device)
     empty = ~own.known.reshape(-1)
+    if not empty.any():
+        return torch.full_like(own.rho, torch.nan)
     for view in views:
         u, v, ahead = project(view.map.rho, view.T_own_neighbour, camera)
         column, row = u.round_(), v.round_()
         inside = ahead & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        target = torch.where(inside, row * width + column, 0).to(torch.int64)
-        chosen = torch.nonzero(inside & empty[target])
-        rows, columns = chosen.unbind(-1)
-        pixels = (columns.to(torch.float32), rows.to(torch.float32))
-        rho, _ = moved(view.map.rho[rows, columns], view.T_own_neighbour, camera, pixels)
-        seeds.scatter_reduce_(0, target[rows, columns], rho, "amax")
+        target = torch.where(inside, row * width + column, 0.0).to(torch.int32).reshape(-1)
+        landing = empty.index_select(0, target) & inside.reshape(-1)
+        chosen = torch.nonzero(landing)[:, 0]
+        pixels = ((chosen % width).to(torch.float32), (chosen // width).to(torch.float32))
+        rho, _ = moved(view.map.rho.reshape(-1)[chosen], view.T_own_neighbour, camera, pixels)
+        seeds.scatter_reduce_(0, target[chosen].to(torch.int64), rho, "amax")
     seeds = seeds.reshape(height, width)
     around = torch.nn.functional.max_pool2d(torch.nan_to_num(own.rho)[None], 3, 1, 1)[0]
     return torch.where((seeds > 0) & (around < RIM_STEP * seeds), seeds, torch.nan)
 
 
 def compatible_members(rho: Sequence[Tensor], weight: Sequence[Tensor]) -> Tensor:
-    """Bit masks (H, W) int64 of the largest mutually compatible sets of two or more estimates.
+    """Bit masks (H, W) uint8 of the largest mutually compatible sets of two or more estimates.
 
-    ``rho`` and ``weight`` hold one (H, W) for each of up to seven keyframes; the weight is 0 where
-    it says nothing. 0 where no two are compatible; of equal sets the one with early members.
+    ``rho`` and ``weight`` hold one (H, W) for each of up to seven keyframes, rho NaN where it says
+    nothing. 0 where no two are compatible; of equal sets the one with early members.
     """
     pairs = list(combinations(range(len(rho)), 2))
     code = torch.zeros(rho[0].shape, dtype=torch.int32, device=rho[0].device)
     for k, (i, j) in enumerate(pairs):
         distance = (rho[i] - rho[j]).square_().mul_(weight[i] + weight[j])
-        agree = (distance < COMPATIBLE) & (weight[i] > 0) & (weight[j] > 0)
-        code |= agree.to(torch.int32) << k
-    return _largest_sets(len(rho)).to(code.device)[code.to(torch.int64)].to(torch.int64)
+        code.add_(distance < COMPATIBLE, alpha=1 << k)
+    table = _largest_sets(len(rho)).to(code.device)
+    return table.index_select(0, code.reshape(-1)).reshape(code.shape)
 
 
 @cache

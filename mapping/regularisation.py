@@ -9,6 +9,8 @@ from mapping.inverse_depth import COMPATIBLE, InverseDepthMap
 
 OFFSETS = tuple((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0))
 MIN_SUPPORT = 2
+FAR = 1e6
+"""Stands for what is missing: compatible with no estimate."""
 FILL_SUPPORT = 5
 """The paper's 2 also fills the rim of silhouettes, from whichever side has more pixels."""
 
@@ -22,27 +24,26 @@ def regularise(given: InverseDepthMap, fill_support: int = FILL_SUPPORT) -> Inve
     least of the set, since neighbours are correlated. An empty pixel is filled in the same way
     from the largest set of mutually compatible neighbours, if that has ``fill_support``.
     """
-    rho = torch.nan_to_num(given.rho)
+    rho = torch.nan_to_num(given.rho, nan=FAR)
     weight = _weight(given)
-    rhos, weights = _padded(rho), _padded(weight)
+    rhos, weights = _padded(rho, FAR), _padded(weight)
     count = torch.zeros_like(rho)
     total, norm, best = rho * weight, weight.clone(), weight.clone()
     for offset in OFFSETS:
         rho_j, weight_j = _shifted(rhos, offset), _shifted(weights, offset)
-        distance = (rho - rho_j).square_().mul_(weight + weight_j)
-        agreeing = ((distance < COMPATIBLE) & (weight_j > 0)).to(rho.dtype)
+        agreeing = (rho - rho_j).square_().mul_(weight + weight_j) < COMPATIBLE
         count += agreeing
-        weight_j = agreeing.mul_(weight_j)
-        norm += weight_j
-        total += weight_j.mul(rho_j)
-        torch.maximum(best, weight_j, out=best)
+        share = agreeing * weight_j
+        norm += share
+        total.addcmul_(share, rho_j)
+        torch.maximum(best, share, out=best)
     cleaned = InverseDepthMap(total / norm, 1 / best).where(given.known & (count >= MIN_SUPPORT))
     return _filled(given, cleaned, fill_support)
 
 
-def _padded(values: Tensor) -> Tensor:
-    """With a rim of zeros one pixel wide."""
-    return torch.nn.functional.pad(values, (1, 1, 1, 1))
+def _padded(values: Tensor, rim: float = 0.0) -> Tensor:
+    """With a rim one pixel wide."""
+    return torch.nn.functional.pad(values, (1, 1, 1, 1), value=rim)
 
 
 def _shifted(padded: Tensor, offset: tuple[int, int]) -> Tensor:

@@ -34,21 +34,25 @@ class View:
     image: Tensor | None = None
 
 
-def hypothesis(seeds: Tensor, view: View, camera: Camera) -> tuple[Tensor, Tensor]:
+def hypothesis(
+    seeds: Tensor, view: View, camera: Camera, first_row: int = 0
+) -> tuple[Tensor, Tensor]:
     """What a neighbour says of the points at inverse depth ``seeds`` (H, W) on each pixel's ray.
 
     Each point is projected into the neighbour, whose rho and sigma there are mapped back as
     {rho + sigma, rho, rho - sigma} to p1, p2, p3: the mean p2 (H, W) and the variance
-    max(|p1 - p2|, |p3 - p2|)^2 (H, W), NaN where it says nothing.
+    max(|p1 - p2|, |p3 - p2|)^2 (H, W), NaN where it says nothing. ``seeds`` may be a strip of the
+    image that begins at ``first_row``.
     """
-    u, v, ahead = project(seeds, inverse(view.T_own_neighbour), camera)
+    columns, rows = image_grid(seeds)
+    rows += first_row
+    u, v, ahead = project(seeds, inverse(view.T_own_neighbour), camera, (columns, rows))
     rho, variance = _sampled(view.map, u, v)
     sigma = variance.sqrt_()
     forward, t_z = _depth_row(view.T_own_neighbour, camera)
     ray = forward[0] * u + forward[1] * v + forward[2]
     p1, p2, p3 = (r / (ray + t_z * r) for r in (rho + sigma, rho, rho - sigma))
     back_u, back_v, behind = project(rho, view.T_own_neighbour, camera, (u, v))
-    columns, rows = image_grid(seeds)
     apart = (back_u - columns).square_() + (back_v - rows).square_()
     usable = ahead & behind & (apart < MAX_APART_PX**2) & (rho > sigma)
     spread = torch.maximum((p1 - p2).abs_(), (p3 - p2).abs_()).square_()
