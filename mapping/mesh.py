@@ -30,10 +30,17 @@ def truncation_voxels(sigmas_m: NDArray[np.floating], voxel_m: float) -> float:
 def tsdf_mesh(
     views: Iterable[View], camera: Camera, voxel_m: float, truncation: float = 4.0
 ) -> Any:
-    """Integrate views and extract the surface, an Open3D triangle mesh in the world frame.
+    """The surface of integrated views, an Open3D triangle mesh in the world frame."""
+    volume = integrated(views, camera, voxel_m, truncation)
+    mesh = volume.extract_triangle_mesh(weight_threshold=1.0).to_legacy()
+    mesh.compute_vertex_normals()
+    return mesh
 
-    ``truncation`` is in voxels.
-    """
+
+def integrated(
+    views: Iterable[View], camera: Camera, voxel_m: float, truncation: float = 4.0
+) -> Any:
+    """Open3D's volume of views; ``truncation`` is in voxels."""
     o3d = load_open3d()
     core = o3d.core
     volume = o3d.t.geometry.VoxelBlockGrid(
@@ -55,9 +62,7 @@ def tsdf_mesh(
         volume.integrate(
             blocks, depth, colour, intrinsic, intrinsic, extrinsic, 1.0, MAX_DEPTH_M, truncation
         )
-    mesh = volume.extract_triangle_mesh(weight_threshold=1.0).to_legacy()
-    mesh.compute_vertex_normals()
-    return mesh
+    return volume
 
 
 def write_mesh(path: Path, mesh: Any) -> None:
