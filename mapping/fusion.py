@@ -23,9 +23,9 @@ MEDIAN_CHI2 = 0.455
 SAMPLE_STEP, MIN_SAMPLE = 4, 200
 FACTOR_RANGE = (0.25, 20.0)
 """Errors that all views share are not seen in their differences: it is never very small."""
-BLUR_PX = 0.45
-RIM_STEP = 1.05
-"""Next to a surface that is nearer by more, nothing is seeded: it may be its rim."""
+BLUR_PX = 0.43
+RIM_STEP, RIM_PX = 1.05, 2
+"""So near to a surface that is nearer by this factor nothing is seeded: it may be its rim."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tenso
         rho, _ = moved(view.map.rho.reshape(-1)[chosen], view.T_own_neighbour, camera, pixels)
         seeds.scatter_reduce_(0, target[chosen].to(torch.int64), rho, "amax")
     seeds = seeds.reshape(height, width)
-    around = torch.nn.functional.max_pool2d(torch.nan_to_num(own.rho)[None], 3, 1, 1)[0]
+    around = torch.nn.functional.max_pool2d(torch.nan_to_num(own.rho)[None], 5, 1, 2)[0]
     return torch.where((seeds > 0) & (around < RIM_STEP * seeds), seeds, torch.nan)
 
 
