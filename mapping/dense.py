@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -14,9 +15,13 @@ from graph.camera import Camera
 from graph.geometry import Array, inverse
 from mapping.fusion import MAX_NEIGHBOURS, fuse, stated
 from mapping.inverse_depth import DepthNoise, InverseDepthMap, from_sensor
+from mapping.plane_sweep import completed, sweep
 from mapping.regularisation import regularise
+from mapping.search_range import search_range
 from mapping.warping import View
 
+DepthSource = Literal["sensor", "both", "motion"]
+MIN_BASELINE_M, SWEEP_VIEWS = 0.03, 2
 WINDOW = 6
 """Keyframes on either side among which neighbours are chosen."""
 
@@ -66,11 +71,14 @@ class DenseConfig:
     Attributes:
         noise: of the depth sensor.
         neighbours: at most so many are fused with a keyframe.
+        source: "sensor"; "both", with a plane sweep where the sensor has nothing; or "motion", the
+            sweep alone.
         device: torch's name of where it is computed.
     """
 
     noise: DepthNoise = field(default_factory=DepthNoise)
     neighbours: int = MAX_NEIGHBOURS
+    source: DepthSource = "sensor"
     device: str = "cpu"
 
 
@@ -101,10 +109,33 @@ class DenseMapper:
 
         One that is not ``wanted`` serves its neighbours only.
         """
-        self._held.append(prepared(keyframe, self.camera, self.config))
+        self._held.append(self._prepare(keyframe))
         if not wanted:
             self._unwanted.add(keyframe.id)
         return self._finished(len(self._held) - WINDOW)
+
+    def _prepare(self, keyframe: DenseKeyframe) -> _Prepared:
+        """Steps 1 to 3 of a keyframe, with those that came before it."""
+        config, measured = self.config, None
+        image = as_image(keyframe.rgb, config.device)
+        if config.source != "motion":
+            measured = from_sensor(keyframe.depth_m, self.camera, config.noise, config.device)
+        if config.source != "sensor":
+            swept = self._sweep(keyframe, image)
+            measured = swept if measured is None else completed(measured, swept)
+        assert measured is not None
+        return _Prepared(keyframe, regularise(measured), image)
+
+    def _sweep(self, keyframe: DenseKeyframe, image: Tensor) -> InverseDepthMap:
+        """Steps 1 and 2 against the last keyframes that stood elsewhere."""
+        T_own_world = inverse(keyframe.T_world_camera)
+        others = [(p.image, T_own_world @ p.keyframe.T_world_camera) for p in self._held[-WINDOW:]]
+        apart = [o for o in others if np.linalg.norm(o[1][:3, 3]) > MIN_BASELINE_M]
+        window = search_range(keyframe.landmark_depths_m)
+        if window is None or not apart:
+            empty = torch.full(image.shape[-2:], torch.nan, device=image.device)
+            return InverseDepthMap(empty, empty)
+        return sweep(image, apart[-SWEEP_VIEWS:], self.camera, window)
 
     def flush(self) -> list[FusedKeyframe]:
         """What still waits for neighbours that will not come."""
@@ -132,12 +163,10 @@ class DenseMapper:
         return fused(own, [others[n.id] for n in chosen], self.camera, self.config)
 
 
-def prepared(keyframe: DenseKeyframe, camera: Camera, config: DenseConfig) -> _Prepared:
-    """Steps 2 and 3 of a keyframe with sensor depth."""
-    measured = from_sensor(keyframe.depth_m, camera, config.noise, config.device)
-    blurred = np.ascontiguousarray(cv2.blur(keyframe.rgb, (3, 3)).transpose(2, 0, 1))
-    image = torch.from_numpy(blurred).to(config.device, torch.float32)
-    return _Prepared(keyframe, regularise(measured), image)
+def as_image(rgb: NDArray[np.uint8], device: str = "cpu") -> Tensor:
+    """Slightly blurred colours (3, H, W), 0 to 255, of an image (H, W, 3)."""
+    blurred = np.ascontiguousarray(cv2.blur(rgb, (3, 3)).transpose(2, 0, 1))
+    return torch.from_numpy(blurred).to(device, torch.float32)
 
 
 def fused(

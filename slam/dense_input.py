@@ -75,7 +75,9 @@ def _recorded_sequence(config: Path) -> Path:
     return folder
 
 
-def load(run: MappedRun, keyframe: Keyframe) -> tuple[DenseKeyframe, NDArray[np.uint8]]:
+def load(
+    run: MappedRun, keyframe: Keyframe, needs_depth: bool = True
+) -> tuple[DenseKeyframe, NDArray[np.uint8]]:
     """A keyframe with its images, undistorted, and its colour image as it was taken.
 
     Raises:
@@ -96,7 +98,7 @@ def load(run: MappedRun, keyframe: Keyframe) -> tuple[DenseKeyframe, NDArray[np.
             f"{name}: frame {keyframe.frame_index} of {run.sequence.folder} is of "
             f"{frame.timestamp_s:.6f} s, not {keyframe.timestamp_s:.6f} s; give its own --sequence"
         )
-    if np.isfinite(frame.depth_m).mean() < MIN_DEPTH_SHARE:
+    if needs_depth and np.isfinite(frame.depth_m).mean() < MIN_DEPTH_SHARE:
         raise InputError(f"{name}: frame {keyframe.frame_index} has no valid depth")
     rgb, depth_m = undistorted(frame, run.camera)
     points = run.world.landmarks.points_world[landmark_ids]

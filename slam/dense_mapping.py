@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph.errors import InputError
-from mapping.dense import WINDOW, DenseConfig, DenseKeyframe, DenseMapper, FusedKeyframe
+from mapping.dense import (
+    WINDOW,
+    DenseConfig,
+    DenseKeyframe,
+    DenseMapper,
+    DepthSource,
+    FusedKeyframe,
+)
 from mapping.inverse_depth import DepthNoise
 from mapping.labels import keyframe_labels, widened
 from mapping.submaps import make_submap
@@ -41,6 +48,7 @@ class MapOptions:
         masks: what finds the instances, None for no labels.
         without: classes that are left out of the map, since they move.
         voxel_m: at most one point in a cube of this edge.
+        source: where depth comes from, see `mapping.dense.DenseConfig`.
         device: torch's name of where depth is fused.
         mesh, plan: whether to make them.
     """
@@ -50,6 +58,7 @@ class MapOptions:
     masks: SegmenterOptions | None = None
     without: tuple[str, ...] = ()
     voxel_m: float = 0.01
+    source: DepthSource = "sensor"
     device: str = "cpu"
     mesh: bool = False
     plan: bool = False
@@ -96,6 +105,7 @@ def _settings(options: MapOptions, segmenter: Segmenter) -> dict[str, Any]:
     return {
         "voxel_m": options.voxel_m,
         "masks": masks,
+        "source": options.source,
         "without": list(options.without),
         "labels": list(segmenter.labels.names),
         "noise": dataclasses.asdict(dense_config(options).noise),
@@ -108,7 +118,7 @@ def dense_config(options: MapOptions) -> DenseConfig:
     noise = DepthNoise(
         disparity_sigma_px=features.disparity_sigma_px, max_depth_m=features.max_depth_m
     )
-    return DenseConfig(noise=noise, device=options.device)
+    return DenseConfig(noise=noise, source=options.source, device=options.device)
 
 
 def fuse_run(
@@ -181,7 +191,7 @@ class _Work:
 
     def _labelled(self, run: MappedRun, keyframe: Keyframe) -> DenseKeyframe:
         """The keyframe with its instances, without the depth of moving ones."""
-        dense, rgb = load(run, keyframe)
+        dense, rgb = load(run, keyframe, self._options.source != "motion")
         name = image_name(run, keyframe)
         instances = self._segmenter.segment(rgb, name)
         labels = keyframe_labels(instances, rgb.shape[:2], len(self._segmenter.labels))

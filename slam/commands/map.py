@@ -32,6 +32,13 @@ def add_map(commands: _Commands) -> None:
     parser.add_argument(
         "--without", default="", metavar="A,B", help="classes left out, since they move"
     )
+    parser.add_argument(
+        "--depth-source",
+        choices=("sensor", "both", "motion"),
+        default="sensor",
+        help="both: with a plane sweep between keyframes where the sensor has nothing; motion: "
+        "the sweep alone",
+    )
     parser.add_argument("--device", default="cpu", help="where depth is fused (default: cpu)")
     parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
 
@@ -55,6 +62,7 @@ def _map(arguments: argparse.Namespace) -> int:
         masks,
         tuple(filter(None, arguments.without.split(","))),
         arguments.voxel,
+        arguments.depth_source,
         arguments.device,
         arguments.mesh,
         arguments.plan,
