@@ -88,64 +88,63 @@ class FloorPlan:
     def __init__(self, frame: PlanFrame, classes: int) -> None:
         self.frame = frame
         self._classes = classes
-        self._standing: dict[tuple[int, int], Array] = {}
-        self._floor: set[tuple[int, int]] = set()
+        self._standing = np.zeros((0, 4), np.int64)  # column, row, label, points
+        self._floor = np.zeros((0, 2), np.int64)
 
     def add(self, cloud: Cloud) -> None:
         """Take a block in."""
         placed = cloud.points.astype(float) @ self.frame.axes.T
         height_m = placed[:, 2] - self.frame.floor_m
-        cells = np.floor(placed[:, :2] / self.frame.cell_m).astype(int)
+        cells = np.floor(placed[:, :2] / self.frame.cell_m).astype(np.int64)
         standing = (height_m > HEIGHTS_M[0]) & (height_m < HEIGHTS_M[1])
-        found, index = np.unique(cells[standing], axis=0, return_inverse=True)
-        votes = np.zeros((len(found), self._classes))
-        np.add.at(votes, (index.reshape(-1), cloud.labels[standing]), 1.0)
-        for cell, row in zip(map(tuple, found.tolist()), votes, strict=True):
-            self._standing[cell] = self._standing.get(cell, 0) + row
+        rows = np.column_stack([cells[standing], cloud.labels[standing].astype(np.int64)])
+        found, count = np.unique(rows, axis=0, return_counts=True)
+        self._standing = np.concatenate([self._standing, np.column_stack([found, count])])
         walked = cells[np.abs(height_m) < HEIGHTS_M[0] / 2]
-        self._floor.update(map(tuple, np.unique(walked, axis=0).tolist()))
+        self._floor = np.concatenate([self._floor, np.unique(walked, axis=0)])
 
-    def grid(self) -> tuple[NDArray[np.int16], tuple[int, int]]:
-        """Cells (rows forward from the back, columns right): label, -1 floor, -2 unseen.
+    def grid(self, path_world: Array) -> tuple[NDArray[np.int16], Array]:
+        """Cells (rows, the foremost last; columns right): label, -1 floor, -2 unseen.
 
-        Also the column and row, in cells, of the plan frame's origin.
+        Also the path (N, 3) in columns and rows (N, 2), all of it inside.
         """
-        cells = np.array([*self._standing, *self._floor], int).reshape(-1, 2)
-        if not len(cells):
-            return np.full((1, 1), -2, np.int16), (0, 0)
+        path = (path_world @ self.frame.axes.T)[:, :2] / self.frame.cell_m
+        cells = np.concatenate([self._standing[:, :2], self._floor, np.floor(path).astype(int)])
         low, high = cells.min(axis=0), cells.max(axis=0)
-        grid = np.full(tuple((high - low + 1)[::-1]), -2, np.int16)
-        for x, y in self._floor:
-            grid[high[1] - y, x - low[0]] = -1
-        for (x, y), votes in self._standing.items():
-            grid[high[1] - y, x - low[0]] = _label(votes)
-        return grid, (int(-low[0]), int(high[1]))
+        width, height = high - low + 1
+        grid = np.full((height, width), -2, np.int16)
+        grid[high[1] - self._floor[:, 1], self._floor[:, 0] - low[0]] = -1
+        votes = np.zeros((height, width, self._classes), np.int64)
+        column, row, label, points = self._standing.T
+        np.add.at(votes, (high[1] - row, column - low[0], label), points)
+        occupied = votes.any(axis=2)
+        grid[occupied] = _labels(votes[occupied])
+        return grid, np.column_stack([path[:, 0] - low[0], high[1] + 1 - path[:, 1]])
 
     def picture(self, names: Sequence[str], path_world: Array) -> NDArray[np.uint8]:
         """The plan (H, W, 3), red first, with scale bar, legend and the camera's path (N, 3)."""
-        grid, (x0, y0) = self.grid()
+        grid, path = self.grid(path_world)
         scale = max(1, round(900 / max(grid.shape)))
         colours = np.vstack([[[EMPTY] * 3, FLOOR_COLOUR], palette(len(names))]).astype(np.uint8)
-        small = colours[grid + 2]
-        image = np.kron(small, np.ones((scale, scale, 1), np.uint8))
-        path = path_world @ self.frame.axes.T / self.frame.cell_m
-        line = np.stack([path[:, 0] + x0, y0 + 1 - path[:, 1]], axis=1) * scale
-        cv2.polylines(image, [np.rint(line).astype(np.int32)], False, (220, 30, 30), 2, cv2.LINE_AA)
-        margin = 40
+        image = np.kron(colours[grid + 2], np.ones((scale, scale, 1), np.uint8))
+        line = np.rint(path * scale).astype(np.int32)
+        cv2.polylines(image, [line], False, (220, 30, 30), 2, cv2.LINE_AA)
+        margin, white = 40, (EMPTY,) * 3
         image = cv2.copyMakeBorder(
-            image, margin, 2 * margin, margin, margin, cv2.BORDER_CONSTANT, value=(EMPTY,) * 3
+            image, margin, 2 * margin, margin, margin, cv2.BORDER_CONSTANT, value=white
         )
         _scale_bar(image, scale / self.frame.cell_m, margin)
         present = [label for label in range(len(names)) if (grid == label).any()]
         return with_legend(image, names, present)
 
 
-def _label(votes: Array) -> int:
-    """The class of a cell: a thing before the background, if it has a fifth of the points."""
-    things = votes[1:]
-    if len(things) and things.max() > 0.2 * votes.sum():
-        return int(things.argmax()) + 1
-    return 0
+def _labels(votes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The class of each cell (N, C): a thing before the background, with a fifth of the points."""
+    things = votes[:, 1:]
+    if things.shape[1] == 0:
+        return np.zeros(len(votes), np.int64)
+    enough = things.max(axis=1) > 0.2 * votes.sum(axis=1)
+    return np.where(enough, things.argmax(axis=1) + 1, 0)
 
 
 def _scale_bar(image: NDArray[np.uint8], px_per_m: float, margin: int) -> None:

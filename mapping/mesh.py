@@ -65,6 +65,15 @@ def integrated(
     return volume
 
 
+def sampled(mesh: Any, count: int = 1_000_000) -> tuple[Array, Array]:
+    """Points and normals (N, 3) spread evenly over a mesh, none if it is empty."""
+    if not len(mesh.triangles):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    load_open3d().utility.random.seed(0)
+    cloud = mesh.sample_points_uniformly(count)
+    return np.asarray(cloud.points), np.asarray(cloud.normals)
+
+
 def write_mesh(path: Path, mesh: Any) -> None:
     """Write a mesh as PLY. Raises InputError where Open3D cannot."""
     temporary = path.with_name(f".part-{path.name}")

@@ -18,7 +18,7 @@ from graph.geometry import Array, make_pose
 from mapping.cloud import Cloud, merged, spill
 from mapping.cloud_files import CloudWriter
 from mapping.floor_plan import FloorPlan, plan_frame
-from mapping.mesh import View, truncation_voxels, tsdf_mesh, write_mesh
+from mapping.mesh import View, sampled, truncation_voxels, tsdf_mesh, write_mesh
 from mapping.pictures import Picture, palette, with_legend
 from mapping.submaps import Submap
 from slam.dense_folder import DenseFolder
@@ -26,7 +26,7 @@ from slam.dense_input import MappedRun, load
 from slam.dense_mapping import MapOptions
 from slam.world_map import Keyframe
 
-PLAN_CELL_M = 0.03
+PLAN_CELL_M, PLAN_SAMPLE = 0.03, 10
 OUTSIDE_M = 1.0
 """The overview is taken from so far behind and above the first keyframe."""
 
@@ -76,6 +76,8 @@ def write_clouds(
             for block in merged(files, voxel_m, table):
                 cloud_file.write(block)
                 semantic_file.write(block)
+                if floor is not None:
+                    floor.add(block)
                 counts += np.bincount(block.labels, minlength=len(names))
                 for name in views:
                     plain[name].draw(block.points, block.colours)
@@ -111,19 +113,12 @@ def _with_table(
 
 
 def _floor_plan(blocks: Iterator[Cloud], keyframes: list[Keyframe], classes: int) -> FloorPlan:
-    """The plan of a cloud; its frame is found in a sample of a block each."""
-    kept = list(blocks)
+    """An empty plan whose frame is that of a sample of the cloud."""
     guess = -np.mean([k.T_world_camera[:3, 1] for k in keyframes], axis=0)
-    sample = _sample(kept)
-    floor = FloorPlan(plan_frame(sample, guess, PLAN_CELL_M), classes)
-    for block in kept:
-        floor.add(block)
-    return floor
-
-
-def _sample(blocks: list[Cloud], step: int = 5) -> Cloud:
     names = Cloud.__dataclass_fields__
-    return Cloud(**{n: np.concatenate([getattr(b, n)[::step] for b in blocks]) for n in names})
+    sample = [Cloud(**{n: getattr(b, n)[::PLAN_SAMPLE] for n in names}) for b in blocks]
+    whole = Cloud(**{n: np.concatenate([getattr(s, n) for s in sample]) for n in names})
+    return FloorPlan(plan_frame(whole, guess, PLAN_CELL_M), classes)
 
 
 def _viewpoints(run: MappedRun, keyframes: list[Keyframe]) -> dict[str, tuple[Camera, Array]]:
@@ -140,14 +135,20 @@ def _viewpoints(run: MappedRun, keyframes: list[Keyframe]) -> dict[str, tuple[Ca
     return {name: (camera, T) for name, T in chosen.items()}
 
 
-def write_dense_mesh(run: MappedRun, folder: DenseFolder, voxel_m: float) -> Path:
-    """Integrate the fused depth of every keyframe and write the mesh."""
+def write_dense_mesh(run: MappedRun, folder: DenseFolder, voxel_m: float) -> list[Path]:
+    """Integrate the fused depth of every keyframe; write the mesh and a picture of its shape."""
     keyframes = finished(run, folder)
     first = folder.fused(keyframes[len(keyframes) // 2].id)
     truncation = truncation_voxels(first.depth_sigma_m(), voxel_m)
     path = folder.path / "mesh.ply"
-    write_mesh(path, tsdf_mesh(_views(run, keyframes, folder), run.camera, voxel_m, truncation))
-    return path
+    mesh = tsdf_mesh(_views(run, keyframes, folder), run.camera, voxel_m, truncation)
+    write_mesh(path, mesh)
+    T = keyframes[len(keyframes) // 2].T_world_camera
+    picture = Picture(run.camera, T, 0.6 * voxel_m)
+    points, normals = sampled(mesh)
+    shade = np.abs(normals @ T[:3, 2])[:, None] * np.full(3, 255)
+    picture.draw(points, shade.astype(np.uint8))
+    return [path, _write(folder, "view_mesh.png", picture.image())]
 
 
 def _views(run: MappedRun, keyframes: list[Keyframe], folder: DenseFolder) -> Iterator[View]:

@@ -41,7 +41,7 @@ def map_run(options: MapOptions, progress: Progress = lambda done, total: None) 
     started_s = time.perf_counter()
     products = write_clouds(run, folder, segmenter.labels.names, options)
     if options.mesh:
-        products.files.append(write_dense_mesh(run, folder, options.voxel_m))
+        products.files.extend(write_dense_mesh(run, folder, options.voxel_m))
     summary = MapSummary(folder.path, counts, products, time.perf_counter() - started_s)
     folder.write_text("dense.json", json.dumps(_rows(summary), indent=1) + "\n")
     return summary

@@ -1,0 +1,104 @@
+"""The floor plan of a box-shaped room with a table, and pictures of points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graph.camera import Camera
+from graph.geometry import make_pose, so3_exp
+from mapping.cloud import Cloud
+from mapping.floor_plan import FloorPlan, floor_height, plan_frame, up_direction
+from mapping.pictures import EMPTY, Picture, palette, with_legend
+
+RNG = np.random.default_rng(4)
+
+
+def room(R: np.ndarray) -> Cloud:
+    """A floor of 4 by 3 m at height 0, two walls, and a table (label 1) at 0.7 m; z is up."""
+    parts = []
+    for size, start, axes, normal, label in (
+        ((4, 3), (0, 0, 0), (0, 1), (0, 0, 1), 0),
+        ((4, 2.5), (0, 3, 0), (0, 2), (0, -1, 0), 0),
+        ((3, 2.5), (0, 0, 0), (1, 2), (1, 0, 0), 0),
+        ((1.2, 0.6), (1, 1, 0.7), (0, 1), (0, 0, 1), 1),
+    ):
+        count = int(3000 * size[0] * size[1])
+        points = np.tile(np.array(start, float), (count, 1))
+        points[:, axes] += RNG.uniform(0, size, (count, 2))
+        parts.append((points, np.tile(np.array(normal, float), (count, 1)), np.full(count, label)))
+    points, normals, labels = (np.concatenate(a) for a in zip(*parts, strict=True))
+    n = len(points)
+    one = np.ones(n, np.float32)
+    return Cloud(
+        (points @ R.T).astype(np.float32),
+        (normals @ R.T).astype(np.float32),
+        np.full((n, 3), 9, np.uint8),
+        one,
+        labels.astype(np.uint16),
+        one,
+        one.astype(np.uint16),
+    )
+
+
+TURN = so3_exp(np.array([1.3, 0.2, -0.4]))
+
+
+def test_up_is_found_from_a_tilted_guess() -> None:
+    guess = TURN @ np.array([0.4, -0.3, 1.0])
+    np.testing.assert_allclose(up_direction(room(TURN).normals, guess), TURN[:, 2], atol=1e-5)
+
+
+def test_the_floor_is_below_the_table() -> None:
+    heights = np.concatenate([RNG.normal(0, 0.005, 5000), np.full(4000, 0.7)])
+    assert floor_height(heights) == pytest.approx(0, abs=0.01)
+    assert floor_height(np.zeros(0)) == 0.0
+
+
+def test_cells_are_what_stands_there() -> None:
+    cloud = room(TURN)
+    frame = plan_frame(cloud, TURN @ np.array([0.2, 0.1, 1.0]), 0.1)
+    plan = FloorPlan(frame, 3)
+    plan.add(cloud)
+    path = np.array([[0.5, 0.5, 1.2], [3.5, 0.5, 1.2]]) @ TURN.T
+    grid, line = plan.grid(path)
+    assert sorted(grid.shape) == pytest.approx([31, 41], abs=1)
+    assert (grid == 1).sum() == pytest.approx(72, abs=20)
+    assert 70 - 12 < (grid == 0).sum() < 2 * 70 + 12  # a wall may lie between two cells
+    assert (grid == -1).sum() > 950
+    length = np.linalg.norm(line[1] - line[0])
+    assert length == pytest.approx(30, rel=0.01)
+    for column, row in line:
+        assert grid[int(row), int(column)] == -1
+
+
+def test_the_picture_holds_a_path_outside_the_map() -> None:
+    cloud = room(np.eye(3))
+    plan = FloorPlan(plan_frame(cloud, np.array([0, 0, 1.0]), 0.05), 2)
+    plan.add(cloud)
+    image = plan.picture(["background", "table"], np.array([[1.0, 1, 1], [6.0, 1, 1]]))
+    red = (image == (220, 30, 30)).all(axis=2)
+    grid, line = plan.grid(np.array([[1.0, 1, 1], [6.0, 1, 1]]))
+    scale = round(900 / max(grid.shape))
+    length = max(np.ptp(np.flatnonzero(red.any(axis=k))) for k in (0, 1))
+    assert length == pytest.approx(scale * np.linalg.norm(line[1] - line[0]), abs=4)
+
+
+def test_the_nearer_point_is_on_top() -> None:
+    camera = Camera(20, 16, fx=20, fy=20, cx=10, cy=8)
+    picture = Picture(camera, make_pose(np.eye(3), np.array([0, 0, -1.0])), 0.01)
+    points = np.array([[0, 0, 0.0], [0, 0, 1.0], [0.1, 0, 0.0], [0, 0, -2.0]])
+    colours = np.array([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]], np.uint8)
+    picture.draw(points, colours)
+    image = picture.image()[:, :, 0]
+    assert image[8, 10] == 1
+    assert image[8, 12] == 3
+    assert (image != EMPTY).sum() == 2
+
+
+def test_labels_have_different_colours_and_a_legend() -> None:
+    colours = palette(24)
+    assert len(np.unique(colours, axis=0)) == 24
+    picture = with_legend(np.zeros((40, 30, 3), np.uint8), ["none", "chair", "desk"], [0, 2])
+    assert picture.shape[1] == 30 + 190
+    assert (picture.reshape(-1, 3) == colours[2]).all(axis=1).any()
