@@ -23,7 +23,8 @@ from slam.evaluation import evaluate_trajectory
 from slam.loop_closing import LoopCloser
 from slam.loop_verification import LoopConstraint
 from slam.sequences import Sequence, open_sequence
-from slam.system import SlamSystem, SystemConfig
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
 from slam.world_map import Keyframe, WorldMap
 
 SNAPSHOT_FRAMES = 50

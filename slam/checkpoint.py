@@ -25,7 +25,7 @@ from slam.run_folder import CHECKPOINT, RunFolder
 from slam.run_options import RunOptions
 from slam.run_results import Tally
 from slam.sequences import Sequence
-from slam.system import SystemConfig
+from slam.system_config import SystemConfig
 from slam.system_interface import System
 
 logger = logging.getLogger(__name__)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -152,6 +152,12 @@ class BriskExtractor:
             colours=frame.rgb[rows, columns],
             gray=gray,
         )
+
+
+def select(features: Features, rows: NDArray[np.int64]) -> Features:
+    """Some of the keypoints, by their rows (M,)."""
+    columns = {f.name: getattr(features, f.name) for f in fields(features)}
+    return Features(**{n: a if n == "gray" else a[rows] for n, a in columns.items()})
 
 
 def spread_order(bucket: NDArray[np.int64], score: Array) -> NDArray[np.int64]:

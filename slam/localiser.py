@@ -64,6 +64,17 @@ class Localiser:
         """Landmarks of the local map that the next frame will be tracked against."""
         return self._local_ids
 
+    def prediction(self) -> Array | None:
+        """T_world_camera (4, 4) of the next frame by constant velocity; None when lost."""
+        if self.lost_frames:
+            return None
+        return orthonormalised(self._T_world_last @ self._T_last_next)
+
+    def leave_out(self, landmark_ids: Ints) -> None:
+        """Do not track against these landmarks (N,)."""
+        self._local_ids = np.setdiff1d(self._local_ids, landmark_ids)
+        self._recent_ids = self._recent_ids[~np.isin(self._recent_ids, landmark_ids)]
+
     def track(self, features: Features, world: WorldMap, reference: Keyframe) -> Tracked:
         """The frame's pose by constant velocity and the local map; when lost, by all keyframes."""
         T_predicted = orthonormalised(self._T_world_last @ self._T_last_next)

@@ -30,6 +30,8 @@ class FrameResult:
             until the old one is recognised.
         matches: landmarks matched in the frame before the robust pose estimate.
         inliers: those that agree with the pose.
+        ignored: features on moving things, which were not used.
+        mostly_moving: too few features would have been left, so that all were used.
         keyframe_id: id of the keyframe made from this frame, or None.
         keyframe_reason: why it was made ("" when it was not).
         stage_ms: wall time of each stage in milliseconds, by name.
@@ -42,6 +44,8 @@ class FrameResult:
     segment: int = 0
     matches: int = 0
     inliers: int = 0
+    ignored: int = 0
+    mostly_moving: bool = False
     keyframe_id: int | None = None
     keyframe_reason: str = ""
     stage_ms: dict[str, float] = field(default_factory=dict)

@@ -45,7 +45,7 @@ from slam.covariances import COVARIANCES
 from slam.results import FrameResult
 from slam.semantic_files import SEMANTIC_FILES
 
-STAGES = ("features", "tracking", "keyframe", "graph", "loops", "semantics")
+STAGES = ("features", "moving", "tracking", "keyframe", "graph", "loops", "semantics")
 FILES = (
     "config.yaml",
     "trajectory.txt",
@@ -64,6 +64,7 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("graph", "semantics", "mapping", "slam")
 COLUMNS = (
     *("index", "timestamp", "status", "segment", "matches", "inliers"),
+    *("ignored", "mostly_moving"),
     *(f"{stage}_ms" for stage in STAGES),
     *("keyframe", "keyframe_reason"),
 )
@@ -171,6 +172,8 @@ class RunFolder:
             "segment": result.segment,
             "matches": result.matches,
             "inliers": result.inliers,
+            "ignored": result.ignored,
+            "mostly_moving": int(result.mostly_moving),
             "keyframe": keyframe,
             "keyframe_reason": result.keyframe_reason,
         }

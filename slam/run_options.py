@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from graph.errors import InputError
-from slam.system import SystemConfig
+from slam.system_config import SystemConfig
 
 _PATHS = ("sequence", "camera", "reference", "map")
 _RECORDED = (*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every")

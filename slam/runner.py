@@ -35,7 +35,8 @@ from slam.run_options import RunOptions
 from slam.run_results import Tally, measure, save
 from slam.sequences import Sequence, open_sequence
 from slam.stop import StopRequest
-from slam.system import SlamSystem, SystemConfig
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
 from slam.system_interface import System
 
 __all__ = ["RunOptions", "RunSummary", "resume", "run"]

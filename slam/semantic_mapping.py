@@ -22,6 +22,7 @@ from semantics.segmenter import NoSegmenter, Segmenter
 from semantics.segmenter_table import SegmenterOptions
 from semantics.upright import Upright
 from semantics.votes import Claims, VoteConfig, check_instances, claim_pixels, vote
+from slam.dynamics import Dynamics, KeyframeMasks
 from slam.frame import Frame
 from slam.landmarks import Ints
 from slam.mapper import Mapper
@@ -107,15 +108,21 @@ class _Observed:
 class SemanticMapper:
     """Segments keyframes and keeps what their masks say about the map, also when they come late.
 
-    Without a segmenter and without masks it does nothing. The map is never changed.
+    Without a segmenter and without masks it does nothing. The map is changed by ``dynamics`` alone,
+    which is told what the masks say.
     """
 
     _done: set[int]
     _waiting: dict[int, _Waiting]
 
     def __init__(
-        self, camera: Camera, config: SemanticsConfig, segmenter: Segmenter | None = None
+        self,
+        camera: Camera,
+        config: SemanticsConfig,
+        segmenter: Segmenter | None = None,
+        dynamics: Dynamics | None = None,
     ) -> None:
+        self._dynamics = dynamics
         self.camera = camera
         self.config = config
         self.segmenter = segmenter or NoSegmenter()
@@ -183,6 +190,19 @@ class SemanticMapper:
             objects = self._add_objects((keyframe_id, waiting), claims, observed, mapper)
             on = objects[votes.instances] >= 0
             self.objects.place_landmarks(ids[on], objects[votes.instances[on]])
+        if self._dynamics is not None:
+            labels = self.labels.probabilities(ids)
+            masks = KeyframeMasks(
+                keyframe_id,
+                observed.T_world_camera,
+                self.names,
+                claims,
+                waiting.depth_m,
+                ids,
+                votes.instances,
+                labels,
+            )
+            self._dynamics.see(masks, mapper)
         return Attachment(keyframe_id, len(instances), ids)
 
     def follow(self, mapper: Mapper) -> None:

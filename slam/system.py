@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,51 +11,27 @@ import numpy as np
 from graph.array_file import Arrays, check_like, nested, part
 from graph.camera import Camera
 from graph.geometry import Array
-from graph.smoother_config import SmootherConfig
 from graph.solver import SolverError
 from graph.trajectory import Trajectory
 from semantics.segmenter import Segmenter
 from slam.covariances import COVARIANCES, KeyframeCovariances, write_covariances
-from slam.features import BriskExtractor, FeatureConfig, Features
+from slam.dynamics import Dynamics, Sifted
+from slam.features import BriskExtractor, Features
 from slam.frame import Frame
-from slam.graph_feed import GraphFeedConfig
-from slam.keyframes import KeyframeConfig, KeyframeEvidence, keyframe_reason
+from slam.keyframes import KeyframeEvidence, keyframe_reason
 from slam.landmark_cloud import LandmarkCloud
-from slam.local_mapping import MappingConfig
 from slam.localiser import Localiser
-from slam.loop_closing import LoopClosingConfig
 from slam.map_file import MAP, write_map
 from slam.mapper import Mapper
-from slam.relocalisation import RelocalisationConfig
 from slam.results import FrameResult, TrackingStatus
 from slam.semantic_files import semantic_writers
-from slam.semantic_mapping import MapObjects, SemanticMapper, SemanticsConfig
+from slam.semantic_mapping import MapObjects, SemanticMapper
 from slam.stage_clock import StageClock
-from slam.tracker import Tracked, Tracker, TrackingConfig, lost, untracked
+from slam.system_config import SystemConfig
+from slam.tracker import Tracked, Tracker, lost, untracked
 from slam.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class SystemConfig:
-    """Everything that can be configured; YAML files hold only what differs from these defaults.
-
-    ``final_adjustment``: a full bundle adjustment ends the run. ``covariances``: those of all
-    keyframes are written with its results.
-    """
-
-    features: FeatureConfig = field(default_factory=FeatureConfig)
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
-    mapping: MappingConfig = field(default_factory=MappingConfig)
-    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
-    feed: GraphFeedConfig = field(default_factory=GraphFeedConfig)
-    graph: SmootherConfig = field(default_factory=SmootherConfig)
-    loops: LoopClosingConfig = field(default_factory=LoopClosingConfig)
-    semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
-    final_adjustment: bool = True
-    covariances: bool = False
 
 
 class SlamSystem:
@@ -76,7 +51,9 @@ class SlamSystem:
         self.mapper = Mapper(camera, tracker, rules)
         places = self.mapper.loops.index
         self.localiser = Localiser(tracker, places, (config.relocalisation, config.mapping))
-        self.semantics = SemanticMapper(camera, config.semantics, segmenter)
+        sigma_px = config.features.disparity_sigma_px
+        self.dynamics = Dynamics(camera, config.dynamics, sigma_px)
+        self.semantics = SemanticMapper(camera, config.semantics, segmenter, self.dynamics)
         self._segment = 0
         self._reference: Keyframe | None = None
         self._frames_since_keyframe = 0
@@ -93,6 +70,7 @@ class SlamSystem:
                 mapper=self.mapper.state(),
                 localiser=self.localiser.state(),
                 semantics=self.semantics.state(),
+                dynamics=self.dynamics.state(),
             ),
         }
 
@@ -102,6 +80,7 @@ class SlamSystem:
         self.mapper.restore(part(state, "mapper"), path)
         self.localiser.restore(part(state, "localiser"))
         self.semantics.restore(part(state, "semantics"), path)
+        self.dynamics.restore(part(state, "dynamics"))
         self._segment = int(state["segment"])
         self._reference = self.mapper.world.keyframes.get(int(state["reference"]))
         self._frames_since_keyframe = int(state["frames_since_keyframe"])
@@ -124,6 +103,7 @@ class SlamSystem:
         self._first_keyframe = world.next_keyframe_id
         self.mapper.begin_session()
         self.semantics.begin_session()
+        self.dynamics.begin_session()
         self.localiser.forget(self.config.relocalisation.patience_frames)
 
     def prepare(self, frame: Frame) -> Features:
@@ -135,8 +115,10 @@ class SlamSystem:
         clock, keyframe = StageClock(), None
         with clock.stage("features"):
             features = features if features is not None else self.prepare(frame)
+        with clock.stage("moving"):
+            sifted = self._sift(frame, features)
         with clock.stage("tracking"):
-            tracked = self._track(features)
+            tracked = self._watch(self._track(sifted.features), sifted)
         with clock.stage("keyframe"):
             reason = self._keyframe_reason(tracked)
             if reason:
@@ -152,6 +134,7 @@ class SlamSystem:
                 self._refer_to(keyframe)
         with clock.stage("semantics"):
             if keyframe:
+                self.dynamics.remember(keyframe, sifted.view, self.mapper)
                 self.semantics.observe(frame, keyframe, self.mapper)
         return FrameResult(
             index=frame.index,
@@ -161,6 +144,8 @@ class SlamSystem:
             segment=self._segment,
             matches=tracked.matches,
             inliers=len(tracked.landmark_ids),
+            ignored=sifted.ignored,
+            mostly_moving=sifted.mostly_moving,
             keyframe_id=keyframe.id if keyframe else None,
             keyframe_reason=reason,
             stage_ms=clock.stage_ms,
@@ -263,6 +248,19 @@ class SlamSystem:
         self._reference = None
         self.localiser.restart(np.eye(4))
         return untracked(np.eye(4), features)
+
+    def _sift(self, frame: Frame, features: Features) -> Sifted:
+        """The features that do not move, by the predicted pose and the map's segment."""
+        begins = self._reference is None
+        predicted = None if begins else self.localiser.prediction()
+        return self.dynamics.sift(frame, features, predicted, self._segment, self.mapper)
+
+    def _watch(self, tracked: Tracked, sifted: Sifted) -> Tracked:
+        """Landmarks that are believed to move are not tracked against from now on."""
+        if tracked.status is not TrackingStatus.LOST:
+            moving = self.dynamics.watch(tracked, sifted.view, self.mapper.world)
+            self.localiser.leave_out(moving)
+        return tracked
 
     def _keyframe_reason(self, tracked: Tracked) -> str:
         if tracked.status is TrackingStatus.LOST:

@@ -105,7 +105,7 @@ def test_make_targets_exist():
 
 def test_configuration_keys_exist():
     from slam.configuration import resolve
-    from slam.system import SystemConfig
+    from slam.system_config import SystemConfig
 
     given = [
         words[i + 1]

@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from slam.configuration import dump, find_config, resolve
     from slam.progress import console_log
     from slam.runner import RunOptions, resume, run
-    from slam.system import SystemConfig
+    from slam.system_config import SystemConfig
 
     file = find_config(arguments.config) if arguments.config else None
     plain = resolve(SystemConfig, file, arguments.set)

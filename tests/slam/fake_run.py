@@ -16,7 +16,7 @@ from graph.trajectory import Trajectory, write_tum
 from slam.frame import Frame
 from slam.landmark_cloud import LandmarkCloud
 from slam.results import FrameResult, TrackingStatus
-from slam.system import SystemConfig
+from slam.system_config import SystemConfig
 
 CAMERA = "{width: 32, height: 24, fx: 30, fy: 31, cx: 15, cy: 12, depth_scale: 1000, fps: 10}\n"
 FPS_HZ = 10.0

@@ -24,7 +24,7 @@ from graph.errors import InputError
 from slam import run_results
 from slam.run_folder import CHECKPOINT, FILES, RunFolder
 from slam.runner import RunOptions, resume, run
-from slam.system import SystemConfig
+from slam.system_config import SystemConfig
 from slam.tracker import TrackingConfig
 
 ROOT = Path(__file__).resolve().parents[2]

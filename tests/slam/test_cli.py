@@ -21,7 +21,7 @@ from slam import cli
 from slam.configuration import resolve
 from slam.rendering.sequence import SCENES, RenderConfig
 from slam.runner import RunSummary
-from slam.system import SystemConfig
+from slam.system_config import SystemConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = ("run", "evaluate", "render", "info", "optimise", "export", "calibrate")

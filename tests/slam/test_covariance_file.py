@@ -11,7 +11,8 @@ from synthetic_view import CAMERA, render_plane
 from graph.errors import InputError
 from graph.geometry import se3_exp
 from slam.covariances import KeyframeCovariances, read_covariances, write_covariances
-from slam.system import SlamSystem, SystemConfig
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
 
 
 def example(count: int = 4) -> KeyframeCovariances:

@@ -25,7 +25,8 @@ from slam.graph_feed import GraphFeed, GraphFeedConfig, read_back
 from slam.map_pruning import KeptReason, MapPruner, MaskScope, covered
 from slam.map_state import world_of, world_state
 from slam.results import TrackingStatus
-from slam.system import SlamSystem, SystemConfig
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
 from slam.world_map import Keyframe, WorldMap
 
 COUNT = 60

@@ -17,7 +17,7 @@ from slam import cli
 from slam.run_adjustment import carry_along
 from slam.runner import RunOptions, run
 from slam.saved_run import read_run
-from slam.system import SystemConfig
+from slam.system_config import SystemConfig
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/redkitchen"
 

@@ -25,7 +25,7 @@ from graph.trajectory import Trajectory, read_tum, write_tum
 from slam.configuration import resolve
 from slam.run_folder import FILES
 from slam.runner import RunOptions, RunSummary, run
-from slam.system import SystemConfig
+from slam.system_config import SystemConfig
 from slam.tracker import TrackingConfig
 
 METRICS = [

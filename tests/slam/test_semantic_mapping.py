@@ -18,7 +18,8 @@ from slam.configuration import resolve
 from slam.frame import Frame
 from slam.landmark_cloud import write_landmarks
 from slam.semantic_files import read_labels, write_labels
-from slam.system import SlamSystem, SystemConfig
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
 
 FILE = Path("run/checkpoint")
 EDGE_M = 0.1  # world x: left of it on the plane is one thing, right of it another

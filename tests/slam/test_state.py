@@ -18,6 +18,7 @@ from graph.geometry import Array, se3_exp
 from graph.shadow import Shadow
 from graph.storage import graph_arrays
 from graph.updates import GraphUpdate, RelativePose
+from semantics.instance_tracks import Sighting
 from semantics.instances import Instance, certain, mask_box
 from semantics.labels import label_set
 from semantics.segmenter import Image
@@ -25,7 +26,8 @@ from slam.configuration import resolve
 from slam.frame import Frame
 from slam.landmarks import LandmarkTable
 from slam.loop_verification import LoopConstraint
-from slam.system import SlamSystem, SystemConfig
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
 
 FILE = Path("run/checkpoint")
 SCRATCH = {"elapsed_s"}  # means nothing between two frames
@@ -85,6 +87,8 @@ def system() -> SlamSystem:
         for k in range(2)
     ]
     system.semantics.expect(system.mapper.world.keyframes[first], FRAMES[3].depth_m)
+    sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
+    system.dynamics.tracks.see(FRAMES[19].timestamp_s, [sighting])
     loops.closed = {(first, second): True, (first, second + 1): False}
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
     return system

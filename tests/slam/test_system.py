@@ -13,7 +13,8 @@ from slam.configuration import resolve
 from slam.frame import Frame
 from slam.results import FrameResult, TrackingStatus
 from slam.sequences import open_sequence
-from slam.system import SlamSystem, SystemConfig
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
 
 KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/redkitchen"
 

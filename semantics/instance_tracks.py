@@ -1,0 +1,232 @@
+"""Where movable things are between the keyframes that showed them: a Kalman filter each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from filterpy.common import Q_discrete_white_noise
+from filterpy.kalman import predict, update
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from graph.array_file import Arrays
+from graph.geometry import Array
+
+_H = np.eye(3, 6)
+_NEVER = 1e9
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """The motion that is expected, and when a track ends.
+
+    ``acceleration_m_s2``: standard deviation of the white acceleration. ``speed_m_s``: that of
+    an unknown speed. ``centroid_sigma_m``: that of a measured centroid, of which part may be
+    hidden. ``gate_chi2`` (3 degrees of freedom) is where a detection no longer belongs to a track;
+    one with a quite different class costs ``class_cost`` more. A track ends ``patience_s`` after
+    it was last seen. Boxes are widened by ``box_sigmas`` of the prediction and ``box_margin_m``.
+    """
+
+    acceleration_m_s2: float = 1.0
+    speed_m_s: float = 0.7
+    centroid_sigma_m: float = 0.08
+    gate_chi2: float = 16.0
+    class_cost: float = 8.0
+    patience_s: float = 2.0
+    box_sigmas: float = 1.0
+    box_margin_m: float = 0.08
+    min_prior: float = 0.2
+
+    def __post_init__(self) -> None:
+        if min(self.acceleration_m_s2, self.speed_m_s, self.centroid_sigma_m) <= 0:
+            raise ValueError("acceleration, speed and centroid sigma must be positive")
+        if self.patience_s <= 0 or self.gate_chi2 <= 0:
+            raise ValueError("patience_s and gate_chi2 must be positive")
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A movable thing in a keyframe.
+
+    Attributes:
+        centroid_world: (3,) m.
+        half_size: (3,) m, along the image's columns, its rows and the depth.
+        distribution: (C,) over classes.
+        log_odds: that it moves, by its class's prior and this keyframe's geometry.
+    """
+
+    centroid_world: Array
+    half_size: Array
+    distribution: NDArray[np.float32]
+    log_odds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A thing that was seen, as of the last time.
+
+    Attributes:
+        id: its number.
+        time_s: when it was last seen.
+        mean: (6,) centroid m and velocity m/s in the world; covariance: (6, 6).
+        half_size, distribution, log_odds: see Sighting, fused over sightings.
+        sightings: how many.
+    """
+
+    id: int
+    time_s: float
+    mean: Array
+    covariance: Array
+    half_size: Array
+    distribution: NDArray[np.float32]
+    log_odds: float
+    sightings: int
+
+    @property
+    def moving(self) -> bool:
+        """Whether it is more likely moving than not."""
+        return self.log_odds > 0
+
+
+class InstanceTracks:
+    """All tracks, by one gated assignment a keyframe."""
+
+    def __init__(self, config: TrackConfig | None = None) -> None:
+        self.config = config or TrackConfig()
+        self.tracks: list[Track] = []
+        self._next_id = 0
+
+    def see(self, time_s: float, sightings: Sequence[Sighting]) -> list[int]:
+        """The movable things of a keyframe; returns the id of the track of each.
+
+        Masks that come after those of a later keyframe, and tracks that have ended, are of no use.
+        """
+        self.expire(time_s)
+        if any(track.time_s > time_s for track in self.tracks):
+            return []
+        ahead = [self.predicted(track, time_s) for track in self.tracks]
+        chosen = self._assign(ahead, sightings)
+        ids = []
+        for sighting, row in zip(sightings, chosen, strict=True):
+            if row < 0:
+                self.tracks.append(self._begun(sighting, time_s))
+                ids.append(self.tracks[-1].id)
+            else:
+                self.tracks[row] = self._joined(ahead[row], sighting, time_s)
+                ids.append(self.tracks[row].id)
+        return ids
+
+    def expire(self, time_s: float) -> None:
+        """End the tracks that were not seen for long."""
+        limit = time_s - self.config.patience_s
+        self.tracks = [track for track in self.tracks if track.time_s >= limit]
+
+    def predicted(self, track: Track, time_s: float) -> Track:
+        """A track at another time, by constant velocity; its ``time_s`` stays that of sight."""
+        dt = time_s - track.time_s
+        F = np.eye(6)
+        F[:3, 3:] = dt * np.eye(3)
+        variance = self.config.acceleration_m_s2**2
+        Q = Q_discrete_white_noise(2, abs(dt), variance, block_size=3, order_by_dim=False)
+        mean, covariance = predict(track.mean, track.covariance, F=F, Q=Q)
+        return replace(track, mean=mean, covariance=covariance)
+
+    def reach_m(self, track: Track) -> Array:
+        """Half size (3,) m of a predicted track's box, widened by what is not known."""
+        sigma_m = np.sqrt(max(np.trace(track.covariance[:3, :3]) / 3, 0.0))
+        return track.half_size + self.config.box_sigmas * sigma_m + self.config.box_margin_m
+
+    def clear(self) -> None:
+        """End all tracks: another recording."""
+        self.tracks = []
+
+    def state(self) -> Arrays:
+        """All tracks as named arrays."""
+        tracks = self.tracks
+        return {
+            "next_id": np.array(self._next_id),
+            "ids": np.array([t.id for t in tracks], np.int64),
+            "times_s": np.array([t.time_s for t in tracks], float),
+            "means": np.array([t.mean for t in tracks], float).ravel(),
+            "covariances": np.array([t.covariance for t in tracks], float).ravel(),
+            "half_sizes": np.array([t.half_size for t in tracks], float).ravel(),
+            "distributions": np.array([t.distribution for t in tracks], np.float32).ravel(),
+            "log_odds": np.array([t.log_odds for t in tracks], float),
+            "sightings": np.array([t.sightings for t in tracks], np.int64),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the tracks of a state."""
+        n = len(state["ids"])
+        self._next_id = int(state["next_id"])
+        distributions = state["distributions"].reshape(n, -1) if n else np.zeros((0, 1))
+        self.tracks = [
+            Track(*row)
+            for row in zip(
+                state["ids"].tolist(),
+                state["times_s"].tolist(),
+                state["means"].reshape(n, 6).copy(),
+                state["covariances"].reshape(n, 6, 6).copy(),
+                state["half_sizes"].reshape(n, 3).copy(),
+                distributions.astype(np.float32),
+                state["log_odds"].tolist(),
+                state["sightings"].tolist(),
+                strict=True,
+            )
+        ]
+
+    def _assign(self, ahead: list[Track], sightings: Sequence[Sighting]) -> list[int]:
+        """The row of the track of each sighting, -1 for none: the cheapest pairs in the gate."""
+        chosen = [-1] * len(sightings)
+        if not ahead or not sightings:
+            return chosen
+        cost = np.full((len(sightings), len(ahead)), _NEVER)
+        noise = self.config.centroid_sigma_m**2 * np.eye(3)
+        for k, track in enumerate(ahead):
+            away = np.array([s.centroid_world for s in sightings]) - track.mean[:3]
+            S = track.covariance[:3, :3] + noise
+            chi2 = np.einsum("ij,ij->i", away, np.linalg.solve(S, away.T).T)
+            alike = np.array([_alike(s.distribution, track.distribution) for s in sightings])
+            total = chi2 + self.config.class_cost * (1 - alike)
+            cost[:, k] = np.where(total < self.config.gate_chi2, total, _NEVER)
+        for row, column in zip(*linear_sum_assignment(cost), strict=True):
+            if cost[row, column] < _NEVER:
+                chosen[row] = int(column)
+        return chosen
+
+    def _begun(self, sighting: Sighting, time_s: float) -> Track:
+        self._next_id += 1
+        variances = [self.config.centroid_sigma_m**2] * 3 + [self.config.speed_m_s**2] * 3
+        return Track(
+            id=self._next_id - 1,
+            time_s=time_s,
+            mean=np.concatenate([sighting.centroid_world, np.zeros(3)]),
+            covariance=np.diag(variances),
+            half_size=sighting.half_size,
+            distribution=sighting.distribution,
+            log_odds=sighting.log_odds,
+            sightings=1,
+        )
+
+    def _joined(self, ahead: Track, sighting: Sighting, time_s: float) -> Track:
+        noise = self.config.centroid_sigma_m**2 * np.eye(3)
+        mean, covariance = update(
+            ahead.mean, ahead.covariance, sighting.centroid_world, noise, H=_H
+        )
+        return replace(
+            ahead,
+            time_s=time_s,
+            mean=mean,
+            covariance=covariance,
+            half_size=np.maximum(sighting.half_size, 0.8 * ahead.half_size),
+            distribution=np.float32(0.5) * (ahead.distribution + sighting.distribution),
+            log_odds=(ahead.log_odds + sighting.log_odds) / 2,
+            sightings=ahead.sightings + 1,
+        )
+
+
+def _alike(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """How much two distributions (C,) have in common, 0 to 1."""
+    return float(np.sqrt(a * b).sum()) if a.shape == b.shape else 0.0

@@ -1,0 +1,331 @@
+"""What moves: kept out of tracking and of the map, taken out of the graph where it was put in."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.array_file import Arrays, nested, part
+from graph.camera import Camera
+from graph.geometry import Array, inverse, transform
+from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
+from semantics.labels import LabelSet
+from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
+from semantics.votes import Claims
+from slam.features import Features, select
+from slam.frame import Frame
+from slam.landmarks import Ints, Mask
+from slam.mapper import Mapper
+from slam.static_check import (
+    DepthView,
+    StaticCheck,
+    StaticCheckConfig,
+    Verdict,
+    Verdicts,
+    ViewMemory,
+    depth_view,
+    distorted,
+)
+from slam.tracker import Tracked
+from slam.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
+
+_SAMPLES = 400
+"""Pixels of an instance that are judged, at most."""
+
+
+@dataclass(frozen=True)
+class DynamicsConfig:
+    """Which evidence of motion counts: that of masks by their ``labels``, that of ``geometry``.
+
+    ``priors`` is a YAML file of P(moving) by class, or the name of one in ``data/labels``. With
+    fewer than ``min_static`` keypoints left all are used, and the frame says so. Masks of moving
+    things are widened by ``mask_border_px``. An instance is judged by at least ``min_judged`` of
+    its pixels.
+    """
+
+    labels: bool = True
+    geometry: bool = True
+    priors: str = "movability"
+    min_static: int = 60
+    mask_border_px: int = 5
+    min_judged: int = 20
+    movability: MovabilityConfig = field(default_factory=MovabilityConfig)
+    check: StaticCheckConfig = field(default_factory=StaticCheckConfig)
+    tracks: TrackConfig = field(default_factory=TrackConfig)
+
+    def __post_init__(self) -> None:
+        if self.min_static < 0 or self.mask_border_px < 0 or self.min_judged < 1:
+            raise ValueError(
+                "min_static and mask_border_px must not be negative, min_judged at least 1"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Sifted:
+    """A frame without what moves.
+
+    Attributes:
+        features: those that are left; all of them where ``mostly_moving``.
+        moving: (N,) of the frame's own features, those on moving things.
+        mostly_moving: too few would have been left.
+        view: what the frame's depth says about space; None if geometry is switched off.
+    """
+
+    features: Features
+    moving: Mask
+    mostly_moving: bool
+    view: DepthView | None
+
+    @property
+    def ignored(self) -> int:
+        """How many features were left out."""
+        return len(self.moving) - len(self.features)
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMasks:
+    """A keyframe's instances and what they say about its landmarks.
+
+    Attributes:
+        keyframe_id, T_world_camera: the keyframe's.
+        names: the label set.
+        claims: who owns its pixels. depth_m: every s-th pixel of its depth, NaN where missing.
+        landmark_ids: (N,) that were spoken of. instances: (N,) the claims' that each is on, -1
+            for none. label_distributions: (N, C) what is known of their classes.
+    """
+
+    keyframe_id: int
+    T_world_camera: Array
+    names: LabelSet
+    claims: Claims
+    depth_m: NDArray[np.float32]
+    landmark_ids: Ints
+    instances: Ints
+    label_distributions: Array
+
+
+class Dynamics:
+    """Keeps which landmarks and instances move; map and graph belong to the caller."""
+
+    def __init__(
+        self, camera: Camera, config: DynamicsConfig, disparity_sigma_px: float = 0.08
+    ) -> None:
+        self.camera = camera
+        self.config = config
+        self.priors = read_priors(config.priors)
+        self.movability = MovabilityFilter(self.priors.unknown, config.movability)
+        self.tracks = InstanceTracks(config.tracks)
+        self.memory = ViewMemory(config.check)
+        self._check = StaticCheck(camera, disparity_sigma_px, config.check)
+
+    def sift(
+        self,
+        frame: Frame,
+        features: Features,
+        T_world_camera: Array | None,
+        segment: int,
+        mapper: Mapper,
+    ) -> Sifted:
+        """Leave out the features on moving things, given the predicted pose; none without it."""
+        geometry = self.config.geometry
+        view = depth_view(frame.depth_m, self.config.check.window_px) if geometry else None
+        moving = np.zeros(len(features), bool)
+        if T_world_camera is not None:
+            if geometry:
+                verdicts = self._judge_features(features, T_world_camera, segment, mapper)
+                moving |= verdicts == Verdict.MOVING
+            moving |= self._on_tracks(features, frame.timestamp_s, T_world_camera)
+        if not moving.any():
+            return Sifted(features, moving, False, view)
+        if np.count_nonzero(~moving) < self.config.min_static:
+            logger.info("frame %d: nearly everything moves; all is used", frame.index)
+            return Sifted(features, moving, True, view)
+        return Sifted(select(features, np.flatnonzero(~moving)), moving, False, view)
+
+    def watch(self, tracked: Tracked, view: DepthView | None, world: WorldMap) -> Ints:
+        """Evidence of a tracked frame about landmarks; returns those in view believed moving."""
+        ids = tracked.visible_ids
+        if view is None or not len(ids):
+            return ids[self.movability.moving(ids)]
+        points = world.landmarks.points_world[ids]
+        gone = self._check.judge(points, view, tracked.T_world_camera) == Verdict.MOVING
+        found = np.isin(ids, tracked.landmark_ids)
+        gone &= ~found
+        told = found | gone
+        self.movability.update(ids[told], gone[told], self.config.movability.frame_power)
+        return ids[self.movability.moving(ids)]
+
+    def remember(self, keyframe: Keyframe, view: DepthView | None, mapper: Mapper) -> None:
+        """A keyframe was made: landmarks that move leave map and graph, its depth is kept."""
+        self._follow(mapper.world)
+        self._remove(self.movability.known(), mapper)
+        if view is not None:
+            self.memory.add(keyframe.id, keyframe.timestamp_s, view)
+
+    def see(self, masks: KeyframeMasks, mapper: Mapper) -> None:
+        """A keyframe's masks, now or late: what is on moving things leaves map and graph."""
+        if not self.config.labels:
+            return
+        sightings = [self._sighting(k, masks, mapper) for k in range(len(masks.claims.instances))]
+        movable = [s for s in sightings if s is not None and s.log_odds > self._least]
+        keyframe = mapper.world.keyframes.get(masks.keyframe_id)
+        if keyframe is not None:
+            self.tracks.see(keyframe.timestamp_s, movable)
+        odds = np.array([-np.inf if s is None else s.log_odds for s in sightings])
+        self._believe(masks, odds > 0)
+        if not (odds > 0).any():
+            return
+        covered = np.isin(masks.claims.owner, np.flatnonzero(odds > 0))
+        self._forget_space(masks.keyframe_id, covered)
+        pruner = replace(mapper.pruner(), border_px=-self.config.mask_border_px)
+        pruner.prune_mask(masks.keyframe_id, covered)
+        self._remove(masks.landmark_ids, mapper)
+
+    def begin_session(self) -> None:
+        """Forget what moved in an earlier recording; landmarks stay what they are."""
+        self.memory.clear()
+        self.tracks.clear()
+
+    def state(self) -> Arrays:
+        """All that was learned, as named arrays."""
+        return nested(
+            movability=self.movability.state(),
+            tracks=self.tracks.state(),
+            memory=self.memory.state(),
+        )
+
+    def restore(self, state: Arrays) -> None:
+        """Go on from a state."""
+        self.movability.restore(part(state, "movability"))
+        self.tracks.restore(part(state, "tracks"))
+        self.memory.restore(part(state, "memory"))
+
+    @property
+    def _least(self) -> float:
+        """Log odds of a class that is movable enough to be tracked."""
+        return float(log_odds(self.config.tracks.min_prior))
+
+    def _judge_features(
+        self, features: Features, T_world_camera: Array, segment: int, mapper: Mapper
+    ) -> Verdicts:
+        """What earlier keyframes say about features (N,), at a predicted pose."""
+        verdicts = np.zeros(len(features), np.int8)
+        views = self._views(segment, mapper)
+        seen = np.flatnonzero(np.isfinite(features.depth_m))
+        if not views or not len(seen):
+            return verdicts
+        points = self.camera.backproject(features.pixels[seen], features.depth_m[seen])
+        points_world = transform(T_world_camera, points)
+        told = [self._check.judge(points_world, view, T) for _, view, T in views]
+        verdicts[seen] = self._check.agree(np.stack(told))
+        return self._check.spread(features.pixels, features.depth_m, verdicts)
+
+    def _views(self, segment: int, mapper: Mapper) -> list[tuple[int, DepthView, Array]]:
+        """Keyframe id, view and pose, as optimised since, of what is remembered of a segment."""
+        found = []
+        for kept in self.memory.views:
+            heir_id, T_heir_keyframe = mapper.history.heir(kept.keyframe_id)
+            heir = mapper.world.keyframes.get(heir_id)
+            if heir is not None and heir.segment == segment:
+                pose = heir.T_world_camera @ T_heir_keyframe
+                found.append((kept.keyframe_id, kept.view, pose))
+        return found
+
+    def _on_tracks(self, features: Features, time_s: float, T_world_camera: Array) -> Mask:
+        """Features (N,) in the predicted boxes of moving tracks, in the image and in depth."""
+        inside = np.zeros(len(features), bool)
+        self.tracks.expire(time_s)
+        for track in self.tracks.tracks:
+            if not track.moving:
+                continue
+            ahead = self.tracks.predicted(track, time_s)
+            reach_m = self.tracks.reach_m(ahead)
+            centre = transform(inverse(T_world_camera), ahead.mean[None, :3])
+            z = float(centre[0, 2])
+            if z < 0.2:
+                continue
+            middle = distorted(self.camera, centre)[0]
+            half_px = np.array([self.camera.fx, self.camera.fy]) * reach_m[:2] / z
+            box = (np.abs(features.image_pixels - middle) < half_px).all(axis=1)
+            inside |= box & ~(np.abs(features.depth_m - z) > reach_m[2])
+        return inside
+
+    def _sighting(self, k: int, masks: KeyframeMasks, mapper: Mapper) -> Sighting | None:
+        """An instance in space, and whether it moves; None without depth."""
+        instance, depth_m = masks.claims.instances[k], masks.depth_m
+        step = max(masks.claims.owner.shape[0] // max(depth_m.shape[0], 1), 1)
+        owner = masks.claims.owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
+        own = (owner == k) & np.isfinite(depth_m)
+        rows, columns = np.nonzero(own)
+        z_m = depth_m[rows, columns].astype(float)
+        surface = masks.claims.on_surface(np.full(len(rows), k), z_m)
+        rows, columns = rows[surface], columns[surface]
+        if len(rows) < self.config.min_judged:
+            return None
+        some = np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLES)).astype(np.int64)
+        rows, columns = rows[some], columns[some]
+        pixels = step * np.stack([columns, rows], axis=1).astype(float)
+        points = self.camera.backproject(pixels, depth_m[rows, columns].astype(float))
+        low, centroid, high = np.percentile(points, (4, 50, 96), axis=0)
+        half_size = np.maximum(high - centroid, centroid - low)
+        prior = float(instance.distribution @ self.priors.of(masks.names))
+        odds = float(log_odds(np.clip(prior, 0.01, 0.99)))
+        odds += self._evidence(transform(masks.T_world_camera, points), masks, mapper)
+        centre_world = transform(masks.T_world_camera, centroid[None])[0]
+        return Sighting(centre_world, half_size, instance.distribution, odds)
+
+    def _evidence(self, points_world: Array, masks: KeyframeMasks, mapper: Mapper) -> float:
+        """Log odds that an instance at these points moves, by what other keyframes saw there."""
+        keyframe = mapper.world.keyframes.get(masks.keyframe_id)
+        if keyframe is None or not self.config.geometry:
+            return 0.0
+        views = [v for v in self._views(keyframe.segment, mapper) if v[0] != masks.keyframe_id]
+        if not views:
+            return 0.0
+        told = [self._check.judge(points_world, view, T) for _, view, T in views]
+        verdicts = self._check.agree(np.stack(told))
+        known = np.count_nonzero(verdicts)
+        if known < self.config.min_judged:
+            return 0.0
+        step = self.config.movability.step
+        return step if np.count_nonzero(verdicts < 0) > known / 2 else -step
+
+    def _believe(self, masks: KeyframeMasks, moving: Mask) -> None:
+        """Landmarks on instances have their classes' priors, and move if their instance does."""
+        ids, first = np.unique(masks.landmark_ids, return_index=True)
+        priors = masks.label_distributions[first] @ self.priors.of(masks.names)
+        self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
+        instances = masks.instances[first]
+        on_one = instances >= 0
+        self.movability.update(ids[on_one], moving[instances[on_one]])
+
+    def _forget_space(self, keyframe_id: int, covered: Mask) -> None:
+        """Where something moved, a remembered view says nothing about space."""
+        for kept in self.memory.views:
+            if kept.keyframe_id == keyframe_id:
+                step = kept.view.step
+                height, width = kept.view.nearest_m.shape
+                hidden = covered[::step, ::step][:height, :width]
+                kept.view.nearest_m[hidden] = kept.view.farthest_m[hidden] = 0.0
+
+    def _remove(self, ids: Ints, mapper: Mapper) -> None:
+        """Take those of the landmarks (N,) that move out of map and graph."""
+        ids = mapper.world.landmarks.living(ids)
+        ids = ids[self.movability.moving(ids)]
+        if len(ids):
+            mapper.pruner().prune_landmarks(ids)
+            self.movability.drop(ids)
+
+    def _follow(self, world: WorldMap) -> None:
+        """Landmarks that were fused take what was known of them along; culled ones lose it."""
+        known = self.movability.known()
+        gone = known[~world.landmarks.alive[known]]
+        heirs = world.landmarks.current(gone)
+        alive = world.landmarks.alive[heirs]
+        self.movability.move(gone[alive], heirs[alive])
+        self.movability.drop(gone[~alive])

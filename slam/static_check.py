@@ -1,0 +1,216 @@
+"""Geometry's evidence of motion: a point in space that a camera saw through cannot be there.
+
+A keypoint's point is compared with what earlier keyframes saw, a landmark with the present depth
+image; neither needs a match or a class. A point behind a surface is hidden and nothing is said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from graph.array_file import Arrays
+from graph.camera import Camera
+from graph.geometry import Array, inverse, transform
+
+Depths = NDArray[np.float32]
+Verdicts = NDArray[np.int8]
+
+
+class Verdict(IntEnum):
+    """What views say about a point."""
+
+    MOVING = -1
+    """It lies in space that was seen to be free."""
+    UNKNOWN = 0
+    """It is hidden, out of view or without depth."""
+    STATIC = 1
+    """There is a surface."""
+
+
+@dataclass(frozen=True)
+class StaticCheckConfig:
+    """When a point lies in free space, and how much is remembered.
+
+    A view saw through a point if every depth within ``window_px`` of it is farther by
+    ``margin_m`` and ``depth_sigmas`` standard deviations of either depth; the window allows for
+    errors of the poses and for the depth image's ragged edges. There is a surface if the nearest
+    or the farthest depth in the window is as near as that. Nothing is judged beyond
+    ``max_depth_m``.
+    ``views`` keyframes are remembered, at least ``interval_s`` apart. ``neighbours`` within
+    ``neighbour_px`` decide about a keypoint that cannot be judged by itself, if their depths
+    differ by less than ``same_depth`` of it.
+    """
+
+    margin_m: float = 0.1
+    depth_sigmas: float = 4.0
+    window_px: int = 5
+    max_depth_m: float = 6.0
+    views: int = 6
+    interval_s: float = 0.25
+    neighbours: int = 5
+    neighbour_px: float = 30.0
+    same_depth: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.margin_m <= 0 or self.depth_sigmas < 0 or self.window_px < 0:
+            raise ValueError("margin_m must be positive, depth_sigmas and window_px not negative")
+        if self.views < 1 or self.neighbours < 1:
+            raise ValueError("views and neighbours must be at least 1")
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """What a depth image says about space, at every ``step``-th pixel in both directions.
+
+    Attributes:
+        nearest_m: (H / step, W / step) nearest depth in a window; 0 where one is missing, since
+            anything may be there.
+        farthest_m: the farthest depth in it, 0 where all are missing.
+    """
+
+    nearest_m: Depths
+    farthest_m: Depths
+    step: int
+
+    def thinned(self, factor: int) -> DepthView:
+        """Every ``factor``-th of its pixels each way, in arrays of their own."""
+        near, far = (a[::factor, ::factor].copy() for a in (self.nearest_m, self.farthest_m))
+        return DepthView(near, far, factor * self.step)
+
+
+def depth_view(depth_m: Depths, window_px: int) -> DepthView:
+    """The view of a depth image (H, W), NaN where missing, at every second pixel."""
+    filled = np.nan_to_num(depth_m[::2, ::2], nan=0.0)
+    side = 2 * (window_px // 2) + 1
+    window = np.ones((side, side), np.uint8)
+    return DepthView(cv2.erode(filled, window), cv2.dilate(filled, window), 2)
+
+
+class StaticCheck:
+    """Compares points with views: pure functions of a camera and its depth noise."""
+
+    def __init__(self, camera: Camera, disparity_sigma_px: float, config: StaticCheckConfig):
+        self.camera = camera
+        self.config = config
+        self._sigma_per_m2 = disparity_sigma_px / camera.stereo_bf_px_m
+
+    def judge(self, points_world: Array, view: DepthView, T_world_camera: Array) -> Verdicts:
+        """What one view says about points (N, 3)."""
+        points_camera = transform(inverse(T_world_camera), points_world)
+        z = points_camera[:, 2]
+        ahead = (z > 0.1) & (z < self.config.max_depth_m)
+        safe = np.where(ahead[:, None], points_camera, [0.0, 0.0, 1.0])
+        u, v = distorted(self.camera, safe).T
+        ahead &= (u > 0) & (u < self.camera.width - 1) & (v > 0) & (v < self.camera.height - 1)
+        rows = np.rint(np.where(ahead, v, 0) / view.step).astype(np.int64)
+        columns = np.rint(np.where(ahead, u, 0) / view.step).astype(np.int64)
+        height, width = view.nearest_m.shape
+        place = np.minimum(rows, height - 1), np.minimum(columns, width - 1)
+        nearest, farthest = view.nearest_m[place], view.farthest_m[place]
+        free = ahead & (nearest - z > self._margin_m(nearest, z))
+        surface = np.abs(nearest - z) < self._margin_m(nearest, z)
+        surface |= np.abs(farthest - z) < self._margin_m(farthest, z)
+        verdicts = np.where(ahead & surface, Verdict.STATIC, Verdict.UNKNOWN)
+        return np.where(free, Verdict.MOVING, verdicts).astype(np.int8)
+
+    def agree(self, verdicts: Verdicts) -> Verdicts:
+        """What several views (K, N) say together (N,): the majority of those that say anything."""
+        return np.sign(verdicts.sum(axis=0, dtype=np.int64)).astype(np.int8)
+
+    def spread(self, pixels: Array, depth_m: Array, verdicts: Verdicts) -> Verdicts:
+        """Verdicts (N,) with those of keypoints that have none taken from their neighbours.
+
+        Args:
+            pixels: (N, 2) of the keypoints.
+            depth_m: (N,) NaN where missing, and then of no matter.
+            verdicts: (N,).
+        """
+        open_, known = np.flatnonzero(verdicts == 0), np.flatnonzero(verdicts)
+        if not len(open_) or not (verdicts[known] < 0).any():
+            return verdicts
+        tree, count = cKDTree(pixels[known]), min(self.config.neighbours, len(known))
+        distance, near = tree.query(
+            pixels[open_], count, distance_upper_bound=self.config.neighbour_px
+        )
+        distance, near = distance.reshape(len(open_), -1), near.reshape(len(open_), -1)
+        there = known[np.minimum(near, len(known) - 1)]
+        apart = np.abs(depth_m[there] - depth_m[open_, None])
+        differs = apart > self.config.same_depth * depth_m[open_, None]
+        speaks = np.isfinite(distance) & ~differs
+        spread = verdicts.copy()
+        spread[open_] = np.sign((verdicts[there] * speaks).sum(axis=1))
+        return spread
+
+    def _margin_m(self, depth_m: Array | Depths, z: Array) -> Array:
+        """How far apart two depths (N,) may lie and still be one surface."""
+        sigma_m = self._sigma_per_m2 * np.hypot(np.square(depth_m, dtype=float), z**2)
+        return self.config.margin_m + self.config.depth_sigmas * sigma_m
+
+
+def distorted(camera: Camera, points_camera: Array) -> Array:
+    """Pixels (N, 2) in the image as recorded of points (N, 3) in front of the camera."""
+    if not any(camera.distortion) or not len(points_camera):
+        return camera.project(points_camera)
+    zero, lens = np.zeros(3), np.array(camera.distortion)
+    return cv2.projectPoints(points_camera, zero, zero, camera.K, lens)[0][:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class RememberedView:
+    """The depth that a keyframe saw, and when."""
+
+    keyframe_id: int
+    timestamp_s: float
+    view: DepthView
+
+
+THINNED = 2
+"""Of a view that is remembered every second pixel each way is kept."""
+
+
+class ViewMemory:
+    """The last few keyframes' depth, spread in time."""
+
+    def __init__(self, config: StaticCheckConfig) -> None:
+        self.config = config
+        self.views: list[RememberedView] = []
+
+    def add(self, keyframe_id: int, timestamp_s: float, view: DepthView) -> None:
+        """Remember what a keyframe saw, unless the last is too recent."""
+        if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.config.interval_s:
+            return
+        self.views.append(RememberedView(keyframe_id, timestamp_s, view.thinned(THINNED)))
+        del self.views[: -self.config.views]
+
+    def clear(self) -> None:
+        """Forget all: another recording."""
+        self.views = []
+
+    def state(self) -> Arrays:
+        """All views as named arrays."""
+        near = [v.view.nearest_m for v in self.views]
+        far = [v.view.farthest_m for v in self.views]
+        return {
+            "keyframe_ids": np.array([v.keyframe_id for v in self.views], np.int64),
+            "timestamps_s": np.array([v.timestamp_s for v in self.views], float),
+            "step": np.array([v.view.step for v in self.views], np.int64),
+            "shape": np.array([v.shape for v in near[:1]], np.int64).ravel(),
+            "nearest_m": np.array(near, np.float32).ravel(),
+            "farthest_m": np.array(far, np.float32).ravel(),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the memory of a state."""
+        ids, shape = state["keyframe_ids"].tolist(), state["shape"].tolist() or [0, 0]
+        near, far = (state[name].reshape(len(ids), *shape) for name in ("nearest_m", "farthest_m"))
+        stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
+        self.views = [
+            RememberedView(i, t, DepthView(n.copy(), f.copy(), s))
+            for i, t, n, f, s in zip(ids, stamps_s, near, far, steps, strict=True)
+        ]

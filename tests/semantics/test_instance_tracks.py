@@ -1,0 +1,84 @@
+"""Tracks on things that walk at a known speed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
+
+SIZE = np.array([0.25, 0.9, 0.2])
+PERSON, CHAIR = np.eye(3, dtype=np.float32)[1:]
+
+
+def seen(x: float, y: float = 0.0, z: float = 3.0, what: NDArray[np.float32] = PERSON) -> Sighting:
+    return Sighting(np.array([x, y, z]), SIZE, what, 2.0)
+
+
+def test_a_walker_is_predicted_between_keyframes() -> None:
+    tracks = InstanceTracks()
+    for k in range(8):
+        tracks.see(0.4 * k, [seen(0.8 * 0.4 * k, z=3 - 0.5 * 0.4 * k)])
+    (track,) = tracks.tracks
+    ahead = tracks.predicted(track, 2.8 + 0.3)
+    np.testing.assert_allclose(ahead.mean[3:], [0.8, 0, -0.5], atol=0.05)
+    np.testing.assert_allclose(ahead.mean[:3], [0.8 * 3.1, 0, 3 - 0.5 * 3.1], atol=0.05)
+    assert (tracks.reach_m(ahead) > SIZE).all()
+    assert (tracks.reach_m(tracks.predicted(track, 4.0)) > tracks.reach_m(ahead)).all()
+
+
+def test_the_filter_agrees_with_the_textbook() -> None:
+    config = TrackConfig(acceleration_m_s2=1.5, speed_m_s=0.9, centroid_sigma_m=0.1)
+    tracks, dt, z = InstanceTracks(config), 0.5, np.array([0.3, -0.1, 3.2])
+    tracks.see(0.0, [seen(0.0)])
+    tracks.see(dt, [Sighting(z, SIZE, PERSON, 2.0)])
+    eye, zero = np.eye(3), np.zeros((3, 3))
+    F = np.block([[eye, dt * eye], [zero, eye]])
+    G = np.vstack([dt**2 / 2 * eye, dt * eye])
+    P = F @ np.diag([0.01] * 3 + [0.81] * 3) @ F.T + 1.5**2 * G @ G.T
+    x = F @ np.array([0, 0, 3, 0, 0, 0.0])
+    K = P[:, :3] @ np.linalg.inv(P[:3, :3] + 0.01 * eye)
+    np.testing.assert_allclose(tracks.tracks[0].mean, x + K @ (z - x[:3]), atol=1e-9)
+    np.testing.assert_allclose(tracks.tracks[0].covariance, P - K @ P[:3], atol=1e-9)
+
+
+def test_two_that_cross_keep_their_tracks_in_any_order() -> None:
+    tracks = InstanceTracks()
+    for k in range(11):
+        both = [seen(-2 + 0.4 * k), seen(2 - 0.4 * k, z=3.3)]
+        ids = tracks.see(0.5 * k, both[:: 1 if k % 2 else -1])
+        assert sorted(ids) == [0, 1]
+    ends = {round(float(t.mean[0]), 1) for t in tracks.tracks}
+    assert ends == {2.0, -2.0}
+
+
+def test_a_chair_is_not_the_person_who_stood_there() -> None:
+    tracks = InstanceTracks(TrackConfig(class_cost=20.0))
+    first = tracks.see(0.0, [seen(0.0)])
+    assert tracks.see(0.3, [seen(0.0, what=CHAIR)]) != first
+    assert len(tracks.tracks) == 2
+
+
+def test_far_away_is_another_and_the_unseen_end() -> None:
+    tracks = InstanceTracks(TrackConfig(patience_s=1.0))
+    assert tracks.see(0.0, [seen(0.0)]) == [0]
+    assert tracks.see(0.3, [seen(3.0)]) == [1]
+    tracks.see(1.2, [])
+    assert [t.id for t in tracks.tracks] == [1]
+
+
+def test_masks_out_of_order_change_nothing() -> None:
+    tracks = InstanceTracks()
+    tracks.see(1.0, [seen(0.0)])
+    before = tracks.state()
+    assert tracks.see(0.5, [seen(1.0)]) == []
+    assert all(np.array_equal(a, before[name]) for name, a in tracks.state().items())
+
+
+def test_state_and_back() -> None:
+    tracks, other = InstanceTracks(), InstanceTracks()
+    tracks.see(0.0, [seen(0.0), seen(2.0, what=CHAIR)])
+    tracks.see(0.4, [seen(0.2)])
+    other.restore(tracks.state())
+    assert all(np.array_equal(a, other.state()[name]) for name, a in tracks.state().items())
+    assert other.see(0.6, [seen(0.3), seen(5.0)]) == tracks.see(0.6, [seen(0.3), seen(5.0)])

@@ -1,0 +1,179 @@
+"""A textured card that slides before a textured plane, and a camera that moves a little."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, TEXTURE, render_plane
+
+from graph.geometry import Array, inverse, se3_exp, transform
+from semantics.instances import Instance, certain, mask_box
+from semantics.labels import label_set
+from semantics.segmenter import Image
+from slam.configuration import resolve
+from slam.dynamics import Sifted
+from slam.features import Features
+from slam.frame import Frame
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
+
+CARD_Z_M = 1.3
+FRAMES = 36
+SETTINGS = ["keyframes.min_interval_frames=6", "keyframes.max_shared=2.0"]
+NAMES = label_set(("person", "picture"))
+_PATTERN = TEXTURE[100:340, 100:340].astype(np.uint8)
+
+
+def pose(index: int) -> Array:
+    return se3_exp(np.array([0, 0.002 * index, 0, 0.004 * index, 0, 0]))
+
+
+def card(index: int) -> tuple[slice, slice]:
+    """Rows and columns that the card covers; it stands still in the world until frame 8."""
+    x_world = -0.55 + 0.04 * max(index - 8, 0)
+    corner = transform(inverse(pose(index)), np.array([[x_world, 0.0, CARD_Z_M]]))
+    left = round(float(CAMERA.project(corner)[0, 0]))
+    return slice(120, 360), slice(left, left + 240)
+
+
+def view(index: int, with_card: bool = True) -> Frame:
+    frame = render_plane(pose(index), index)
+    if not with_card:
+        return frame
+    rgb, depth_m = frame.rgb.copy(), frame.depth_m.copy()
+    rows, columns = card(index)
+    width = rgb[rows, columns].shape[1]
+    rgb[rows, columns] = _PATTERN[:, :width, None]
+    depth_m[rows, columns] = CARD_Z_M
+    return replace(frame, rgb=rgb, depth_m=depth_m, name=str(index))
+
+
+class CardSegmenter:
+    """The card, as a person or as a picture."""
+
+    labels = NAMES
+
+    def __init__(self, label: int) -> None:
+        self._label = label
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        mask = np.zeros(image.shape[:2], bool)
+        mask[card(int(name))] = True
+        found = certain(self._label, len(NAMES), 0.95)
+        return [Instance(mask, mask_box(mask), self._label, found, 0.95, 0.95)]
+
+
+class WatchedSystem(SlamSystem):
+    """Counts, for every frame, keypoints on the card and off it, and those left out of either."""
+
+    counts: list[tuple[int, int, int, int]]
+
+    def _sift(self, frame: Frame, features: Features) -> Sifted:
+        sifted = super()._sift(frame, features)
+        u, v = features.image_pixels.T
+        _, columns = card(frame.index)
+        right = min(columns.stop, 640)
+        inside = (abs(u - (columns.start + right) / 2) < (right - columns.start) / 2 - 8) & (
+            abs(v - 240) < 112
+        )
+        outside = (u < columns.start - 12) | (u > right + 12) | (abs(v - 240) > 132)
+        left_out = sifted.moving
+        both = (inside, inside & left_out, outside, outside & left_out)
+        self.counts.append(tuple(int(n.sum()) for n in both))  # type: ignore[arg-type]
+        return sifted
+
+
+def run(frames: Sequence[Frame], label: int = 0, settings: Sequence[str] = ()) -> WatchedSystem:
+    config = resolve(SystemConfig, None, [*SETTINGS, *settings])
+    system = WatchedSystem(CAMERA, config, CardSegmenter(label) if label else None)
+    system.counts = []
+    for frame in frames:
+        system.process(frame)
+    return system
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return [view(k) for k in range(FRAMES)]
+
+
+def landmarks_on_card(system: SlamSystem) -> int:
+    """Landmarks nearer than halfway between the card and the plane."""
+    table = system.mapper.world.landmarks
+    return int((table.points_world[table.alive, 2] < 1.65).sum())
+
+
+def position_error_m(system: SlamSystem) -> float:
+    found = system.trajectory().poses_world_camera
+    true = np.array([inverse(pose(0)) @ pose(k) for k in range(FRAMES)])
+    return float(np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1).max())
+
+
+def test_without_any_label_the_card_is_found_once_it_moves(frames: list[Frame]) -> None:
+    system = run(frames)
+    inside, found, outside, wrong = np.array(system.counts[25:]).sum(axis=0)
+    assert inside > 500
+    assert found > 0.9 * inside
+    assert wrong < 0.01 * outside
+    assert landmarks_on_card(system) < 10
+    assert position_error_m(system) < 0.01
+
+
+def test_switched_off_the_card_stays_in_the_map(frames: list[Frame]) -> None:
+    system = run(frames, settings=["dynamics.geometry=false"])
+    assert np.array(system.counts)[:, 1].sum() == 0
+    assert landmarks_on_card(system) > 50
+
+
+def test_a_person_is_left_out_before_moving_and_between_keyframes(frames: list[Frame]) -> None:
+    system = run(frames[:8], label=1, settings=["dynamics.geometry=false"])
+    inside, found, _, wrong = np.array(system.counts[1:]).sum(axis=0)
+    assert found > 0.95 * inside > 0
+    assert wrong == 0
+    assert landmarks_on_card(system) < 5
+    track = system.dynamics.tracks.tracks[0]
+    assert track.moving
+    np.testing.assert_allclose(track.half_size[:2], 120 * CARD_Z_M / CAMERA.fx, rtol=0.1)
+
+
+def test_a_picture_that_hangs_still_is_structure(frames: list[Frame]) -> None:
+    system = run(frames[:8], label=2)
+    assert np.array(system.counts)[:, 1].sum() == 0
+    assert landmarks_on_card(system) > 50
+
+
+def test_a_mask_that_comes_late_takes_out_what_was_put_in(frames: list[Frame]) -> None:
+    late = CardSegmenter(1)
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), late)
+    late.segment = lambda image, name: []  # type: ignore[method-assign]
+    waiting = {}
+    attach, system.semantics.attach = system.semantics.attach, lambda *_: None  # type: ignore
+    for frame in frames[:8]:
+        result = system.process(frame)
+        if result.keyframe_id is not None:
+            waiting[result.keyframe_id] = frame
+    before = landmarks_on_card(system)
+    in_graph = len(system.mapper.smoother.estimate().landmark_ids)
+    for keyframe_id, frame in waiting.items():
+        attach(keyframe_id, CardSegmenter(1).segment(frame.rgb, frame.name), system.mapper)
+    assert before > 50
+    assert landmarks_on_card(system) < 0.05 * before
+    assert len(system.mapper.smoother.estimate().landmark_ids) < in_graph
+
+
+def test_a_scene_without_anything_that_moves_is_used_whole() -> None:
+    system = run([view(k, with_card=False) for k in range(20)])
+    _, found, _, wrong = np.array(system.counts).sum(axis=0)
+    assert found + wrong == 0
+
+
+def test_when_nearly_everything_moves_all_is_used_and_said(frames: list[Frame]) -> None:
+    settings = resolve(SystemConfig, None, [*SETTINGS, "dynamics.min_static=100000"])
+    system = SlamSystem(CAMERA, settings)
+    results = [system.process(frame) for frame in frames[:24]]
+    assert results[-1].mostly_moving
+    assert results[-1].ignored == 0
+    assert not results[3].mostly_moving

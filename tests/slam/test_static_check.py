@@ -1,0 +1,121 @@
+"""Free space seen by views of a plane with a box before it, in a world turned at random."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graph.camera import Camera
+from graph.geometry import Array, inverse, se3_exp, transform
+from slam.static_check import StaticCheck, StaticCheckConfig, Verdict, ViewMemory, depth_view
+
+CAMERA = Camera(160, 120, fx=130.0, fy=130.0, cx=79.5, cy=59.5)
+CHECK = StaticCheck(CAMERA, 0.08, StaticCheckConfig())
+T_WORLD_CAMERA = se3_exp(np.array([0.3, -0.7, 0.2, 1.0, 2.0, -0.5]))
+
+
+def box_before_wall() -> Array:
+    """A wall 3 m away with a box of 2 m in its middle, and a hole in the depth at the left."""
+    depth_m = np.full((120, 160), 3.0, np.float32)
+    depth_m[40:80, 60:100] = 2.0
+    depth_m[:, :20] = np.nan
+    return depth_m
+
+
+def verdict(u: float, v: float, z: float, T: Array = T_WORLD_CAMERA) -> int:
+    point = CAMERA.backproject(np.array([[u, v]]), np.array([z]))
+    view = depth_view(box_before_wall(), CHECK.config.window_px)
+    return int(CHECK.judge(transform(T_WORLD_CAMERA, point), view, T)[0])
+
+
+@pytest.mark.parametrize(
+    ("u", "v", "z", "expected"),
+    [
+        (80, 60, 2.0, Verdict.STATIC),  # on the box
+        (80, 60, 1.5, Verdict.MOVING),  # before it
+        (80, 60, 2.7, Verdict.UNKNOWN),  # inside it, hidden
+        (80, 60, 3.0, Verdict.UNKNOWN),  # the wall behind it
+        (130, 30, 3.0, Verdict.STATIC),  # on the wall
+        (130, 30, 3.03, Verdict.STATIC),  # within the depth's noise
+        (130, 30, 2.0, Verdict.MOVING),  # where the box is not
+        (61, 41, 2.5, Verdict.UNKNOWN),  # the box's corner, between the two
+        (58, 60, 2.3, Verdict.UNKNOWN),  # a pixel beside the box: its edge is ragged
+        (10, 60, 1.0, Verdict.UNKNOWN),  # no depth
+        (300, 60, 1.0, Verdict.UNKNOWN),  # out of view
+        (80, 60, -1.0, Verdict.UNKNOWN),  # behind the camera
+    ],
+)
+def test_judgement(u: float, v: float, z: float, expected: Verdict) -> None:
+    assert verdict(u, v, z) == expected
+
+
+def test_an_error_of_the_pose_is_allowed_for() -> None:
+    T_off = T_WORLD_CAMERA @ se3_exp(np.array([0.01, -0.01, 0.02, 0.02, 0.0, 0.02]))
+    assert verdict(130, 30, 3.0, T_off) == Verdict.STATIC
+    assert verdict(130, 30, 2.0, T_off) == Verdict.MOVING
+
+
+def test_against_a_point_by_point_reference() -> None:
+    rng = np.random.default_rng(0)
+    pixels, z = rng.uniform(0, [200, 150], (400, 2)) - 20, rng.uniform(0.5, 4, 400)
+    points = transform(T_WORLD_CAMERA, CAMERA.backproject(pixels, z))
+    depth_m = box_before_wall()
+    found = CHECK.judge(points, depth_view(depth_m, 5), T_WORLD_CAMERA)
+    expected = [reference(p, depth_m) for p in transform(inverse(T_WORLD_CAMERA), points)]
+    assert np.mean(found == np.array(expected)) > 0.98  # it looks at every second pixel
+
+
+def reference(p: Array, depth_m: Array) -> int:
+    u, v = 130 * p[0] / p[2] + 79.5, 130 * p[1] / p[2] + 59.5
+    if not (0 < u < 159 and 0 < v < 119):
+        return 0
+    u, v = round(u / 2) * 2, round(v / 2) * 2
+    window = depth_m[max(v - 4, 0) : v + 5, max(u - 4, 0) : u + 5]
+    if np.isnan(window).all():
+        return 0
+    near, far = np.nanmin(window), np.nanmax(window)
+
+    def margin(d: float) -> float:
+        return 0.1 + 4 * 0.08 / 40 * float(np.hypot(d**2, p[2] ** 2))
+
+    if not np.isnan(window).any() and near - p[2] > margin(near):
+        return -1
+    holes = np.isnan(window).any()
+    return int((not holes and abs(near - p[2]) < margin(near)) or abs(far - p[2]) < margin(far))
+
+
+def test_views_decide_by_majority_and_the_silent_do_not_count() -> None:
+    told = np.array([[-1, -1, 0, 1], [-1, 1, 0, 0], [1, 0, 0, 0]], np.int8)
+    assert CHECK.agree(told).tolist() == [-1, 0, 0, 1]
+
+
+def test_neighbours_speak_for_the_silent_of_the_same_depth() -> None:
+    pixels = np.array([[10, 10], [12, 10], [14, 12], [11, 12], [13, 11], [12, 14], [90, 90.0]])
+    depth_m = np.array([2.0, 2.0, 2.0, 2.02, 3.0, np.nan, 2.0])
+    verdicts = np.array([-1, -1, -1, 0, 0, 0, 0], np.int8)
+    assert CHECK.spread(pixels, depth_m, verdicts).tolist() == [-1, -1, -1, -1, 0, -1, 0]
+    static = np.abs(verdicts)
+    assert CHECK.spread(pixels, depth_m, static).tolist() == static.tolist()
+
+
+def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
+    config = StaticCheckConfig(views=3, interval_s=0.25)
+    memory, other = ViewMemory(config), ViewMemory(config)
+    for k in range(12):
+        memory.add(k, 0.1 * k, depth_view(box_before_wall() + k, 5))
+    assert [v.keyframe_id for v in memory.views] == [3, 6, 9]
+    other.restore(memory.state())
+    for a, b in zip(memory.views, other.views, strict=True):
+        assert (a.keyframe_id, a.timestamp_s, a.view.step) == (
+            b.keyframe_id,
+            b.timestamp_s,
+            b.view.step,
+        )
+        np.testing.assert_array_equal(a.view.nearest_m, b.view.nearest_m)
+        np.testing.assert_array_equal(a.view.farthest_m, b.view.farthest_m)
+
+
+@pytest.mark.parametrize("bad", [{"margin_m": 0.0}, {"views": 0}, {"window_px": -1}])
+def test_bad_configuration_is_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        StaticCheckConfig(**bad)  # type: ignore[arg-type]
