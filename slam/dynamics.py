@@ -92,18 +92,18 @@ class KeyframeMasks:
     """A keyframe's instances and what they say about its landmarks.
 
     Attributes:
-        keyframe_id, T_world_camera: the keyframe's.
-        names: the label set.
+        keyframe_id: its. names: the label set.
         claims: who owns its pixels. depth_m: every s-th pixel of its depth, NaN where missing.
+        T_world_camera: its pose.
         landmark_ids: (N,) that were spoken of. instances: (N,) the claims' that each is on, -1
             for none. label_distributions: (N, C) what is known of their classes.
     """
 
     keyframe_id: int
-    T_world_camera: Array
     names: LabelSet
     claims: Claims
     depth_m: NDArray[np.float32]
+    T_world_camera: Array
     landmark_ids: Ints
     instances: Ints
     label_distributions: Array

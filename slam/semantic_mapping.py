@@ -191,17 +191,9 @@ class SemanticMapper:
             on = objects[votes.instances] >= 0
             self.objects.place_landmarks(ids[on], objects[votes.instances[on]])
         if self._dynamics is not None:
-            labels = self.labels.probabilities(ids)
-            masks = KeyframeMasks(
-                keyframe_id,
-                observed.T_world_camera,
-                self.names,
-                claims,
-                waiting.depth_m,
-                ids,
-                votes.instances,
-                labels,
-            )
+            about = (ids, votes.instances, self.labels.probabilities(ids))
+            seen = (claims, waiting.depth_m, observed.T_world_camera)
+            masks = KeyframeMasks(keyframe_id, self.names, *seen, *about)
             self._dynamics.see(masks, mapper)
         return Attachment(keyframe_id, len(instances), ids)
 
