@@ -29,7 +29,8 @@ from semantics.segmenter_table import SegmenterOptions, make_segmenter
 from slam.configuration import resolve
 from slam.rendering.true_boxes import OBJECTS_TRUTH
 from slam.sequences import Sequence, open_sequence
-from slam.system import SlamSystem, SystemConfig
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
 from slam.world_map import Keyframe
 
 MIN_PIXELS = 300
