@@ -6,17 +6,15 @@ import logging
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
 from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
-from semantics.labels import LabelSet
 from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
-from semantics.votes import Claims
 from slam.features import Features, select
 from slam.frame import Frame
+from slam.keyframe_masks import KeyframeMasks, surface_points
 from slam.landmarks import Ints, Mask
 from slam.mapper import Mapper
 from slam.static_check import (
@@ -33,9 +31,6 @@ from slam.tracker import Tracked
 from slam.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
-
-_SAMPLES = 400
-"""Pixels of an instance that are judged, at most."""
 
 
 @dataclass(frozen=True)
@@ -85,28 +80,6 @@ class Sifted:
     def ignored(self) -> int:
         """How many features were left out."""
         return len(self.moving) - len(self.features)
-
-
-@dataclass(frozen=True, eq=False)
-class KeyframeMasks:
-    """A keyframe's instances and what they say about its landmarks.
-
-    Attributes:
-        keyframe_id: its. names: the label set.
-        claims: who owns its pixels. depth_m: every s-th pixel of its depth, NaN where missing.
-        T_world_camera: its pose.
-        landmark_ids: (N,) that were spoken of. instances: (N,) the claims' that each is on, -1
-            for none. label_distributions: (N, C) what is known of their classes.
-    """
-
-    keyframe_id: int
-    names: LabelSet
-    claims: Claims
-    depth_m: NDArray[np.float32]
-    T_world_camera: Array
-    landmark_ids: Ints
-    instances: Ints
-    label_distributions: Array
 
 
 class Dynamics:
@@ -257,27 +230,17 @@ class Dynamics:
 
     def _sighting(self, k: int, masks: KeyframeMasks, mapper: Mapper) -> Sighting | None:
         """An instance in space, and whether it moves; None without depth."""
-        instance, depth_m = masks.claims.instances[k], masks.depth_m
-        step = max(masks.claims.owner.shape[0] // max(depth_m.shape[0], 1), 1)
-        owner = masks.claims.owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
-        own = (owner == k) & np.isfinite(depth_m)
-        rows, columns = np.nonzero(own)
-        z_m = depth_m[rows, columns].astype(float)
-        surface = masks.claims.on_surface(np.full(len(rows), k), z_m)
-        rows, columns = rows[surface], columns[surface]
-        if len(rows) < self.config.min_judged:
+        points = surface_points(self.camera, masks, k, self.config.min_judged)
+        if points is None:
             return None
-        some = np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLES)).astype(np.int64)
-        rows, columns = rows[some], columns[some]
-        pixels = step * np.stack([columns, rows], axis=1).astype(float)
-        points = self.camera.backproject(pixels, depth_m[rows, columns].astype(float))
         low, centroid, high = np.percentile(points, (4, 50, 96), axis=0)
         half_size = np.maximum(high - centroid, centroid - low)
-        prior = float(instance.distribution @ self.priors.of(masks.names))
+        distribution = masks.claims.instances[k].distribution
+        prior = float(distribution @ self.priors.of(masks.names))
         odds = float(log_odds(np.clip(prior, 0.01, 0.99)))
         odds += self._evidence(transform(masks.T_world_camera, points), masks, mapper)
         centre_world = transform(masks.T_world_camera, centroid[None])[0]
-        return Sighting(centre_world, half_size, instance.distribution, odds)
+        return Sighting(centre_world, half_size, distribution, odds)
 
     def _evidence(self, points_world: Array, masks: KeyframeMasks, mapper: Mapper) -> float:
         """Log odds that an instance at these points moves, by what other keyframes saw there."""

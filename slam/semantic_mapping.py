@@ -22,8 +22,9 @@ from semantics.segmenter import NoSegmenter, Segmenter
 from semantics.segmenter_table import SegmenterOptions
 from semantics.upright import Upright
 from semantics.votes import Claims, VoteConfig, check_instances, claim_pixels, vote
-from slam.dynamics import Dynamics, KeyframeMasks
+from slam.dynamics import Dynamics
 from slam.frame import Frame
+from slam.keyframe_masks import KeyframeMasks
 from slam.landmarks import Ints
 from slam.mapper import Mapper
 from slam.world_map import Keyframe

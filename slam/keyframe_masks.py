@@ -1,0 +1,55 @@
+"""What a keyframe's masks tell those who ask whether things move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.camera import Camera
+from graph.geometry import Array
+from semantics.labels import LabelSet
+from semantics.votes import Claims
+from slam.landmarks import Ints
+
+_SAMPLES = 400
+"""Points of an instance, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMasks:
+    """A keyframe's instances and what they say about its landmarks.
+
+    Attributes:
+        keyframe_id: its. names: the label set.
+        claims: who owns its pixels. depth_m: every s-th pixel of its depth, NaN where missing.
+        T_world_camera: its pose.
+        landmark_ids: (N,) that were spoken of. instances: (N,) the claims' that each is on, -1
+            for none. label_distributions: (N, C) what is known of their classes.
+    """
+
+    keyframe_id: int
+    names: LabelSet
+    claims: Claims
+    depth_m: NDArray[np.float32]
+    T_world_camera: Array
+    landmark_ids: Ints
+    instances: Ints
+    label_distributions: Array
+
+
+def surface_points(camera: Camera, masks: KeyframeMasks, k: int, at_least: int) -> Array | None:
+    """Points (N, 3) on an instance's surface, in the camera's frame; None if fewer have depth."""
+    depth_m = masks.depth_m
+    step = max(masks.claims.owner.shape[0] // max(depth_m.shape[0], 1), 1)
+    owner = masks.claims.owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
+    rows, columns = np.nonzero((owner == k) & np.isfinite(depth_m))
+    z_m = depth_m[rows, columns].astype(float)
+    surface = np.flatnonzero(masks.claims.on_surface(np.full(len(rows), k), z_m))
+    if len(surface) < at_least:
+        return None
+    some = np.linspace(0, len(surface) - 1, min(len(surface), _SAMPLES)).astype(np.int64)
+    chosen = surface[some]
+    pixels = step * np.stack([columns[chosen], rows[chosen]], axis=1).astype(float)
+    return camera.backproject(pixels, z_m[chosen])
