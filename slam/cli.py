@@ -130,12 +130,15 @@ def _add_render(commands: _Commands) -> None:
     text = "render an indoor sequence with exact ground truth, in TUM layout"
     parser = commands.add_parser("render", help=text, description=text)
     parser.set_defaults(handler=_render)
-    parser.add_argument("name", help="office, living_room, corridor or room")
+    parser.add_argument("name", help="office, busy_office, living_room, corridor or room")
     parser.add_argument("--out", type=Path, required=True, help="folder to make")
     parser.add_argument("--frames", type=int, metavar="N", help="number of frames (default: all)")
     parser.add_argument("--fps", type=float, default=30.0, help="frame rate (default: 30)")
     parser.add_argument("--seed", type=int, default=0, help="of people, noise, textures, room")
     parser.add_argument("--people", type=int, default=0, metavar="N", help="people in the scene")
+    parser.add_argument(
+        "--carry", action="store_true", help="the first carries a box, pulls a chair"
+    )
     parser.add_argument("--no-noise", action="store_true", help="exact depth and colours")
     parser.add_argument("--exposure-change", action="store_true", help="brightness that varies")
     parser.add_argument("--motion-blur", action="store_true", help="blur along the motion")
@@ -153,7 +156,7 @@ def _render(arguments: argparse.Namespace) -> int:
     from slam.rendering.sequence import RenderConfig, render_sequence
 
     names = ("name", "frames", "fps", "seed", "people", "depth_delay_ms")
-    flags = ("sweeping", "exposure_change", "motion_blur", "true_depth", "normals")
+    flags = ("carry", "sweeping", "exposure_change", "motion_blur", "true_depth", "normals")
     given = {name: getattr(arguments, name) for name in names + flags}
     config = RenderConfig(noise=not arguments.no_noise, **given)
     with console_log(), counting_bar(arguments.quiet) as progress:

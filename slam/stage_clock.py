@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class StageClock:
-    """Wall time of named stages in milliseconds."""
+    """Wall time of named stages in milliseconds; a stage may be entered again."""
 
     def __init__(self) -> None:
         self.stage_ms: dict[str, float] = {}
@@ -18,4 +18,5 @@ class StageClock:
         """Time what is done inside, under this name."""
         started_s = time.perf_counter()
         yield
-        self.stage_ms[name] = 1e3 * (time.perf_counter() - started_s)
+        spent_ms = 1e3 * (time.perf_counter() - started_s)
+        self.stage_ms[name] = self.stage_ms.get(name, 0.0) + spent_ms

@@ -118,7 +118,9 @@ class SlamSystem:
         with clock.stage("moving"):
             sifted = self._sift(frame, features)
         with clock.stage("tracking"):
-            tracked = self._watch(self._track(sifted.features), sifted)
+            tracked = self._track(sifted.features)
+        with clock.stage("moving"):
+            self._watch(tracked, sifted)
         with clock.stage("keyframe"):
             reason = self._keyframe_reason(tracked)
             if reason:
@@ -255,12 +257,11 @@ class SlamSystem:
         predicted = None if begins else self.localiser.prediction()
         return self.dynamics.sift(frame, features, predicted, self._segment, self.mapper)
 
-    def _watch(self, tracked: Tracked, sifted: Sifted) -> Tracked:
+    def _watch(self, tracked: Tracked, sifted: Sifted) -> None:
         """Landmarks that are believed to move are not tracked against from now on."""
         if tracked.status is not TrackingStatus.LOST:
             moving = self.dynamics.watch(tracked, sifted.view, self.mapper.world)
             self.localiser.leave_out(moving)
-        return tracked
 
     def _keyframe_reason(self, tracked: Tracked) -> str:
         if tracked.status is TrackingStatus.LOST:

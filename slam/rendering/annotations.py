@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph.camera import Camera
+from slam.rendering.builder import UNLABELLED
 from slam.rendering.classes import CATEGORY_IDS
 from slam.rendering.scene import Scene
 
@@ -62,6 +63,8 @@ def coco(
     annotations: list[dict[str, Any]] = []
     for k, marks in enumerate(frames, 1):
         for mark in marks:
+            if scene.categories[mark.instance - 1] == UNLABELLED:
+                continue
             category = CATEGORY_IDS[scene.categories[mark.instance - 1]]
             size = [camera.height, camera.width]
             annotations.append({

@@ -16,6 +16,9 @@ Image = NDArray[np.uint8]
 Painter = Callable[[int, int, float, np.random.Generator], Image]
 """A texture maker: (rows, columns, texels per metre, random numbers) -> (rows, columns, 3) RGB."""
 
+UNLABELLED = ""
+"""The class of an instance that is in no annotation."""
+
 
 @dataclass(frozen=True)
 class Part:

@@ -131,6 +131,16 @@ def umbrella(b: SceneBuilder, colour: Colour, opened: bool = False) -> None:
         )
 
 
+def parcel(b: SceneBuilder) -> None:
+    """A cardboard box with labels on its sides; centre of its floor at the origin."""
+    b.box((0.42, 0.32, 0.3), plain((176, 134, 88), 9))
+    with b.at(pose(0, 0, 0.15)):
+        for yaw_deg, out in ((0, 0.161), (90, 0.211), (180, 0.161), (270, 0.211)):
+            with b.at(pose(0, 0, 0, yaw_deg)):
+                b.quad((-0.12, -out, 0.11), (0.14, 0, 0), (0, 0, -0.2), label(), 900)
+                b.quad((0.05, -out, 0.08), (0.09, 0, 0), (0, 0, -0.06), sign("UP"), 1200)
+
+
 def switchbox(b: SceneBuilder) -> None:
     """A grey electrical cabinet with a warning sign; back at y = 0."""
     b.box((0.4, 0.16, 0.55), plain((146, 150, 152)), (0, -0.08, 0))

@@ -12,8 +12,8 @@ from scipy.interpolate import CubicSpline
 from graph.geometry import Array
 from slam.rendering import objects as o
 from slam.rendering import skeleton as sk
-from slam.rendering.builder import Image, Painter, Part, SceneBuilder
-from slam.rendering.furniture import lying_book
+from slam.rendering.builder import UNLABELLED, Image, Painter, Part, SceneBuilder
+from slam.rendering.furniture import lying_book, office_chair
 from slam.rendering.lighting import Lighting, irradiance
 from slam.rendering.meshes import Shape, ellipsoid, lathe, pose, tapered_capsule, tilt
 from slam.rendering.raycast import Floats, Geometry
@@ -32,8 +32,9 @@ class Role:
         action: "stand", "sit" or "walk".
         places: (x, y) in metres: one to stand or sit at, or a closed round to walk.
         facing_deg: where who stands or sits looks, 0 along -y, counter-clockwise.
-        carries: "", "suitcase", "book", "cup", "cell phone" or "umbrella".
+        carries: "", "suitcase", "book", "cup", "cell phone", "umbrella" or "box".
         speed_m_s: walking speed.
+        pulls: whether a chair comes along from PULLED_S[0] to PULLED_S[1]; then it stays there.
     """
 
     action: str
@@ -41,6 +42,7 @@ class Role:
     facing_deg: float = 0.0
     carries: str = ""
     speed_m_s: float = 0.8
+    pulls: bool = False
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,13 @@ class Person:
         if self.role.carries:
             posture = sk.holding(posture, _GRIPS[self.role.carries])
         size = np.diag([self.scale, self.scale, self.scale, 1.0])
-        return {
+        bones = {
             name: T_world_person @ size @ T_person_bone @ np.linalg.inv(size)
             for name, T_person_bone in sk.bones(posture).items()
         }
+        if self.role.pulls:
+            bones["pulled"] = self._posture(float(np.clip(time_s, *PULLED_S)))[1] @ _BESIDE
+        return bones
 
     def _posture(self, time_s: float) -> tuple[sk.Posture, Array]:
         role = self.role
@@ -89,7 +94,12 @@ _GRIPS = {
     "cup": "front",
     "cell phone": "high",
     "umbrella": "front",
+    "box": "both",
 }
+
+PULLED_S = (3.4, 5.0)
+"""When a chair is pulled along."""
+_BESIDE = pose(-0.75, 0.3, 0.0, 30)
 
 
 @dataclass(frozen=True)
@@ -127,9 +137,11 @@ def hire(b: SceneBuilder, roles: tuple[Role, ...], lighting: Lighting, count: in
     """Dress the people for the first ``count`` roles; each is an instance of the builder."""
     people, parts, owners = [], [], []
     for who, role in enumerate(roles[:count]):
-        person = Person(role, b.rng.random(), b.rng.uniform(0.94, 1.06))
+        phase, scale = b.rng.random(), b.rng.uniform(0.94, 1.06)
+        person = Person(role, 0.0 if role.pulls else phase, scale)
         people.append(person)
-        for bone, part in [*_body(b, person.scale), *_load(b, role.carries)]:
+        load = [*_load(b, role.carries), *(_pulled(b) if role.pulls else [])]
+        for bone, part in [*_body(b, person.scale), *load]:
             parts.append(part)
             owners.append((who, bone))
     return Cast(tuple(people), parts, owners, lighting)
@@ -253,6 +265,9 @@ def _load(b: SceneBuilder, carries: str) -> list[tuple[str, Part]]:
         elif carries == "cup":
             with b.at(pose(0, -0.04, -0.02)):
                 o.cup(b, _cloth(b.rng, 60, 230))
+        elif carries == "box":
+            with b.at(pose(0.2, -0.1, -0.1)):
+                o.parcel(b)
         elif carries == "umbrella":
             with b.at(pose(0, 0, 0) @ tilt("x", 180) @ pose(0, 0, -0.84)):
                 o.umbrella(b, _cloth(b.rng, 60, 230), opened=True)
@@ -260,4 +275,10 @@ def _load(b: SceneBuilder, carries: str) -> list[tuple[str, Part]]:
             with b.at(tilt("x", 80)):
                 o.cell_phone(b)
 
-    return [("right grip", part) for part in _taken(b, carries, build)]
+    category = UNLABELLED if carries == "box" else carries
+    return [("right grip", part) for part in _taken(b, category, build)]
+
+
+def _pulled(b: SceneBuilder) -> list[tuple[str, Part]]:
+    parts = _taken(b, "chair", lambda: office_chair(b, (150, 60, 44)))
+    return [("pulled", part) for part in parts]

@@ -6,7 +6,7 @@ import importlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ from slam.sequences.cameras import write_camera
 
 SCENES: dict[str, str] = {
     "office": "an office for three with desks, computers and bookcases; one round through it",
+    "busy_office": "the same office from the door side, with room for people to walk before it",
     "living_room": "a living room with sofa, television, dining table and bookcase; one round",
     "corridor": "a square corridor, a loop of 30 m that ends where it began",
     "room": "a room drawn at random from the seed: size, walls, light, furniture and round",
@@ -55,6 +56,7 @@ class RenderConfig:
         frames: number of frames from the start of the path; None for the whole path.
         seed: of people, noise, textures and the hand's tremor, and of a random room.
         people: how many people stand, sit, walk and carry things in the scene.
+        carry: the first of them carries a box, of no class, and pulls a chair along for a while.
         noise: apply the Kinect's depth noise and holes, and image noise of 2 grey levels.
         exposure_change: let the brightness vary slowly.
         motion_blur: blur along the image motion while the shutter is open.
@@ -71,6 +73,7 @@ class RenderConfig:
     frames: int | None = None
     seed: int = 0
     people: int = 0
+    carry: bool = False
     noise: bool = True
     exposure_change: bool = False
     motion_blur: bool = False
@@ -142,6 +145,8 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"frames={config.frames}: must be at least 1")
     if config.people < 0:
         raise InputError(f"people={config.people}: must not be negative")
+    if config.carry and not config.people:
+        raise InputError("carry: nobody is there to carry anything; ask for people=1")
     if not 0.1 <= config.fps <= 1000:
         raise InputError(f"fps={config.fps}: must be between 0.1 and 1000")
     if not abs(config.depth_delay_ms) <= 1000:
@@ -187,7 +192,10 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     builder = SceneBuilder(config.seed, detail=float(np.clip(config.width / 640, 0.25, 1.0)))
     plan.furnish(builder)
     write_json(folder / OBJECTS_TRUTH, true_boxes(builder))
-    cast = hire(builder, plan.roles, plan.lighting, config.people)
+    roles = plan.roles
+    if config.carry:
+        roles = (replace(roles[0], carries="box", pulls=True), *roles[1:])
+    cast = hire(builder, roles, plan.lighting, config.people)
     scene = build_scene(builder, plan.lighting, cast.parts, config.seed)
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]

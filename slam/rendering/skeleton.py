@@ -82,9 +82,11 @@ def sitting(time_s: float, phase: float) -> Posture:
 
 
 def holding(posture: Posture, how: str) -> Posture:
-    """The same with the right arm hanging, in front of the belly, or raised to the ear."""
-    shoulder, elbow = {"hang": (0.02, 0.05), "front": (0.25, 1.35), "high": (0.75, 1.3)}[how]
-    changes = {"shoulders": (shoulder, posture.shoulders[1]), "elbows": (elbow, posture.elbows[1])}
+    """The same with the right arm hanging, raised to the ear, or one or both before the belly."""
+    front = 0.25, 1.35
+    arm = {"hang": (0.02, 0.05), "front": front, "both": front, "high": (0.75, 1.3)}[how]
+    other = front if how == "both" else (posture.shoulders[1], posture.elbows[1])
+    changes = {"shoulders": (arm[0], other[0]), "elbows": (arm[1], other[1])}
     return Posture(**{**posture.__dict__, **changes})
 
 

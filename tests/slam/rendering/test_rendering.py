@@ -23,11 +23,12 @@ from slam.rendering.atlas import build_atlas
 from slam.rendering.classes import CATEGORY_IDS
 from slam.rendering.meshes import quad
 from slam.rendering.path import CameraPath, camera_poses, look_at
-from slam.rendering.people import Person, Role
+from slam.rendering.people import PULLED_S, Person, Role
 from slam.rendering.raycast import Renderer, build_geometry
 from slam.rendering.sensor import blur, depth_sigma_m, measure_depth, optical_flow
 from slam.rendering.sequence import SCENES, RenderConfig, kinect_camera, render_sequence
 
+PERSON = CATEGORY_IDS["person"]
 CAMERA = Camera(160, 120, fx=131.25, fy=131.25, cx=79.5, cy=59.5, stereo_bf_px_m=10.0)
 KINECT = Camera(640, 480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 
@@ -169,8 +170,7 @@ def test_annotations_agree_with_the_instance_pictures(sequence: Path) -> None:
 
 def test_people_are_seen_and_labelled(sequence: Path) -> None:
     content = json.loads((sequence / "annotations.json").read_text())
-    person = CATEGORY_IDS["person"]
-    assert any(a["category_id"] == person and a["area"] > 100 for a in content["annotations"])
+    assert any(a["category_id"] == PERSON and a["area"] > 100 for a in content["annotations"])
 
 
 def test_run_lengths_start_with_zeros() -> None:
@@ -276,6 +276,32 @@ def test_camera_moves_like_a_person(plan: object) -> None:
     np.testing.assert_allclose(T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2), np.tile(np.eye(3), (len(T), 1, 1)), atol=1e-9)  # fmt: skip  # noqa: E501
 
 
+def test_a_chair_is_pulled_for_a_while_and_the_box_is_held_in_both_hands() -> None:
+    role = Role("walk", ((0, 0), (3, 0), (3, 2), (0, 2)), carries="box", pulls=True)
+    person = Person(role, phase=0.0, scale=1.0)
+    begin_s, end_s = PULLED_S
+    chair = [person.bones(t)["pulled"] for t in (0.0, begin_s, end_s, end_s + 3)]
+    np.testing.assert_array_equal(chair[0], chair[1])
+    np.testing.assert_array_equal(chair[2], chair[3])
+    assert np.linalg.norm(chair[2][:3, 3] - chair[1][:3, 3]) > 0.8
+    assert chair[1][2, 3] == chair[2][2, 3] == 0
+    bones = person.bones(1.0)
+    left, right = (bones[f"{side} grip"][:3, 3] for side in ("left", "right"))
+    assert 0.3 < np.linalg.norm(left - right) < 0.5
+    assert abs(left[2] - right[2]) < 0.01
+
+
+def test_the_box_is_an_instance_without_annotation(tmp_path: Path) -> None:
+    config = RenderConfig(
+        "busy_office", frames=1, people=1, carry=True, width=160, height=120, noise=False
+    )
+    folder = render_sequence(config, tmp_path / "out")
+    marks = json.loads((folder / "annotations.json").read_text())["annotations"]
+    drawn = set(np.unique(cv2.imread(str(folder / "instances/0.000000.png"), -1)).tolist())
+    (box,) = drawn - {0} - {mark["instance_id"] for mark in marks}
+    assert box == min(m["instance_id"] for m in marks if m["category_id"] == PERSON) - 2
+
+
 def test_corridor_is_thirty_metres_and_ends_where_it_began() -> None:
     T = camera_poses(corridor.PATH, 30.0, seed=0)
     assert np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum() == pytest.approx(30, abs=1.0)
@@ -302,6 +328,7 @@ def test_a_walker_keeps_feet_on_the_floor_and_looks_ahead() -> None:
         ({"frames": 0}, "frames=0"),
         ({"frames": 10**6}, "has"),
         ({"people": 99}, "people=99"),
+        ({"carry": True}, "nobody"),
         ({"fps": 0.0}, "fps=0"),
         ({"width": 2}, "2x120"),
     ],
@@ -325,7 +352,7 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
 
 
 def test_scenes_are_listed_without_open3d() -> None:
-    assert set(SCENES) == {"office", "living_room", "corridor", "room"}
+    assert set(SCENES) == {"office", "busy_office", "living_room", "corridor", "room"}
     code = "import sys, slam.rendering.sequence; assert 'open3d' not in sys.modules"
     root = Path(__file__).resolve().parents[3]
     subprocess.run([sys.executable, "-c", code], cwd=root, check=True)
