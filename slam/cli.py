@@ -19,6 +19,7 @@ from slam import __version__
 from slam.commands.calibrate import add_calibrate
 from slam.commands.evaluate_segmentation import add_evaluate_segmentation
 from slam.commands.export import add_export
+from slam.commands.live import add_live
 from slam.commands.map import add_map
 from slam.commands.optimise import add_optimise
 from slam.commands.query import add_query
@@ -73,6 +74,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"bmask-slam {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     add_run(commands)
+    add_live(commands)
     _add_evaluate(commands)
     _add_render(commands)
     _add_info(commands)

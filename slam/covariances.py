@@ -1,7 +1,8 @@
-"""The file of keyframe covariances: written after a run, read back by `read_covariances`."""
+"""Covariances of keyframes: from the graph, to a file, and back by `read_covariances`."""
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,11 @@ import numpy as np
 
 from graph.errors import InputError, finite_number
 from graph.geometry import Array
+from graph.smoother import Smoother
+from graph.solver import SolverError
 from slam.landmarks import Ints
+
+logger = logging.getLogger(__name__)
 
 COVARIANCES = "covariances.txt"
 HEADER = """\
@@ -30,6 +35,21 @@ class KeyframeCovariances:
     keyframe_ids: Ints
     timestamps_s: Array
     covariances: Array
+
+
+def find_covariances(smoother: Smoother, stamps_s: dict[int, float]) -> KeyframeCovariances:
+    """How sure the graph is of keyframes with these stamps; none, and a line in the log, if GTSAM
+    fails.
+    """
+    try:
+        found = smoother.marginals()
+    except SolverError as error:
+        logger.error("no covariances, the graph is singular (%s)", error)
+        return KeyframeCovariances(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 6, 6)))
+    rows = np.flatnonzero(np.isin(found.keyframe_ids, list(stamps_s)))
+    ids = found.keyframe_ids[rows]
+    stamps = np.array([stamps_s[i] for i in ids.tolist()])
+    return KeyframeCovariances(ids, stamps, found.keyframes[rows])
 
 
 def write_covariances(path: Path, found: KeyframeCovariances) -> None:

@@ -13,7 +13,9 @@ from slam.world_map import WorldMap
 
 
 @dataclass(frozen=True)
-class _Entry:
+class HistoryEntry:
+    """A frame's stamp and its pose as seen from its reference keyframe."""
+
     timestamp_s: float
     keyframe_id: int
     T_keyframe_camera: Array
@@ -23,15 +25,28 @@ class FrameHistory:
     """One entry a tracked frame; a keyframe that is culled hands its frames to another."""
 
     def __init__(self) -> None:
-        self._entries: list[_Entry] = []
+        self._entries: list[HistoryEntry] = []
         self._parent: dict[int, tuple[int, Array]] = {}
+
+    @property
+    def heirs(self) -> dict[int, tuple[int, Array]]:
+        """Of every culled keyframe the one that took its frames, and T_heir_culled."""
+        return self._parent
 
     def append(
         self, timestamp_s: float, keyframe_id: int, T_world_keyframe: Array, T_world_camera: Array
     ) -> None:
         """Remember a frame's pose as seen from a keyframe whose current pose is given."""
         T_keyframe_camera = inverse(T_world_keyframe) @ T_world_camera
-        self._entries.append(_Entry(timestamp_s, keyframe_id, T_keyframe_camera))
+        self._entries.append(HistoryEntry(timestamp_s, keyframe_id, T_keyframe_camera))
+
+    def since(self, count: int) -> list[HistoryEntry]:
+        """What was appended after the first ``count`` frames."""
+        return self._entries[count:]
+
+    def extend(self, entries: list[HistoryEntry]) -> None:
+        """Append what another history holds of the frames that follow."""
+        self._entries += entries
 
     def hand_over(self, keyframe_id: int, parent_id: int, T_parent_keyframe: Array) -> None:
         """A keyframe leaves the map: its frames follow the parent from now on."""
@@ -71,7 +86,7 @@ class FrameHistory:
         """Become the history of a state."""
         columns = [state[name] for name in ("timestamps_s", "keyframe_ids", "T_keyframe_camera")]
         rows = zip(columns[0].tolist(), columns[1].tolist(), columns[2], strict=True)
-        self._entries = [_Entry(stamp_s, keyframe_id, T) for stamp_s, keyframe_id, T in rows]
+        self._entries = [HistoryEntry(stamp_s, keyframe_id, T) for stamp_s, keyframe_id, T in rows]
         heirs = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
         self._parent = dict(zip(state["culled_ids"].tolist(), heirs, strict=True))
 

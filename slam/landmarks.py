@@ -95,6 +95,13 @@ class LandmarkTable:
         self.visible[ids] = self.found[ids] = 1
         return ids
 
+    def extend_to(self, size: int) -> None:
+        """Rows up to a size, those that are new not alive: to be filled from another table."""
+        self._size = size
+        if size > len(self._store["alive"]):
+            self._grow(max(2 * len(self._store["alive"]), size))
+        self._make_views()
+
     def living(self, ids: Ints) -> Ints:
         """Those of the ids that are still in the map."""
         ids = ids[ids >= 0]

@@ -110,6 +110,11 @@ class Localiser:
         self._recent_ids = seen_ids
         self.lost_frames = 0
 
+    def moved(self, T_new_old: Array, world: WorldMap) -> None:
+        """The map was moved by its owner: what was tracked in it goes along, fused ones too."""
+        self._T_world_last = T_new_old @ self._T_world_last
+        self._recent_ids = world.landmarks.living(world.landmarks.current(self._recent_ids))
+
     def new_local_map(self, world: WorldMap, keyframe: Keyframe) -> None:
         """Track against the surroundings of this keyframe from now on."""
         _, seen = world.observed(keyframe)

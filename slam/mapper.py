@@ -33,6 +33,7 @@ from slam.loop_closing import LoopCloser, LoopClosingConfig
 from slam.loop_verification import LoopConstraint
 from slam.map_pruning import MapPruner
 from slam.map_state import world_of, world_state
+from slam.place_recognition import DescriptorIndex
 from slam.segments import join_segment
 from slam.tracker import Tracked, Tracker
 from slam.triangulation import triangulate_landmarks
@@ -59,6 +60,16 @@ class Mapper:
         self._tracker = tracker
         self._mapping, self._graph_config = config[0], config[2]
         self._feed = GraphFeed(config[1])
+
+    @property
+    def places(self) -> DescriptorIndex:
+        """What finds the keyframes that look like a frame."""
+        return self.loops.index
+
+    @property
+    def idle(self) -> bool:
+        """Whether it waits for work: always, since every update ends before the next frame."""
+        return True
 
     def state(self) -> Arrays:
         """Map, history and graph as named arrays."""

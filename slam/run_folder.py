@@ -16,6 +16,7 @@ covariances.txt       with ``--covariances``: of every keyframe's pose, see `sla
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference
 log.txt               what the program had to say
+health.json           of a live run: rates, delays, queues, what was dropped, every second
 checkpoint            while a run with ``--checkpoint-every`` is not finished: all it needs to
                       be resumed (``run --resume``); it is gone when the run is complete
 ====================  ============================================================================
@@ -59,7 +60,8 @@ FILES = (
     "log.txt",
 )
 CHECKPOINT = "checkpoint"
-SOMETIMES = (CHECKPOINT, COVARIANCES, *SEMANTIC_FILES)
+HEALTH = "health.json"
+SOMETIMES = (CHECKPOINT, COVARIANCES, HEALTH, *SEMANTIC_FILES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("graph", "semantics", "mapping", "slam")
 COLUMNS = (

@@ -63,7 +63,7 @@ def measure(system: System, reference: Trajectory | None, tally: Tally, stride: 
     """The rows of metrics.json; errors only where there is a reference that covers the run."""
     trajectory, statistics = system.trajectory(), system.statistics()
     given = len(range(0, tally.next_index, stride))
-    rows = [_row("tracked_share", len(trajectory) / max(given, 1), "1")]
+    rows = [row("tracked_share", len(trajectory) / max(given, 1), "1")]
     if reference is not None:
         try:
             errors = evaluate_trajectory(trajectory, reference).rows
@@ -71,16 +71,17 @@ def measure(system: System, reference: Trajectory | None, tally: Tally, stride: 
         except InputError as error:
             logger.warning("no comparison with the reference: %s", error)
     rows += _percentiles("tracking_ms", tally.tracking_ms)
-    rows.append(_row("frames_per_second", tally.frames / tally.wall_s, "Hz"))
-    rows.append(_row("keyframes", int(statistics["keyframes"]), "keyframes"))
-    rows.append(_row("landmarks", int(statistics["landmarks"]), "landmarks"))
-    rows.append(_row("loops_closed", int(statistics["loops_closed"]), "loops"))
+    rows.append(row("frames_per_second", tally.frames / tally.wall_s, "Hz"))
+    rows.append(row("keyframes", int(statistics["keyframes"]), "keyframes"))
+    rows.append(row("landmarks", int(statistics["landmarks"]), "landmarks"))
+    rows.append(row("loops_closed", int(statistics["loops_closed"]), "loops"))
     rows += _percentiles("isam2_update_ms", statistics["isam2_update_ms"])
-    rows.append(_row("peak_rss_mb", peak_rss_mb(), "MB"))
+    rows.append(row("peak_rss_mb", peak_rss_mb(), "MB"))
     return rows
 
 
-def _row(name: str, value: float, unit: str) -> Row:
+def row(name: str, value: float, unit: str) -> Row:
+    """A row of metrics.json."""
     return {"name": name, "value": value, "unit": unit}
 
 
@@ -89,7 +90,7 @@ def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
     if not values_ms:
         return []
     median, high = np.percentile(values_ms, (50, 95))
-    return [_row(f"{name}_median", float(median), "ms"), _row(f"{name}_p95", float(high), "ms")]
+    return [row(f"{name}_median", float(median), "ms"), row(f"{name}_p95", float(high), "ms")]
 
 
 def save(

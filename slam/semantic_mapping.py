@@ -144,7 +144,7 @@ class SemanticMapper:
         self.follow(mapper)
         if not len(self.segmenter.labels) > 1:
             return
-        self.expect(keyframe, frame.depth_m)
+        self.expect(keyframe, kept_depth(frame.depth_m))
         try:
             instances = self.segmenter.segment(frame.rgb, frame.name)
             self.attach(keyframe.id, instances, mapper)
@@ -154,10 +154,9 @@ class SemanticMapper:
             logger.warning("keyframe %d has no masks: %s", keyframe.id, error)
 
     def expect(self, keyframe: Keyframe, depth_m: NDArray[np.float32]) -> None:
-        """Keep of a keyframe what its masks will need, (H, W) z-depth in m, until they come."""
-        few = depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()
-        self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, few)
-        self._upright.add(keyframe.id, few, self._rays)
+        """Keep of a keyframe what its masks will need, its ``kept_depth``, until they come."""
+        self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, depth_m)
+        self._upright.add(keyframe.id, depth_m, self._rays)
         if len(self._waiting) > MAX_WAITING:
             del self._waiting[min(self._waiting)]
 
@@ -303,6 +302,11 @@ class SemanticMapper:
             heir = observed.anchor.id, observed.T_anchor_camera
             self.objects.points.hand_over(keyframe_id, *heir)
         return np.append(objects, -1)
+
+
+def kept_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Every DEPTH_STEP-th pixel each way of a z-depth image (H, W) in m."""
+    return depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()
 
 
 def _observed(keyframe_id: int, mapper: Mapper) -> _Observed | None:

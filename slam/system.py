@@ -11,15 +11,20 @@ import numpy as np
 from graph.array_file import Arrays, check_like, nested, part
 from graph.camera import Camera
 from graph.geometry import Array
-from graph.solver import SolverError
 from graph.trajectory import Trajectory
 from semantics.segmenter import Segmenter
-from slam.covariances import COVARIANCES, KeyframeCovariances, write_covariances
+from slam.covariances import (
+    COVARIANCES,
+    KeyframeCovariances,
+    find_covariances,
+    write_covariances,
+)
 from slam.dynamics import Dynamics, Sifted
 from slam.features import BriskExtractor, Features
 from slam.frame import Frame
 from slam.keyframes import KeyframeEvidence, keyframe_reason
 from slam.landmark_cloud import LandmarkCloud
+from slam.landmarks import Ints
 from slam.localiser import Localiser
 from slam.map_file import MAP, write_map
 from slam.mapper import Mapper
@@ -47,10 +52,9 @@ class SlamSystem:
         self.config = config = config or SystemConfig()
         self.extractor = BriskExtractor(camera, config.features)
         tracker = Tracker(camera, config.tracking)
-        rules = (config.mapping, config.feed, config.graph, config.loops)
-        self.mapper = Mapper(camera, tracker, rules)
-        places = self.mapper.loops.index
-        self.localiser = Localiser(tracker, places, (config.relocalisation, config.mapping))
+        self.mapper = self._make_mapper(tracker)
+        rules_here = (config.relocalisation, config.mapping)
+        self.localiser = Localiser(tracker, self.mapper.places, rules_here)
         sigma_px = config.features.disparity_sigma_px
         self.dynamics = Dynamics(camera, config.dynamics, sigma_px)
         self.semantics = SemanticMapper(camera, config.semantics, segmenter, self.dynamics)
@@ -58,6 +62,11 @@ class SlamSystem:
         self._reference: Keyframe | None = None
         self._frames_since_keyframe = 0
         self._first_keyframe = 0  # of this session
+
+    def _make_mapper(self, tracker: Tracker) -> Mapper:
+        config = self.config
+        rules = (config.mapping, config.feed, config.graph, config.loops)
+        return Mapper(self.camera, tracker, rules)
 
     def state(self) -> Arrays:
         """All that the past has left behind, as named arrays."""
@@ -124,9 +133,7 @@ class SlamSystem:
         with clock.stage("keyframe"):
             reason = self._keyframe_reason(tracked)
             if reason:
-                tracked = self._join_segments(tracked)
-                local_ids = self.localiser.local_ids
-                keyframe = self.mapper.insert(frame, tracked, self._segment, local_ids)
+                tracked, keyframe = self.insert(frame, tracked, self.localiser.local_ids)
         with clock.stage("graph"):
             if keyframe:
                 self.mapper.optimise(keyframe)
@@ -152,6 +159,19 @@ class SlamSystem:
             keyframe_reason=reason,
             stage_ms=clock.stage_ms,
         )
+
+    def continue_segment(self, segment: int) -> None:
+        """The next keyframe belongs to this map segment."""
+        self._segment = segment
+
+    def insert(self, frame: Frame, tracked: Tracked, local_ids: Ints) -> tuple[Tracked, Keyframe]:
+        """Make a frame a keyframe; its segment is joined to another that shows it too.
+
+        ``local_ids`` are the landmarks that it was tracked against. Returns the frame as it is
+        tracked in the joined map, and the keyframe.
+        """
+        tracked = self._join_segments(tracked)
+        return tracked, self.mapper.insert(frame, tracked, self._segment, local_ids)
 
     def finish(self) -> None:
         """The last optimisation; the map is then final."""
@@ -180,13 +200,9 @@ class SlamSystem:
 
     def keyframe_covariances(self) -> KeyframeCovariances:
         """How sure the graph is of the keyframes of the largest segment."""
-        found = self.mapper.smoother.marginals()
         chosen = self.mapper.world.in_segment(largest(self.segments()))
-        stamps = {k.id: k.timestamp_s for k in chosen}
-        rows = np.flatnonzero(np.isin(found.keyframe_ids, list(stamps)))
-        ids = found.keyframe_ids[rows]
-        stamps_s = np.array([stamps[i] for i in ids.tolist()])
-        return KeyframeCovariances(ids, stamps_s, found.keyframes[rows])
+        stamps_s = {keyframe.id: keyframe.timestamp_s for keyframe in chosen}
+        return find_covariances(self.mapper.smoother, stamps_s)
 
     def landmarks(self) -> LandmarkCloud:
         """The living landmarks of the largest segment, with their colours."""
@@ -211,18 +227,8 @@ class SlamSystem:
         if self.semantics.enabled:
             found |= semantic_writers(self.landmarks(), self.objects(), self.trajectory())
         if self.config.covariances:
-            found[COVARIANCES] = self.save_covariances
+            found[COVARIANCES] = lambda path: write_covariances(path, self.keyframe_covariances())
         return found
-
-    def save_covariances(self, path: Path) -> None:
-        """Write the covariances of the keyframes; none, and a line in the log, if GTSAM fails."""
-        try:
-            found = self.keyframe_covariances()
-        except SolverError as error:
-            logger.error("no covariances, the graph is singular (%s)", error)
-            nothing = np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 6, 6))
-            found = KeyframeCovariances(*nothing)
-        write_covariances(path, found)
 
     def save_map(self, path: Path) -> None:
         """Write all that was learned, but no times: the same run gives the same bytes."""
@@ -274,7 +280,7 @@ class SlamSystem:
         close_tracked = int(close[tracked.keypoints].sum())
         evidence = KeyframeEvidence(
             frames_since=self._frames_since_keyframe,
-            mapping_idle=True,  # offline: every update ends before the next frame
+            mapping_idle=self.mapper.idle,
             tracked=len(tracked.landmark_ids),
             shared=len(tracked.landmark_ids) / max(len(points), 1),
             close_tracked=close_tracked,

@@ -26,6 +26,7 @@ from slam.configuration import resolve
 from slam.frame import Frame
 from slam.landmarks import LandmarkTable
 from slam.loop_verification import LoopConstraint
+from slam.semantic_mapping import kept_depth
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 
@@ -86,7 +87,7 @@ def system() -> SlamSystem:
         LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
         for k in range(2)
     ]
-    system.semantics.expect(system.mapper.world.keyframes[first], FRAMES[3].depth_m)
+    system.semantics.expect(system.mapper.world.keyframes[first], kept_depth(FRAMES[3].depth_m))
     sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
     system.dynamics.tracks.see(FRAMES[19].timestamp_s, [sighting])
     loops.closed = {(first, second): True, (first, second + 1): False}

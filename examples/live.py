@@ -1,0 +1,19 @@
+"""The live loop in a few lines: python examples/live.py path/to/recording
+
+A recording stands in for a camera here; anything that gives colour and depth will do.
+"""
+
+import sys
+from pathlib import Path
+
+from slam.live.live_slam import LiveOptions, LiveSlam
+from slam.sequences import open_sequence
+
+sequence = open_sequence(Path(sys.argv[1]))
+with LiveSlam(sequence.camera, options=LiveOptions(out=Path("runs/live"), overwrite=True)) as slam:
+    for frame in sequence.frames():
+        result = slam.track(frame.timestamp_s, frame.rgb, frame.depth_m)
+        if result.T_world_camera is not None:
+            x, y, z = result.T_world_camera[:3, 3]
+            print(f"{frame.timestamp_s:.3f}  {result.status.value}  {x:.3f} {y:.3f} {z:.3f} m")
+    print(slam.health().line())

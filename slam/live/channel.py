@@ -1,0 +1,112 @@
+"""Both directions of a socket between two processes, each with a thread of its own.
+
+Messages are pickled. Neither side ever waits for the other: what is sent waits in a queue, what
+has come waits in another. The end of the other process, however it came, ends the channel.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from typing import Any
+
+_END = object()
+
+
+class Channel:
+    """One end. Log records that arrive are handled at once, everything else waits to be asked for.
+
+    Attributes:
+        open: False once the other side has gone or this one was closed.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self.open = True
+        self._connection = connection
+        self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._sender = threading.Thread(target=self._send_all, daemon=True)
+        self._reader = threading.Thread(target=self._read_all, daemon=True)
+        self._sender.start()
+        self._reader.start()
+
+    def send(self, message: Any) -> None:
+        """Send in order, later; nothing happens once the channel has ended."""
+        self._outbox.put(message)
+
+    def receive(self, timeout_s: float = 0.0) -> list[Any]:
+        """Every message that has come, waiting for the first for at most ``timeout_s``."""
+        found: list[Any] = []
+        deadline_s = time.monotonic() + timeout_s
+        with suppress(queue.Empty):
+            while True:
+                left_s = 0.0 if found else max(deadline_s - time.monotonic(), 0.0)
+                message = self._inbox.get(block=left_s > 0.0, timeout=left_s or None)
+                if message is _END:
+                    self._inbox.put(_END)
+                    break
+                found.append(message)
+        return found
+
+    def messages(self) -> Iterator[Any]:
+        """Each message as it comes, until the other side ends."""
+        while (message := self._inbox.get()) is not _END:
+            yield message
+
+    def finish(self, timeout_s: float = 5.0) -> None:
+        """Send what waits, then tell the other side that nothing more will come."""
+        self._outbox.put(_END)
+        self._sender.join(timeout_s)
+
+    def close(self) -> None:
+        """End both directions at once."""
+        self.open = False
+        self._outbox.put(_END)
+        self._shutdown(socket.SHUT_RDWR)
+
+    def _send_all(self) -> None:
+        while (message := self._outbox.get()) is not _END:
+            try:
+                self._connection.send(message)
+            except OSError:  # the other side has gone
+                self.open = False
+                return
+        self._shutdown(socket.SHUT_WR)
+
+    def _read_all(self) -> None:
+        try:
+            while True:
+                message = self._connection.recv()
+                if isinstance(message, logging.LogRecord):
+                    logging.getLogger(message.name).handle(message)
+                else:
+                    self._inbox.put(message)
+        except (EOFError, OSError):
+            self.open = False
+            self._inbox.put(_END)
+
+    def _shutdown(self, how: int) -> None:
+        with suppress(OSError), socket.socket(fileno=os.dup(self._connection.fileno())) as end:
+            end.shutdown(how)
+
+
+class ForwardedLog(logging.Handler):
+    """Sends log records through a channel, to the process that has the files."""
+
+    def __init__(self, channel: Channel) -> None:
+        super().__init__()
+        self._channel = channel
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if record.exc_info:
+            text += "\n" + logging.Formatter().formatException(record.exc_info)
+        place = record.name, record.levelno, record.pathname, record.lineno
+        self._channel.send(logging.LogRecord(*place, text, None, None))

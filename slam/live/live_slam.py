@@ -1,0 +1,289 @@
+"""SLAM for a camera that does not wait: ``with LiveSlam(camera) as slam: slam.track(...)``."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.trajectory import Trajectory
+from semantics.segmenter_table import SegmenterOptions
+from slam.configuration import dump
+from slam.evaluation import Row
+from slam.features import Features
+from slam.frame import Frame
+from slam.landmark_cloud import LandmarkCloud
+from slam.live.health import WINDOW, FrameMeter, Health
+from slam.live.segmentation import RemoteSegmenter
+from slam.live.system import LiveSystem
+from slam.results import FrameResult
+from slam.run_folder import HEALTH, RunFolder
+from slam.run_results import Tally, measure, row, save
+from slam.system_config import SystemConfig
+
+logger = logging.getLogger(__name__)
+
+HEALTH_S = 1.0
+SNAPSHOT_S = 5.0
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Where results go and what they are compared to.
+
+    Attributes:
+        out: run folder, as an offline run's; None: nothing is written.
+        overwrite: replace the run that it holds.
+        reference: trajectory to compare with at the end.
+        images: folder that a segmenter looks masks up for.
+        title: of the picture.
+    """
+
+    out: Path | None = None
+    overwrite: bool = False
+    reference: Trajectory | None = None
+    images: Path = Path()
+    title: str = "live"
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A frame's features, computed ahead of tracking.
+
+    Attributes:
+        features: see there. ms: time that they took.
+        arrived_s: ``time.monotonic()`` when the frame was there.
+    """
+
+    features: Features
+    ms: float
+    arrived_s: float
+
+
+class LiveSlam:
+    """The live loop. The map, its graph and loops, and segmentation run in other processes.
+
+    A context manager: leaving it ends them and saves everything, whatever the reason.
+
+    Attributes:
+        frames_dropped: by the source, which counts them here.
+        rows: what metrics.json holds, once it is closed.
+    """
+
+    def __init__(
+        self, camera: Camera, config: SystemConfig | None = None, options: LiveOptions | None = None
+    ) -> None:
+        """Start the processes; returns when they can work.
+
+        Raises:
+            InputError: the run folder cannot be used, or the segmenter cannot start.
+        """
+        self.camera = camera
+        self.config = config or SystemConfig()
+        self.options = options or LiveOptions()
+        self.frames_dropped = 0
+        self.rows: list[Row] = []
+        self._tally, self._meter = Tally(), FrameMeter()
+        self._refused = 0
+        self._closed = False
+        self._last_s = -np.inf
+        self._started_s = self._health_s = self._snapshot_s = time.monotonic()
+        self._scratch = Path(tempfile.mkdtemp(prefix="bmask-slam-"))
+        self._folder: RunFolder | None = None
+        try:
+            if self.options.out is not None:
+                self._folder = RunFolder(self.options.out, self.options.overwrite).__enter__()
+                self._folder.write_text("config.yaml", dump(self.config))
+            self._system = self._start(self.config.semantics.segmenter)
+        except BaseException:
+            self._leave(None)
+            raise
+
+    def __enter__(self) -> LiveSlam:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def prepare(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Prepared:
+        """A frame's features, for ``track``; may be called ahead in another thread."""
+        arrived_s, started_s = time.monotonic(), time.perf_counter()
+        features = self._system.prepare(Frame(0, 0.0, rgb, depth_m))
+        return Prepared(features, 1e3 * (time.perf_counter() - started_s), arrived_s)
+
+    def track(
+        self,
+        timestamp_s: float,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        prepared: Prepared | None = None,
+        name: str = "",
+    ) -> FrameResult:
+        """Where the camera is: ``T_world_camera`` (4, 4) and a status, in bounded time.
+
+        Args:
+            timestamp_s: of the frame; later than the one before.
+            rgb: (H, W, 3) uint8, red first.
+            depth_m: (H, W) z-depth in metres, NaN or 0 where missing, registered to rgb.
+            prepared: from ``prepare``, if the features were computed ahead.
+            name: of the image, for a segmenter that looks masks up.
+
+        Raises:
+            InputError: an image of another size or type than the camera's, or a stamp that is not
+                later. The frame is not used; the next one may be.
+        """
+        arrived_s = time.monotonic() if prepared is None else prepared.arrived_s
+        try:
+            frame = self._checked(timestamp_s, rgb, depth_m, name)
+        except InputError:
+            self._refused += 1
+            raise
+        self._last_s = timestamp_s
+        result = self._system.process(frame, prepared.features if prepared else None)
+        if prepared is not None:
+            result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
+        self._tally.count(result)
+        self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
+        self._write(result)
+        return result
+
+    def trajectory(self) -> Trajectory:
+        """Every frame of the largest map segment so far, from the keyframes as they are."""
+        return self._system.trajectory()
+
+    def map(self) -> LandmarkCloud:
+        """The landmarks of the largest map segment as they are."""
+        return self._system.landmarks()
+
+    def catch_up(self) -> None:
+        """Take in what the other processes have found; ``track`` does so too."""
+        self._system.catch_up()
+
+    def processes(self) -> dict[str, int]:
+        """Process ids by name."""
+        found = {"map": self._system.remote.pid}
+        if self._system.segmenter is not None:
+            found["segmenter"] = self._system.segmenter.pid
+        return found
+
+    def health(self) -> Health:
+        """How the loop is doing."""
+        system, meter = self._system, self._meter
+        median, high = meter.percentiles_ms(WINDOW)
+        segmenter, remote = system.segmenter, system.remote
+        return Health(
+            status=meter.status,
+            frames=meter.frames,
+            frames_per_second=meter.frames_per_second,
+            latency_ms_median=median,
+            latency_ms_p95=high,
+            keyframes=len(remote.world.keyframes),
+            landmarks=int(remote.world.landmarks.alive.sum()),
+            loops_closed=remote.loops_closed,
+            keyframes_waiting=remote.pending,
+            masks_waiting=segmenter.waiting if segmenter else 0,
+            frames_dropped=self.frames_dropped,
+            frames_refused=self._refused,
+            masks_dropped=segmenter.dropped if segmenter else 0,
+            lost_frames=meter.lost_frames,
+            lost_episodes=meter.lost_episodes,
+            map_deaths=remote.deaths,
+            segmenter_deaths=segmenter.deaths if segmenter else 0,
+        )
+
+    def close(self) -> None:
+        """End the processes and save everything. Safe to call twice."""
+        if self._closed:
+            return
+        self._closed = True
+        health = self.health()
+        self._tally.wall_s = max(time.monotonic() - self._started_s, 1e-9)
+        try:
+            self._conclude(health)
+        finally:
+            self._system.close()
+            self._leave(None)
+
+    def _start(self, segmenter: SegmenterOptions) -> LiveSystem:
+        remote = None
+        if segmenter.name != "none":
+            remote = RemoteSegmenter(segmenter, self.options.images)
+        try:
+            return LiveSystem(self.camera, self.config, self._scratch, remote)
+        except BaseException:
+            if remote is not None:
+                remote.close()
+            raise
+
+    def _checked(self, timestamp_s: float, rgb: NDArray, depth_m: NDArray, name: str) -> Frame:
+        height, width = self.camera.height, self.camera.width
+        if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
+            raise InputError(
+                f"frame at {timestamp_s}: colour is {rgb.dtype} {rgb.shape}, the camera gives "
+                f"uint8 ({height}, {width}, 3); resize it, or correct the camera"
+            )
+        if depth_m.shape != (height, width) or depth_m.dtype.kind != "f":
+            raise InputError(
+                f"frame at {timestamp_s}: depth is {depth_m.dtype} {depth_m.shape}; give metres as "
+                f"float ({height}, {width}), registered to the colour image"
+            )
+        if not timestamp_s > self._last_s:
+            raise InputError(
+                f"frame at {timestamp_s}: not later than the one before, at {self._last_s}; leave "
+                "it out, or begin anew if the clock was set back"
+            )
+        known = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype(np.float32, copy=False)
+        return Frame(self._meter.frames, timestamp_s, rgb, known, name)
+
+    def _write(self, result: FrameResult) -> None:
+        if self._folder is None:
+            return
+        self._folder.write_frame(result)
+        now_s = time.monotonic()
+        if now_s - self._health_s >= HEALTH_S:
+            self._health_s = now_s
+            self._folder.write_text(HEALTH, self.health().as_json())
+        if now_s - self._snapshot_s >= SNAPSHOT_S:
+            self._snapshot_s = now_s
+            self._folder.write_trajectory(self.trajectory())
+
+    def _conclude(self, health: Health) -> None:
+        """Save what an offline run saves; the trajectory at least, if the map cannot be had."""
+        folder = self._folder
+        if folder is None:
+            return
+        folder.write_text(HEALTH, health.as_json())
+        if not self._tally.frames:
+            return
+        folder.write_trajectory(self.trajectory())
+        try:
+            self._system.finish()
+        except InputError as error:
+            logger.error("the map is lost, the trajectory is saved: %s", error)
+            return
+        rows = measure(self._system, self.options.reference, self._tally, 1)
+        median, high = self._meter.percentiles_ms()
+        rows += [row("latency_ms_median", median, "ms"), row("latency_ms_p95", high, "ms")]
+        rows.append(row("frames_dropped", health.frames_dropped, "frames"))
+        self.rows = rows
+        save(self._system, folder, rows, self.options.reference, self.options.title)
+        folder.complete()
+
+    def _leave(self, error: BaseException | None) -> None:
+        shutil.rmtree(self._scratch, ignore_errors=True)
+        if self._folder is not None:
+            self._folder.__exit__(None, error, None)

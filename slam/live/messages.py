@@ -1,0 +1,174 @@
+"""What the processes of the live loop say to each other: plain values that pickle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.geometry import Array
+from semantics.instances import Instance
+from slam.history import HistoryEntry
+from slam.landmarks import Ints
+from slam.live.replica import WorldDelta
+from slam.tracker import Tracked
+
+Image = NDArray[np.uint8]
+Depth = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Landmarks (N,) with the number of frames that should have seen, and did see, each."""
+
+    ids: Ints
+    visible: Ints
+    found: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class NewKeyframe:
+    """To the map: tracking made a frame a keyframe.
+
+    Attributes:
+        id: of the keyframe.
+        frame_index, timestamp_s: of the frame.
+        tracked: how it was tracked; with the image, from which patches are cut.
+        segment: the map segment.
+        reference: a keyframe and its pose as tracking knew it, which says where
+            ``tracked.T_world_camera`` is; None where the frame begins a segment.
+        local_ids: (N,) landmarks that it was tracked against.
+        sightings: of the frames since the last keyframe.
+        history: the frames since then.
+        depth_m: (h, w) every second pixel of its z-depth, for its masks.
+    """
+
+    id: int
+    frame_index: int
+    timestamp_s: float
+    tracked: Tracked
+    segment: int
+    reference: tuple[int, Array] | None
+    local_ids: Ints
+    sightings: Sightings
+    history: list[HistoryEntry]
+    depth_m: Depth
+
+
+@dataclass(frozen=True, eq=False)
+class PackedInstance:
+    """An instance whose mask, of ``shape``, is a bit a pixel."""
+
+    bits: NDArray[np.uint8]
+    shape: tuple[int, int]
+    rest: tuple[NDArray[np.float32], int, NDArray[np.float32], float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Masks:
+    """Of a keyframe: from the segmenter, and on to the map. ``segmentation_ms``: time it took."""
+
+    keyframe_id: int
+    instances: list[PackedInstance]
+    segmentation_ms: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ImageToSegment:
+    """To the segmenter: a keyframe's image (H, W, 3), and its name for those who look masks up."""
+
+    keyframe_id: int
+    rgb: Image
+    name: str
+
+
+@dataclass(frozen=True)
+class NotSegmented:
+    """From the segmenter: a keyframe's image was passed over, and why."""
+
+    keyframe_id: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class PruneLandmarks:
+    """To the map: landmarks (N,) on things that move."""
+
+    ids: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class PruneMask:
+    """To the map: a mask of ``shape``, a bit a pixel, of what moves in a keyframe's image."""
+
+    keyframe_id: int
+    bits: NDArray[np.uint8]
+    shape: tuple[int, ...]
+    border_px: int
+
+
+@dataclass(frozen=True)
+class SaveState:
+    """To the map: write all that is known to a file."""
+
+    path: Path
+
+
+@dataclass(frozen=True, eq=False)
+class Finish:
+    """To the map: no more keyframes; optimise once more and write all that is known."""
+
+    path: Path
+    history: list[HistoryEntry]
+
+
+@dataclass(frozen=True, eq=False)
+class MapChanged:
+    """From the map: a delta after ``keyframe_id``'s landmarks were made or the graph moved.
+
+    ``done``: the keyframe's work is finished; ``update_ms`` is then the time it took.
+    """
+
+    keyframe_id: int
+    delta: WorldDelta
+    done: bool
+    update_ms: float = 0.0
+    loops_closed: int = 0
+
+
+@dataclass(frozen=True)
+class StateSaved:
+    """From the map: the file holds everything up to message ``number``."""
+
+    number: int
+    path: Path
+
+
+@dataclass(frozen=True)
+class Ready:
+    """From a worker: it has started."""
+
+    labels: tuple[str, ...] = field(default=())
+
+
+def packed(instances: Sequence[Instance]) -> list[PackedInstance]:
+    """Instances in an eighth of the bytes."""
+    return [
+        PackedInstance(
+            np.packbits(i.mask),
+            (i.mask.shape[0], i.mask.shape[1]),
+            (i.box, i.label, i.distribution, i.class_score, i.mask_score),
+        )
+        for i in instances
+    ]
+
+
+def unpacked(instances: Sequence[PackedInstance]) -> list[Instance]:
+    """The instances again."""
+    return [
+        Instance(np.unpackbits(i.bits, count=i.shape[0] * i.shape[1]).reshape(i.shape) > 0, *i.rest)
+        for i in instances
+    ]

@@ -1,0 +1,83 @@
+"""From a source into the live loop, until it ends or is stopped."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from graph.errors import InputError
+from slam.frame import Frame
+from slam.live.live_slam import LiveSlam, Prepared
+from slam.live.sources import Newest, Source
+from slam.progress import make_bar
+from slam.sequences.prefetch import prefetched
+from slam.stop import StopRequest
+
+logger = logging.getLogger(__name__)
+
+AHEAD = 2
+"""Frames whose features are computed ahead of tracking where the source waits."""
+
+_Pairs: TypeAlias = Iterator[tuple[Frame, Prepared]]
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """``realtime``: a frame that tracking has no time for is dropped, else the source waits.
+
+    ``silence_s``: a source that gives nothing for so long is reported.
+    """
+
+    realtime: bool = True
+    silence_s: float = 5.0
+    quiet: bool = False
+
+
+def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals | None:
+    """Track what a source gives; returns the signal that ended it early, if one did.
+
+    Frames that are refused are passed over with a warning.
+    """
+    pairs = _with_features(slam, source)
+    with StopRequest() as stop, make_bar(None, options.quiet) as bar:
+        chosen = (
+            _newest(slam, pairs, options, stop) if options.realtime else prefetched(pairs, AHEAD)
+        )
+        for frame, prepared in chosen:
+            try:
+                slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, prepared, frame.name)
+            except InputError as error:
+                logger.warning("%s", error)
+            bar.set_postfix_str(slam.health().line(), refresh=False)
+            bar.update()
+            if stop.signal is not None:
+                break
+    return stop.signal
+
+
+def _with_features(slam: LiveSlam, source: Source) -> _Pairs:
+    """Frames with their features, for a thread that is one frame ahead of tracking."""
+    for frame in source.frames():
+        yield frame, slam.prepare(frame.rgb, frame.depth_m)
+
+
+def _newest(slam: LiveSlam, pairs: _Pairs, options: PlayOptions, stop: StopRequest) -> _Pairs:
+    """What comes, dropping what there is no time for."""
+    newest = Newest(pairs, keep=1)
+    heard_s, silent = time.monotonic(), False
+    try:
+        while not newest.ended and stop.signal is None:
+            pair = newest.get(0.1)
+            slam.frames_dropped = newest.dropped
+            if pair is not None:
+                heard_s, silent = time.monotonic(), False
+                yield pair
+            elif not silent and time.monotonic() - heard_s > options.silence_s:
+                silent = True
+                logger.warning("no frame for %.0f s; waiting", options.silence_s)
+    finally:
+        newest.stop()

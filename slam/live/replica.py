@@ -1,0 +1,194 @@
+"""A second copy of the map in another process, kept equal by what changed.
+
+The map's owner works in its own process; tracking needs the whole map between two frames. So the
+owner sends, after each change, a ``WorldDelta``: every pose and point, since the graph moves all of
+them, but descriptors, patches and observations only where they changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.geometry import Array
+from slam.features import Features
+from slam.history import FrameHistory
+from slam.landmarks import Ints, Mask
+from slam.world_map import Keyframe, WorldMap
+
+COLUMNS = (
+    *("descriptors", "directions", "extent", "angles_rad", "patches", "patch_views"),
+    *("colours", "host", "last_keyframe", "observations"),
+)
+"""Of the landmark table; ``visible`` and ``found`` are counted by whoever tracks."""
+COMPARED = ("descriptors", "directions", "patch_views", "host", "observations")
+"""No other column changes unless one of these does."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeRow:
+    """A keyframe's observations (N,), where they changed; features only if the copy lacks them."""
+
+    landmark_ids: Ints
+    masked: Mask
+    frame_index: int
+    timestamp_s: float
+    features: Features | None
+
+
+@dataclass(frozen=True, eq=False)
+class WorldDelta:
+    """What changed in a map since the last delta.
+
+    Attributes:
+        size: landmarks ever made. alive: (size,) flags as packed bits.
+        points_world: (A, 3) of the living landmarks, in the order of their ids.
+        ids: (R,) living landmarks that changed otherwise. columns: their rows, by name.
+        replaced_by: (size,) of all landmarks if any was fused, else None.
+        next_keyframe_id: of the map.
+        keyframe_ids: (K,) all of them. poses: (K, 4, 4). segments: (K,).
+        rows: observations of the keyframes where they changed, by id.
+        heirs: new heirs, as ``FrameHistory.hand_over`` takes them.
+    """
+
+    size: int
+    alive: NDArray[np.uint8]
+    points_world: Array
+    ids: Ints
+    columns: dict[str, NDArray]
+    replaced_by: Ints | None
+    next_keyframe_id: int
+    keyframe_ids: Ints
+    poses: Array
+    segments: Ints
+    rows: dict[int, KeyframeRow]
+    heirs: dict[int, tuple[int, Array]]
+
+
+@dataclass
+class _Sent:
+    """What the other side has."""
+
+    landmarks: dict[str, NDArray] = field(default_factory=dict)
+    fused: int = 0
+    observations: dict[int, Ints] = field(default_factory=dict)
+    masked: dict[int, Mask] = field(default_factory=dict)
+    heirs: set[int] = field(default_factory=set)
+
+
+class DeltaMaker:
+    """Remembers what was sent; ``known`` are keyframes whose features the other side has."""
+
+    def __init__(self) -> None:
+        self._sent = _Sent()
+        self._features: set[int] = set()
+
+    def has_features(self, keyframe_id: int) -> None:
+        """The other side made this keyframe."""
+        self._features.add(keyframe_id)
+
+    def delta(self, world: WorldMap, history: FrameHistory) -> WorldDelta:
+        """What changed since the last call; all of the map at the first."""
+        table, keyframes = world.landmarks, list(world.keyframes.values())
+        ids = self._changed_landmarks(world)
+        fused = int(np.count_nonzero(table.replaced_by >= 0))
+        replaced_by = table.replaced_by.copy() if fused != self._sent.fused else None
+        self._sent.fused = fused
+        return WorldDelta(
+            size=len(table),
+            alive=np.packbits(table.alive),
+            points_world=table.points_world[table.alive],
+            ids=ids,
+            columns={name: getattr(table, name)[ids] for name in COLUMNS},
+            replaced_by=replaced_by,
+            next_keyframe_id=world.next_keyframe_id,
+            keyframe_ids=np.array([k.id for k in keyframes], np.int64),
+            poses=np.array([k.T_world_camera for k in keyframes], float).reshape(-1, 4, 4),
+            segments=np.array([k.segment for k in keyframes], np.int64),
+            rows={k.id: self._row(k) for k in keyframes if self._has_changed(k)},
+            heirs=self._new_heirs(history),
+        )
+
+    def _changed_landmarks(self, world: WorldMap) -> Ints:
+        """Living landmarks whose looks or observations are not as sent; they count as sent now."""
+        table, sent = world.landmarks, self._sent.landmarks
+        changed = table.alive.copy()
+        old = len(sent["host"]) if sent else 0
+        same = np.ones(old, bool)
+        for name in COMPARED if old else ():
+            here, there = getattr(table, name)[:old], sent[name]
+            bytes_here, bytes_there = (a.reshape(old, -1).view(np.uint8) for a in (here, there))
+            same &= (bytes_here == bytes_there).all(axis=1)  # NaN is equal to itself
+        changed[:old] &= ~same
+        self._sent.landmarks = {name: getattr(table, name).copy() for name in COMPARED}
+        return np.flatnonzero(changed)
+
+    def _has_changed(self, keyframe: Keyframe) -> bool:
+        sent = self._sent
+        return not (
+            np.array_equal(sent.observations.get(keyframe.id, ()), keyframe.landmark_ids)
+            and np.array_equal(sent.masked.get(keyframe.id, ()), keyframe.masked)
+        )
+
+    def _row(self, keyframe: Keyframe) -> KeyframeRow:
+        ids, masked = keyframe.landmark_ids.copy(), keyframe.masked.copy()
+        self._sent.observations[keyframe.id], self._sent.masked[keyframe.id] = ids, masked
+        features = None if keyframe.id in self._features else keyframe.features
+        self._features.add(keyframe.id)
+        return KeyframeRow(ids, masked, keyframe.frame_index, keyframe.timestamp_s, features)
+
+    def _new_heirs(self, history: FrameHistory) -> dict[int, tuple[int, Array]]:
+        fresh = {k: heir for k, heir in history.heirs.items() if k not in self._sent.heirs}
+        self._sent.heirs |= fresh.keys()
+        return fresh
+
+
+def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> None:
+    """Make a copy of the map equal to its owner's.
+
+    Keyframes that the owner has not met yet stay, and keep their place relative to the newest one
+    that both know.
+    """
+    _apply_landmarks(delta, world)
+    pending = [k for k in world.keyframes.values() if k.id >= delta.next_keyframe_id]
+    shared = [i for i in delta.keyframe_ids.tolist() if i in world.keyframes]
+    poses = dict(zip(delta.keyframe_ids.tolist(), delta.poses, strict=True))
+    if pending and shared:
+        newest = world.keyframes[shared[-1]]
+        T_move = poses[newest.id] @ np.linalg.inv(newest.T_world_camera)
+        for keyframe in pending:
+            keyframe.T_world_camera = T_move @ keyframe.T_world_camera
+    segments = dict(zip(delta.keyframe_ids.tolist(), delta.segments.tolist(), strict=True))
+    kept = {i: _keyframe(i, delta, world) for i in poses}
+    for keyframe in kept.values():
+        keyframe.T_world_camera = poses[keyframe.id]
+        keyframe.segment = segments[keyframe.id]
+    world.keyframes = kept | {k.id: k for k in pending}
+    world.next_keyframe_id = max(world.next_keyframe_id, delta.next_keyframe_id)
+    for keyframe_id, (heir, T_heir_culled) in delta.heirs.items():
+        history.hand_over(keyframe_id, heir, T_heir_culled)
+
+
+def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
+    table = world.landmarks
+    table.extend_to(delta.size)
+    table.alive[:] = np.unpackbits(delta.alive, count=delta.size)
+    table.points_world[table.alive] = delta.points_world
+    for name, rows in delta.columns.items():
+        getattr(table, name)[delta.ids] = rows
+    if delta.replaced_by is not None:
+        table.replaced_by[:] = delta.replaced_by
+
+
+def _keyframe(keyframe_id: int, delta: WorldDelta, world: WorldMap) -> Keyframe:
+    """The copy's keyframe with the owner's observations; made where the copy lacks it."""
+    keyframe, row = world.keyframes.get(keyframe_id), delta.rows.get(keyframe_id)
+    if keyframe is None:
+        assert row is not None and row.features is not None, "a delta of another map"
+        about = (keyframe_id, row.frame_index, row.timestamp_s, 0, np.eye(4), row.features)
+        keyframe = Keyframe(*about, row.landmark_ids)
+    if row is not None:
+        keyframe.landmark_ids, keyframe.masked = row.landmark_ids, row.masked
+    return keyframe

@@ -1,0 +1,107 @@
+"""Where live frames come from, and what happens to those that there is no time for."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Generic, Protocol, TypeVar
+
+from graph.camera import Camera
+from graph.trajectory import Trajectory
+from slam.frame import Frame
+from slam.sequences import Sequence
+
+T = TypeVar("T")
+
+
+class Source(Protocol):
+    """Frames that come when they come.
+
+    Attributes:
+        name: for titles. camera: of the frames. groundtruth: where there is one.
+    """
+
+    name: str
+    camera: Camera
+    groundtruth: Trajectory | None
+
+    def frames(self) -> Iterator[Frame]:
+        """Frames in the order of their stamps, each as soon as it is there."""
+
+
+class RecordedSource:
+    """A recorded sequence, at the speed of its stamps if ``realtime``."""
+
+    def __init__(self, sequence: Sequence, realtime: bool, max_frames: int | None = None) -> None:
+        self.name, self.camera = sequence.name, sequence.camera
+        self.groundtruth = sequence.groundtruth
+        self._sequence, self._realtime, self._max_frames = sequence, realtime, max_frames
+
+    def frames(self) -> Iterator[Frame]:
+        """Each frame, not before its time; decoded ahead, as a camera's driver would."""
+        begin_s = None
+        for frame in self._sequence.frames(0, self._max_frames):
+            if begin_s is None:
+                begin_s = time.monotonic() - frame.timestamp_s
+            if self._realtime:
+                time.sleep(max(begin_s + frame.timestamp_s - time.monotonic(), 0.0))
+            yield frame
+
+
+class Newest(Generic[T]):
+    """Takes items from an iterator in a thread and keeps a few; a new one drives out the oldest.
+
+    Attributes:
+        dropped: items that nobody took in time.
+    """
+
+    def __init__(self, items: Iterator[T], keep: int) -> None:
+        self.dropped = 0
+        self._items, self._keep = items, keep
+        self._kept: list[T] = []
+        self._stopped = False
+        self._changed = threading.Condition()
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="source")
+        self._end = self._thread.submit(self._take)
+        self._end.add_done_callback(lambda _: self._notify())
+
+    def get(self, timeout_s: float) -> T | None:
+        """The oldest item kept; None if none comes in that time, or at the end.
+
+        Raises what the iterator raised, after the items that came before.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._kept or self._end.done(), timeout_s)
+            if self._kept:
+                return self._kept.pop(0)
+        if self._end.done():
+            self._end.result()
+        return None
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will come, not even an error."""
+        with self._changed:
+            return not self._kept and self._end.done() and self._end.exception() is None
+
+    def stop(self) -> None:
+        """Take no more."""
+        self._stopped = True
+        self._thread.shutdown(wait=False)
+
+    def _take(self) -> None:
+        for item in self._items:
+            if self._stopped:
+                return
+            with self._changed:
+                self._kept.append(item)
+                if len(self._kept) > self._keep:
+                    self._kept.pop(0)
+                    self.dropped += 1
+                self._changed.notify()
+
+    def _notify(self) -> None:
+        with self._changed:
+            self._changed.notify()

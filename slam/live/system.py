@@ -1,0 +1,137 @@
+"""The live system: the same step as offline, with map and segmentation in other processes."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from graph.array_file import nested, read_arrays
+from graph.camera import Camera
+from graph.geometry import inverse
+from semantics.segmenter import NoSegmenter
+from slam.features import Features
+from slam.frame import Frame
+from slam.landmarks import Ints
+from slam.live.map_process import STATE_FILE, LabelledNothing
+from slam.live.messages import ImageToSegment
+from slam.live.remote_mapper import RemoteMapper
+from slam.live.segmentation import RemoteSegmenter
+from slam.mapper import Mapper
+from slam.results import FrameResult
+from slam.semantic_mapping import LandmarkLabels, SemanticMapper
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
+from slam.tracker import Tracked, Tracker
+from slam.world_map import Keyframe
+
+MAX_PENDING = 3
+"""Keyframes that wait for the map; with so many no further one is promised."""
+FIRST_MAP_S = 5.0
+"""How long the frame that begins a map may wait for its landmarks."""
+START_S = 60.0
+MASKS_S = 10.0
+"""How long the masks of the last keyframes are waited for at the end."""
+FINISH_S = 600.0
+
+
+class LiveSystem(SlamSystem):
+    """Tracks in the caller's process; ``finish`` brings the map home.
+
+    Attributes:
+        remote: the map's copy, and the process that keeps it.
+        segmenter: the process that makes masks; None without.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: SystemConfig,
+        folder: Path,
+        segmenter: RemoteSegmenter | None = None,
+    ) -> None:
+        self.segmenter = segmenter
+        self._names = (segmenter or NoSegmenter).labels.names
+        self.remote = RemoteMapper(camera, config, self._names, folder)
+        super().__init__(camera, config)
+        self.remote.wait_until_ready(START_S)
+        self.semantics = _AskedMasks(self)
+
+    def _make_mapper(self, tracker: Tracker) -> Mapper:
+        return self.remote  # type: ignore[return-value]  # it has what the step asks for
+
+    def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
+        """Take in what the other processes have found, then the same step as offline."""
+        self.catch_up()
+        result = super().process(frame, features)
+        reference = self._reference
+        if result.keyframe_id is not None and reference is not None:
+            world = self.remote.world
+            if len(world.in_segment(reference.segment)) == 1:
+                self.remote.wait_for(reference, FIRST_MAP_S)
+                self.localiser.new_local_map(world, reference)
+        return result
+
+    def catch_up(self) -> None:
+        """Bring the map's copy up to date, pass masks on, and stay where the map has moved to."""
+        reference, changes = self._reference, self.remote.changes
+        T_before = None if reference is None else reference.T_world_camera
+        for masks in self.remote.catch_up():
+            self.dynamics.see(masks, self.mapper)
+        for found in self.segmenter.answers() if self.segmenter else ():
+            self.remote.tell(found)
+        if reference is None or T_before is None or self.remote.changes == changes:
+            return
+        heir_id, T_heir_reference = self.remote.history.heir(reference.id)
+        heir = self.remote.world.keyframes[heir_id]
+        T_now = heir.T_world_camera @ T_heir_reference
+        self.localiser.moved(T_now @ inverse(T_before), self.remote.world)
+        self.localiser.new_local_map(self.remote.world, heir)
+        self._reference, self._segment = heir, heir.segment
+
+    def insert(self, frame: Frame, tracked: Tracked, local_ids: Ints) -> tuple[Tracked, Keyframe]:
+        """Make a frame a keyframe; segments are joined by the map's process."""
+        self.remote.reference = self._reference
+        return tracked, self.remote.insert(frame, tracked, self._segment, local_ids)
+
+    def finish(self) -> None:
+        """Let the other processes end their work; from then on this is an offline system."""
+        deadline_s = time.monotonic() + MASKS_S
+        while self.segmenter and self.segmenter.waiting and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+            self.catch_up()
+        path = self.remote.finish(FINISH_S)
+        state = read_arrays(path, STATE_FILE)[1]
+        own = nested(dynamics=self.dynamics.state())
+        whole = SlamSystem(self.camera, self.config, LabelledNothing(self._names))
+        whole.restore({**state, **own}, path)
+        self.mapper, self.localiser = whole.mapper, whole.localiser
+        self.semantics, self.dynamics = whole.semantics, whole.dynamics
+        self.close()
+
+    def close(self) -> None:
+        """End the other processes; what they knew and did not send is lost."""
+        self.remote.close()
+        if self.segmenter is not None:
+            self.segmenter.close()
+
+    def _keyframe_reason(self, tracked: Tracked) -> str:
+        """None while the map has too much to do: what is promised will be kept."""
+        busy = self.remote.pending >= MAX_PENDING or self.remote.given_up
+        return "" if busy else super()._keyframe_reason(tracked)
+
+
+class _AskedMasks(SemanticMapper):
+    """On tracking's side: asks for a keyframe's masks; what they say is known elsewhere."""
+
+    def __init__(self, system: LiveSystem) -> None:
+        super().__init__(system.camera, system.config.semantics)
+        self._system = system
+
+    def observe(self, frame: Frame, keyframe: Keyframe, mapper: Mapper) -> None:
+        """Ask, and do not wait."""
+        if self._system.segmenter is not None:
+            self._system.segmenter.ask(ImageToSegment(keyframe.id, frame.rgb, frame.name))
+
+    def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
+        """None: the map's process has them."""
+        return None

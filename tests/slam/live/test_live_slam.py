@@ -1,0 +1,161 @@
+"""The live loop on rendered views: as good as offline, and whole whatever dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane
+
+from graph.errors import InputError
+from graph.geometry import Array, inverse, se3_exp
+from graph.trajectory import read_tum
+from semantics.segmenter_table import SegmenterOptions
+from slam.configuration import resolve
+from slam.frame import Frame
+from slam.landmark_cloud import LandmarkCloud
+from slam.live.live_slam import LiveOptions, LiveSlam
+from slam.live.segmentation import RemoteSegmenter, SegmentationConfig
+from slam.results import TrackingStatus
+from slam.run_folder import HEALTH
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
+
+SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
+CONFIG = resolve(SystemConfig, None, SETTINGS)
+TRUTH = [se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a, 0, 0])) for a in np.arange(30) * 0.02]
+FRAMES = [render_plane(pose, index) for index, pose in enumerate(TRUTH)]
+
+
+def feed(slam: LiveSlam, frames: list[Frame]) -> list[TrackingStatus]:
+    """Frames at a rate that a map on a busy machine can follow."""
+    statuses = []
+    for frame in frames:
+        statuses.append(slam.track(frame.timestamp_s, frame.rgb, frame.depth_m).status)
+        deadline_s = time.monotonic() + 2
+        while slam.health().keyframes_waiting > 1 and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+            slam.catch_up()
+    return statuses
+
+
+def error_m(poses: Array) -> float:
+    """RMS position error of poses (N, 4, 4) in the first one's frame, against the truth."""
+    truth = np.array([inverse(TRUTH[0]) @ pose for pose in TRUTH[: len(poses)]])
+    found = inverse(poses[0]) @ poses
+    return float(np.sqrt(np.mean(np.sum((found - truth)[:, :3, 3] ** 2, axis=1))))
+
+
+def children() -> set[int]:
+    """Processes of this one's that still run."""
+    tasks = Path("/proc/self/task").glob("*/children")
+    found = {int(pid) for task in tasks for pid in task.read_text().split()}
+    states = {p: Path(f"/proc/{p}/stat").read_text().rsplit(")", 1)[1].split()[0] for p in found}
+    return {pid for pid, state in states.items() if state != "Z"}
+
+
+@pytest.fixture(scope="module")
+def offline() -> SlamSystem:
+    system = SlamSystem(CAMERA, CONFIG)
+    for frame in FRAMES:
+        system.process(frame)
+    system.finish()
+    return system
+
+
+def test_live_is_as_good_as_offline_and_leaves_the_same_files(tmp_path, offline) -> None:
+    before = children()
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
+        assert set(feed(slam, FRAMES)) == {TrackingStatus.OK}
+        assert len(children() - before) == 1
+        cloud, health = slam.map(), slam.health()
+        assert len(slam.trajectory()) == len(FRAMES)
+    assert children() == before
+    trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
+    assert len(trajectory) == len(FRAMES)
+    allowed = 1.5 * error_m(offline.trajectory().poses_world_camera) + 1e-3
+    assert error_m(trajectory.poses_world_camera) < allowed
+    assert isinstance(cloud, LandmarkCloud)
+    assert len(cloud.ids) == health.landmarks > 100
+    assert (health.frames, health.lost_frames, health.map_deaths) == (len(FRAMES), 0, 0)
+    files = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"graph", "map", "metrics.json", "landmarks.ply", "keyframes.txt", HEALTH} <= files
+    assert not any(name.startswith(".") for name in files)
+    names = {row["name"] for row in json.loads((tmp_path / "run" / "metrics.json").read_text())}
+    assert {"latency_ms_median", "frames_dropped", "isam2_update_ms_median"} <= names
+
+
+def test_a_killed_map_comes_back_and_no_frame_is_lost(tmp_path) -> None:
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
+        feed(slam, FRAMES[:12])
+        os.kill(slam.processes()["map"], signal.SIGKILL)
+        assert set(feed(slam, FRAMES[12:])) == {TrackingStatus.OK}
+        health = slam.health()
+    assert health.map_deaths == 1
+    trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
+    assert len(trajectory) == len(FRAMES)
+    assert error_m(trajectory.poses_world_camera) < 0.02
+    assert (tmp_path / "run" / "map").stat().st_size > 10_000
+
+
+def test_a_map_that_dies_again_and_again_costs_the_map_but_not_the_trajectory(tmp_path) -> None:
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
+        feed(slam, FRAMES[:8])
+        for _ in range(3):
+            os.kill(slam.processes()["map"], signal.SIGKILL)
+            deaths, deadline_s = slam.health().map_deaths, time.monotonic() + 10
+            while slam.health().map_deaths == deaths and time.monotonic() < deadline_s:
+                slam.catch_up()
+        for frame in FRAMES[8:12]:
+            assert slam.track(frame.timestamp_s, frame.rgb, frame.depth_m).keyframe_id is None
+    assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == 12
+    assert "the trajectory is saved" in (tmp_path / "run" / "log.txt").read_text()
+
+
+def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> None:
+    first, second = FRAMES[:2]
+    with LiveSlam(CAMERA, CONFIG) as slam:
+        slam.track(first.timestamp_s, first.rgb, first.depth_m)
+        for rgb, depth_m, stamp_s, words in (
+            (second.rgb[:, :, 0], second.depth_m, 1.0, "colour is uint8"),
+            (second.rgb, (1000 * np.nan_to_num(second.depth_m)).astype(np.uint16), 1.0, "metres"),
+            (second.rgb, second.depth_m[:100], 1.0, "registered"),
+            (second.rgb, second.depth_m, first.timestamp_s, "not later"),
+            (second.rgb, second.depth_m, float("nan"), "not later"),
+        ):
+            with pytest.raises(InputError, match=words):
+                slam.track(stamp_s, rgb, depth_m)
+        assert slam.track(1.0, second.rgb, second.depth_m).status is TrackingStatus.OK
+        assert slam.health().frames_refused == 5
+
+
+def test_black_frames_are_lost_and_tracking_comes_back() -> None:
+    black = np.zeros_like(FRAMES[0].rgb)
+    nothing = np.full_like(FRAMES[0].depth_m, np.nan)
+    with LiveSlam(CAMERA, CONFIG) as slam:
+        feed(slam, FRAMES[:10])
+        for k in range(3):
+            result = slam.track(FRAMES[9].timestamp_s + 0.01 * (k + 1), black, nothing)
+            assert result.status is TrackingStatus.LOST
+        assert feed(slam, FRAMES[11:13])[-1] is TrackingStatus.OK
+        health = slam.health()
+    assert (health.lost_frames, health.lost_episodes) == (3, 1)
+
+
+def test_a_run_folder_in_use_is_refused_and_nothing_starts(tmp_path) -> None:
+    (tmp_path / "frames.csv").write_text("")
+    before = children()
+    with pytest.raises(InputError, match="already holds a run"):
+        LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path))
+    assert children() == before
+
+
+def test_a_segmenter_that_cannot_start_says_why(tmp_path) -> None:
+    options = SegmenterOptions("precomputed", masks=tmp_path / "none.json")
+    with pytest.raises(InputError, match=r"none\.json"):
+        RemoteSegmenter(options, tmp_path, SegmentationConfig())

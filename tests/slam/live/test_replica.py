@@ -1,0 +1,101 @@
+"""A copy fed with deltas is the owner's map, whatever happened to that."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane
+
+from graph.geometry import se3_exp
+from slam.configuration import resolve
+from slam.history import FrameHistory
+from slam.live.replica import COLUMNS, DeltaMaker, apply_delta
+from slam.system import SlamSystem
+from slam.system_config import SystemConfig
+from slam.world_map import Keyframe, WorldMap
+
+SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
+    *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),
+    *("mapping.redundant_share=0.3", "mapping.redundant_views=2"),
+]
+
+
+def equal(copy: WorldMap, world: WorldMap) -> None:
+    alive = world.landmarks.alive
+    assert copy.keyframes.keys() == world.keyframes.keys()
+    np.testing.assert_array_equal(copy.landmarks.alive, alive)
+    np.testing.assert_array_equal(copy.landmarks.replaced_by, world.landmarks.replaced_by)
+    for name in ("points_world", *COLUMNS):
+        here, there = getattr(copy.landmarks, name)[alive], getattr(world.landmarks, name)[alive]
+        np.testing.assert_array_equal(here, there, err_msg=name)
+    for key, keyframe in world.keyframes.items():
+        other = copy.keyframes[key]
+        np.testing.assert_array_equal(other.T_world_camera, keyframe.T_world_camera)
+        np.testing.assert_array_equal(other.landmark_ids, keyframe.landmark_ids)
+        np.testing.assert_array_equal(other.masked, keyframe.masked)
+        assert (other.segment, other.timestamp_s) == (keyframe.segment, keyframe.timestamp_s)
+
+
+@pytest.fixture(scope="module")
+def followed() -> tuple[SlamSystem, WorldMap, FrameHistory, list[int]]:
+    """A system, a copy that was brought up to date after every frame, and the deltas' sizes."""
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS))
+    maker, copy, history, sizes = DeltaMaker(), WorldMap(), FrameHistory(), []
+    x = np.concatenate([np.arange(12), np.arange(12)[::-1]]) * 0.03
+    for index, shift in enumerate(x):
+        system.process(render_plane(se3_exp(np.array([0, 0, 0, shift, 0, 0])), index))
+        if index == 8:
+            seen = system.mapper.world.observed(list(system.mapper.world.keyframes.values())[-1])
+            system.mapper.pruner().prune_landmarks(seen[1][:20])
+        sent = pickle.dumps(maker.delta(system.mapper.world, system.mapper.history))
+        sizes.append(len(sent))
+        apply_delta(pickle.loads(sent), copy, history)
+        equal(copy, system.mapper.world)
+    return system, copy, history, sizes
+
+
+def test_the_copy_went_through_everything(followed) -> None:
+    system, copy, history, _ = followed
+    assert len(copy.keyframes) >= 3
+    assert (copy.landmarks.replaced_by >= 0).any(), "nothing was fused"
+    assert history.heirs, "no keyframe was culled"
+    for culled in history.heirs:
+        assert history.heir(culled)[0] == system.mapper.history.heir(culled)[0]
+        np.testing.assert_array_equal(
+            history.heir(culled)[1], system.mapper.history.heir(culled)[1]
+        )
+
+
+def test_a_delta_without_change_is_small(followed) -> None:
+    system, *_ = followed
+    maker = DeltaMaker()
+    first = maker.delta(system.mapper.world, system.mapper.history)
+    second = maker.delta(system.mapper.world, system.mapper.history)
+    assert len(first.ids) == system.mapper.world.landmarks.alive.sum()
+    assert len(second.ids) == 0
+    assert not second.rows
+    assert not second.heirs
+    assert second.replaced_by is None
+    assert len(pickle.dumps(second)) < 0.2 * len(pickle.dumps(first))
+
+
+def test_keyframes_that_the_owner_has_not_met_move_with_the_others(followed) -> None:
+    system, *_ = followed
+    world, copy, history = system.mapper.world, WorldMap(), FrameHistory()
+    apply_delta(DeltaMaker().delta(world, system.mapper.history), copy, history)
+    newest = list(copy.keyframes.values())[-1]
+    ahead = se3_exp(np.array([0.1, 0, 0, 0.2, 0, 0]))
+    pending = Keyframe(
+        copy.next_keyframe_id, 99, 9.9, 0, newest.T_world_camera @ ahead, newest.features,
+        newest.landmark_ids.copy(),
+    )  # fmt: skip
+    copy.add_keyframe(pending)
+    moved = se3_exp(np.array([0, 0.3, 0, 1.0, -2.0, 0.5]))
+    for keyframe in world.keyframes.values():
+        keyframe.T_world_camera = moved @ keyframe.T_world_camera
+    apply_delta(DeltaMaker().delta(world, system.mapper.history), copy, history)
+    expected = world.keyframes[newest.id].T_world_camera @ ahead
+    np.testing.assert_allclose(copy.keyframes[pending.id].T_world_camera, expected, atol=1e-12)
+    assert copy.next_keyframe_id == pending.id + 1

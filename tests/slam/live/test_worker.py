@@ -1,0 +1,143 @@
+"""Processes: what is said arrives in order, and no death goes unseen or leaves anything."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.live.channel import Channel
+from slam.live.worker import ROOT, Failure, Worker
+
+HERE = f"{__name__}"
+
+
+def echo(channel: Channel, prefix: str) -> None:
+    """Answer every message with itself."""
+    logging.getLogger("slam.echo").warning("%s begins", prefix)
+    for message in channel.messages():
+        channel.send((prefix, message))
+
+
+def fail(channel: Channel) -> None:
+    for message in channel.messages():
+        raise ValueError(f"cannot do {message}")
+
+
+def sleep(channel: Channel) -> None:
+    time.sleep(600)
+
+
+def gone(pid: int, timeout_s: float = 5.0) -> bool:
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return True
+        if (Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]) == "Z":
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def answers(worker: Worker, count: int) -> list:
+    found, deadline_s = [], time.monotonic() + 20
+    while len(found) < count and time.monotonic() < deadline_s:
+        found += worker.receive(0.2)
+    return found
+
+
+def test_messages_of_any_size_come_back_in_order(caplog) -> None:
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    big = np.arange(2_000_000)
+    for message in (1, big, "three"):
+        worker.send(message)
+    first, second, third = answers(worker, 3)
+    assert (first, third) == (("a", 1), ("a", "three"))
+    np.testing.assert_array_equal(second[1], big)
+    assert worker.alive
+    worker.stop()
+    assert not worker.alive
+    assert "a begins" in caplog.text
+    worker.stop()
+
+
+def test_what_was_sent_before_a_stop_is_still_done() -> None:
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    for k in range(50):
+        worker.send(k)
+    worker.stop()
+    assert [k for _, k in worker.receive()] == list(range(50))
+
+
+def test_an_error_is_told() -> None:
+    worker = Worker("fail", f"{HERE}:fail")
+    worker.send("this")
+    (failure,) = answers(worker, 1)
+    assert isinstance(failure, Failure)
+    assert "ValueError: cannot do this" in failure.text
+    worker.stop()
+    assert not worker.alive
+
+
+def test_a_killed_worker_is_seen_and_sending_does_no_harm() -> None:
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    worker.send(1)
+    answers(worker, 1)
+    os.kill(worker.pid, signal.SIGKILL)
+    deadline_s = time.monotonic() + 5
+    while worker.alive and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    assert not worker.alive
+    for _ in range(20):
+        worker.send(np.zeros(100_000))
+    assert worker.receive() == []
+    worker.stop()
+
+
+def test_one_that_does_not_end_is_killed(caplog) -> None:
+    worker = Worker("sleeper", f"{HERE}:sleep")
+    pid = worker.pid
+    worker.stop(timeout_s=0.5)
+    assert gone(pid)
+    assert "sleeper does not end; killed" in caplog.text
+
+
+def test_ctrl_c_in_the_terminal_does_not_reach_it() -> None:
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    worker.send(1)
+    answers(worker, 1)
+    os.kill(worker.pid, signal.SIGINT)
+    worker.send(2)
+    assert answers(worker, 1) == [("a", 2)]
+    assert os.getpgid(worker.pid) != os.getpgid(0)
+    worker.stop()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_it_ends_with_its_owner_however_that_ends() -> None:
+    script = (
+        "from slam.live.worker import Worker; import time\n"
+        f"w = Worker('echo', '{HERE}:echo', 'a'); w.send(1); w.receive(20)\n"
+        "print(w.pid, flush=True); time.sleep(600)"
+    )
+    paths = [str(ROOT), str(Path(__file__).parent)]
+    owner = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+    )
+    assert owner.stdout is not None
+    pid = int(owner.stdout.readline())
+    owner.kill()
+    owner.wait()
+    assert gone(pid)
