@@ -145,9 +145,7 @@ def ablation(steps: Steps) -> dict[str, list[Map]]:
         "Step 3": step3,
         "Steps 3, 4": [f.map for f in step4],
         "Steps 3, 4, 5": step5,
-        "Steps 3, 4, 5, honest variance": [
-            stated(m, f.factor) for m, f in zip(step5, step4, strict=True)
-        ],
+        "Steps 3, 4, 5, honest variance": [stated(m, f) for m, f in zip(step5, step4, strict=True)],
         "without 3": [regularise(f.map) for f in without3],
         "without 4": [regularise(m) for m in step3],
         "two neighbours": [regularise(f.map) for f in two],
@@ -242,7 +240,7 @@ def step_times_ms(steps: Steps, run: MappedRun, config: DenseConfig) -> dict[str
         "sensor": _ms(lambda: from_sensor(steps.keyframes[i].depth_m, run.camera, config.noise)),
         "Step 3": _ms(lambda: regularise(steps.raw[i])),
         "Step 4": _ms(single.fuse),
-        "Step 5": _ms(lambda: stated(regularise(fused.map), fused.factor)),
+        "Step 5": _ms(lambda: stated(regularise(fused.map), fused)),
         "Step 6": _ms(lambda: surface_normals(back_project(fused.map, run.camera))),
     }
 

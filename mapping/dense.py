@@ -179,7 +179,7 @@ def fused(
         for other in others
     ]
     result = fuse(own.map, views, camera, own.image)
-    final = stated(regularise(result.map), result.factor)
+    final = stated(regularise(result.map), result)
     return FusedKeyframe(own.keyframe, final, result.views.cpu().numpy())
 
 

@@ -24,6 +24,9 @@ SAMPLE_STEP, MIN_SAMPLE = 4, 200
 FACTOR_RANGE = (0.25, 20.0)
 """Errors that all views share are not seen in their differences: it is never very small."""
 BLUR_PX = 0.43
+MAX_SMOOTHED = 0.9
+WRONG_SIDE = 0.03
+"""Measured on the rendered rooms' silhouettes."""
 RIM_STEP, RIM_PX = 1.05, 2
 """So near to a surface that is nearer by this factor nothing is seeded: it may be its rim."""
 
@@ -62,7 +65,7 @@ def fuse(
     views = neighbours[:MAX_NEIGHBOURS]
     seeds = seeded(own, views, camera)
     empty = ~own.known
-    hypotheses = [hypothesis(torch.where(empty, seeds, own.rho), v, camera) for v in views]
+    hypotheses = [hypothesis(torch.where(empty, seeds, own.rho), v, camera, empty) for v in views]
     factor = variance_factor(own, hypotheses)
     rho, weight = [own.rho], [_weight(own.variance)]
     through = torch.zeros_like(empty)
@@ -103,14 +106,48 @@ def variance_factor(own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Ten
     return float(np.clip(np.median(factors), *FACTOR_RANGE)) if factors else 1.0
 
 
-def stated(final: InverseDepthMap, factor: float) -> InverseDepthMap:
-    """A map with its honest variance: the factor's, and what smoothing did to it.
+def stated(final: InverseDepthMap, before: Fused) -> InverseDepthMap:
+    """A map after Step 5 with its honest variance, by what Step 4 made.
 
-    Steps 3 and 5 and the reading between pixels move a depth in the image by BLUR_PX, which adds
-    (BLUR_PX |grad rho|)^2.
+    It is what both Steps state times ``before.factor``, less what Step 5 smoothed away: at least
+    var(after - before), as for means over all neighbours; over compatible ones it is more. Steps 3 and 5
+    and the reading between pixels move a depth in the image by BLUR_PX, which adds
+    (BLUR_PX |grad rho|)^2. On the rim of a silhouette a share WRONG_SIDE of the estimates belongs
+    to the surface on the other side, which adds that share of the squared step.
     """
-    blur = BLUR_PX**2 * squared_gradient(final.rho)
-    return InverseDepthMap(final.rho, factor * final.variance + blur)
+    variance = before.factor * final.variance
+    variance *= 1 - _smoothed_away(final, before)
+    variance += BLUR_PX**2 * squared_gradient(final.rho)
+    rows, columns, step = rim_steps(final)
+    variance[rows, columns] += WRONG_SIDE * step**2
+    return InverseDepthMap(final.rho, variance)
+
+
+def _smoothed_away(final: InverseDepthMap, before: Fused) -> float:
+    """Share of the variance, by the median change of the estimates."""
+    step = (slice(None, None, SAMPLE_STEP),) * 2
+    change = (final.rho[step] - before.map.rho[step]) ** 2 / before.map.variance[step]
+    change = change[torch.isfinite(change)]
+    if len(change) < MIN_SAMPLE:
+        return 0.0
+    return min(float(change.median()) / (MEDIAN_CHI2 * before.factor), MAX_SMOOTHED)
+
+
+def rim_steps(given: InverseDepthMap) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows and columns (N,) of estimates beside a hole, and how far others within two pixels are.
+
+    The third is the greatest |rho_j - rho| (N,) of the 5x5 pixels around.
+    """
+    known = given.known
+    share = torch.nn.functional.avg_pool2d(
+        known[None].to(torch.float32), 3, 1, 1, count_include_pad=False
+    )[0]
+    rows, columns = torch.nonzero(known & (share < 0.99)).unbind(-1)
+    padded = torch.nn.functional.pad(given.rho, (2, 2, 2, 2), value=torch.nan)
+    around = torch.arange(5, device=padded.device)
+    window = padded[rows[:, None, None] + around[:, None], columns[:, None, None] + around]
+    steps = torch.nan_to_num(window - given.rho[rows, columns][:, None, None]).abs()
+    return rows, columns, steps.amax((1, 2))
 
 
 def drop_other_colours(

@@ -35,19 +35,18 @@ class View:
 
 
 def hypothesis(
-    seeds: Tensor, view: View, camera: Camera, first_row: int = 0
+    seeds: Tensor, view: View, camera: Camera, inner: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """What a neighbour says of the points at inverse depth ``seeds`` (H, W) on each pixel's ray.
 
     Each point is projected into the neighbour, whose rho and sigma there are mapped back as
     {rho + sigma, rho, rho - sigma} to p1, p2, p3: the mean p2 (H, W) and the variance
-    max(|p1 - p2|, |p3 - p2|)^2 (H, W), NaN where it says nothing. ``seeds`` may be a strip of the
-    image that begins at ``first_row``.
+    max(|p1 - p2|, |p3 - p2|)^2 (H, W), NaN where it says nothing. At pixels of ``inner`` (H, W)
+    only the inside of a surface counts: its last pixels reach up to half a pixel beyond its rim.
     """
     columns, rows = image_grid(seeds)
-    rows += first_row
     u, v, ahead = project(seeds, inverse(view.T_own_neighbour), camera, (columns, rows))
-    rho, variance = _sampled(view.map, u, v)
+    rho, variance = _sampled(view.map, u, v, inner)
     sigma = variance.sqrt_()
     forward, t_z = _depth_row(view.T_own_neighbour, camera)
     ray = forward[0] * u + forward[1] * v + forward[2]
@@ -103,11 +102,13 @@ def _depth_row(T_own_other: Array, camera: Camera) -> tuple[list[float], float]:
     return row.tolist(), float(T_own_other[2, 3])
 
 
-def _sampled(view: InverseDepthMap, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+def _sampled(
+    view: InverseDepthMap, u: Tensor, v: Tensor, inner: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """rho and variance of a map at pixels (H, W), NaN outside.
 
     Inverse depth is linear in the image of a plane, so it is interpolated; where the pixels
-    around are not one surface the nearest is taken.
+    around are not one surface the nearest is taken, or none at pixels of ``inner`` (H, W).
     """
     height, width = view.rho.shape
     outside = (u < 0) | (v < 0) | (u > width - 1) | (v > height - 1)
@@ -117,4 +118,6 @@ def _sampled(view: InverseDepthMap, u: Tensor, v: Tensor) -> tuple[Tensor, Tenso
     between = grid_sample(stack[:, :1], grid, "bilinear", "border", align_corners=True)[0, 0]
     one_surface = (between - near).square() < JUMP_SIGMAS**2 * variance
     rho = torch.where(one_surface, between, near)
+    if inner is not None:
+        outside |= inner & ~one_surface
     return rho.masked_fill_(outside, torch.nan), variance.masked_fill_(outside, torch.nan)

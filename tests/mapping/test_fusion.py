@@ -16,13 +16,23 @@ from surface_scene import (
     weighted,
 )
 
-from graph.geometry import inverse, se3_exp, transform
-from mapping.fusion import BLUR_PX, fuse, seeded, stated, variance_factor
+from graph.geometry import inverse, make_pose, se3_exp, transform
+from mapping.fusion import (
+    BLUR_PX,
+    WRONG_SIDE,
+    Fused,
+    fuse,
+    rim_steps,
+    seeded,
+    stated,
+    variance_factor,
+)
+from mapping.regularisation import regularise
 from mapping.inverse_depth import InverseDepthMap, squared_gradient
 from mapping.warping import JUMP_SIGMAS, MAX_APART_PX, View, hypothesis
 
 
-def read(given: InverseDepthMap, u: float, v: float):
+def read(given: InverseDepthMap, u: float, v: float, inner: bool):
     """rho and variance of a map at a pixel: between pixels if they are one surface."""
     rho, variance = (a.numpy().astype(float) for a in (given.rho, given.variance))
     height, width = rho.shape
@@ -35,17 +45,17 @@ def read(given: InverseDepthMap, u: float, v: float):
     between = np.array([1 - b, b]) @ block @ np.array([1 - a, a])
     if (between - rho[near]) ** 2 < JUMP_SIGMAS**2 * variance[near]:
         return between, variance[near]
-    return rho[near], variance[near]
+    return (np.nan, np.nan) if inner else (rho[near], variance[near])
 
 
-def say(seed: float, u: int, v: int, view: View):
+def say(seed: float, u: int, v: int, view: View, inner: bool):
     """One neighbour's hypothesis about the point at ``seed`` on the ray of pixel (u, v)."""
     point = CAMERA.backproject(np.array([u, v], float), np.array(1 / seed))
     there = transform(inverse(view.T_own_neighbour), point[None])[0]
     if there[2] <= 0:
         return np.nan, np.nan
     pixel = CAMERA.project(there)
-    rho, variance = read(view.map, *pixel)
+    rho, variance = read(view.map, *pixel, inner)
     sigma = np.sqrt(variance)
     if not rho > sigma:
         return np.nan, np.nan
@@ -70,7 +80,7 @@ def reference(own: InverseDepthMap, views: list[View], seeds):
         seed = rho0[v, u] if known else seeds[v, u]
         if not np.isfinite(seed):
             continue
-        said = [say(seed, u, v, view) for view in views]
+        said = [say(seed, u, v, view, not known) for view in views]
         r, s = [rho0[v, u], *(m for m, _ in said)], [variance0[v, u], *(x for _, x in said)]
         chosen = largest_set(r, s)
         if not chosen and known and not any(m < seed for m, _ in said):
@@ -176,10 +186,56 @@ def test_no_neighbours_no_factor() -> None:
     assert variance_factor(as_map(np.full((30, 40), 0.5), 0.01), []) == 1.0
 
 
+def unchanged(given: InverseDepthMap, factor: float) -> Fused:
+    """Step 4 of a map that Step 5 leaves as it is."""
+    return Fused(given, given.known.to(torch.uint8), factor)
+
+
 def test_the_stated_variance_grows_with_the_slope() -> None:
     rho = np.tile(np.linspace(0.4, 0.8, 40), (30, 1))
     given = as_map(rho, 0.002)
     slope = squared_gradient(given.rho).numpy()[:, 1:-1]
     np.testing.assert_allclose(slope, (0.4 / 39) ** 2, rtol=1e-3)
-    extra = (stated(given, 0.5).variance - 0.5 * given.variance).numpy()[:, 1:-1]
+    stated_variance = stated(given, unchanged(given, 0.5)).variance
+    extra = (stated_variance - 0.5 * given.variance).numpy()[:, 1:-1]
     np.testing.assert_allclose(extra, BLUR_PX**2 * slope, rtol=1e-3)
+
+
+def test_the_stated_variance_shrinks_by_what_was_smoothed_away() -> None:
+    rng = np.random.default_rng(4)
+    given = as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004)
+    final = regularise(given)
+    said = float(stated(final, unchanged(given, 1.0)).variance.nanmedian())
+    smoothed = float((final.rho - 0.5).square().nanmedian() / 0.455)
+    slope = BLUR_PX**2 * float(squared_gradient(final.rho).nanmedian())
+    assert smoothed < said - slope < 0.8 * 0.004**2
+
+
+def test_a_rim_may_belong_to_the_other_side() -> None:
+    rho = np.full((30, 40), 0.5)
+    rho[:, :20], rho[:, 20] = 1.0, np.nan
+    rho[4, 5] = np.nan
+    given = as_map(rho, 0.01)
+    rows, columns, steps = (a.numpy() for a in rim_steps(given))
+    near = [
+        (r, c)
+        for r, c in np.argwhere(np.isfinite(rho)).tolist()
+        if np.isnan(rho[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]).any()
+    ]
+    assert set(map(tuple, near)) == set(zip(rows.tolist(), columns.tolist(), strict=True))
+    np.testing.assert_allclose(steps[(columns == 19) | (columns == 21)], 0.5)
+    np.testing.assert_allclose(steps[columns < 10], 0.0)
+    added = (stated(given, unchanged(given, 1.0)).variance - given.variance).numpy()
+    np.testing.assert_allclose(added[:, 19], WRONG_SIDE * 0.25, rtol=1e-4)
+    np.testing.assert_allclose(added[:, 10], 0, atol=1e-9)
+
+
+def test_a_neighbours_surface_does_not_grow_beyond_its_rim() -> None:
+    T_own_other = make_pose(np.eye(3), np.array([0.4 / 38, 0.0, 0.0]))
+    rho = np.full((30, 40), np.nan)
+    rho[:, :20] = 1.0
+    view = View(as_map(rho, 0.01), T_own_other)
+    empty = as_map(np.full((30, 40), np.nan), 0.01)
+    known = fuse(empty, [view, view], CAMERA).map.known.numpy()
+    assert known[:, 2:19].all()
+    assert not known[:, 20:].any()
