@@ -110,8 +110,8 @@ def stated(final: InverseDepthMap, before: Fused) -> InverseDepthMap:
     """A map after Step 5 with its honest variance, by what Step 4 made.
 
     It is what both Steps state times ``before.factor``, less what Step 5 smoothed away: at least
-    var(after - before), as for means over all neighbours; over compatible ones it is more. Steps 3 and 5
-    and the reading between pixels move a depth in the image by BLUR_PX, which adds
+    var(after - before), as for means over all neighbours; over compatible ones it is more.
+    Steps 3 and 5 and the reading between pixels move a depth in the image by BLUR_PX, which adds
     (BLUR_PX |grad rho|)^2. On the rim of a silhouette a share WRONG_SIDE of the estimates belongs
     to the surface on the other side, which adds that share of the squared step.
     """

@@ -31,6 +31,37 @@ class KeyframeLabels:
     log_likelihoods: NDArray[np.float32]
 
 
+@dataclass(frozen=True, eq=False)
+class InstanceEvidence:
+    """What is known of the classes of a keyframe's instances.
+
+    Attributes:
+        log_likelihoods: (I + 1, C) float32 by their masks, as in KeyframeLabels.
+        landmark_ids: (L,) landmarks seen on instances.
+        landmark_instances: (L,) uint16 which, from 1.
+    """
+
+    log_likelihoods: NDArray[np.float32]
+    landmark_ids: NDArray[np.int64]
+    landmark_instances: NDArray[np.uint16]
+
+    def with_landmarks(
+        self, distributions: NDArray[np.floating], known: NDArray[np.bool_]
+    ) -> NDArray[np.float32]:
+        """The likelihoods (I + 1, C) with what the map believes of the landmarks on instances.
+
+        ``distributions`` (L, C) of the landmarks that are ``known`` (L,): their mean counts as one
+        more view of the instance.
+        """
+        rows, classes = self.log_likelihoods.shape
+        total, instances = np.zeros((rows, classes)), self.landmark_instances[known]
+        np.add.at(total, instances, distributions[known])
+        count = np.bincount(instances, minlength=rows)[:, None]
+        mean = np.where(count > 0, total / np.maximum(count, 1), 1 / classes)
+        mixed = (1 - OTHER_SHARE) * mean + OTHER_SHARE / classes
+        return self.log_likelihoods + np.log(mixed).astype(np.float32)
+
+
 def keyframe_labels(
     instances: Sequence[Instance], shape: tuple[int, int], classes: int
 ) -> KeyframeLabels:

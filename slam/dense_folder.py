@@ -3,10 +3,12 @@
 ==================  ==============================================================================
 settings.json       what the keyframes were fused with; another setting begins anew
 depth/ID            fused inverse depth and its sigma, quantised
-labels/ID           log likelihoods of the keyframe's instances, one row each
+labels/ID           log likelihoods of the keyframe's instances, one row each, and landmarks on them
 submaps/ID          its points; written last, so that a keyframe that has one is finished
 cloud.ply, .pcd     the cloud, with normals, label, probability and sigma of each point
 semantic.ply, .pcd  the same in the colours of the labels
+objects/ID-CLASS    a cloud of each object of the run
+moving/ID, .ply     what moves, if it is kept: points of each keyframe, and all of them
 mesh.ply            the mesh
 plan.png            the map from above
 view_*.png          pictures of cloud and mesh
@@ -24,18 +26,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph.array_file import FileKind, read_arrays, write_arrays
 from graph.errors import InputError
 from mapping.depth_files import read_fused, write_fused
 from mapping.inverse_depth import InverseDepthMap
+from mapping.labels import InstanceEvidence
 from mapping.submaps import Submap, read_submap, write_submap
 
 logger = logging.getLogger(__name__)
 
-LABEL_FILE = FileKind("keyframe labels", 1)
-PARTS = ("depth", "labels", "submaps")
+LABEL_FILE = FileKind("keyframe labels", 2)
+PARTS = ("depth", "labels", "submaps", "moving")
 
 
 class DenseFolder:
@@ -83,27 +85,33 @@ class DenseFolder:
         """Whether the keyframe is finished."""
         return self._file("submaps", keyframe_id).is_file()
 
-    def write(
-        self, submap: Submap, fused: InverseDepthMap, log_likelihoods: NDArray[np.float32]
-    ) -> None:
+    def write(self, submap: Submap, fused: InverseDepthMap, evidence: InstanceEvidence) -> None:
         """Save a finished keyframe. Raises InputError, with nothing half written, if it cannot."""
         write_fused(self._file("depth", submap.anchor), fused)
-        self.write_labels(submap.anchor, log_likelihoods)
+        write_arrays(self._file("labels", submap.anchor), LABEL_FILE, {}, vars(evidence))
         write_submap(self._file("submaps", submap.anchor), submap)
 
-    def write_labels(self, keyframe_id: int, log_likelihoods: NDArray[np.float32]) -> None:
-        """Replace what is known of a keyframe's instances; nothing is fused again."""
-        arrays = {"log_likelihoods": log_likelihoods}
-        write_arrays(self._file("labels", keyframe_id), LABEL_FILE, {}, arrays)
+    def write_moving(self, submap: Submap) -> None:
+        """Save what moves in a keyframe. Raises InputError if it cannot."""
+        write_submap(self._file("moving", submap.anchor), submap)
+
+    def moving(self, keyframe_id: int) -> Submap | None:
+        """What moves in a keyframe, if that was kept."""
+        path = self._file("moving", keyframe_id)
+        return read_submap(path) if path.is_file() else None
 
     def submap(self, keyframe_id: int) -> Submap:
         """The points of a finished keyframe."""
         return read_submap(self._file("submaps", keyframe_id))
 
-    def log_likelihoods(self, keyframe_id: int) -> NDArray[np.float32]:
-        """(I + 1, C) of its instances, row 0 of none."""
+    def evidence(self, keyframe_id: int) -> InstanceEvidence:
+        """What its masks say of its instances, and the landmarks on them."""
         arrays = read_arrays(self._file("labels", keyframe_id), LABEL_FILE)[1]
-        return np.asarray(arrays["log_likelihoods"], np.float32)
+        return InstanceEvidence(
+            np.asarray(arrays["log_likelihoods"], np.float32),
+            np.asarray(arrays["landmark_ids"], np.int64),
+            np.asarray(arrays["landmark_instances"], np.uint16),
+        )
 
     def fused(self, keyframe_id: int) -> InverseDepthMap:
         """The inverse depth of a finished keyframe."""

@@ -10,14 +10,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.array_file import part
+from graph.array_file import Arrays, part
 from graph.camera import Camera
 from graph.errors import InputError
-from graph.geometry import inverse, transform
+from graph.geometry import Array, inverse, transform
 from mapping.dense import DenseKeyframe
+from semantics.label_store import LabelStore
+from semantics.labels import LabelSet
+from slam.configuration import resolve
 from slam.frame import Frame
 from slam.map_file import read_map
+from slam.landmarks import Ints, Mask
 from slam.map_state import world_of
+from slam.semantic_mapping import SemanticsConfig
 from slam.sequences import Sequence, open_sequence
 from slam.world_map import Keyframe, WorldMap
 
@@ -36,6 +41,7 @@ class MappedRun:
         keyframes: those of its largest segment, oldest first.
         camera: whose distortion is taken out of what ``load`` returns.
         sequence: the images.
+        labels: what it knows of its landmarks' classes; None if it had no segmenter.
     """
 
     path: Path
@@ -43,6 +49,24 @@ class MappedRun:
     keyframes: list[Keyframe]
     camera: Camera
     sequence: Sequence
+    labels: RunLabels | None = None
+
+    def believed(self, ids: Ints, names: LabelSet) -> tuple[Array, Mask]:
+        """Distributions (N, C) over ``names`` of landmarks (N,), and which are known."""
+        nothing = np.zeros((len(ids), len(names))), np.zeros(len(ids), bool)
+        if self.labels is None or self.labels.names != names or not len(ids):
+            return nothing
+        heirs = self.world.landmarks.current(ids)
+        store = self.labels.store
+        return store.probabilities(heirs), store.estimates(heirs).views > 0
+
+
+@dataclass(frozen=True, eq=False)
+class RunLabels:
+    """The label store of a run, by landmark ids, and its label set."""
+
+    names: LabelSet
+    store: LabelStore
 
 
 def open_run(path: Path, sequence: Path | None = None) -> MappedRun:
@@ -57,7 +81,22 @@ def open_run(path: Path, sequence: Path | None = None) -> MappedRun:
     world = world_of(part(state, "mapper.world"))
     folder = sequence or _recorded_sequence(path / "config.yaml")
     keyframes = world.in_segment(world.largest_segment())
-    return MappedRun(path, world, keyframes, camera, open_sequence(folder, camera=camera))
+    labels = _labels(part(state, "semantics"), path / "config.yaml")
+    return MappedRun(path, world, keyframes, camera, open_sequence(folder, camera=camera), labels)
+
+
+def run_semantics(config: Path) -> SemanticsConfig:
+    """Where a run's masks came from, and what was believed of them."""
+    return resolve(SemanticsConfig, config, section="semantics")
+
+
+def _labels(state: Arrays, config: Path) -> RunLabels | None:
+    names = LabelSet(tuple(state["names"].tolist())) if state else LabelSet()
+    if len(names) < 2:
+        return None
+    store = LabelStore(len(names), run_semantics(config).labels)
+    store.restore(part(state, "labels"))
+    return RunLabels(names, store)
 
 
 def _recorded_sequence(config: Path) -> Path:

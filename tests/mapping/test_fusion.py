@@ -27,8 +27,8 @@ from mapping.fusion import (
     stated,
     variance_factor,
 )
-from mapping.regularisation import regularise
 from mapping.inverse_depth import InverseDepthMap, squared_gradient
+from mapping.regularisation import regularise
 from mapping.warping import JUMP_SIGMAS, MAX_APART_PX, View, hypothesis
 
 

@@ -1,0 +1,124 @@
+"""Clouds against the true surface of a rendered room: distance, F-score, labels."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from graph.geometry import Array, inverse, transform
+from graph.metrics import align
+from mapping.backprojection import back_project, surface_normals
+from mapping.dense import DenseKeyframe
+from mapping.inverse_depth import InverseDepthMap
+from mapping.mesh import integrated
+from mapping.submaps import nearest_a_voxel
+from semantics.segmenter import CocoSegmenter
+from slam.dense_input import MappedRun, image_name
+
+F_SCORE_M = 0.01
+VOXEL_M = 0.01
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Truth:
+    """What a keyframe really sees: depth (H, W) and its pose in the estimate's world."""
+
+    depth_m: NDArray[np.float32]
+    T_world_camera: Array
+
+
+def read_truth(run: MappedRun) -> list[Truth]:
+    """True depth and poses of the keyframes, aligned to the estimate as a whole."""
+    assert run.sequence.groundtruth is not None
+    poses = run.sequence.groundtruth.poses_world_camera
+    true = np.stack([poses[k.frame_index] for k in run.keyframes])
+    mine = np.stack([k.T_world_camera for k in run.keyframes])
+    T_mine_true = align(true[:, :3, 3], mine[:, :3, 3]).T_reference_estimate
+    if len(mine) < 3:
+        T_mine_true = mine[0] @ inverse(true[0])
+    found = []
+    for keyframe, T in zip(run.keyframes, true, strict=True):
+        name = run.sequence.pairs.depth_files[keyframe.frame_index].name
+        stored = cv2.imread(str(run.sequence.folder / "depth_true" / name), cv2.IMREAD_UNCHANGED)
+        depth_m = (stored / run.camera.depth_scale).astype(np.float32)
+        found.append(Truth(np.where(stored > 0, depth_m, np.nan), T_mine_true @ T))
+    return found
+
+
+def surface(truths: list[Truth], run: MappedRun, max_depth_m: float = 5.0) -> dict[str, Any]:
+    """Points and normals of the true surface that the keyframes see, and their labels."""
+    points, normals, labels = [], [], []
+    file = run.sequence.folder / "annotations.json"
+    segmenter = CocoSegmenter(file) if file.is_file() else None
+    for truth, keyframe in zip(truths, run.keyframes, strict=True):
+        rho = torch.from_numpy(1 / truth.depth_m)
+        grid = back_project(InverseDepthMap(rho, rho), run.camera)
+        normal = surface_normals(grid)
+        keep = (torch.isfinite(normal).all(-1) & (rho > 1 / max_depth_m)).numpy()
+        image = np.zeros(truth.depth_m.shape, np.uint16)
+        if segmenter is not None:
+            rgb = np.zeros((*image.shape, 3), np.uint8)
+            for instance in reversed(segmenter.segment(rgb, image_name(run, keyframe))):
+                image[instance.mask] = instance.label
+        labels.append(image[keep])
+        points.append(transform(truth.T_world_camera, grid.numpy()[keep].astype(float)))
+        normals.append(normal.numpy()[keep] @ truth.T_world_camera[:3, :3].T)
+    p, n, label = (np.concatenate(a) for a in (points, normals, labels))
+    kept = nearest_a_voxel(p.astype(np.float32), np.zeros(len(p), np.float32), VOXEL_M / 2)
+    return {"points": p[kept], "normals": n[kept], "labels": label[kept]}
+
+
+def surface_errors(points: Array, true: dict[str, Any]) -> dict[str, float]:
+    """Distance to the true surface along its normal, and the F-score at 1 cm."""
+    distance, index = cKDTree(true["points"]).query(points, workers=1)
+    offset = points - true["points"][index]
+    along = np.abs(np.einsum("ij,ij->i", offset, true["normals"][index]))
+    near = distance < 3 * VOXEL_M
+    error = np.where(near, along, distance)
+    precision = float(np.mean(error < F_SCORE_M))
+    thin = true["points"][
+        nearest_a_voxel(
+            true["points"].astype(np.float32), np.zeros(len(true["points"]), np.float32), VOXEL_M
+        )
+    ]
+    back, index = cKDTree(points).query(thin, workers=1)
+    recall = float(np.mean(back < F_SCORE_M))
+    return {
+        "points": len(points),
+        "mean_distance_mm": 1e3 * float(np.mean(error)),
+        "precision": precision,
+        "recall": recall,
+        "f_score": 2 * precision * recall / max(precision + recall, 1e-9),
+    }
+
+
+def open3d_points(run: MappedRun, keyframes: list[DenseKeyframe]) -> tuple[Array, float]:
+    """Open3D's TSDF of the sensor's depth, and its least milliseconds a keyframe."""
+    views = [(k.depth_m, k.rgb, k.T_world_camera) for k in keyframes]
+    integrated(views[:1], run.camera, VOXEL_M, 4.0)
+    times_s = []
+    for _ in range(3):
+        started_s = time.perf_counter()
+        volume = integrated(views, run.camera, VOXEL_M, 4.0)
+        times_s.append(time.perf_counter() - started_s)
+    elapsed_ms = 1e3 * min(times_s) / len(views)
+    cloud = volume.extract_point_cloud(weight_threshold=1.0)
+    return cloud.point.positions.numpy().astype(float), elapsed_ms
+
+
+def label_errors(cloud: dict[str, Any], true: dict[str, Any]) -> dict[str, float]:
+    """Accuracy of the labels of points within 2 cm of the true surface, and the mean IoU."""
+    points = np.stack([cloud[c] for c in "xyz"], axis=1).astype(float)
+    distance, index = cKDTree(true["points"]).query(points, workers=1)
+    near = distance < 0.02
+    mine, real = cloud["label"][near].astype(int), true["labels"][index[near]].astype(int)
+    classes = np.unique(real)
+    ious = [np.sum((mine == c) & (real == c)) / np.sum((mine == c) | (real == c)) for c in classes]
+    return {"accuracy": float(np.mean(mine == real)), "mean_iou": float(np.mean(ious))}
