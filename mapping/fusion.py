@@ -189,7 +189,9 @@ def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tenso
         rho, _ = moved(view.map.rho.reshape(-1)[chosen], view.T_own_neighbour, camera, pixels)
         seeds.scatter_reduce_(0, target[chosen].to(torch.int64), rho, "amax")
     seeds = seeds.reshape(height, width)
-    around = torch.nn.functional.max_pool2d(torch.nan_to_num(own.rho)[None], 5, 1, 2)[0]
+    around = torch.nn.functional.max_pool2d(
+        torch.maximum(torch.nan_to_num(own.rho), seeds)[None], 5, 1, 2
+    )[0]
     return torch.where((seeds > 0) & (around < RIM_STEP * seeds), seeds, torch.nan)
 
 
