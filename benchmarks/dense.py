@@ -44,7 +44,8 @@ from mapping.regularisation import regularise
 from mapping.warping import View
 from semantics.segmenter_table import SegmenterOptions
 from slam.dense_input import MappedRun, load, open_run
-from slam.dense_mapping import MapOptions, dense_config
+from slam.dense_keyframes import dense_config
+from slam.dense_options import MapOptions
 from slam.dense_run import map_run
 
 OUTLIER_M = 0.05

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import cv2
@@ -137,9 +138,18 @@ class DenseMapper:
             return InverseDepthMap(empty, empty)
         return sweep(image, apart[-SWEEP_VIEWS:], self.camera, window)
 
+    def move(self, poses: Mapping[int, Array]) -> None:
+        """Take over the T_world_camera (4, 4) of keyframes by their ids, as optimised since."""
+        for k, held in enumerate(self._held):
+            T = poses.get(held.keyframe.id)
+            if T is not None and T is not held.keyframe.T_world_camera:
+                self._held[k] = replace(held, keyframe=replace(held.keyframe, T_world_camera=T))
+
     def flush(self) -> list[FusedKeyframe]:
-        """What still waits for neighbours that will not come."""
-        return self._finished(len(self._held))
+        """What still waits for neighbours that will not come; what follows begins anew."""
+        results = self._finished(len(self._held))
+        self._held, self._done = [], 0
+        return results
 
     def _finished(self, end: int) -> list[FusedKeyframe]:
         """Fuse those held up to ``end`` and let go of what nobody needs any more."""

@@ -28,7 +28,8 @@ MAX_SMOOTHED = 0.9
 WRONG_SIDE = 0.03
 """Measured on the rendered rooms' silhouettes."""
 RIM_STEP, RIM_PX = 1.05, 2
-"""So near to a surface that is nearer by this factor nothing is seeded: it may be its rim."""
+"""So near to a surface, seeded or not, that is nearer by this factor nothing is seeded: it may be
+its rim."""
 
 
 @dataclass(frozen=True, eq=False)

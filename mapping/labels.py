@@ -86,10 +86,7 @@ def _trusted(instance: Instance, classes: int) -> NDArray[np.floating]:
     return trust * instance.distribution + (1 - trust) / classes
 
 
-def widened(
-    numbers: NDArray[np.uint16], chosen: Sequence[int], margin_px: int = 5
-) -> NDArray[np.bool_]:
-    """Pixels (H, W) that show one of the chosen instances, or are nearly beside one."""
+def widened(shown: NDArray[np.bool_], margin_px: int = 5) -> NDArray[np.bool_]:
+    """Pixels (H, W) of a mask, and those nearly beside it."""
     size = 2 * margin_px + 1
-    found = np.isin(numbers, chosen).astype(np.uint8)
-    return np.asarray(cv2.dilate(found, np.ones((size, size), np.uint8)) > 0)
+    return np.asarray(cv2.dilate(shown.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)

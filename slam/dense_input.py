@@ -16,11 +16,11 @@ from graph.errors import InputError
 from graph.geometry import Array, inverse, transform
 from mapping.dense import DenseKeyframe
 from semantics.label_store import LabelStore
-from semantics.labels import LabelSet
+from semantics.labels import LabelSet, label_set
 from slam.configuration import resolve
 from slam.frame import Frame
-from slam.map_file import read_map
 from slam.landmarks import Ints, Mask
+from slam.map_file import read_map
 from slam.map_state import world_of
 from slam.semantic_mapping import SemanticsConfig
 from slam.sequences import Sequence, open_sequence
@@ -50,6 +50,10 @@ class MappedRun:
     camera: Camera
     sequence: Sequence
     labels: RunLabels | None = None
+
+    def poses(self) -> dict[int, Array]:
+        """T_world_camera of every keyframe by its id, as it is at this moment."""
+        return {k.id: k.T_world_camera for k in self.world.keyframes.values()}
 
     def believed(self, ids: Ints, names: LabelSet) -> tuple[Array, Mask]:
         """Distributions (N, C) over ``names`` of landmarks (N,), and which are known."""
@@ -91,7 +95,7 @@ def run_semantics(config: Path) -> SemanticsConfig:
 
 
 def _labels(state: Arrays, config: Path) -> RunLabels | None:
-    names = LabelSet(tuple(state["names"].tolist())) if state else LabelSet()
+    names = LabelSet(tuple(state["names"].tolist())) if state else label_set(())
     if len(names) < 2:
         return None
     store = LabelStore(len(names), run_semantics(config).labels)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,11 +19,12 @@ from mapping.cloud import Cloud, merged, spill
 from mapping.cloud_files import CloudWriter
 from mapping.floor_plan import FloorPlan, plan_frame
 from mapping.mesh import View, sampled, truncation_voxels, tsdf_mesh, write_mesh
+from mapping.object_clouds import ObjectClouds, ObjectRegion
 from mapping.pictures import Picture, palette, with_legend
-from mapping.submaps import Submap
 from slam.dense_folder import DenseFolder
 from slam.dense_input import MappedRun, load
-from slam.dense_mapping import MapOptions
+from slam.dense_keyframes import OpenMap
+from slam.semantic_files import OBJECTS, read_objects
 from slam.world_map import Keyframe
 
 PLAN_CELL_M, PLAN_SAMPLE = 0.03, 10
@@ -51,65 +52,141 @@ def finished(run: MappedRun, folder: DenseFolder) -> list[Keyframe]:
     return [k for k in run.keyframes if folder.is_done(k.id)]
 
 
-def write_clouds(
-    run: MappedRun, folder: DenseFolder, names: tuple[str, ...], options: MapOptions
-) -> Products:
-    """Write the coloured and the semantic cloud, pictures of them and, if asked, the plan."""
-    keyframes, voxel_m = finished(run, folder), options.voxel_m
-    colours = palette(len(names))
-    counts = np.zeros(len(names), np.int64)
-    views = _viewpoints(run, keyframes)
+def write_clouds(opened: OpenMap) -> Products:
+    """Write the coloured and the semantic cloud and what is drawn of them, in one pass a cloud."""
+    run, folder, voxel_m = opened.run, opened.folder, opened.options.voxel_m
+    names, keyframes = opened.segmenter.labels.names, finished(run, folder)
     with tempfile.TemporaryDirectory(dir=folder.path, prefix=".blocks-") as temporary:
-        table, submaps = _with_table(keyframes, folder)
+        table, first = likelihood_table(opened, keyframes)
+        rows = zip(keyframes, first.tolist(), strict=True)
+        submaps = ((folder.submap(k.id), k.T_world_camera, row) for k, row in rows)
         files = spill(submaps, voxel_m, Path(temporary))
-        floor = (
-            _floor_plan(merged(files, voxel_m, table), keyframes, len(names))
-            if options.plan
-            else None
-        )
-        plain = {n: Picture(*view, voxel_m) for n, view in views.items()}
-        semantic = {n: Picture(*view, voxel_m) for n, view in views.items()}
-        with (
-            CloudWriter(folder.path / "cloud") as cloud_file,
-            CloudWriter(folder.path / "semantic", colours) as semantic_file,
-        ):
-            for block in merged(files, voxel_m, table):
-                cloud_file.write(block)
-                semantic_file.write(block)
-                if floor is not None:
-                    floor.add(block)
-                counts += np.bincount(block.labels, minlength=len(names))
-                for name in views:
-                    plain[name].draw(block.points, block.colours)
-                    semantic[name].draw(block.points, colours[block.labels])
-    total = max(int(counts.sum()), 1)
-    present = np.flatnonzero(counts).tolist()
-    written = [folder.path / f"{n}{s}" for n in ("cloud", "semantic") for s in (".ply", ".pcd")]
-    for name in views:
-        written.append(_write(folder, f"view_{name}.png", plain[name].image()))
-        if len(present) > 1:
-            picture = with_legend(semantic[name].image(), names, present)
-            written.append(_write(folder, f"view_{name}_semantic.png", picture))
+        floor = None
+        if opened.options.plan:
+            floor = _floor_plan(merged(files, voxel_m, table), keyframes, len(names))
+        gallery = _Gallery(_viewpoints(run, keyframes), voxel_m, names)
+        written = _write_blocks(opened, merged(files, voxel_m, table), gallery, floor)
+        written += gallery.write(folder)
+        written += _write_moving(opened, keyframes, (table, first), Path(temporary))
     if floor is not None:
         path = np.stack([k.T_world_camera[:3, 3] for k in keyframes])
         written.append(_write(folder, "plan.png", floor.picture(names, path)))
-    legend = {names[k]: colours[k].tolist() for k in range(len(names))}
+    legend = dict(zip(names, palette(len(names)).tolist(), strict=True))
     folder.write_text("legend.json", json.dumps(legend, indent=1) + "\n")
-    shares = {names[k]: float(counts[k] / total) for k in present}
-    return Products(written, int(counts.sum()), shares)
+    total = max(int(gallery.counts.sum()), 1)
+    shares = {names[k]: float(gallery.counts[k] / total) for k in gallery.present}
+    return Products(written, int(gallery.counts.sum()), shares)
 
 
-def _with_table(
-    keyframes: list[Keyframe], folder: DenseFolder
-) -> tuple[NDArray[np.float32], Iterator[tuple[Submap, Array, int]]]:
-    """All instances' log likelihoods, and every submap with its place in that table."""
-    rows = [folder.log_likelihoods(k.id) for k in keyframes]
-    first = np.cumsum([0, *(len(r) for r in rows)])
-    submaps = (
-        (folder.submap(k.id), k.T_world_camera, int(start))
-        for k, start in zip(keyframes, first, strict=False)
-    )
-    return np.concatenate(rows), submaps
+def _write_blocks(
+    opened: OpenMap, blocks: Iterable[Cloud], gallery: _Gallery, floor: FloorPlan | None
+) -> list[Path]:
+    """Give each block to all that want it."""
+    path = opened.folder.path
+    with (
+        CloudWriter(path / "cloud") as cloud_file,
+        CloudWriter(path / "semantic", gallery.colours) as semantic_file,
+        ObjectClouds(path / "objects", _regions(opened)) as objects,
+    ):
+        for block in blocks:
+            cloud_file.write(block)
+            semantic_file.write(block)
+            objects.write(block)
+            gallery.draw(block)
+            if floor is not None:
+                floor.add(block)
+    written = [path / f"{n}{s}" for n in ("cloud", "semantic") for s in (".ply", ".pcd")]
+    return written + objects.files
+
+
+def _write_moving(
+    opened: OpenMap,
+    keyframes: list[Keyframe],
+    labels: tuple[NDArray[np.float32], NDArray[np.int64]],
+    temporary: Path,
+) -> list[Path]:
+    """The cloud of what moves, where it was kept: of every keyframe, in no order of time."""
+    kept = [(opened.folder.moving(k.id), k, f) for k, f in zip(keyframes, labels[1], strict=True)]
+    submaps = [(s, k.T_world_camera, int(f)) for s, k, f in kept if s is not None]
+    path = opened.folder.path / "moving"
+    path.with_suffix(".ply").unlink(missing_ok=True)
+    if not submaps:
+        return []
+    temporary = temporary / "moving"
+    temporary.mkdir()
+    voxel_m = opened.options.voxel_m
+    with CloudWriter(path) as file:
+        for block in merged(spill(submaps, voxel_m, temporary), voxel_m, labels[0]):
+            file.write(block)
+    return [path.with_suffix(".ply")]
+
+
+class _Gallery:
+    """Pictures of the cloud, by its colours and by its labels, and how many points have each."""
+
+    def __init__(
+        self, views: dict[str, tuple[Camera, Array]], voxel_m: float, names: tuple[str, ...]
+    ) -> None:
+        self.names, self.colours = names, palette(len(names))
+        self.counts = np.zeros(len(names), np.int64)
+        self._plain = {n: Picture(*view, voxel_m) for n, view in views.items()}
+        self._semantic = {n: Picture(*view, voxel_m) for n, view in views.items()}
+
+    @property
+    def present(self) -> list[int]:
+        """Labels that some point has."""
+        return [int(k) for k in np.flatnonzero(self.counts)]
+
+    def draw(self, block: Cloud) -> None:
+        """Take a block in."""
+        self.counts += np.bincount(block.labels, minlength=len(self.names))
+        for picture in self._plain.values():
+            picture.draw(block.points, block.colours)
+        for picture in self._semantic.values():
+            picture.draw(block.points, self.colours[block.labels])
+
+    def write(self, folder: DenseFolder) -> list[Path]:
+        """Save the pictures; those of labels only if there are several."""
+        plain = [_write(folder, f"view_{n}.png", p.image()) for n, p in self._plain.items()]
+        if len(self.present) < 2:
+            return plain
+        return plain + [
+            _write(
+                folder,
+                f"view_{n}_semantic.png",
+                with_legend(p.image(), self.names, self.present),
+            )
+            for n, p in self._semantic.items()
+        ]
+
+
+def likelihood_table(
+    opened: OpenMap, keyframes: list[Keyframe]
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """All instances' log likelihoods (I, C), and the first row (K,) of each keyframe in it.
+
+    They hold what the run's label store believes at this moment, so that a label that changes
+    there changes in the map.
+    """
+    rows = []
+    for keyframe in keyframes:
+        evidence = opened.folder.evidence(keyframe.id)
+        told = opened.run.believed(evidence.landmark_ids, opened.segmenter.labels)
+        rows.append(evidence.with_landmarks(*told))
+    first = np.cumsum([0, *(len(r) for r in rows)], dtype=np.int64)[:-1]
+    return np.concatenate(rows), first
+
+
+def _regions(opened: OpenMap) -> list[ObjectRegion]:
+    """The objects that the run found, if it had a segmenter with the same labels."""
+    if not (opened.run.path / OBJECTS).is_file():
+        return []
+    number = opened.segmenter.labels.number
+    return [
+        ObjectRegion(f"{o.id:04d}-{o.label.replace(' ', '_')}", number(o.label), o.box)
+        for o in read_objects(opened.run.path)[1]
+        if number(o.label)
+    ]
 
 
 def _floor_plan(blocks: Iterator[Cloud], keyframes: list[Keyframe], classes: int) -> FloorPlan:

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.dense_mapping import FusionCounts, MapOptions, Progress, fuse_run, open_map
+from slam.dense_keyframes import FusionCounts
+from slam.dense_mapping import Progress, fuse_run, open_map
+from slam.dense_options import MapOptions
 from slam.dense_products import Products, write_clouds, write_dense_mesh
 
 
@@ -36,12 +38,13 @@ def map_run(options: MapOptions, progress: Progress = lambda done, total: None) 
     Raises:
         InputError: as for ``open_map`` and ``fuse_run``.
     """
-    run, segmenter, folder = open_map(options)
-    counts = fuse_run((run, segmenter), folder, options, progress)
+    opened = open_map(options)
+    counts = fuse_run(opened, progress)
     started_s = time.perf_counter()
-    products = write_clouds(run, folder, segmenter.labels.names, options)
+    products = write_clouds(opened)
     if options.mesh:
-        products.files.extend(write_dense_mesh(run, folder, options.voxel_m))
+        products.files.extend(write_dense_mesh(opened.run, opened.folder, options.voxel_m))
+    folder = opened.folder
     summary = MapSummary(folder.path, counts, products, time.perf_counter() - started_s)
     folder.write_text("dense.json", json.dumps(_rows(summary), indent=1) + "\n")
     return summary

@@ -11,7 +11,7 @@ from graph.errors import InputError
 from slam.system_config import SystemConfig
 
 _PATHS = ("sequence", "camera", "reference", "map")
-_RECORDED = (*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every")
+_RECORDED = (*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense")
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class RunOptions:
         checkpoint_every: frames from one checkpoint to the next; None: none is written.
         map: map file, or run folder that holds one, to go on from.
         localise: the same, to find the frames in; it stays as it is.
+        dense: also make a dense map, keyframes being fused on the way.
         quiet: no progress bar.
     """
 
@@ -46,6 +47,7 @@ class RunOptions:
     checkpoint_every: int | None = None
     map: Path | None = None
     localise: Path | None = None
+    dense: bool = False
     quiet: bool = False
 
     def __post_init__(self) -> None:
@@ -55,8 +57,8 @@ class RunOptions:
                 raise InputError(f"{_flag(option)} {value}: must be a whole number of at least 1")
         if self.localise is None:
             return
-        for option in ("map", "checkpoint_every"):
-            if getattr(self, option) is not None:
+        for option in ("map", "checkpoint_every", "dense"):
+            if getattr(self, option):
                 raise InputError(
                     f"--localise {self.localise}: learns nothing that {_flag(option)} could go on "
                     "from; leave one of the two away"

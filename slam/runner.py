@@ -25,6 +25,9 @@ from semantics.segmenter_table import make_segmenter
 from slam import __version__
 from slam.checkpoint import Checkpoints, read_checkpoint
 from slam.configuration import dump
+from slam.dense_follow import dense_follower
+from slam.dense_options import MapOptions
+from slam.dense_run import map_run
 from slam.evaluation import Row
 from slam.frame import Frame
 from slam.map_file import read_map
@@ -213,6 +216,7 @@ def track(
         begin * options.stride, end, options.stride, prepare=_timed(system.prepare)
     )
     checkpoints = Checkpoints(folder, options, sequence)
+    follow = dense_follower(system, sequence, folder.path, options.dense)
     start_s = time.perf_counter() - tally.wall_s
     with (
         closing(frames),  # type: ignore[type-var]
@@ -226,6 +230,7 @@ def track(
             result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
             folder.write_frame(result)
             tally.count(result)
+            follow(result)
             tally.wall_s = time.perf_counter() - start_s
             bar.update(result.status, tally.keyframes, tally.lost)
             snapshot()
@@ -251,6 +256,8 @@ def conclude(
     rows = measure(system, reference, tally, options.stride)
     title = "-".join(filter(None, (sequence.name, options.config_name)))
     save(system, folder, rows, reference, title)
+    if options.dense:
+        map_run(MapOptions(folder.path))
     if stop.signal is None:
         folder.complete()
     skipped = sum(index < tally.next_index for index, _ in sequence.skipped)

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
+
+from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+
+if TYPE_CHECKING:
+    from semantics.segmenter_table import SegmenterOptions
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
 TEXT = "make a dense map of a finished run: cloud, mesh, floor plan"
 MORE = """\
 Every keyframe's depth is fused with its neighbours' and becomes a submap in RUN/dense; keyframes
-that are finished are not done again. With --masks the points get labels."""
+that are finished are not done again. Points get labels if the run had a segmenter, or with
+--segmenter or --masks; what became of a label in the run's map shows here when called again."""
 
 
 def add_map(commands: _Commands) -> None:
@@ -25,12 +31,12 @@ def add_map(commands: _Commands) -> None:
     )
     parser.add_argument("--mesh", action="store_true", help="also a mesh (mesh.ply)")
     parser.add_argument("--plan", action="store_true", help="also a floor plan (plan.png)")
+    add_segmenter_arguments(parser, "the run's own")
     parser.add_argument(
-        "--masks", metavar="F", help="labels: COCO file, folder of label PNGs, or truth"
+        "--without", metavar="A,B", help="classes left out (default: people and animals)"
     )
-    parser.add_argument("--labels", metavar="F", help="label set of label PNGs")
     parser.add_argument(
-        "--without", default="", metavar="A,B", help="classes left out, since they move"
+        "--moving", action="store_true", help="keep what is left out in a cloud (moving.ply)"
     )
     parser.add_argument(
         "--depth-source",
@@ -44,23 +50,17 @@ def add_map(commands: _Commands) -> None:
 
 
 def _map(arguments: argparse.Namespace) -> int:
-    from semantics.segmenter_table import SegmenterOptions
-    from slam.dense_mapping import MapOptions
+    from slam.dense_options import MapOptions
     from slam.dense_run import format_summary, map_run
     from slam.progress import console_log, counting_bar
 
-    masks = None
-    if arguments.masks == "truth":
-        masks = SegmenterOptions("truth")
-    elif arguments.masks:
-        masks = SegmenterOptions(
-            "precomputed", masks=Path(arguments.masks), labels=arguments.labels
-        )
+    without = arguments.without
     options = MapOptions(
         arguments.run,
         arguments.sequence,
-        masks,
-        tuple(filter(None, arguments.without.split(","))),
+        _masks(arguments),
+        None if without is None else tuple(filter(None, without.split(","))),
+        arguments.moving,
         arguments.voxel,
         arguments.depth_source,
         arguments.device,
@@ -71,3 +71,14 @@ def _map(arguments: argparse.Namespace) -> int:
         summary = map_run(options, progress)
     print(summary.folder if arguments.quiet else format_summary(summary))
     return 0
+
+
+def _masks(arguments: argparse.Namespace) -> SegmenterOptions | None:
+    """What was asked for; None if nothing was."""
+    from semantics.segmenter_table import SegmenterOptions
+
+    if arguments.segmenter is None:
+        if arguments.masks is None and arguments.weights is None:
+            return None
+        arguments.segmenter = "light" if arguments.masks is None else "precomputed"
+    return segmenter_options(arguments, SegmenterOptions())

@@ -33,6 +33,7 @@ OPTIONS = (
     "checkpoint_every",
     "map",
     "localise",
+    "dense",
 )
 
 
@@ -67,6 +68,9 @@ def add_run(commands: _Commands) -> None:
     parser.add_argument("--map", type=Path, metavar="MAP", help="run or map file to continue")
     parser.add_argument(
         "--localise", type=Path, metavar="MAP", help="only find the frames in a map, unchanged"
+    )
+    parser.add_argument(
+        "--dense", action="store_true", default=None, help="also a dense map, as by bmask-slam map"
     )
     parser.add_argument(
         "--covariances",

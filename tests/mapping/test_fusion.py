@@ -174,6 +174,17 @@ def test_the_rim_of_a_nearer_surface_is_not_filled_from_behind() -> None:
     assert np.isnan(seeded(as_map(own, 0.01), views, CAMERA).numpy()[:, 10:12]).all()
 
 
+def test_the_rim_of_a_seeded_surface_is_not_seeded_from_behind() -> None:
+    near, far = np.full((30, 40), np.nan), np.full((30, 40), 0.5)
+    near[:, 10:20], far[:, 10:20] = 1.0, np.nan
+    empty = as_map(np.full((30, 40), np.nan), 0.01)
+    views = [View(as_map(rho, 0.01), np.eye(4)) for rho in (near, far)]
+    found = seeded(empty, views, CAMERA).numpy()
+    np.testing.assert_array_equal(found[:, 10:20], 1.0)
+    assert np.isnan(found[:, [8, 9, 20, 21]]).all()
+    np.testing.assert_array_equal(found[:, :8], 0.5)
+
+
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
 def test_the_factor_finds_what_variances_lack(scale: float) -> None:
     rng = np.random.default_rng(1)

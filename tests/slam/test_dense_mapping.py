@@ -65,7 +65,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def mapped(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run(tmp_path_factory.mktemp("runs") / "office", open_sequence(room))
-    arguments = ["map", str(run), "--voxel", "0.02", "--masks", "truth", "--plan", "--mesh"]
+    arguments = ["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--plan", "--mesh"]
     assert main([*arguments, "--quiet"]) == 0
     return run
 
@@ -130,7 +130,7 @@ def test_again_nothing_is_fused_and_the_bytes_are_the_same(
     mapped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (mapped / "dense" / "cloud.ply").read_bytes()
-    arguments = ["map", str(mapped), "--voxel", "0.02", "--masks", "truth", "--quiet"]
+    arguments = ["map", str(mapped), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]
     stamps = [p.stat().st_mtime_ns for p in sorted((mapped / "dense" / "submaps").iterdir())]
     assert main(arguments) == 0
     assert [
@@ -144,7 +144,7 @@ def test_a_map_that_was_stopped_goes_on_to_the_same_bytes(mapped: Path, tmp_path
     shutil.copytree(mapped, run)
     for name in ("000003", "000004", "000009"):
         (run / "dense" / "submaps" / name).unlink()
-    assert main(["map", str(run), "--voxel", "0.02", "--masks", "truth", "--quiet"]) == 0
+    assert main(["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]) == 0
     for name in ("submaps/000003", "submaps/000009", "cloud.ply"):
         assert (run / "dense" / name).read_bytes() == (mapped / "dense" / name).read_bytes()
 
@@ -200,7 +200,7 @@ def test_a_full_disk_stops_with_what_was_written(
     ("arguments", "text"),
     [
         (["--voxel", "0"], "voxel"),
-        (["--without", "elephant", "--masks", "truth"], "elephant"),
+        (["--without", "elephant", "--segmenter", "truth"], "elephant"),
         (["--masks", "nowhere.json"], "nowhere.json"),
         (["--sequence", "nowhere"], "nowhere"),
     ],

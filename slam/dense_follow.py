@@ -1,0 +1,62 @@
+"""``run --dense``: keyframes are fused as they come; ``map_run`` completes that at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantics.instances import Instance
+from semantics.segmenter import Segmenter
+from slam.dense_input import MappedRun
+from slam.dense_keyframes import KeyframeWork
+from slam.dense_mapping import assembled
+from slam.dense_options import MapOptions
+from slam.results import FrameResult
+from slam.sequences import Sequence
+from slam.system import SlamSystem
+from slam.system_interface import System
+
+
+class LastSegmentation:
+    """A segmenter that is asked twice in a row for the same image and works once."""
+
+    def __init__(self, segmenter: Segmenter) -> None:
+        self.labels = segmenter.labels
+        self._segmenter = segmenter
+        self._name: str | None = None
+
+    def segment(self, image: NDArray[np.uint8], name: str) -> list[Instance]:
+        """What the segmenter finds."""
+        if name != self._name:
+            self._found = self._segmenter.segment(image, name)
+            self._name = name
+        return self._found
+
+
+def dense_follower(
+    system: System, sequence: Sequence, run: Path, wanted: bool
+) -> Callable[[FrameResult], None]:
+    """A function to call after every frame; it does nothing unless that is ``wanted``.
+
+    It needs no state of its own: what a killed run has not fused is fused at the end.
+
+    Raises:
+        InputError: later, when the disk is full.
+    """
+    if not wanted or not isinstance(system, SlamSystem):
+        return lambda result: None
+    segmenter = system.semantics.segmenter = LastSegmentation(system.semantics.segmenter)
+    masks = system.config.semantics.segmenter
+    world = system.mapper.world
+    mapped = MappedRun(run, world, [], sequence.camera, sequence)
+    work = KeyframeWork(assembled(mapped, segmenter, MapOptions(run, masks=masks)))
+
+    def follow(result: FrameResult) -> None:
+        keyframe = world.keyframes.get(-1 if result.keyframe_id is None else result.keyframe_id)
+        if keyframe is not None:
+            work.take(keyframe)
+
+    return follow
