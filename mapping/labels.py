@@ -13,6 +13,7 @@ from semantics.instances import Instance
 
 OTHER_SHARE = 0.1
 """Of every distribution, spread over all classes: no view rules a class out."""
+MIN_LANDMARKS = 3
 BACKGROUND_TRUST = 0.7
 """Probability that a pixel outside all masks shows the background."""
 
@@ -50,16 +51,17 @@ class InstanceEvidence:
     ) -> NDArray[np.float32]:
         """The likelihoods (I + 1, C) with what the map believes of the landmarks on instances.
 
-        ``distributions`` (L, C) of the landmarks that are ``known`` (L,): their mean counts as one
-        more view of the instance.
+        ``distributions`` (L, C) of the landmarks that are ``known`` (L,): where an instance has
+        MIN_LANDMARKS of them their mean, which rests on all keyframes, replaces the mask's word.
         """
         rows, classes = self.log_likelihoods.shape
         total, instances = np.zeros((rows, classes)), self.landmark_instances[known]
         np.add.at(total, instances, distributions[known])
         count = np.bincount(instances, minlength=rows)[:, None]
-        mean = np.where(count > 0, total / np.maximum(count, 1), 1 / classes)
+        mean = total / np.maximum(count, 1)
         mixed = (1 - OTHER_SHARE) * mean + OTHER_SHARE / classes
-        return self.log_likelihoods + np.log(mixed).astype(np.float32)
+        believed = np.log(mixed).astype(np.float32)
+        return np.where(count >= MIN_LANDMARKS, believed, self.log_likelihoods)
 
 
 def keyframe_labels(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import shutil
 from pathlib import Path
@@ -15,11 +16,13 @@ from graph.array_file import nested
 from graph.errors import InputError
 from graph.geometry import Array, inverse, transform
 from graph.ply import read_ply
+from semantics.label_store import LabelStore
+from semantics.segmenter import CocoSegmenter
 from slam.cli import main
 from slam.dense_folder import DenseFolder
-from slam.dense_input import load, open_run
+from slam.dense_input import MappedRun, load, open_run
 from slam.features import BriskExtractor, FeatureConfig
-from slam.map_file import write_map
+from slam.map_file import read_map, write_map
 from slam.map_state import world_state
 from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.sequences import Sequence, open_sequence
@@ -54,6 +57,17 @@ def make_run(folder: Path, sequence: Sequence, broken: dict[int, str] | None = N
     write_map(folder / "map", nested(mapper=nested(world=world_state(world))), sequence.camera)
     (folder / "config.yaml").write_text(f"# bmask-slam 0, sequence {sequence.folder}, stride 1\n")
     return folder
+
+
+def shares_of(run: Path) -> dict[str, float]:
+    """Share of the map's points by class."""
+    shares = json.loads((run / "dense" / "dense.json").read_text())["label_shares"]
+    return {str(k): float(v) for k, v in shares.items()}
+
+
+def truth_file(run: MappedRun) -> Path:
+    """The annotations of a rendered sequence."""
+    return run.sequence.folder / "annotations.json"
 
 
 @pytest.fixture(scope="module")
@@ -109,11 +123,7 @@ def test_labels_are_those_of_the_truth(mapped: Path, room: Path) -> None:
     inside = ((pixels >= 0) & (pixels < (160, 120))).all(axis=1) & (seen[:, 2] > 0)
     pixels, z, label = pixels[inside], seen[inside, 2], cloud["label"][inside]
     visible = np.abs(true_m[pixels[:, 1], pixels[:, 0]] - z) < 0.05
-    import json
-
     content = json.loads((room / "annotations.json").read_text())
-    from semantics.segmenter import CocoSegmenter
-
     found = CocoSegmenter(room / "annotations.json").segment(
         np.zeros((120, 160, 3), np.uint8), f"rgb/{keyframe.timestamp_s:.6f}.png"
     )
@@ -147,6 +157,45 @@ def test_a_map_that_was_stopped_goes_on_to_the_same_bytes(mapped: Path, tmp_path
     assert main(["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]) == 0
     for name in ("submaps/000003", "submaps/000009", "cloud.ply"):
         assert (run / "dense" / name).read_bytes() == (mapped / "dense" / name).read_bytes()
+
+
+def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    stamps = [p.stat().st_mtime_ns for p in sorted((run / "dense" / "submaps").iterdir())]
+    opened, names = open_run(run), CocoSegmenter(truth_file(open_run(run))).labels
+    folder = DenseFolder.opened(run)
+    evidence = [folder.evidence(k.id) for k in opened.keyframes]
+    seen = [e.log_likelihoods[e.landmark_instances].argmax(axis=1) for e in evidence]
+    old = int(np.bincount(np.concatenate(seen)).argmax())
+    new = names.number("cup")
+    assert old not in (0, new)
+    store, ids = LabelStore(len(names)), np.flatnonzero(opened.world.landmarks.alive)
+    table = np.zeros((len(ids), len(names)), np.float32)
+    table[:, new] = 1.0
+    store.update(ids, table, np.full(len(ids), 0.9, np.float32))
+    state, camera = read_map(run)
+    known = {"names": np.array(names.names), **nested(labels=store.state())}
+    write_map(run / "map", state | nested(semantics=known), camera)
+    shares = [shares_of(run)]
+    assert main(["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]) == 0
+    shares.append(shares_of(run))
+    assert shares[1].get(names.names[old], 0) < 0.3 * shares[0][names.names[old]]
+    assert shares[1]["cup"] > shares[0].get("cup", 0) + 0.5 * shares[0][names.names[old]]
+    assert [p.stat().st_mtime_ns for p in sorted((run / "dense" / "submaps").iterdir())] == stamps
+
+
+def test_what_moves_is_left_out_or_kept_in_a_cloud_of_its_own(mapped: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    names = CocoSegmenter(truth_file(open_run(run))).labels
+    arguments = ["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--without", "chair"]
+    assert main([*arguments, "--moving", "--quiet"]) == 0
+    chair = names.number("chair")
+    still, moving = (read_ply(run / "dense" / f"{n}.ply") for n in ("cloud", "moving"))
+    assert (still["label"] == chair).mean() < 0.001
+    assert (moving["label"] == chair).mean() > 0.9
+    assert len(moving["x"]) > 100
 
 
 def test_keyframes_that_cannot_be_used_are_left_out(
@@ -194,6 +243,34 @@ def test_a_full_disk_stops_with_what_was_written(
     assert len(list((run / "dense" / "submaps").iterdir())) == 2
     monkeypatch.undo()
     assert main(["map", str(run), "--voxel", "0.05", "--quiet"]) == 0
+
+
+def test_a_run_can_fuse_its_keyframes_on_the_way(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    often = "keyframes={max_shared: 1.1, min_interval_frames: 2, min_tracked: 5}"
+    arguments = ["run", str(room), "--dense", "--segmenter", "truth", "--set", often]
+    assert main([*arguments, "--out", str(run), "--quiet"]) == 0
+    counts = json.loads((run / "dense" / "dense.json").read_text())
+    total = counts["keyframes_fused"] + counts["keyframes_reused"]
+    assert total == len(open_run(run).keyframes) > 8
+    assert counts["keyframes_reused"] >= total - 7 - len(counts["keyframes_left_out"])
+    assert len(counts["label_shares"]) > 3
+    capsys.readouterr()
+    assert main(["map", str(run)]) == 0
+    assert f"0 fused, {total} were finished" in capsys.readouterr().out
+
+
+def test_what_an_overwritten_run_left_is_not_used(
+    room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = make_run(tmp_path / "run", open_sequence(room))
+    for began, done in (("2026-01-01 a\nb\n", 0), ("2026-01-01 a\nc\n", 10), ("later\n", 0)):
+        (run / "log.txt").write_text(began)
+        assert main(["map", str(run), "--voxel", "0.05", "--quiet"]) == 0
+        counts = json.loads((run / "dense" / "dense.json").read_text())
+        assert counts["keyframes_reused"] == done
 
 
 @pytest.mark.parametrize(

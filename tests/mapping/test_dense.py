@@ -1,0 +1,80 @@
+"""Keyframes through all Steps in a stream: delayed, bounded, in any world frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from surface_scene import CAMERA, noisy_map, poses
+
+from graph.geometry import Array, se3_exp
+from mapping.dense import WINDOW, DenseKeyframe, DenseMapper, FusedKeyframe, neighbours
+
+RGB = np.full((30, 40, 3), 100, np.uint8)
+
+
+def keyframes(count: int) -> list[DenseKeyframe]:
+    """Keyframes of one plane; k shares landmarks k to k + 9 with its neighbours in order."""
+    rng = np.random.default_rng(3)
+    found = []
+    for k, T in enumerate(poses(rng, count)):
+        ids = np.arange(k, k + 10)
+        depth_m = noisy_map(rng, T, missing=0.05).depth_m()
+        found.append(DenseKeyframe(k, T, RGB, depth_m, ids, np.full(10, 2.0)))
+    return found
+
+
+def all_of(mapper: DenseMapper, given: list[DenseKeyframe]) -> list[FusedKeyframe]:
+    return [r for k in given for r in mapper.push(k)] + mapper.flush()
+
+
+def test_a_keyframe_comes_back_once_six_more_came() -> None:
+    mapper, given = DenseMapper(CAMERA), keyframes(16)
+    ids = [[r.keyframe.id for r in mapper.push(k)] for k in given]
+    assert ids == [[]] * WINDOW + [[k] for k in range(16 - WINDOW)]
+    assert len(mapper._held) <= 2 * WINDOW + 1
+    assert [r.keyframe.id for r in mapper.flush()] == list(range(10, 16))
+
+
+def test_what_is_not_wanted_serves_its_neighbours_only() -> None:
+    given = keyframes(9)
+    expected = {r.keyframe.id: r for r in all_of(DenseMapper(CAMERA), given)}
+    mapper = DenseMapper(CAMERA)
+    found = [r for k in given for r in mapper.push(k, k.id == 4)] + mapper.flush()
+    assert [r.keyframe.id for r in found] == [4]
+    np.testing.assert_array_equal(found[0].map.rho.numpy(), expected[4].map.rho.numpy())
+
+
+def test_the_neighbours_are_those_with_most_landmarks_in_common() -> None:
+    given = keyframes(12)
+    chosen = neighbours(given[5], [k for k in given if k.id != 5], 6)
+    assert [k.id for k in chosen] == [4, 6, 3, 7, 2, 8]
+
+
+def moved_by(T: Array, keyframe: DenseKeyframe) -> DenseKeyframe:
+    return replace(keyframe, T_world_camera=T @ keyframe.T_world_camera)
+
+
+def test_poses_that_are_optimised_meanwhile_are_followed() -> None:
+    """The first keyframes stand in another world until they are moved, like before a loop."""
+    given = keyframes(8)
+    expected = all_of(DenseMapper(CAMERA), given)
+    mapper = DenseMapper(CAMERA)
+    away = se3_exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, -1.0]))
+    for k in given[:4]:
+        assert mapper.push(moved_by(away, k)) == []
+    mapper.move({k.id: k.T_world_camera for k in given} | {99: np.eye(4)})
+    found = [r for k in given[4:] for r in mapper.push(k)] + mapper.flush()
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
+        np.testing.assert_array_equal(mine.keyframe.T_world_camera, theirs.keyframe.T_world_camera)
+
+
+def test_after_a_flush_it_begins_anew() -> None:
+    mapper, given = DenseMapper(CAMERA), keyframes(6)
+    first = all_of(mapper, given[:3])
+    again = all_of(mapper, given[3:])
+    alone = all_of(DenseMapper(CAMERA), given[3:])
+    assert [r.keyframe.id for r in first + again] == list(range(6))
+    for mine, theirs in zip(again, alone, strict=True):
+        np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
