@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graph.array_file import Arrays
-from graph.geometry import Array, inverse, orthonormalised
+from graph.geometry import Array, inverse, orthonormalised, se3_exp, se3_log
 from slam.features import Features
 from slam.landmarks import Ints
 from slam.local_mapping import MappingConfig, local_landmarks
@@ -14,6 +14,11 @@ from slam.relocalisation import RelocalisationConfig, relocalise, similar_keyfra
 from slam.results import TrackingStatus
 from slam.tracker import Tracked, Tracker
 from slam.world_map import Keyframe, WorldMap
+
+UNEVEN = 0.25
+"""Frames count as evenly spaced if their intervals differ by a smaller share."""
+MAX_STEPS = 4.0
+"""A motion is not believed to go on for longer than so many times its own length."""
 
 
 class Localiser:
@@ -34,6 +39,8 @@ class Localiser:
         self._relocalisation, self._mapping = config
         self._T_world_last = np.eye(4)
         self._T_last_next = np.eye(4)
+        self._last_s = self._now_s = np.nan
+        self._interval_s = np.nan  # during which T_last_next happened
         self._recent_ids: Ints = np.zeros(0, np.int64)
         self._local_ids: Ints = np.zeros(0, np.int64)
 
@@ -43,6 +50,7 @@ class Localiser:
             "lost_frames": np.array(self.lost_frames),
             "T_world_last": self._T_world_last,
             "T_last_next": self._T_last_next,
+            "stamps_s": np.array([self._last_s, self._now_s, self._interval_s]),
             "recent_ids": self._recent_ids,
             "local_ids": self._local_ids,
         }
@@ -51,6 +59,7 @@ class Localiser:
         """Become the localiser of a state."""
         self.lost_frames = int(state["lost_frames"])
         self._T_world_last, self._T_last_next = state["T_world_last"], state["T_last_next"]
+        self._last_s, self._now_s, self._interval_s = state["stamps_s"].tolist()
         self._recent_ids, self._local_ids = state["recent_ids"], state["local_ids"]
 
     def forget(self, lost_frames: int) -> None:
@@ -64,11 +73,13 @@ class Localiser:
         """Landmarks of the local map that the next frame will be tracked against."""
         return self._local_ids
 
+    def expect(self, timestamp_s: float) -> None:
+        """The next frame is of this time; without a word it comes as soon as the last one did."""
+        self._now_s = timestamp_s
+
     def prediction(self) -> Array | None:
         """T_world_camera (4, 4) of the next frame by constant velocity; None when lost."""
-        if self.lost_frames:
-            return None
-        return orthonormalised(self._T_world_last @ self._T_last_next)
+        return None if self.lost_frames else self._predicted()
 
     def leave_out(self, landmark_ids: Ints) -> None:
         """Do not track against these landmarks (N,)."""
@@ -77,7 +88,7 @@ class Localiser:
 
     def track(self, features: Features, world: WorldMap, reference: Keyframe) -> Tracked:
         """The frame's pose by constant velocity and the local map; when lost, by all keyframes."""
-        T_predicted = orthonormalised(self._T_world_last @ self._T_last_next)
+        T_predicted = self._predicted()
         self._local_ids = world.landmarks.living(self._local_ids)
         tracked = self.tracker.track(
             features, T_predicted, self._recent_ids, self._local_ids, world
@@ -107,6 +118,7 @@ class Localiser:
         steady = self.lost_frames == 0
         self._T_last_next = inverse(self._T_world_last) @ T_world_tracked if steady else np.eye(4)
         self._T_world_last = T_world_camera
+        self._interval_s, self._last_s = self._now_s - self._last_s, self._now_s
         self._recent_ids = seen_ids
         self.lost_frames = 0
 
@@ -119,6 +131,15 @@ class Localiser:
         """Track against the surroundings of this keyframe from now on."""
         _, seen = world.observed(keyframe)
         self._local_ids = local_landmarks(world, seen, self._mapping)
+
+    def _predicted(self) -> Array:
+        """The motion goes on, for as long as the frames are apart."""
+        known = self._interval_s > 0  # False for NaN
+        steps = (self._now_s - self._last_s) / self._interval_s if known else 1.0
+        if not abs(steps - 1) >= UNEVEN:
+            return orthonormalised(self._T_world_last @ self._T_last_next)
+        motion = min(steps, MAX_STEPS) * se3_log(self._T_last_next)
+        return orthonormalised(self._T_world_last @ se3_exp(motion))
 
     def restart(self, T_world_camera: Array) -> None:
         """Begin anew at a pose, without speed: a new segment, or a map that was moved."""

@@ -35,6 +35,7 @@ class MapLocalisation(SlamSystem):
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Find a frame in the map."""
         clock = StageClock()
+        self.localiser.expect(frame.timestamp_s)
         with clock.stage("features"):
             features = features if features is not None else self.prepare(frame)
         with clock.stage("tracking"):

@@ -122,6 +122,7 @@ class SlamSystem:
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Track a frame and, if it becomes a keyframe, extend and optimise the map."""
         clock, keyframe = StageClock(), None
+        self.localiser.expect(frame.timestamp_s)
         with clock.stage("features"):
             features = features if features is not None else self.prepare(frame)
         with clock.stage("moving"):

@@ -96,7 +96,7 @@ class LiveSlam:
         self._refused = 0
         self._closed = False
         self._last_s = -np.inf
-        self._started_s = self._health_s = self._snapshot_s = time.monotonic()
+        self._begin_s = self._health_s = self._snapshot_s = time.monotonic()
         self._scratch = Path(tempfile.mkdtemp(prefix="bmask-slam-"))
         self._folder: RunFolder | None = None
         try:
@@ -152,6 +152,8 @@ class LiveSlam:
         except InputError:
             self._refused += 1
             raise
+        if not self._meter.frames:
+            self._begin_s = time.monotonic()
         self._last_s = timestamp_s
         result = self._system.process(frame, prepared.features if prepared else None)
         if prepared is not None:
@@ -211,7 +213,7 @@ class LiveSlam:
             return
         self._closed = True
         health = self.health()
-        self._tally.wall_s = max(time.monotonic() - self._started_s, 1e-9)
+        self._tally.wall_s = max(time.monotonic() - self._begin_s, 1e-9)
         try:
             self._conclude(health)
         finally:

@@ -6,7 +6,7 @@ import logging
 import signal
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from graph.errors import InputError
@@ -47,7 +47,10 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
         chosen = (
             _newest(slam, pairs, options, stop) if options.realtime else prefetched(pairs, AHEAD)
         )
-        for frame, prepared in chosen:
+        for frame, ahead in chosen:
+            prepared = ahead
+            if not options.realtime:  # it waited in a queue, which no camera would make it do
+                prepared = replace(ahead, arrived_s=time.monotonic())
             try:
                 slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, prepared, frame.name)
             except InputError as error:

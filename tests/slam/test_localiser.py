@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from synthetic_view import T_NEW_OLD, add_keyframe, make_features
 
-from graph.geometry import Array, se3_exp
+from graph.geometry import Array, se3_exp, se3_log
 from slam.features import Features
 from slam.local_mapping import MappingConfig
 from slam.localiser import Localiser
@@ -45,6 +46,20 @@ def test_the_camera_is_expected_to_go_on_in_its_own_frame() -> None:
     localiser.moved_on(T_NEW_OLD @ STEP, T_NEW_OLD @ STEP, NO_IDS)
     localiser.track(features, world, world.keyframes[0])
     assert np.allclose(tracker.predictions[-1], T_NEW_OLD @ STEP @ STEP)
+
+
+@pytest.mark.parametrize(
+    ("stamp_s", "steps"), [(2.0, 1.0), (2.1, 1.0), (3.0, 2.0), (1.5, 0.5), (60.0, 4.0)]
+)
+def test_a_frame_that_comes_later_is_expected_farther_on(stamp_s: float, steps: float) -> None:
+    localiser, tracker, world, features = scene()
+    for time_s, pose in ((0.0, T_NEW_OLD), (1.0, T_NEW_OLD @ STEP)):
+        localiser.expect(time_s)
+        localiser.moved_on(pose, pose, NO_IDS)
+    localiser.expect(stamp_s)
+    localiser.track(features, world, world.keyframes[0])
+    ahead = se3_exp(steps * se3_log(STEP))
+    assert np.allclose(tracker.predictions[-1], T_NEW_OLD @ STEP @ ahead)
 
 
 def test_the_speed_is_of_tracking_the_place_of_the_optimised_keyframe() -> None:
