@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graph.array_file import FileKind, check_like, read_arrays, write_arrays
 from graph.camera import Camera
-from graph.geometry import Array, transform
+from graph.geometry import Array
 from mapping.backprojection import back_project, surface_normals
 from mapping.dense import FusedKeyframe
 
@@ -46,9 +46,8 @@ class Submap:
 
     def placed(self, T_world_anchor: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Points and normals (N, 3) in the world for a pose of the anchor (4, 4)."""
-        points = transform(T_world_anchor, self.points.astype(float))
-        normals = self.normals @ T_world_anchor[:3, :3].T
-        return points.astype(np.float32), normals.astype(np.float32)
+        T = T_world_anchor.astype(np.float32)
+        return self.points @ T[:3, :3].T + T[:3, 3], self.normals @ T[:3, :3].T
 
 
 def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) -> Submap:
