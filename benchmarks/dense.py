@@ -176,7 +176,9 @@ def step_times_ms(steps: Steps, run: MappedRun, config: DenseConfig) -> dict[str
         "Step 3": _ms(lambda: regularise(steps.raw[i])),
         "Step 4": _ms(single.fuse),
         "Step 5": _ms(lambda: stated(regularise(fused.map), fused)),
-        "Step 6": _ms(lambda: surface_normals(back_project(fused.map, run.camera))),
+        "Step 6": _ms(
+            lambda: (back_project(fused.map, run.camera), surface_normals(fused.map, run.camera))
+        ),
     }
 
 

@@ -59,8 +59,9 @@ def surface(truths: list[Truth], run: MappedRun, max_depth_m: float = 5.0) -> di
     segmenter = CocoSegmenter(file) if file.is_file() else None
     for truth, keyframe in zip(truths, run.keyframes, strict=True):
         rho = torch.from_numpy(1 / truth.depth_m)
-        grid = back_project(InverseDepthMap(rho, rho), run.camera)
-        normal = surface_normals(grid)
+        true_map = InverseDepthMap(rho, rho)
+        grid = back_project(true_map, run.camera)
+        normal = surface_normals(true_map, run.camera)
         keep = (torch.isfinite(normal).all(-1) & (rho > 1 / max_depth_m)).numpy()
         image = np.zeros(truth.depth_m.shape, np.uint16)
         if segmenter is not None:

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
 
 from graph.camera import Camera
 from mapping.inverse_depth import InverseDepthMap
 from mapping.warping import image_grid
+
+NORMAL_WINDOW_PX = 5
+MAX_STEP = 0.05
+"""Of the inverse depth, from pixel to pixel but one: beyond it is another surface."""
 
 
 def back_project(given: InverseDepthMap, camera: Camera) -> Tensor:
@@ -21,14 +26,31 @@ def back_project(given: InverseDepthMap, camera: Camera) -> Tensor:
     return torch.stack([x, y, z], dim=-1)
 
 
-def surface_normals(points: Tensor) -> Tensor:
-    """Unit normals (H, W, 3) towards the camera of points (H, W, 3), by central differences.
+def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
+    """Unit normals (H, W, 3) towards the camera.
 
-    NaN at the border and where one of the four neighbours is missing.
+    The image of a plane n x = d has rho = n K^-1 (u, v, 1) / d, so that its gradient (a, b) gives
+    n ~ K^T (a, b, rho - a u - b v). The gradient is a mean of central differences over a window:
+    unlike normals, these are not drawn towards the camera by noise. NaN at the border, where one of
+    the four neighbours is missing and where they belong to different surfaces.
     """
-    normals = torch.full_like(points, torch.nan)
-    across = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    n = torch.linalg.cross(down, across)
-    normals[1:-1, 1:-1] = n / torch.linalg.norm(n, dim=-1, keepdim=True)
-    return normals
+    rho = given.rho
+    inner = rho[1:-1, 1:-1]
+    across, down = rho[1:-1, 2:] - rho[1:-1, :-2], rho[2:, 1:-1] - rho[:-2, 1:-1]
+    smooth = (across.abs() < MAX_STEP * inner) & (down.abs() < MAX_STEP * inner)
+    share = smooth.to(torch.float32)
+    stack = torch.stack([torch.where(smooth, across, 0.0), torch.where(smooth, down, 0.0), share])
+    a, b, weight = _window_mean(stack)
+    weight = torch.where(smooth, 2 * weight, torch.nan)
+    a, b = a / weight, b / weight
+    u, v = image_grid(rho)
+    u, v = u[:, 1:-1] - camera.cx, v[1:-1] - camera.cy
+    n = torch.stack([camera.fx * a, camera.fy * b, inner - a * u - b * v], dim=-1)
+    n = -n / torch.linalg.norm(n, dim=-1, keepdim=True)
+    return pad(n, (0, 0, 1, 1, 1, 1), value=torch.nan)
+
+
+def _window_mean(planes: Tensor) -> Tensor:
+    """Means of (C, H, W) over a square window; zero beyond the image."""
+    size, rim = NORMAL_WINDOW_PX, NORMAL_WINDOW_PX // 2
+    return avg_pool2d(avg_pool2d(planes, (size, 1), 1, (rim, 0)), (1, size), 1, (0, rim))

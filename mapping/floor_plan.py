@@ -18,22 +18,46 @@ HEIGHTS_M = (0.1, 1.9)
 """Above the floor: what stands between is in the way."""
 UPRIGHT_COSINE = 0.95
 BIN_M = 0.04
+GUESS_DEG, CANDIDATES = 45.0, 400
 
 
 def up_direction(normals: NDArray[np.floating], first_guess: Array) -> Array:
-    """The world's upward unit vector (3,): the mean of normals (N, 3) near it, nearer each time.
+    """The world's upward unit vector (3,): where most normals (N, 3) lie near ``first_guess``.
 
-    Floors and table tops have it, ceilings its opposite. ``first_guess`` is e.g. the cameras' mean
-    -y axis.
+    Floors and table tops have it, ceilings its opposite. The guess, e.g. the cameras' mean -y
+    axis, may be GUESS_DEG off. Of CANDIDATES normals the one with most others within 8 degrees
+    begins; means over cones that narrow to 4 degrees make it exact.
     """
     up = first_guess / np.linalg.norm(first_guess)
-    for degrees in (45, 30, 20, 10, 6, 4):
-        cosine = normals @ up
-        near = np.abs(cosine) > np.cos(np.deg2rad(degrees))
-        if near.sum() >= 100:
-            mean = (np.sign(cosine[near])[:, None] * normals[near]).sum(axis=0)
-            up = mean / np.linalg.norm(mean)
+    cosine = normals @ up
+    possible = (np.sign(cosine)[:, None] * normals)[np.abs(cosine) > np.cos(np.deg2rad(GUESS_DEG))]
+    if len(possible) < 100:
+        return np.asarray(up, float)
+    candidates = possible[:: max(len(possible) // CANDIDATES, 1)]
+    others = possible[:: max(len(possible) // (20 * CANDIDATES), 1)]
+    votes = (candidates @ others.T > np.cos(np.deg2rad(8))).sum(axis=1)
+    up = candidates[votes.argmax()]
+    for degrees in (12, 8, 6, 4):
+        near = possible[possible @ up > np.cos(np.deg2rad(degrees))]
+        mean = near.sum(axis=0)
+        up = mean / np.linalg.norm(mean)
     return np.asarray(up, float)
+
+
+def levelled(points: Array, up: Array, floor_m: float) -> tuple[Array, float]:
+    """Up and the floor's height by a plane through the points (N, 3) near the floor.
+
+    Normals are noisy: over some metres their mean is centimetres off.
+    """
+    for _ in range(4):
+        near = points[np.abs(points @ up - floor_m) < 1.5 * BIN_M]
+        if len(near) < 100:
+            break
+        middle = near.mean(axis=0)
+        normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
+        up = normal * np.sign(normal @ up)
+        floor_m = float(middle @ up)
+    return up, floor_m
 
 
 def floor_height(heights_m: Array, share: float = 0.15) -> float:
@@ -67,7 +91,8 @@ def plan_frame(cloud_sample: Cloud, first_guess: Array, cell_m: float) -> PlanFr
     """The frame by a sample of the cloud: up by the floor, right along the longest walls."""
     up = up_direction(cloud_sample.normals, first_guess)
     facing_up = cloud_sample.normals @ up > UPRIGHT_COSINE
-    floor_m = floor_height(cloud_sample.points[facing_up].astype(float) @ up)
+    level = cloud_sample.points[facing_up].astype(float)
+    up, floor_m = levelled(level, up, floor_height(level @ up))
     helper = np.eye(3)[np.argmin(np.abs(up))]
     right = np.cross(helper, up)
     right /= np.linalg.norm(right)

@@ -57,7 +57,7 @@ def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) ->
     than 6 degrees, are left out: they are rims.
     """
     grid = back_project(result.map, camera)
-    normal_grid = surface_normals(grid)
+    normal_grid = surface_normals(result.map, camera)
     rays = grid / torch.linalg.norm(grid, dim=-1, keepdim=True)
     facing = -(normal_grid * rays).sum(-1) > MAX_GRAZING_COSINE
     rows, columns = (a.cpu().numpy() for a in torch.nonzero(facing).unbind(-1))

@@ -28,6 +28,8 @@ from slam.world_map import Keyframe
 
 Progress = Callable[[int, int], None]
 LIKELY_MOVING = 0.5
+METHOD = 2
+"""Counts up when the same settings come to give other submaps."""
 
 
 def open_map(options: MapOptions) -> OpenMap:
@@ -61,6 +63,7 @@ def assembled(run: MappedRun, segmenter: Segmenter, options: MapOptions) -> Open
 
 def _settings(options: MapOptions, segmenter: Segmenter) -> dict[str, Any]:
     return {
+        "method": METHOD,
         "run": run_began(options.run),
         "voxel_m": options.voxel_m,
         "masks": None if options.masks is None else options.masks.described(),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,6 +44,19 @@ def room(R: np.ndarray) -> Cloud:
 
 
 TURN = so3_exp(np.array([1.3, 0.2, -0.4]))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.15])
+def test_walls_do_not_pull_up_aside(noise: float) -> None:
+    """A camera that looks down by 37 degrees: walls are only 53 degrees from its own up."""
+    given = room(TURN)
+    normals = given.normals + noise * RNG.standard_normal(given.normals.shape)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    guess = TURN @ np.array([0.42, -0.43, 0.8])
+    frame = plan_frame(replace(given, normals=normals.astype(np.float32)), guess, 0.05)
+    tilt_deg = np.degrees(np.arccos(min(frame.axes[2] @ TURN[:, 2], 1.0)))
+    assert tilt_deg < (0.01 if noise == 0 else 0.2)
+    assert frame.floor_m == pytest.approx(0.0, abs=0.01)
 
 
 def test_up_is_found_from_a_tilted_guess() -> None:

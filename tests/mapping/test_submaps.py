@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from surface_scene import CAMERA, as_map, plane_rho, poses
 
 from graph.errors import InputError
-from graph.geometry import se3_exp, transform
+from graph.geometry import make_pose, se3_exp, transform
 from mapping.backprojection import back_project, surface_normals
 from mapping.dense import DenseKeyframe, FusedKeyframe
 from mapping.submaps import make_submap, nearest_a_voxel, read_submap, write_submap
@@ -37,12 +38,38 @@ def test_points_are_those_of_the_camera_model() -> None:
 
 
 def test_normals_are_the_planes_and_face_the_camera() -> None:
-    normals = surface_normals(back_project(as_map(plane_rho(T), 0.01), CAMERA)).numpy()
+    normals = surface_normals(as_map(plane_rho(T), 0.01), CAMERA).numpy()
     expected = -(T[:3, :3].T @ NORMAL) / np.linalg.norm(NORMAL)
     np.testing.assert_allclose(
         normals[1:-1, 1:-1], np.broadcast_to(expected, (28, 38, 3)), atol=1e-3
     )
     assert np.isnan(normals[0]).all()
+
+
+def test_noise_does_not_draw_normals_towards_the_camera() -> None:
+    camera = replace(CAMERA, width=160, height=120)
+    floor = np.array([0.05, 1.0, 0.1])
+    pose = make_pose(np.eye(3), np.array([0.0, -1.2, 0.0]))
+    exact = plane_rho(pose, floor, 0.0, camera)
+    exact[exact < 0.2] = np.nan
+    noisy = exact + np.random.default_rng(0).normal(0, 0.003, exact.shape)
+    normals = surface_normals(as_map(noisy, 0.003), camera).numpy()
+    known = np.isfinite(normals).all(axis=-1)
+    assert known.sum() > 2000
+    mean = normals[known].mean(axis=0)
+    expected = -floor / np.linalg.norm(floor)
+    assert np.degrees(np.arccos(mean @ expected / np.linalg.norm(mean))) < 0.5
+    off_deg = np.degrees(np.arccos(np.clip(normals[known] @ expected, -1, 1)))
+    assert np.median(off_deg) < 5
+
+
+def test_normals_stay_on_their_side_of_an_edge() -> None:
+    rho = np.full((30, 40), 0.5)
+    rho[:, 20:] = np.linspace(0.8, 1.0, 30)[:, None]
+    normals = surface_normals(as_map(rho, 0.01), CAMERA).numpy()
+    alone = surface_normals(as_map(np.where(np.arange(40) < 20, rho, np.nan), 0.01), CAMERA)
+    np.testing.assert_allclose(normals[1:-1, 1:19], alone.numpy()[1:-1, 1:19], atol=1e-6)
+    assert np.isnan(normals[:, 19:21]).all()
 
 
 def test_placed_points_lie_on_the_plane_and_follow_the_anchor() -> None:
