@@ -26,7 +26,9 @@ class TrackConfig:
     an unknown speed. ``centroid_sigma_m``: that of a measured centroid, of which part may be
     hidden. ``gate_chi2`` (3 degrees of freedom) is where a detection no longer belongs to a track;
     one with a quite different class costs ``class_cost`` more. A track ends ``patience_s`` after
-    it was last seen. Boxes are widened by ``box_sigmas`` of the prediction and ``box_margin_m``.
+    it was last seen. Boxes are widened by ``box_sigmas`` of the prediction, but by no more than
+    ``box_slack_m``, and by ``box_margin_m``. Classes that move with less than ``min_prior`` have
+    no tracks.
     """
 
     acceleration_m_s2: float = 1.0
@@ -36,6 +38,7 @@ class TrackConfig:
     class_cost: float = 8.0
     patience_s: float = 2.0
     box_sigmas: float = 1.0
+    box_slack_m: float = 0.25
     box_margin_m: float = 0.08
     min_prior: float = 0.2
 
@@ -136,7 +139,8 @@ class InstanceTracks:
     def reach_m(self, track: Track) -> Array:
         """Half size (3,) m of a predicted track's box, widened by what is not known."""
         sigma_m = np.sqrt(max(np.trace(track.covariance[:3, :3]) / 3, 0.0))
-        return track.half_size + self.config.box_sigmas * sigma_m + self.config.box_margin_m
+        slack_m = min(self.config.box_sigmas * sigma_m, self.config.box_slack_m)
+        return track.half_size + slack_m + self.config.box_margin_m
 
     def clear(self) -> None:
         """End all tracks: another recording."""

@@ -12,6 +12,8 @@ from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
 from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
 from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
+from semantics.objects import pixel_rays
+from slam.depth_regions import DepthRegionConfig, depth_regions
 from slam.features import Features, select
 from slam.frame import Frame
 from slam.keyframe_masks import KeyframeMasks, surface_points
@@ -32,13 +34,17 @@ from slam.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
 
+_View = tuple[int, DepthView, Array]
+"""A keyframe's id, what it saw and T_world_camera (4, 4)."""
+
 
 @dataclass(frozen=True)
 class DynamicsConfig:
     """Which evidence of motion counts: that of masks by their ``labels``, that of ``geometry``.
 
     ``priors`` is a YAML file of P(moving) by class, or the name of one in ``data/labels``. With
-    fewer than ``min_static`` keypoints left all are used, and the frame says so. Masks of moving
+    fewer than ``min_static`` keypoints left all are used, and the frame says so. If more than
+    ``doubt_share`` of them seem to move, the pose is looked at again. Masks of moving
     things are widened by ``mask_border_px``. An instance is judged by at least ``min_judged`` of
     its pixels.
     """
@@ -46,11 +52,13 @@ class DynamicsConfig:
     labels: bool = True
     geometry: bool = True
     priors: str = "movability"
+    doubt_share: float = 0.5
     min_static: int = 60
     mask_border_px: int = 5
     min_judged: int = 20
     movability: MovabilityConfig = field(default_factory=MovabilityConfig)
     check: StaticCheckConfig = field(default_factory=StaticCheckConfig)
+    regions: DepthRegionConfig = field(default_factory=DepthRegionConfig)
     tracks: TrackConfig = field(default_factory=TrackConfig)
 
     def __post_init__(self) -> None:
@@ -95,6 +103,7 @@ class Dynamics:
         self.tracks = InstanceTracks(config.tracks)
         self.memory = ViewMemory(config.check)
         self._check = StaticCheck(camera, disparity_sigma_px, config.check)
+        self._rays = pixel_rays(camera, config.regions.step_px)
 
     def sift(
         self,
@@ -107,18 +116,23 @@ class Dynamics:
         """Leave out the features on moving things, given the predicted pose; none without it."""
         geometry = self.config.geometry
         view = depth_view(frame.depth_m, self.config.check.window_px) if geometry else None
-        moving = np.zeros(len(features), bool)
+        verdicts, moving = np.zeros(len(features), np.int8), np.zeros(len(features), bool)
         if T_world_camera is not None:
             if geometry:
-                verdicts = self._judge_features(features, T_world_camera, segment, mapper)
-                moving |= verdicts == Verdict.MOVING
-            moving |= self._on_tracks(features, frame.timestamp_s, T_world_camera)
+                views = self._views(segment, mapper)
+                verdicts = self._judge_features(frame, features, T_world_camera, views)
+            on_tracks = self._on_tracks(features, frame.timestamp_s, T_world_camera)
+            moving = (verdicts == Verdict.MOVING) | (on_tracks & (verdicts != Verdict.STATIC))
         if not moving.any():
             return Sifted(features, moving, False, view)
         if np.count_nonzero(~moving) < self.config.min_static:
             logger.info("frame %d: nearly everything moves; all is used", frame.index)
             return Sifted(features, moving, True, view)
         return Sifted(select(features, np.flatnonzero(~moving)), moving, False, view)
+
+    def doubts(self, sifted: Sifted) -> bool:
+        """Whether so much seems to move that the pose it was judged by may be wrong."""
+        return bool(sifted.moving.mean() > self.config.doubt_share) if len(sifted.moving) else False
 
     def watch(self, tracked: Tracked, view: DepthView | None, world: WorldMap) -> Ints:
         """Evidence of a tracked frame about landmarks; returns those in view believed moving."""
@@ -184,21 +198,23 @@ class Dynamics:
         return float(log_odds(self.config.tracks.min_prior))
 
     def _judge_features(
-        self, features: Features, T_world_camera: Array, segment: int, mapper: Mapper
+        self, frame: Frame, features: Features, T_world_camera: Array, views: list[_View]
     ) -> Verdicts:
         """What earlier keyframes say about features (N,), at a predicted pose."""
-        verdicts = np.zeros(len(features), np.int8)
-        views = self._views(segment, mapper)
-        seen = np.flatnonzero(np.isfinite(features.depth_m))
-        if not views or not len(seen):
-            return verdicts
-        points = self.camera.backproject(features.pixels[seen], features.depth_m[seen])
-        points_world = transform(T_world_camera, points)
-        told = [self._check.judge(points_world, view, T) for _, view, T in views]
-        verdicts[seen] = self._check.agree(np.stack(told))
-        return self._check.spread(features.pixels, features.depth_m, verdicts)
+        if not views:
+            return np.zeros(len(features), np.int8)
+        regions = depth_regions(frame.depth_m, self.config.regions)
+        samples = (self._rays * regions.depth_m[..., None]).reshape(-1, 3)
+        points = self.camera.backproject(features.pixels, features.depth_m)
+        points_world = transform(T_world_camera, np.concatenate([points, samples]))
+        told = self._check.judge_all(points_world, [(view, T) for _, view, T in views])
+        verdicts = self._check.agree(told)
+        moving = regions.moving(verdicts[len(features) :].reshape(regions.labels.shape))
+        verdicts = self._check.spread(features.pixels, features.depth_m, verdicts[: len(features)])
+        on_moving = regions.on(moving, features.image_pixels, features.depth_m)
+        return np.where(on_moving, Verdict.MOVING, verdicts).astype(np.int8)
 
-    def _views(self, segment: int, mapper: Mapper) -> list[tuple[int, DepthView, Array]]:
+    def _views(self, segment: int, mapper: Mapper) -> list[_View]:
         """Keyframe id, view and pose, as optimised since, of what is remembered of a segment."""
         found = []
         for kept in self.memory.views:
@@ -250,8 +266,8 @@ class Dynamics:
         views = [v for v in self._views(keyframe.segment, mapper) if v[0] != masks.keyframe_id]
         if not views:
             return 0.0
-        told = [self._check.judge(points_world, view, T) for _, view, T in views]
-        verdicts = self._check.agree(np.stack(told))
+        told = self._check.judge_all(points_world, [(view, T) for _, view, T in views])
+        verdicts = self._check.agree(told)
         known = np.count_nonzero(verdicts)
         if known < self.config.min_judged:
             return 0.0

@@ -81,8 +81,16 @@ class Localiser:
         """T_world_camera (4, 4) of the next frame by constant velocity; None when lost."""
         return None if self.lost_frames else self._predicted()
 
+    def preview(self, features: Features, world: WorldMap) -> Array | None:
+        """The pose that tracking would find, None if it would not; nothing is remembered of it."""
+        recent_ids, local_ids = self._recent_ids, world.landmarks.living(self._local_ids)
+        tracked = self.tracker.track(features, self._predicted(), recent_ids, local_ids, world)
+        return None if tracked.status is TrackingStatus.LOST else tracked.T_world_camera
+
     def leave_out(self, landmark_ids: Ints) -> None:
         """Do not track against these landmarks (N,)."""
+        if not len(landmark_ids):
+            return
         self._local_ids = np.setdiff1d(self._local_ids, landmark_ids)
         self._recent_ids = self._recent_ids[~np.isin(self._recent_ids, landmark_ids)]
 

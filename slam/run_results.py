@@ -32,7 +32,7 @@ class Tally:
     """What is counted while frames go by.
 
     Attributes:
-        tracking_ms: of each frame, features and tracking; what a keyframe adds is not in it.
+        tracking_ms: of each frame, features, what moves and tracking, without what a keyframe adds.
         next_index: the first index of the sequence that was not reached.
         keyframes: frames that became one.
         lost: frames without a pose.
@@ -53,7 +53,8 @@ class Tally:
     def count(self, result: FrameResult) -> None:
         """Count a frame."""
         stages = result.stage_ms
-        self.tracking_ms.append(stages["features"] + stages.get("tracking", 0.0))
+        spent_ms = (stages.get(stage, 0.0) for stage in ("features", "moving", "tracking"))
+        self.tracking_ms.append(sum(spent_ms))
         self.next_index = result.index + 1
         self.keyframes += result.keyframe_id is not None
         self.lost += result.status is TrackingStatus.LOST

@@ -6,6 +6,7 @@ image; neither needs a match or a class. A point behind a surface is hidden and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -16,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from graph.array_file import Arrays
 from graph.camera import Camera
-from graph.geometry import Array, inverse, transform
+from graph.geometry import Array, inverse
 
 Depths = NDArray[np.float32]
 Verdicts = NDArray[np.int8]
@@ -38,9 +39,9 @@ class StaticCheckConfig:
     """When a point lies in free space, and how much is remembered.
 
     A view saw through a point if every depth within ``window_px`` of it is farther by
-    ``margin_m`` and ``depth_sigmas`` standard deviations of either depth; the window allows for
-    errors of the poses and for the depth image's ragged edges. There is a surface if the nearest
-    or the farthest depth in the window is as near as that. Nothing is judged beyond
+    ``margin_m`` and ``depth_sigmas`` standard deviations of a difference of such depths; the
+    window allows for errors of the poses and for the depth image's ragged edges. There is a surface
+    if the nearest or the farthest depth in the window is as near as that. Nothing is judged beyond
     ``max_depth_m``.
     ``views`` keyframes are remembered, at least ``interval_s`` apart. ``neighbours`` within
     ``neighbour_px`` decide about a keypoint that cannot be judged by itself, if their depths
@@ -98,26 +99,38 @@ class StaticCheck:
     def __init__(self, camera: Camera, disparity_sigma_px: float, config: StaticCheckConfig):
         self.camera = camera
         self.config = config
-        self._sigma_per_m2 = disparity_sigma_px / camera.stereo_bf_px_m
+        both = np.sqrt(2.0) * disparity_sigma_px / camera.stereo_bf_px_m
+        self._sigmas_per_m2 = config.depth_sigmas * both
 
     def judge(self, points_world: Array, view: DepthView, T_world_camera: Array) -> Verdicts:
-        """What one view says about points (N, 3)."""
-        points_camera = transform(inverse(T_world_camera), points_world)
-        z = points_camera[:, 2]
+        """What one view says about points (N, 3); nothing about those that are NaN."""
+        return self.judge_all(points_world, [(view, T_world_camera)])[0]
+
+    def judge_all(self, points_world: Array, views: Sequence[tuple[DepthView, Array]]) -> Verdicts:
+        """What views, each with T_world_camera (4, 4), say about points (N, 3): (K, N).
+
+        The views have one size and step.
+        """
+        T_camera_world = np.stack([inverse(T) for _, T in views]).astype(np.float32)
+        points = points_world.astype(np.float32) @ T_camera_world[:, :3, :3].transpose(0, 2, 1)
+        points += T_camera_world[:, None, :3, 3]
+        z = points[..., 2]
         ahead = (z > 0.1) & (z < self.config.max_depth_m)
-        safe = np.where(ahead[:, None], points_camera, [0.0, 0.0, 1.0])
-        u, v = distorted(self.camera, safe).T
+        u, v = self._pixels(np.where(ahead[..., None], points, np.array([0, 0, 1], np.float32)))
         ahead &= (u > 0) & (u < self.camera.width - 1) & (v > 0) & (v < self.camera.height - 1)
-        rows = np.rint(np.where(ahead, v, 0) / view.step).astype(np.int64)
-        columns = np.rint(np.where(ahead, u, 0) / view.step).astype(np.int64)
-        height, width = view.nearest_m.shape
-        place = np.minimum(rows, height - 1), np.minimum(columns, width - 1)
-        nearest, farthest = view.nearest_m[place], view.farthest_m[place]
-        free = ahead & (nearest - z > self._margin_m(nearest, z))
-        surface = np.abs(nearest - z) < self._margin_m(nearest, z)
-        surface |= np.abs(farthest - z) < self._margin_m(farthest, z)
-        verdicts = np.where(ahead & surface, Verdict.STATIC, Verdict.UNKNOWN)
-        return np.where(free, Verdict.MOVING, verdicts).astype(np.int8)
+        first = views[0][0]
+        height, width = first.nearest_m.shape
+        rows = np.minimum(np.rint(v / first.step).astype(np.int32), height - 1)
+        columns = np.minimum(np.rint(u / first.step).astype(np.int32), width - 1)
+        number = np.arange(len(views), dtype=np.int32)[:, None]
+        place = np.where(ahead, (number * height + rows) * width + columns, 0)
+        nearest = np.stack([view.nearest_m for view, _ in views]).ravel()[place]
+        farthest = np.stack([view.farthest_m for view, _ in views]).ravel()[place]
+        margin = self._margin_m(z)
+        verdicts = (np.abs(nearest - z) < margin) | (np.abs(farthest - z) < margin)
+        free = nearest - z > self._margin_m(nearest)
+        told = np.where(free, np.int8(Verdict.MOVING), verdicts.astype(np.int8))
+        return np.where(ahead, told, np.int8(Verdict.UNKNOWN))
 
     def agree(self, verdicts: Verdicts) -> Verdicts:
         """What several views (K, N) say together (N,): the majority of those that say anything."""
@@ -147,10 +160,19 @@ class StaticCheck:
         spread[open_] = np.sign((verdicts[there] * speaks).sum(axis=1))
         return spread
 
-    def _margin_m(self, depth_m: Array | Depths, z: Array) -> Array:
-        """How far apart two depths (N,) may lie and still be one surface."""
-        sigma_m = self._sigma_per_m2 * np.hypot(np.square(depth_m, dtype=float), z**2)
-        return self.config.margin_m + self.config.depth_sigmas * sigma_m
+    def _margin_m(self, depth_m: Depths) -> Depths:
+        """How far apart two depths as large as these may lie and still be one surface."""
+        return np.float32(self.config.margin_m) + np.float32(self._sigmas_per_m2) * depth_m**2
+
+    def _pixels(self, points_camera: Depths) -> tuple[Array, Array]:
+        """Columns and rows (K, N) in the image as recorded of points (K, N, 3) before it."""
+        if any(self.camera.distortion):
+            flat = distorted(self.camera, points_camera.reshape(-1, 3).astype(float))
+            pixels = flat.astype(np.float32).reshape(*points_camera.shape[:2], 2)
+            return pixels[..., 0], pixels[..., 1]
+        camera, per_z = self.camera, 1 / points_camera[..., 2]
+        u = np.float32(camera.fx) * points_camera[..., 0] * per_z + np.float32(camera.cx)
+        return u, np.float32(camera.fy) * points_camera[..., 1] * per_z + np.float32(camera.cy)
 
 
 def distorted(camera: Camera, points_camera: Array) -> Array:

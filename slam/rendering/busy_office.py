@@ -24,12 +24,13 @@ PATH = CameraPath(
 )  # fmt: skip
 
 ROLES = (
-    Role("walk", ((2.1, 1.8), (3.0, 1.75), (3.9, 1.8), (3.9, 2.1), (3.0, 2.15), (2.1, 2.1))),
+    Role("walk", ((2.1, 1.8), (3.0, 1.75), (3.9, 1.8), (3.9, 2.1), (3.0, 2.15), (2.1, 2.1)),
+         patched=True),
     Role("walk", ((4.1, 2.6), (3.0, 2.55), (1.9, 2.6), (1.9, 2.9), (3.0, 2.95), (4.1, 2.9)),
-         speed_m_s=1.0),
+         speed_m_s=1.0, patched=True),
     Role("walk", ((1.4, 3.4), (2.1, 3.36), (2.75, 3.4), (2.75, 3.52), (2.1, 3.55), (1.4, 3.52)),
-         speed_m_s=0.6),
+         speed_m_s=0.6, patched=True),
     Role("walk", ((4.4, 3.4), (3.8, 3.36), (3.2, 3.4), (3.2, 3.52), (3.8, 3.55), (4.4, 3.52)),
-         carries="book", speed_m_s=0.7),
+         carries="book", speed_m_s=0.7, patched=True),
 )  # fmt: skip
-"""Each walks in a lane of their own."""
+"""Each walks in a lane of their own, in a shirt that is as rich in corners as the room."""

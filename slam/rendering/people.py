@@ -16,6 +16,7 @@ from slam.rendering.builder import UNLABELLED, Image, Painter, Part, SceneBuilde
 from slam.rendering.furniture import lying_book, office_chair
 from slam.rendering.lighting import Lighting, irradiance
 from slam.rendering.meshes import Shape, ellipsoid, lathe, pose, tapered_capsule, tilt
+from slam.rendering.prints import patchwork
 from slam.rendering.raycast import Floats, Geometry
 from slam.rendering.scene import Scene, assemble
 from slam.rendering.surfaces import Colour, as_image, fabric, field, flat, octaves, plain
@@ -34,6 +35,7 @@ class Role:
         facing_deg: where who stands or sits looks, 0 along -y, counter-clockwise.
         carries: "", "suitcase", "book", "cup", "cell phone", "umbrella" or "box".
         speed_m_s: walking speed.
+        patched: whether the shirt is of patches, rich in corners.
         pulls: whether a chair comes along from PULLED_S[0] to PULLED_S[1]; then it stays there.
     """
 
@@ -42,6 +44,7 @@ class Role:
     facing_deg: float = 0.0
     carries: str = ""
     speed_m_s: float = 0.8
+    patched: bool = False
     pulls: bool = False
 
 
@@ -141,7 +144,7 @@ def hire(b: SceneBuilder, roles: tuple[Role, ...], lighting: Lighting, count: in
         person = Person(role, 0.0 if role.pulls else phase, scale)
         people.append(person)
         load = [*_load(b, role.carries), *(_pulled(b) if role.pulls else [])]
-        for bone, part in [*_body(b, person.scale), *load]:
+        for bone, part in [*_body(b, person.scale, role.patched), *load]:
             parts.append(part)
             owners.append((who, bone))
     return Cast(tuple(people), parts, owners, lighting)
@@ -157,11 +160,11 @@ def _taken(b: SceneBuilder, category: str, build: Callable[[], None]) -> list[Pa
     return parts
 
 
-def _body(b: SceneBuilder, scale: float) -> list[tuple[str, Part]]:
+def _body(b: SceneBuilder, scale: float, patched: bool) -> list[tuple[str, Part]]:
     names: list[str] = []
 
     def build() -> None:
-        for bone, shape, painter in _limbs(b.rng):
+        for bone, shape, painter in _limbs(b.rng, patched):
             larger = Shape(scale * shape.corners, shape.normals, shape.uvs)
             extent = np.ptp(larger.corners.reshape(-1, 3), axis=0)
             b.solid(larger, painter, (np.pi * float(extent[:2].max()), float(extent[2])), 600)
@@ -171,10 +174,11 @@ def _body(b: SceneBuilder, scale: float) -> list[tuple[str, Part]]:
     return list(zip(names, parts, strict=True))
 
 
-def _limbs(rng: np.random.Generator) -> list[tuple[str, Shape, Painter]]:
+def _limbs(rng: np.random.Generator, patched: bool) -> list[tuple[str, Shape, Painter]]:
     """Bone, shape in the bone's frame and painter of every limb, for a person of 1.72 m."""
     skin, hair = _SKIN[rng.integers(4)], _HAIR[rng.integers(4)]
     shirt = fabric(_cloth(rng, 60, 230), _cloth(rng, 20, 240))
+    shirt = patchwork() if patched else shirt
     trousers, shoes = fabric(_cloth(rng, 25, 110)), plain(_cloth(rng, 20, 90))
     profile = [(0.11, -0.01), (0.138, 0.02), (0.134, 0.08), (0.125, 0.18), (0.15, 0.36),
                (0.148, 0.44), (0.1, 0.5), (0.05, 0.53)]  # fmt: skip

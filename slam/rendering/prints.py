@@ -17,7 +17,7 @@ from slam.rendering.drawing import (
     words,
     write,
 )
-from slam.rendering.surfaces import Colour, as_image, flat, octaves
+from slam.rendering.surfaces import Colour, as_image, field, flat, octaves
 
 
 def poster() -> Painter:
@@ -134,6 +134,18 @@ def rug(colour: Colour, second: Colour) -> Painter:
         edge = int(0.08 * px_per_m)
         cv2.rectangle(picture, (edge, edge), (columns - edge, rows - edge), second, edge // 3)
         return as_image(picture)
+
+    return paint
+
+
+def patchwork(size_m: float = 0.03) -> Painter:
+    """Square patches of cloth, each of a colour of its own."""
+
+    def paint(rows: int, columns: int, px_per_m: float, rng: np.random.Generator) -> Image:
+        side = max(round(size_m * px_per_m), 1)
+        patches = rng.uniform(30, 230, (rows // side + 1, columns // side + 1, 3))
+        picture = patches.repeat(side, axis=0).repeat(side, axis=1)[:rows, :columns]
+        return as_image(picture + 5 * field(rows, columns, (3, 3), rng)[..., None])
 
     return paint
 

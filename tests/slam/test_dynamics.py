@@ -10,6 +10,7 @@ import pytest
 from synthetic_view import CAMERA, TEXTURE, render_plane
 
 from graph.geometry import Array, inverse, se3_exp, transform
+from semantics.instance_tracks import Sighting
 from semantics.instances import Instance, certain, mask_box
 from semantics.labels import label_set
 from semantics.segmenter import Image
@@ -137,6 +138,26 @@ def test_a_person_is_left_out_before_moving_and_between_keyframes(frames: list[F
     track = system.dynamics.tracks.tracks[0]
     assert track.moving
     np.testing.assert_allclose(track.half_size[:2], 120 * CARD_Z_M / CAMERA.fx, rtol=0.1)
+
+
+def test_what_is_seen_to_stand_still_is_used_in_a_walkers_box_too(frames: list[Frame]) -> None:
+    system = run(frames[:8])
+    wall = np.array([0.5, 0.0, 2.0])
+    someone = Sighting(wall, np.full(3, 0.5), certain(1, len(NAMES), 0.95), 3.0)
+    system.dynamics.tracks.see(frames[7].timestamp_s, [someone])
+    features = system.prepare(frames[8])
+    left_out = {
+        geometry: SlamSystem._sift(replaced(system, geometry), frames[8], features).moving.sum()
+        for geometry in (True, False)
+    }
+    assert left_out[False] > 50
+    assert left_out[True] < 0.1 * left_out[False]
+
+
+def replaced(system: SlamSystem, geometry: bool) -> SlamSystem:
+    """The system with geometry switched on or off."""
+    system.dynamics.config = replace(system.dynamics.config, geometry=geometry)
+    return system
 
 
 def test_a_picture_that_hangs_still_is_structure(frames: list[Frame]) -> None:

@@ -1,0 +1,161 @@
+"""What people who walk before the camera do to the trajectory, with and without the cure.
+
+    python benchmarks/dynamic.py [--sequences runs/bench] [--segmenter truth] [--seed 1]
+
+The same camera path through the same room is rendered without people, with one, two and four who
+walk, and with one who carries a box of no class and pulls a chair along; sequences that are there
+already are used as they are. Each is run with nothing, with the labels of masks alone, with
+geometry alone, and with both. "x clean" compares with the same camera path without people, run with
+nothing; "left out" is the share of the keypoints on people, the box, the chair while it is pulled,
+and on all the rest, that were not used. The check's time is the processor's, of all frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from moving_points import KINDS, MovingTruth, WatchedSystem, strip
+from report import table
+
+from graph.camera import Camera
+from semantics.segmenter_table import SegmenterOptions, make_segmenter
+from slam.configuration import resolve
+from slam.rendering.sequence import RenderConfig, render_sequence
+from slam.runner import RunOptions, run
+from slam.system_config import SystemConfig
+
+SCENES = {
+    "nobody": {"people": 0},
+    "1 walks": {"people": 1},
+    "2 walk": {"people": 2},
+    "4 walk": {"people": 4},
+    "box and chair": {"people": 1, "carry": True},
+}
+VARIANTS = {
+    "nothing": (False, False),
+    "labels": (True, False),
+    "geometry": (False, True),
+    "both": (True, True),
+}
+"""Name to whether labels and geometry count."""
+FPS_HZ = 15.0
+PICTURES = 8
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run.
+
+    Attributes:
+        ate_mm: root mean square over all frames.
+        tracked_share: of the frames.
+        left_out: share of keypoints left out, by what they are on; None where it is not there.
+        check_ms: median time of the dynamic check in a frame, and its 95 % quantile.
+        mostly_moving: frames in which nearly everything seemed to move.
+    """
+
+    scene: str
+    variant: str
+    ate_mm: float
+    tracked_share: float
+    left_out: dict[str, float | None]
+    check_ms: tuple[float, float]
+    mostly_moving: int
+
+
+def main() -> None:
+    """Parse, render, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sequences", type=Path, default=Path("runs/bench"))
+    parser.add_argument("--segmenter", default="truth")
+    parser.add_argument("--weights")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--scenes", help="some of them, separated by commas")
+    parser.add_argument("--variants", help="some of them, separated by commas")
+    parser.add_argument("--set", action="append", default=[], metavar="A.B=C")
+    parser.add_argument("--out", type=Path, default=Path("runs/dynamic"))
+    arguments = parser.parse_args()
+    chosen = arguments.scenes.split(",") if arguments.scenes else list(SCENES)
+    variants = arguments.variants.split(",") if arguments.variants else list(VARIANTS)
+    outcomes = []
+    for scene in chosen:
+        folder = rendered(arguments.sequences, scene, arguments.seed)
+        outcomes += [measure(folder, scene, variant, arguments) for variant in variants]
+    content = [asdict(outcome) for outcome in outcomes]
+    (arguments.out / "dynamic.json").write_text(json.dumps(content, indent=1) + "\n")
+    print(report(outcomes))
+
+
+def rendered(sequences: Path, scene: str, seed: int) -> Path:
+    """The sequence of a scene, rendered if it is not there."""
+    what = SCENES[scene]
+    name = "carry" if "carry" in what else what["people"]
+    folder = sequences / f"busy_office-{seed}-{name}"
+    if not folder.is_dir():
+        render_sequence(RenderConfig("busy_office", seed=seed, fps=FPS_HZ, **what), folder)
+    return folder
+
+
+def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespace) -> Outcome:
+    """Run a sequence; with "labels" or "both" its masks are segmented too."""
+    labels, geometry = VARIANTS[variant]
+    settings = [f"dynamics.{k}={v}" for k, v in (("labels", labels), ("geometry", geometry))]
+    config = resolve(SystemConfig, None, [*settings, *arguments.set])
+    options = SegmenterOptions(arguments.segmenter if labels else "none", arguments.weights)
+    segmenter = make_segmenter(options, folder)
+    systems = []
+    frames = len((folder / "rgb.txt").read_text().splitlines()) - 2
+
+    def make(camera: Camera, config: SystemConfig) -> WatchedSystem:
+        system = WatchedSystem(camera, config, segmenter)
+        systems.append(system.watch(MovingTruth(folder), frames // PICTURES))
+        return system
+
+    out = arguments.out / f"{folder.name}-{variant}"
+    summary = run(RunOptions(folder, config, out=out, overwrite=True, quiet=True), make)
+    metrics = {row["name"]: row["value"] for row in summary.rows}
+    if systems[0].pictures:
+        cv2.imwrite(str(out.with_suffix(".png")), strip(systems[0].pictures[:PICTURES]))
+    with (out / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    check_ms = np.percentile(systems[0].check_ms, [50, 95])
+    shares = {kind: systems[0].total(kind).share for kind in (*KINDS, "rest")}
+    return Outcome(
+        scene=scene,
+        variant=variant,
+        ate_mm=1e3 * metrics.get("ate_rmse", float("nan")),
+        tracked_share=metrics["tracked_share"],
+        left_out={k: None if np.isnan(share) else share for k, share in shares.items()},
+        check_ms=(float(check_ms[0]), float(check_ms[1])),
+        mostly_moving=sum(int(row["mostly_moving"]) for row in rows),
+    )
+
+
+def report(outcomes: Sequence[Outcome]) -> str:
+    """The table in Markdown."""
+    clean_mm = next(
+        (o.ate_mm for o in outcomes if (o.scene, o.variant) == ("nobody", "nothing")), float("nan")
+    )
+    header = ("scene", "with", "ATE mm", "x clean", "tracked", *(f"{k} left out" for k in KINDS),
+              "rest left out", "check ms: median, 95 %")  # fmt: skip
+    rows = [
+        (
+            *(o.scene, o.variant, f"{o.ate_mm:.2f}", f"{o.ate_mm / clean_mm:.2f}"),
+            f"{100 * o.tracked_share:.0f} %",
+            *("" if s is None else f"{100 * s:.1f} %" for s in o.left_out.values()),
+            "{:.2f}, {:.2f}".format(*o.check_ms),
+        )
+        for o in outcomes
+    ]
+    return table(header, rows)
+
+
+if __name__ == "__main__":
+    main()
