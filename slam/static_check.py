@@ -164,15 +164,16 @@ class StaticCheck:
         """How far apart two depths as large as these may lie and still be one surface."""
         return np.float32(self.config.margin_m) + np.float32(self._sigmas_per_m2) * depth_m**2
 
-    def _pixels(self, points_camera: Depths) -> tuple[Array, Array]:
+    def _pixels(self, points_camera: Depths) -> tuple[Depths, Depths]:
         """Columns and rows (K, N) in the image as recorded of points (K, N, 3) before it."""
         if any(self.camera.distortion):
             flat = distorted(self.camera, points_camera.reshape(-1, 3).astype(float))
             pixels = flat.astype(np.float32).reshape(*points_camera.shape[:2], 2)
             return pixels[..., 0], pixels[..., 1]
         camera, per_z = self.camera, 1 / points_camera[..., 2]
-        u = np.float32(camera.fx) * points_camera[..., 0] * per_z + np.float32(camera.cx)
-        return u, np.float32(camera.fy) * points_camera[..., 1] * per_z + np.float32(camera.cy)
+        u = camera.fx * points_camera[..., 0] * per_z + camera.cx
+        v = camera.fy * points_camera[..., 1] * per_z + camera.cy
+        return u.astype(np.float32, copy=False), v.astype(np.float32, copy=False)
 
 
 def distorted(camera: Camera, points_camera: Array) -> Array:
