@@ -67,7 +67,8 @@ def moving_points(
     second = replace(pair[1], index=1, timestamp_s=1 / CAMERA.fps)
     features = system.prepare(second)
     pose = system.process(second, features).T_world_camera
-    sifted = system.dynamics.sift(second, features, pose, 0, system.mapper)
+    views = system.dynamics.memory.posed(0, system.mapper)
+    sifted = system.dynamics.sift(second, features, pose, views)
     return features.image_pixels, sifted.moving
 
 

@@ -18,6 +18,7 @@ from slam.features import Features, select
 from slam.frame import Frame
 from slam.keyframe_masks import KeyframeMasks, surface_points
 from slam.landmarks import Ints, Mask
+from slam.localiser import Localiser
 from slam.mapper import Mapper
 from slam.static_check import (
     DepthView,
@@ -25,17 +26,14 @@ from slam.static_check import (
     StaticCheckConfig,
     Verdict,
     Verdicts,
-    ViewMemory,
     depth_view,
     distorted,
 )
 from slam.tracker import Tracked
+from slam.view_memory import PosedView, ViewMemory
 from slam.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
-
-_View = tuple[int, DepthView, Array]
-"""A keyframe's id, what it saw and T_world_camera (4, 4)."""
 
 
 @dataclass(frozen=True)
@@ -105,21 +103,42 @@ class Dynamics:
         self._check = StaticCheck(camera, disparity_sigma_px, config.check)
         self._rays = pixel_rays(camera, config.regions.step_px)
 
+    def leave_out(
+        self,
+        frame: Frame,
+        features: Features,
+        localiser: Localiser | None,
+        segment: int,
+        mapper: Mapper,
+    ) -> Sifted:
+        """Leave out the features on moving things, by the predicted pose, if there is one.
+
+        If most seem to move, all are tracked first, and used if even they give no pose.
+        """
+        views = self.memory.posed(segment, mapper)
+        predicted = localiser.prediction() if localiser is not None else None
+        sifted = self.sift(frame, features, predicted, views)
+        doubted = sifted.moving.sum() > self.config.doubt_share * len(features)
+        if localiser is None or not doubted:
+            return sifted
+        found = localiser.preview(features, mapper.world)
+        if found is None:
+            return replace(sifted, features=features, mostly_moving=True)
+        return self.sift(frame, features, found, views)
+
     def sift(
         self,
         frame: Frame,
         features: Features,
         T_world_camera: Array | None,
-        segment: int,
-        mapper: Mapper,
+        views: list[PosedView],
     ) -> Sifted:
-        """Leave out the features on moving things, given the predicted pose; none without it."""
+        """Leave out the features on moving things, given a pose; none without it."""
         geometry = self.config.geometry
         view = depth_view(frame.depth_m, self.config.check.window_px) if geometry else None
         verdicts, moving = np.zeros(len(features), np.int8), np.zeros(len(features), bool)
         if T_world_camera is not None:
             if geometry:
-                views = self._views(segment, mapper)
                 verdicts = self._judge_features(frame, features, T_world_camera, views)
             on_tracks = self._on_tracks(features, frame.timestamp_s, T_world_camera)
             moving = (verdicts == Verdict.MOVING) | (on_tracks & (verdicts != Verdict.STATIC))
@@ -129,10 +148,6 @@ class Dynamics:
             logger.info("frame %d: nearly everything moves; all is used", frame.index)
             return Sifted(features, moving, True, view)
         return Sifted(select(features, np.flatnonzero(~moving)), moving, False, view)
-
-    def doubts(self, sifted: Sifted) -> bool:
-        """Whether so much seems to move that the pose it was judged by may be wrong."""
-        return bool(sifted.moving.mean() > self.config.doubt_share) if len(sifted.moving) else False
 
     def watch(self, tracked: Tracked, view: DepthView | None, world: WorldMap) -> Ints:
         """Evidence of a tracked frame about landmarks; returns those in view believed moving."""
@@ -168,7 +183,7 @@ class Dynamics:
         if not (odds > 0).any():
             return
         covered = np.isin(masks.claims.owner, np.flatnonzero(odds > 0))
-        self._forget_space(masks.keyframe_id, covered)
+        self.memory.forget_space(masks.keyframe_id, covered)
         pruner = replace(mapper.pruner(), border_px=-self.config.mask_border_px)
         pruner.prune_mask(masks.keyframe_id, covered)
         self._remove(masks.landmark_ids, mapper)
@@ -198,7 +213,7 @@ class Dynamics:
         return float(log_odds(self.config.tracks.min_prior))
 
     def _judge_features(
-        self, frame: Frame, features: Features, T_world_camera: Array, views: list[_View]
+        self, frame: Frame, features: Features, T_world_camera: Array, views: list[PosedView]
     ) -> Verdicts:
         """What earlier keyframes say about features (N,), at a predicted pose."""
         if not views:
@@ -207,23 +222,12 @@ class Dynamics:
         samples = (self._rays * regions.depth_m[..., None]).reshape(-1, 3)
         points = self.camera.backproject(features.pixels, features.depth_m)
         points_world = transform(T_world_camera, np.concatenate([points, samples]))
-        told = self._check.judge_all(points_world, [(view, T) for _, view, T in views])
+        told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
         verdicts = self._check.agree(told)
         moving = regions.moving(verdicts[len(features) :].reshape(regions.labels.shape))
         verdicts = self._check.spread(features.pixels, features.depth_m, verdicts[: len(features)])
         on_moving = regions.on(moving, features.image_pixels, features.depth_m)
         return np.where(on_moving, Verdict.MOVING, verdicts).astype(np.int8)
-
-    def _views(self, segment: int, mapper: Mapper) -> list[_View]:
-        """Keyframe id, view and pose, as optimised since, of what is remembered of a segment."""
-        found = []
-        for kept in self.memory.views:
-            heir_id, T_heir_keyframe = mapper.history.heir(kept.keyframe_id)
-            heir = mapper.world.keyframes.get(heir_id)
-            if heir is not None and heir.segment == segment:
-                pose = heir.T_world_camera @ T_heir_keyframe
-                found.append((kept.keyframe_id, kept.view, pose))
-        return found
 
     def _on_tracks(self, features: Features, time_s: float, T_world_camera: Array) -> Mask:
         """Features (N,) in the predicted boxes of moving tracks, in the image and in depth."""
@@ -263,10 +267,11 @@ class Dynamics:
         keyframe = mapper.world.keyframes.get(masks.keyframe_id)
         if keyframe is None or not self.config.geometry:
             return 0.0
-        views = [v for v in self._views(keyframe.segment, mapper) if v[0] != masks.keyframe_id]
+        here = self.memory.posed(keyframe.segment, mapper)
+        views = [v for v in here if v.keyframe_id != masks.keyframe_id]
         if not views:
             return 0.0
-        told = self._check.judge_all(points_world, [(view, T) for _, view, T in views])
+        told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
         verdicts = self._check.agree(told)
         known = np.count_nonzero(verdicts)
         if known < self.config.min_judged:
@@ -282,15 +287,6 @@ class Dynamics:
         instances = masks.instances[first]
         on_one = instances >= 0
         self.movability.update(ids[on_one], moving[instances[on_one]])
-
-    def _forget_space(self, keyframe_id: int, covered: Mask) -> None:
-        """Where something moved, a remembered view says nothing about space."""
-        for kept in self.memory.views:
-            if kept.keyframe_id == keyframe_id:
-                step = kept.view.step
-                height, width = kept.view.nearest_m.shape
-                hidden = covered[::step, ::step][:height, :width]
-                kept.view.nearest_m[hidden] = kept.view.farthest_m[hidden] = 0.0
 
     def _remove(self, ids: Ints, mapper: Mapper) -> None:
         """Take those of the landmarks (N,) that move out of map and graph."""

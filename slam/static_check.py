@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from graph.array_file import Arrays
 from graph.camera import Camera
 from graph.geometry import Array, inverse
 
@@ -182,58 +181,3 @@ def distorted(camera: Camera, points_camera: Array) -> Array:
         return camera.project(points_camera)
     zero, lens = np.zeros(3), np.array(camera.distortion)
     return cv2.projectPoints(points_camera, zero, zero, camera.K, lens)[0][:, 0]
-
-
-@dataclass(frozen=True, eq=False)
-class RememberedView:
-    """The depth that a keyframe saw, and when."""
-
-    keyframe_id: int
-    timestamp_s: float
-    view: DepthView
-
-
-THINNED = 2
-"""Of a view that is remembered every second pixel each way is kept."""
-
-
-class ViewMemory:
-    """The last few keyframes' depth, spread in time."""
-
-    def __init__(self, config: StaticCheckConfig) -> None:
-        self.config = config
-        self.views: list[RememberedView] = []
-
-    def add(self, keyframe_id: int, timestamp_s: float, view: DepthView) -> None:
-        """Remember what a keyframe saw, unless the last is too recent."""
-        if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.config.interval_s:
-            return
-        self.views.append(RememberedView(keyframe_id, timestamp_s, view.thinned(THINNED)))
-        del self.views[: -self.config.views]
-
-    def clear(self) -> None:
-        """Forget all: another recording."""
-        self.views = []
-
-    def state(self) -> Arrays:
-        """All views as named arrays."""
-        near = [v.view.nearest_m for v in self.views]
-        far = [v.view.farthest_m for v in self.views]
-        return {
-            "keyframe_ids": np.array([v.keyframe_id for v in self.views], np.int64),
-            "timestamps_s": np.array([v.timestamp_s for v in self.views], float),
-            "step": np.array([v.view.step for v in self.views], np.int64),
-            "shape": np.array([v.shape for v in near[:1]], np.int64).ravel(),
-            "nearest_m": np.array(near, np.float32).ravel(),
-            "farthest_m": np.array(far, np.float32).ravel(),
-        }
-
-    def restore(self, state: Arrays) -> None:
-        """Become the memory of a state."""
-        ids, shape = state["keyframe_ids"].tolist(), state["shape"].tolist() or [0, 0]
-        near, far = (state[name].reshape(len(ids), *shape) for name in ("nearest_m", "farthest_m"))
-        stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
-        self.views = [
-            RememberedView(i, t, DepthView(n.copy(), f.copy(), s))
-            for i, t, n, f, s in zip(ids, stamps_s, near, far, steps, strict=True)
-        ]

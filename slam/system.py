@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -260,19 +259,9 @@ class SlamSystem:
         return untracked(np.eye(4), features)
 
     def _sift(self, frame: Frame, features: Features) -> Sifted:
-        """The features that do not move, by the predicted pose and the map's segment.
-
-        If most seem to move, all are tracked first, and used if even they give no pose.
-        """
-        begins = self._reference is None
-        predicted = None if begins else self.localiser.prediction()
-        sifted = self.dynamics.sift(frame, features, predicted, self._segment, self.mapper)
-        if not self.dynamics.doubts(sifted):
-            return sifted
-        found = self.localiser.preview(features, self.mapper.world)
-        if found is None:
-            return replace(sifted, features=features, mostly_moving=True)
-        return self.dynamics.sift(frame, features, found, self._segment, self.mapper)
+        """The frame's features without those on moving things."""
+        localiser = self.localiser if self._reference is not None else None
+        return self.dynamics.leave_out(frame, features, localiser, self._segment, self.mapper)
 
     def _watch(self, tracked: Tracked, sifted: Sifted) -> None:
         """Landmarks that are believed to move are not tracked against from now on."""

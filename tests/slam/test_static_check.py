@@ -7,7 +7,8 @@ import pytest
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse, se3_exp, transform
-from slam.static_check import StaticCheck, StaticCheckConfig, Verdict, ViewMemory, depth_view
+from slam.static_check import StaticCheck, StaticCheckConfig, Verdict, depth_view
+from slam.view_memory import ViewMemory
 
 CAMERA = Camera(160, 120, fx=130.0, fy=130.0, cx=79.5, cy=59.5)
 CHECK = StaticCheck(CAMERA, 0.08, StaticCheckConfig())

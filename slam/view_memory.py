@@ -1,0 +1,97 @@
+"""What the last keyframes saw of space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from graph.array_file import Arrays
+from graph.geometry import Array
+from slam.landmarks import Mask
+from slam.mapper import Mapper
+from slam.static_check import DepthView, StaticCheckConfig
+
+
+@dataclass(frozen=True, eq=False)
+class RememberedView:
+    """The depth that a keyframe saw, and when."""
+
+    keyframe_id: int
+    timestamp_s: float
+    view: DepthView
+
+
+class PosedView(NamedTuple):
+    """A remembered view, ``T_world_camera`` (4, 4)."""
+
+    keyframe_id: int
+    view: DepthView
+    T_world_camera: Array
+
+
+THINNED = 2
+"""Of a view that is remembered every second pixel each way is kept."""
+
+
+class ViewMemory:
+    """The last few keyframes' depth, spread in time."""
+
+    def __init__(self, config: StaticCheckConfig) -> None:
+        self.config = config
+        self.views: list[RememberedView] = []
+
+    def add(self, keyframe_id: int, timestamp_s: float, view: DepthView) -> None:
+        """Remember what a keyframe saw, unless the last is too recent."""
+        if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.config.interval_s:
+            return
+        self.views.append(RememberedView(keyframe_id, timestamp_s, view.thinned(THINNED)))
+        del self.views[: -self.config.views]
+
+    def posed(self, segment: int, mapper: Mapper) -> list[PosedView]:
+        """What is remembered of a map segment, with poses as optimised since."""
+        found = []
+        for kept in self.views:
+            heir_id, T_heir_keyframe = mapper.history.heir(kept.keyframe_id)
+            heir = mapper.world.keyframes.get(heir_id)
+            if heir is not None and heir.segment == segment:
+                pose = heir.T_world_camera @ T_heir_keyframe
+                found.append(PosedView(kept.keyframe_id, kept.view, pose))
+        return found
+
+    def forget_space(self, keyframe_id: int, covered: Mask) -> None:
+        """A keyframe's view says nothing about space where something (H, W) moved."""
+        for kept in self.views:
+            if kept.keyframe_id == keyframe_id:
+                step = kept.view.step
+                height, width = kept.view.nearest_m.shape
+                hidden = covered[::step, ::step][:height, :width]
+                kept.view.nearest_m[hidden] = kept.view.farthest_m[hidden] = 0.0
+
+    def clear(self) -> None:
+        """Forget all: another recording."""
+        self.views = []
+
+    def state(self) -> Arrays:
+        """All views as named arrays."""
+        near = [v.view.nearest_m for v in self.views]
+        far = [v.view.farthest_m for v in self.views]
+        return {
+            "keyframe_ids": np.array([v.keyframe_id for v in self.views], np.int64),
+            "timestamps_s": np.array([v.timestamp_s for v in self.views], float),
+            "step": np.array([v.view.step for v in self.views], np.int64),
+            "shape": np.array([v.shape for v in near[:1]], np.int64).ravel(),
+            "nearest_m": np.array(near, np.float32).ravel(),
+            "farthest_m": np.array(far, np.float32).ravel(),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the memory of a state."""
+        ids, shape = state["keyframe_ids"].tolist(), state["shape"].tolist() or [0, 0]
+        near, far = (state[name].reshape(len(ids), *shape) for name in ("nearest_m", "farthest_m"))
+        stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
+        self.views = [
+            RememberedView(i, t, DepthView(n.copy(), f.copy(), s))
+            for i, t, n, f, s in zip(ids, stamps_s, near, far, steps, strict=True)
+        ]
