@@ -1,0 +1,68 @@
+"""``bmask-slam live`` as a process: what it leaves however it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from graph.trajectory import read_tum
+from slam.cli import main
+from slam.live.worker import ROOT
+
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "office"
+    command = ["render", "office", "--frames", str(FRAMES), "--fps", "8", "--out", str(path)]
+    assert main([*command, "--quiet"]) == 0
+    return path
+
+
+def start(recording: Path, out: Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "slam", "live", str(recording), "--out", str(out), *options]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def frames_written(out: Path) -> int:
+    path = out / "frames.csv"
+    return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
+
+
+def test_masks_from_another_process_label_the_map(recording, tmp_path) -> None:
+    live = start(recording, tmp_path / "run", "--segmenter", "truth")
+    output, errors = live.communicate(timeout=120)
+    assert live.returncode == 0, errors
+    assert "latency_ms_median" in output
+    out = tmp_path / "run"
+    health = json.loads((out / "health.json").read_text())
+    assert health["frames"] == FRAMES == len(read_tum(out / "trajectory.txt"))
+    assert health["segmenter_deaths"] == health["map_deaths"] == 0
+    assert len((out / "labels.csv").read_text().splitlines()) > 100
+    assert json.loads((out / "objects.json").read_text())["objects"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_with_everything_saved(recording, tmp_path, number) -> None:
+    out = tmp_path / "run"
+    live = start(recording, out, "--realtime", "--segmenter", "none")
+    deadline_s = time.monotonic() + 60
+    while frames_written(out) < 8 and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    live.send_signal(number)
+    _, errors = live.communicate(timeout=60)
+    assert live.returncode == 128 + number, errors
+    tracked = len(read_tum(out / "trajectory.txt"))
+    assert 8 <= tracked == frames_written(out) < FRAMES
+    assert {"map", "metrics.json", "landmarks.ply"} <= {path.name for path in out.iterdir()}

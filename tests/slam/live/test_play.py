@@ -1,0 +1,115 @@
+"""What the live loop takes from a source, and what it leaves."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane
+
+from graph.errors import InputError
+from graph.geometry import se3_exp
+from slam.frame import Frame
+from slam.live.live_slam import LiveSlam
+from slam.live.play import PlayOptions, play
+from slam.live.sources import Newest
+
+POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(10)]
+FRAMES = [render_plane(pose, index) for index, pose in enumerate(POSES)]
+
+
+class Given:
+    """A source that gives these frames."""
+
+    name, camera, groundtruth = "given", CAMERA, None
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = frames
+
+    def frames(self) -> Iterator[Frame]:
+        yield from self._frames
+
+
+def taken(newest: Newest[int]) -> list[int]:
+    found = []
+    while not newest.ended:
+        item = newest.get(0.05)
+        if item is not None:
+            found.append(item)
+    return found
+
+
+def test_items_that_are_taken_in_time_all_come_in_order() -> None:
+    def slowly() -> Iterator[int]:
+        for k in range(5):
+            time.sleep(0.02)
+            yield k
+
+    newest = Newest(slowly(), keep=1)
+    assert taken(newest) == [0, 1, 2, 3, 4]
+    assert newest.dropped == 0
+
+
+def test_a_slow_taker_gets_the_newest_and_the_rest_is_counted() -> None:
+    all_there = threading.Event()
+
+    def at_once() -> Iterator[int]:
+        yield from range(10)
+        all_there.set()
+
+    newest = Newest(at_once(), keep=2)
+    assert all_there.wait(5)
+    assert taken(newest) == [8, 9]
+    assert newest.dropped == 8
+
+
+def test_an_error_of_the_source_comes_after_what_it_gave() -> None:
+    def broken() -> Iterator[int]:
+        yield 1
+        raise InputError("camera: unplugged; plug it in")
+
+    newest = Newest(broken(), keep=1)
+    assert newest.get(5) == 1
+    with pytest.raises(InputError, match="unplugged"):
+        taken(newest)
+
+
+def test_an_endless_source_stops_when_asked() -> None:
+    newest = Newest(itertools.count(), keep=1)
+    assert newest.get(5) is not None
+    newest.stop()
+    deadline_s = time.monotonic() + 5
+    while not newest.ended and time.monotonic() < deadline_s:
+        newest.get(0.01)
+    assert newest.ended
+
+
+@pytest.fixture(scope="module")
+def slam() -> Iterator[LiveSlam]:
+    with LiveSlam(CAMERA) as slam:
+        yield slam
+
+
+def test_a_source_that_waits_is_tracked_whole_and_refused_frames_are_passed_over(slam) -> None:
+    small = Frame(3, FRAMES[3].timestamp_s, FRAMES[3].rgb[::2], FRAMES[3].depth_m)
+    frames = [*FRAMES[:3], small, FRAMES[2], *FRAMES[4:6]]
+    assert play(slam, Given(frames), PlayOptions(realtime=False, quiet=True)) is None
+    health = slam.health()
+    assert (health.frames, health.frames_refused, health.frames_dropped) == (5, 2, 0)
+
+
+def test_silence_is_reported_once_and_frames_after_it_are_tracked(slam, caplog) -> None:
+    class Silent(Given):
+        def frames(self) -> Iterator[Frame]:
+            yield FRAMES[6]
+            time.sleep(0.6)
+            yield FRAMES[7]
+
+    before = slam.health().frames
+    play(slam, Silent([]), PlayOptions(silence_s=0.2, quiet=True))
+    assert slam.health().frames == before + 2
+    assert caplog.text.count("no frame for") == 1
