@@ -131,9 +131,13 @@ class Localiser:
         self.lost_frames = 0
 
     def moved(self, T_new_old: Array, world: WorldMap) -> None:
-        """The map was moved by its owner: what was tracked in it goes along, fused ones too."""
+        """The map was moved by its owner: what was tracked in it goes along, fused ones too.
+
+        The owner may have begun anew with fewer landmarks.
+        """
         self._T_world_last = T_new_old @ self._T_world_last
-        self._recent_ids = world.landmarks.living(world.landmarks.current(self._recent_ids))
+        known = self._recent_ids[self._recent_ids < len(world.landmarks)]
+        self._recent_ids = world.landmarks.living(world.landmarks.current(known))
 
     def new_local_map(self, world: WorldMap, keyframe: Keyframe) -> None:
         """Track against the surroundings of this keyframe from now on."""

@@ -65,6 +65,10 @@ class Channel:
         self._outbox.put(_END)
         self._sender.join(timeout_s)
 
+    def read_to_the_end(self, timeout_s: float = 1.0) -> None:
+        """Take in what the other side, which has gone, had sent."""
+        self._reader.join(timeout_s)
+
     def close(self) -> None:
         """End both directions at once."""
         self.open = False

@@ -7,6 +7,7 @@ and with landmarks that may have been fused meanwhile, and are brought up to dat
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +18,7 @@ import numpy as np
 
 from graph.array_file import FileKind, read_arrays, write_arrays
 from graph.camera import Camera
+from graph.errors import InputError
 from graph.geometry import inverse
 from semantics.labels import LabelSet
 from semantics.segmenter import NoSegmenter
@@ -25,7 +27,9 @@ from slam.frame import Frame
 from slam.keyframe_masks import KeyframeMasks
 from slam.live.channel import Channel
 from slam.live.messages import (
+    Began,
     Finish,
+    LostKeyframe,
     MapChanged,
     Masks,
     NewKeyframe,
@@ -43,6 +47,8 @@ from slam.semantic_mapping import SemanticMapper
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 from slam.tracker import Tracked
+
+logger = logging.getLogger(__name__)
 
 STATE_FILE = FileKind("live state", 1)
 
@@ -99,13 +105,14 @@ class MapKeeper:
 
     def handle(self, number: int, message: Any) -> None:
         """Carry out one message."""
+        self._send(Began(number))
         match message:
             case NewKeyframe():
                 self.add(message)
+            case LostKeyframe():
+                self.pass_over(message)
             case Masks():
-                self.system.semantics.attach(
-                    message.keyframe_id, unpacked(message.instances), self.system.mapper
-                )
+                self.attach(message)
             case PruneLandmarks():
                 ids = self.system.mapper.world.landmarks.living(message.ids)
                 if len(ids):
@@ -150,6 +157,22 @@ class MapKeeper:
             system.semantics.follow(system.mapper)
         elapsed_ms = 1e3 * (time.perf_counter() - started_s)
         self.tell(message.id, done=True, update_ms=elapsed_ms)
+
+    def pass_over(self, message: LostKeyframe) -> None:
+        """Count a keyframe that could not be taken in; another has its frames."""
+        mapper = self.system.mapper
+        mapper.history.extend(message.history)
+        mapper.history.hand_over(message.id, message.heir_id, message.T_heir_lost)
+        mapper.world.next_keyframe_id = message.id + 1
+        self.tell(message.id, done=True)
+
+    def attach(self, message: Masks) -> None:
+        """Use a keyframe's masks; those that cannot be used are passed over."""
+        semantics, mapper = self.system.semantics, self.system.mapper
+        try:
+            semantics.attach(message.keyframe_id, unpacked(message.instances), mapper)
+        except InputError as error:
+            logger.warning("keyframe %d has no masks: %s", message.keyframe_id, error)
 
     def tell(self, keyframe_id: int, done: bool, update_ms: float = 0.0) -> None:
         """Send what changed."""

@@ -59,6 +59,28 @@ class NewKeyframe:
 
 
 @dataclass(frozen=True, eq=False)
+class LostKeyframe:
+    """To the map, in place of a ``NewKeyframe`` that it cannot take in: its frames go to another.
+
+    Attributes:
+        id: of the keyframe. heir_id: a keyframe that takes its frames. T_heir_lost: (4, 4).
+        history: as of the ``NewKeyframe``.
+    """
+
+    id: int
+    heir_id: int
+    T_heir_lost: Array
+    history: list[HistoryEntry]
+
+
+@dataclass(frozen=True)
+class Began:
+    """From the map: it has begun to carry out message ``number``."""
+
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
 class PackedInstance:
     """An instance whose mask, of ``shape``, is a bit a pixel."""
 

@@ -16,11 +16,14 @@ import numpy as np
 
 from graph.camera import Camera
 from graph.errors import InputError
+from graph.geometry import inverse
 from slam.frame import Frame
 from slam.history import FrameHistory
 from slam.landmarks import Ints, Mask
 from slam.live.messages import (
+    Began,
     Finish,
+    LostKeyframe,
     MapChanged,
     NewKeyframe,
     PruneLandmarks,
@@ -100,6 +103,7 @@ class RemoteMapper:
         self._finished = False
         self._pending: set[int] = set()
         self._is_ready = False
+        self._began = self._died_at = 0
         self._worker = self._start()
 
     @property
@@ -179,11 +183,20 @@ class RemoteMapper:
 
         Returns what came that is not about the map's own state.
         """
+        others = self._heed(self._worker.receive(timeout_s))
         if not self._worker.alive and not self.given_up:
+            self._worker.kill()
+            others += self._heed(self._worker.receive())
             self._restart()
+        return others
+
+    def _heed(self, messages: list[Any]) -> list[Any]:
+        """Take in the answers that are about the map; returns the others."""
         others = []
-        for message in self._worker.receive(timeout_s):
+        for message in messages:
             match message:
+                case Began():
+                    self._began = message.number
                 case MapChanged():
                     self._apply(message)
                 case StateSaved():
@@ -251,10 +264,23 @@ class RemoteMapper:
             )
             return
         logger.warning("the map's process died; started again, %d messages", len(self._journal))
-        self._worker.kill()
+        if self._died_at == self._began > 0:
+            self._pass_over(self._began)
+        self._died_at = self._began
         self._worker = self._start()
         for number, message in sorted(self._journal.items()):
             self._worker.send((number, message))
+
+    def _pass_over(self, number: int) -> None:
+        """Twice the process died of a message: do without it."""
+        message = self._journal.pop(number, None)
+        logger.error("message %d, %s, is passed over", number, type(message).__name__)
+        match message:
+            case NewKeyframe(reference=(heir_id, T_world_heir)):
+                T_heir_lost = inverse(T_world_heir) @ message.tracked.T_world_camera
+                self.history.hand_over(message.id, heir_id, T_heir_lost)
+                heir = LostKeyframe(message.id, heir_id, T_heir_lost, message.history)
+                self._journal[number] = heir
 
     def _apply(self, message: MapChanged) -> None:
         apply_delta(message.delta, self.world, self.history)

@@ -153,6 +153,8 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
     """
     _apply_landmarks(delta, world)
     pending = [k for k in world.keyframes.values() if k.id >= delta.next_keyframe_id]
+    for keyframe in pending:  # an owner that began anew may have fewer landmarks
+        keyframe.landmark_ids[keyframe.landmark_ids >= delta.size] = -1
     shared = [i for i in delta.keyframe_ids.tolist() if i in world.keyframes]
     poses = dict(zip(delta.keyframe_ids.tolist(), delta.poses, strict=True))
     if pending and shared:

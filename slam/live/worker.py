@@ -89,9 +89,10 @@ class Worker:
         self._channel.close()
 
     def kill(self) -> None:
-        """End it at once."""
+        """End it at once. What it said before can still be received."""
         self._process.kill()
         self._process.wait()
+        self._channel.read_to_the_end()
         self._channel.close()
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from slam.configuration import resolve
 from slam.frame import Frame
 from slam.landmark_cloud import LandmarkCloud
 from slam.live.live_slam import LiveOptions, LiveSlam
+from slam.live.messages import NewKeyframe
 from slam.live.segmentation import RemoteSegmenter, SegmentationConfig
 from slam.results import TrackingStatus
 from slam.run_folder import HEALTH
@@ -115,6 +117,30 @@ def test_a_map_that_dies_again_and_again_costs_the_map_but_not_the_trajectory(tm
             assert slam.track(frame.timestamp_s, frame.rgb, frame.depth_m).keyframe_id is None
     assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == 12
     assert "the trajectory is saved" in (tmp_path / "run" / "log.txt").read_text()
+
+
+def test_a_keyframe_that_kills_the_map_is_passed_over(tmp_path, monkeypatch) -> None:
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
+        feed(slam, FRAMES[:6])
+        remote, poisoned = slam._system.remote, []
+        tell = remote.tell
+
+        def poison(message: object) -> None:
+            if isinstance(message, NewKeyframe) and not poisoned:
+                poisoned.append(message.id)
+                message = replace(message, sightings=None)
+            tell(message)
+
+        monkeypatch.setattr(remote, "tell", poison)
+        assert set(feed(slam, FRAMES[6:])) == {TrackingStatus.OK}
+        deadline_s = time.monotonic() + 60
+        while slam.health().keyframes_waiting and time.monotonic() < deadline_s:
+            slam.catch_up()
+        assert slam.health().map_deaths == 2
+        assert poisoned[0] not in remote.world.keyframes
+    trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
+    assert len(trajectory) == len(FRAMES)
+    assert error_m(trajectory.poses_world_camera) < 0.02
 
 
 def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> None:
