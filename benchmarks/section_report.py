@@ -54,6 +54,9 @@ REPORTS = {
             "covariances.py --runs 200 --sequence {sequences}/living_room",
         ),
     }),
+    "live": Report(ROOT / "docs" / "live.md", "What the live loop reaches", {
+        "speed": ("Red kitchen, offline and live", "live.py --repeats 3"),
+    }),
     "semantics": Report(ROOT / "docs" / "semantics.md", "What the semantics reach", {
         "photographs": (
             "Masks of photographs", "segmentation.py photographs --weights {sequences}/light-{{}}"
