@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
+
 from graph.geometry import Array
 
 
@@ -32,6 +34,8 @@ class FrameResult:
         inliers: those that agree with the pose.
         ignored: features on moving things, which were not used.
         mostly_moving: too few features would have been left, so that all were used.
+        information: (6, 6) of the pose against a map taken for exact, in the camera's tangent
+            [rotation rad, translation m]; None without a pose, and where a frame begins a map.
         keyframe_id: id of the keyframe made from this frame, or None.
         keyframe_reason: why it was made ("" when it was not).
         stage_ms: wall time of each stage in milliseconds, by name.
@@ -46,6 +50,12 @@ class FrameResult:
     inliers: int = 0
     ignored: int = 0
     mostly_moving: bool = False
+    information: Array | None = None
     keyframe_id: int | None = None
     keyframe_reason: str = ""
     stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def covariance(self) -> Array | None:
+        """(6, 6) of the pose against the map, ``[rad, m]`` on the right side; None without."""
+        return None if self.information is None else np.linalg.inv(self.information)

@@ -156,6 +156,7 @@ class SlamSystem:
             inliers=len(tracked.landmark_ids),
             ignored=sifted.ignored,
             mostly_moving=sifted.mostly_moving,
+            information=tracked.information if tracked.information.any() else None,
             keyframe_id=keyframe.id if keyframe else None,
             keyframe_reason=reason,
             stage_ms=clock.stage_ms,

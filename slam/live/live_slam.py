@@ -135,6 +135,8 @@ class LiveSlam:
     ) -> FrameResult:
         """Where the camera is: ``T_world_camera`` (4, 4) and a status, in bounded time.
 
+        The result's ``covariance`` says how sure that is.
+
         Args:
             timestamp_s: of the frame; later than the one before.
             rgb: (H, W, 3) uint8, red first.

@@ -100,7 +100,6 @@ class RemoteMapper:
         self._told_frames = 0
         self._saved_keyframes = 0
         self._deaths_in_a_row = 0
-        self._finished = False
         self._pending: set[int] = set()
         self._is_ready = False
         self._began = self._died_at = 0

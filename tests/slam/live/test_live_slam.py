@@ -146,7 +146,8 @@ def test_a_keyframe_that_kills_the_map_is_passed_over(tmp_path, monkeypatch) -> 
 def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> None:
     first, second = FRAMES[:2]
     with LiveSlam(CAMERA, CONFIG) as slam:
-        slam.track(first.timestamp_s, first.rgb, first.depth_m)
+        begun = slam.track(first.timestamp_s, first.rgb, first.depth_m)
+        assert begun.covariance is None
         for rgb, depth_m, stamp_s, words in (
             (second.rgb[:, :, 0], second.depth_m, 1.0, "colour is uint8"),
             (second.rgb, (1000 * np.nan_to_num(second.depth_m)).astype(np.uint16), 1.0, "metres"),
@@ -156,7 +157,13 @@ def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> Non
         ):
             with pytest.raises(InputError, match=words):
                 slam.track(stamp_s, rgb, depth_m)
-        assert slam.track(1.0, second.rgb, second.depth_m).status is TrackingStatus.OK
+        result = slam.track(1.0, second.rgb, second.depth_m)
+        assert result.status is TrackingStatus.OK
+        assert result.covariance is not None
+        sigmas = np.sqrt(np.diag(result.covariance))
+        assert (sigmas[:3] < 0.01).all()
+        assert (sigmas[3:] < 0.02).all()
+        assert (sigmas > 1e-6).all()
         assert slam.health().frames_refused == 5
 
 
