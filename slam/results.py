@@ -58,4 +58,6 @@ class FrameResult:
     @property
     def covariance(self) -> Array | None:
         """(6, 6) of the pose against the map, ``[rad, m]`` on the right side; None without."""
-        return None if self.information is None else np.linalg.inv(self.information)
+        if self.information is None:
+            return None
+        return np.asarray(np.linalg.inv(self.information), float)
