@@ -36,8 +36,13 @@ def decode_image(path: Path, flags: int) -> NDArray:
     except OSError as error:
         reason = "no such image" if not path.exists() else f"cannot be read ({error.strerror})"
         raise InputError(f"{path}: {reason}; restore it or correct the list") from error
+    return decode_bytes(data, flags, str(path))
+
+
+def decode_bytes(data: bytes, flags: int, where: str) -> NDArray:
+    """An image from the bytes of its file; ``where`` they are from, for errors."""
     if not data:
-        raise InputError(f"{path}: the image is empty (0 bytes); restore it or correct the list")
+        raise InputError(f"{where}: the image is empty (0 bytes); restore it or leave it out")
     tail = data[-_TAIL_BYTES:]
     truncated = (data.startswith(b"\xff\xd8") and b"\xff\xd9" not in tail) or (
         data.startswith(b"\x89PNG") and b"IEND" not in tail
@@ -45,5 +50,5 @@ def decode_image(path: Path, flags: int) -> NDArray:
     image = None if truncated else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         reason = "truncated" if truncated else "not a readable image"
-        raise InputError(f"{path}: {reason} ({len(data)} bytes); restore it or correct the list")
+        raise InputError(f"{where}: {reason} ({len(data)} bytes); restore it or leave it out")
     return image

@@ -46,10 +46,18 @@ def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
             f"store 16-bit depth with {camera.depth_scale:g} to the metre"
         )
     _check_size(path, stored, camera)
+    return depth_in_metres(stored, camera)
+
+
+def depth_in_metres(stored: NDArray, camera: Camera) -> NDArray[np.float32]:
+    """Depth (H, W) in metres from stored values, integers or floats (paper eq. 9, and an offset).
+
+    NaN where they are 0, negative or not finite.
+    """
     depth_m = np.divide(stored, np.float32(camera.depth_scale), dtype=np.float32)
     if camera.depth_offset_m:
         depth_m += np.float32(camera.depth_offset_m)
-    depth_m[(stored == 0) | (depth_m <= 0)] = np.nan
+    depth_m[~((stored > 0) & (depth_m > 0) & (depth_m < np.inf))] = np.nan
     return depth_m
 
 

@@ -11,9 +11,14 @@ from typing import Generic, Protocol, TypeVar
 from graph.camera import Camera
 from graph.trajectory import Trajectory
 from slam.frame import Frame
+from slam.live.sources.counts import SourceCounts
 from slam.sequences import Sequence
 
 T = TypeVar("T")
+
+
+MAX_WAIT_S = 10.0
+"""A longer pause in a recording is not played."""
 
 
 class Source(Protocol):
@@ -21,14 +26,21 @@ class Source(Protocol):
 
     Attributes:
         name: for titles. camera: of the frames. groundtruth: where there is one.
+        counts: what was met that was no frame.
+        waits: whether frames wait until they are taken, as in a recording; a camera's do not.
     """
 
     name: str
     camera: Camera
     groundtruth: Trajectory | None
+    counts: SourceCounts
+    waits: bool
 
     def frames(self) -> Iterator[Frame]:
         """Frames in the order of their stamps, each as soon as it is there."""
+
+    def close(self) -> None:
+        """End ``frames`` soon, from any thread."""
 
 
 class RecordedSource:
@@ -37,17 +49,32 @@ class RecordedSource:
     def __init__(self, sequence: Sequence, realtime: bool, max_frames: int | None = None) -> None:
         self.name, self.camera = sequence.name, sequence.camera
         self.groundtruth = sequence.groundtruth
-        self._sequence, self._realtime, self._max_frames = sequence, realtime, max_frames
+        self.counts = SourceCounts(
+            unpaired_rgb=sequence.pairs.unpaired_rgb, unpaired_depth=sequence.pairs.unpaired_depth
+        )
+        self.waits = not realtime
+        self._sequence, self._max_frames = sequence, max_frames
 
     def frames(self) -> Iterator[Frame]:
         """Each frame, not before its time; decoded ahead, as a camera's driver would."""
-        begin_s = None
-        for frame in self._sequence.frames(0, self._max_frames):
-            if begin_s is None:
-                begin_s = time.monotonic() - frame.timestamp_s
-            if self._realtime:
-                time.sleep(max(begin_s + frame.timestamp_s - time.monotonic(), 0.0))
+        frames = self._sequence.frames(0, self._max_frames)
+        for frame in frames if self.waits else paced(frames):
+            self.counts.broken = len(self._sequence.skipped)
             yield frame
+
+    def close(self) -> None:
+        """Nothing waits long."""
+
+
+def paced(frames: Iterator[Frame]) -> Iterator[Frame]:
+    """Each frame, not before its time by the stamps; the first at once."""
+    begin_s = None
+    for frame in frames:
+        now_s = time.monotonic()
+        if begin_s is None or begin_s + frame.timestamp_s - now_s > MAX_WAIT_S:
+            begin_s = now_s - frame.timestamp_s
+        time.sleep(max(begin_s + frame.timestamp_s - now_s, 0.0))
+        yield frame
 
 
 class Newest(Generic[T]):

@@ -1,0 +1,171 @@
+"""Frames from a ROS bag, read as they are needed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.trajectory import Trajectory
+from slam.frame import Frame
+from slam.live.sources.bags import IMAGE_TYPES, INFO_TYPE, Bag, open_bag
+from slam.live.sources.checks import check_depth_scale, check_sizes
+from slam.live.sources.counts import SourceCounts
+from slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
+from slam.live.sources.ros_images import (
+    DEPTH_SCALES,
+    camera_of,
+    colour_image,
+    depth_encoding,
+    depth_image,
+    stamp_s,
+)
+from slam.live.sources.source import paced
+from slam.sequences import read_camera
+from slam.sequences.images import depth_in_metres
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class BagTopics:
+    """Where a bag's images are; TUM's by default.
+
+    Attributes:
+        rgb, depth: images, raw or compressed; depth registered to colour.
+        camera_info: of the colour camera; empty: the ``camera_info`` beside the colour topic.
+    """
+
+    rgb: str = "/camera/rgb/image_color"
+    depth: str = "/camera/depth/image"
+    camera_info: str = ""
+
+
+class BagSource:
+    """A recorded bag; colour and depth are paired by the stamps in their headers.
+
+    Attributes:
+        counts: what was left out so far.
+        waits: whether frames wait until they are taken; if not, they come at their own speed.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        topics: BagTopics | None = None,
+        camera: Path | None = None,
+        realtime: bool = False,
+        max_frames: int | None = None,
+    ) -> None:
+        """Look at the first message of each topic.
+
+        Raises:
+            InputError: a bag that cannot be read, a topic that is not there, images that are
+                none, or a camera that is not known.
+        """
+        self.name = path.resolve().stem
+        self.groundtruth: Trajectory | None = None
+        self.counts = SourceCounts()
+        self.waits = not realtime
+        self._path, self._max_frames = path, max_frames
+        with open_bag(path) as bag:
+            self._topics = find_topics(bag, topics or BagTopics())
+            self.camera = _find_camera(bag, self._topics, camera)
+
+    def frames(self) -> Iterator[Frame]:
+        """Each pair of images; what cannot be decoded is counted and left out."""
+        frames = islice(self._frames(), self._max_frames)
+        return frames if self.waits else paced(frames)
+
+    def close(self) -> None:
+        """Nothing is held open between frames."""
+
+    def _frames(self) -> Iterator[Frame]:
+        index = 0
+        for pair in self._pairs():
+            try:
+                rgb = colour_image(pair.rgb, f"{self._topics.rgb} at {pair.stamp_s:.6f}")
+                stored = depth_image(pair.depth, f"{self._topics.depth} at {pair.stamp_s:.6f}")
+                check_sizes(rgb, stored, self.camera, f"{self._path} at {pair.stamp_s:.6f}")
+            except InputError as error:
+                self.counts.broken += 1
+                logger.warning("left out: %s", error)
+                continue
+            yield Frame(index, pair.stamp_s, rgb, depth_in_metres(stored, self.camera))
+            index += 1
+
+    def _pairs(self) -> Iterator[Pair[Any]]:
+        pairer = Pairer[Any](self.counts, self.camera.depth_time_offset_s)
+        with open_bag(self._path) as bag:
+            for name, message in bag.messages(self._topics.rgb, self._topics.depth):
+                stream = RGB if name == self._topics.rgb else DEPTH
+                yield from pairer.add(stream, stamp_s(message.header), message)
+        yield from pairer.finish()
+
+
+def find_topics(bag: Bag, wanted: BagTopics) -> BagTopics:
+    """The topics as they are in the bag: an image topic may be there in a compressed form only.
+
+    Raises:
+        InputError: one is not there or has no messages; names those that are.
+    """
+    found = {topic.name: topic.type for topic in bag.topics if topic.messages}
+    images = [name for name, kind in found.items() if kind in IMAGE_TYPES]
+    names = []
+    for wish, option in ((wanted.rgb, "--rgb-topic"), (wanted.depth, "--depth-topic")):
+        forms = [wish, f"{wish}/compressed", f"{wish}/compressedDepth"]
+        there = [name for name in forms if name in images]
+        if not there:
+            raise InputError(
+                f"{bag.path}: no images on {wish}; give {option}, one of: "
+                f"{', '.join(images) or 'none, the bag has no images'}"
+            )
+        names.append(there[0])
+    return BagTopics(names[0], names[1], wanted.camera_info or _info_beside(wanted.rgb))
+
+
+def _info_beside(rgb: str) -> str:
+    """The camera_info of an image topic, where image_transport puts it."""
+    base = rgb.removesuffix("/compressed")
+    return f"{base.rpartition('/')[0]}/camera_info"
+
+
+def _find_camera(bag: Bag, topics: BagTopics, given: Path | None) -> Camera:
+    """The camera that is given, or that of the camera_info; fits the first images."""
+    first = {name: _first(bag, name) for name in (topics.rgb, topics.depth)}
+    rgb, depth = first[topics.rgb], first[topics.depth]
+    scale = DEPTH_SCALES[depth_encoding(depth, topics.depth)]
+    if given is not None:
+        camera = read_camera(given)
+        check_depth_scale(camera, scale, str(given), f"{bag.path}'s depth")
+    else:
+        rectified = "_rect" in topics.rgb.removesuffix("/compressed").rpartition("/")[2]
+        where = f"{bag.path}: {topics.camera_info}"
+        camera = camera_of(_camera_info(bag, topics.camera_info), scale, rectified, where)
+    if rgb.header.frame_id != depth.header.frame_id:
+        logger.warning(
+            "%s: colour is in the frame %r, depth in %r; depth must be registered to colour",
+            bag.path, rgb.header.frame_id, depth.header.frame_id,
+        )  # fmt: skip
+    images = colour_image(rgb, topics.rgb), depth_image(depth, topics.depth)
+    check_sizes(*images, camera, f"{bag.path}: {topics.rgb} and {topics.depth}")
+    return camera
+
+
+def _camera_info(bag: Bag, name: str) -> Any:
+    there = [topic.name for topic in bag.topics if topic.type == INFO_TYPE and topic.messages]
+    if name not in there:
+        raise InputError(
+            f"{bag.path}: no camera_info on {name}; give --camera F or --camera-info-topic, one "
+            f"of: {', '.join(there) or 'none'}"
+        )
+    return _first(bag, name)
+
+
+def _first(bag: Bag, name: str) -> Any:
+    return next(message for _, message in bag.messages(name))

@@ -1,0 +1,114 @@
+"""ROS bags as files: ROS 1 .bag, ROS 2 folders (sqlite3, mcap), and single .mcap and .db3 files."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from graph.errors import InputError
+from slam.live.sources.optional import import_optional
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+_CURE = (
+    "if the recording was cut off, repair it with `rosbag reindex`, `ros2 bag reindex` or "
+    "`mcap recover`"
+)
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+
+
+class Topic(NamedTuple):
+    """What a bag holds of a topic."""
+
+    name: str
+    type: str
+    messages: int
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path has the form of a bag; it may be broken."""
+    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in SUFFIXES
+
+
+class Bag:
+    """An open bag."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.path = path
+        self._reader = reader
+        self.topics = sorted(
+            Topic(name, str(topic.msgtype), topic.msgcount) for name, topic in reader.topics.items()
+        )
+
+    @property
+    def duration_s(self) -> float:
+        """From the first message to the last, as they were recorded."""
+        return max(float(self._reader.duration), 0.0) * 1e-9
+
+    def messages(self, *names: str) -> Iterator[tuple[str, Any]]:
+        """The messages of these topics with their topic's name, in the order of recording.
+
+        Raises:
+            InputError: the bag is damaged; what came before was read.
+        """
+        chosen = [c for c in self._reader.connections if c.topic in names]
+        if not chosen:
+            return
+        with _translated(self.path):
+            raw = iter(self._reader.messages(chosen))
+        while True:
+            with _translated(self.path):
+                found = next(raw, None)
+                if found is None:
+                    return
+                connection, _, data = found
+                message = self._reader.deserialize(data, connection.msgtype)
+            yield connection.topic, message
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """A bag to read from; messages are read one by one.
+
+    Raises:
+        InputError: no such bag, one that cannot be read, or rosbags is not installed.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such bag")
+    typesys = import_optional("rosbags.typesys", "ros", str(path))
+    highlevel = import_optional("rosbags.highlevel", "ros", str(path))
+    with _translated(path):
+        types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        reader = highlevel.AnyReader([path], default_typestore=types)
+        reader.open()
+    try:
+        yield Bag(path, reader)
+    finally:
+        reader.close()
+
+
+def format_topics(bag: Bag) -> str:
+    """A bag's topics as aligned text."""
+    rows = [(topic.name, topic.type, f"{topic.messages} messages") for topic in bag.topics]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)] or [0, 0, 0]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    return "\n".join([f"{bag.path}: {bag.duration_s:.2f} s", *lines])
+
+
+@contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    """What rosbags raises for bags that it cannot read, as InputError."""
+    one, two = (import_optional(f"rosbags.rosbag{k}", "ros", str(path)) for k in (1, 2))
+    reader = import_optional("rosbags.rosbag2.reader", "ros", str(path))
+    highlevel = import_optional("rosbags.highlevel", "ros", str(path))
+    known = (highlevel.AnyReaderError, one.ReaderError, two.ReaderError, reader.zstd.ZstdError)
+    damaged = (sqlite3.Error, struct.error, AssertionError, EOFError, LookupError)
+    try:
+        yield
+    except (*known, *damaged, RuntimeError, ValueError, TypeError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: cannot be read ({reason}); {_CURE}") from error

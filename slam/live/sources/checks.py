@@ -1,0 +1,40 @@
+"""What images from a device or a bag must be, where no file names can be blamed."""
+
+from __future__ import annotations
+
+from numpy.typing import NDArray
+
+from graph.camera import Camera
+from graph.errors import InputError
+
+SCALE_TOLERANCE = 0.1
+"""A calibrated depth scale differs from the nominal one by less."""
+
+
+def check_sizes(rgb: NDArray, stored: NDArray, camera: Camera, where: str) -> None:
+    """Colour (H, W, 3) and depth (H, W) have the camera's size.
+
+    Raises:
+        InputError: they have not.
+    """
+    size = (camera.height, camera.width)
+    if rgb.shape[:2] != size or stored.shape != size:
+        (rgb_height, rgb_width), (height, width) = rgb.shape[:2], stored.shape
+        raise InputError(
+            f"{where}: colour has {rgb_width}x{rgb_height} pixels, depth {width}x{height}, the "
+            f"camera {camera.width}x{camera.height}; depth must be registered to colour and all "
+            "three have one size"
+        )
+
+
+def check_depth_scale(camera: Camera, scale: float, given: str, where: str) -> None:
+    """A camera that is given states about the depth scale that the images are known to have.
+
+    Raises:
+        InputError: it does not.
+    """
+    if abs(camera.depth_scale / scale - 1) > SCALE_TOLERANCE:
+        raise InputError(
+            f"{given}: depth_scale is {camera.depth_scale:g}, but {where} has {scale:g} to the "
+            f"metre; write depth_scale: {scale:g}"
+        )

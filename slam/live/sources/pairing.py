@@ -1,0 +1,177 @@
+"""Stamps that come in: put on one clock that never goes back, colour and depth paired by them."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from graph.trajectory import associate_stamps, nearest_indices
+from slam.live.sources.counts import SourceCounts
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+RGB, DEPTH = 0, 1
+MAX_DIFFERENCE_S = 0.02
+LATE_S = 1.0
+"""A stamp is late if it is back by less; by more, the clock was set back."""
+GAP_STEPS = 3
+USUAL_FRAMES = 30
+"""Frames whose median step is the usual one."""
+MAX_WAITING = 30
+"""Images of one stream that wait for the other: a second, which bounds the memory."""
+
+
+class Pair(NamedTuple, Generic[T]):
+    """A colour and a depth image that belong together, at the colour image's time."""
+
+    stamp_s: float
+    rgb: T
+    depth: T
+
+
+class StreamClock:
+    """The stamps of two streams on one clock that only goes forward.
+
+    Where the clock of the streams is set back, it goes on ``LATE_S`` after the latest stamp, with
+    one shift for both streams: each is shifted from its own first stamp that is back.
+    """
+
+    def __init__(self, counts: SourceCounts) -> None:
+        self._counts = counts
+        self._shifts_s = [0.0]
+        self._epochs = [0, 0]
+        self._last_s = [-np.inf, -np.inf]
+        self._latest_s = -np.inf
+
+    def place(self, stream: int, stamp_s: float) -> float | None:
+        """The stamp in seconds on this clock; None for a duplicate and a late one."""
+        last_s = self._last_s[stream]
+        if stamp_s == last_s:
+            self._counts.duplicates += 1
+            return None
+        if stamp_s < last_s - LATE_S:
+            self._set_back(stream, stamp_s)
+        elif stamp_s < last_s:
+            self._counts.late += 1
+            return None
+        self._last_s[stream] = stamp_s
+        placed_s = stamp_s + self._shifts_s[self._epochs[stream]]
+        self._latest_s = max(self._latest_s, placed_s)
+        return placed_s
+
+    def _set_back(self, stream: int, stamp_s: float) -> None:
+        self._epochs[stream] += 1
+        if self._epochs[stream] < len(self._shifts_s):
+            return
+        self._counts.clock_jumps += 1
+        self._shifts_s.append(self._latest_s + LATE_S - stamp_s)
+        logger.warning(
+            "the clock was set back by %.3f s; stamps are shifted by %.3f s from here on",
+            self._last_s[stream] - stamp_s,
+            self._shifts_s[-1],
+        )
+
+
+class GapMeter:
+    """Counts steps between frames that are longer than usual."""
+
+    def __init__(self, counts: SourceCounts) -> None:
+        self._counts = counts
+        self._last_s: float | None = None
+        self._steps_s: deque[float] = deque(maxlen=USUAL_FRAMES)
+
+    def count(self, stamp_s: float) -> None:
+        """One more frame."""
+        if self._last_s is not None:
+            step_s = stamp_s - self._last_s
+            if self._steps_s and step_s > GAP_STEPS * float(np.median(self._steps_s)):
+                self._counts.gaps += 1
+            self._steps_s.append(step_s)
+        self._last_s = stamp_s
+
+
+class Pairer(Generic[T]):
+    """Pairs colour and depth by nearest stamp, each used once, as they come.
+
+    A pair is given out once no image that may still come could fit either better: at once where
+    the stamps are equal, else with the next image of the stream whose stamp is the earlier. The
+    pairs are those of ``associate_stamps`` over all stamps, unless streams step by less than
+    ``max_difference_s``.
+    """
+
+    def __init__(
+        self,
+        counts: SourceCounts,
+        depth_offset_s: float = 0.0,
+        max_difference_s: float = MAX_DIFFERENCE_S,
+    ) -> None:
+        self._counts, self._max_s = counts, max_difference_s
+        self._offsets_s = (0.0, depth_offset_s)
+        self._clock, self._gaps = StreamClock(counts), GapMeter(counts)
+        self._waiting: tuple[deque[tuple[float, T]], ...] = (deque(), deque())
+        self._heard_s = [-np.inf, -np.inf]
+
+    def add(self, stream: int, stamp_s: float, item: T) -> list[Pair[T]]:
+        """An image of a stream, RGB or DEPTH; returns the pairs that are certain by it."""
+        placed_s = self._clock.place(stream, stamp_s)
+        if placed_s is None:
+            return []
+        placed_s += self._offsets_s[stream]
+        self._heard_s[stream] = placed_s
+        self._waiting[stream].append((placed_s, item))
+        pairs = self._settled()
+        for each in (RGB, DEPTH):
+            self._discard(each)
+        return pairs
+
+    def finish(self) -> list[Pair[T]]:
+        """What is left when nothing more will come."""
+        return self._take(len(self._waiting[RGB]), len(self._waiting[DEPTH]))
+
+    def _settled(self) -> list[Pair[T]]:
+        """All up to the latest pair that nothing to come can break."""
+        rgb_s, depth_s = (np.array([s for s, _ in queue]) for queue in self._waiting)
+        if not len(rgb_s) or not len(depth_s):
+            return []
+        to_depth, to_rgb = nearest_indices(depth_s, rgb_s), nearest_indices(rgb_s, depth_s)
+        partners_s = depth_s[to_depth]
+        mutual = to_rgb[to_depth] == np.arange(len(rgb_s))
+        mutual &= np.abs(partners_s - rgb_s) <= self._max_s
+        mutual &= np.maximum(rgb_s, partners_s) <= min(self._heard_s)
+        found = np.flatnonzero(mutual)
+        if not len(found):
+            return []
+        return self._take(found[-1] + 1, to_depth[found[-1]] + 1)
+
+    def _take(self, rgb_count: int, depth_count: int) -> list[Pair[T]]:
+        """Pair the first images of the queues; those that stay alone are unpaired."""
+        rgb = [self._waiting[RGB].popleft() for _ in range(rgb_count)]
+        depth = [self._waiting[DEPTH].popleft() for _ in range(depth_count)]
+        stamps_s = (np.array([s for s, _ in images]) for images in (rgb, depth))
+        i, j = associate_stamps(*stamps_s, self._max_s)
+        self._counts.unpaired_rgb += rgb_count - len(i)
+        self._counts.unpaired_depth += depth_count - len(j)
+        pairs = [Pair(*rgb[k], depth[m][1]) for k, m in zip(i, j, strict=True)]
+        for pair in pairs:
+            self._gaps.count(pair.stamp_s)
+        return pairs
+
+    def _discard(self, stream: int) -> None:
+        """Let go of images that nothing fits any more, and of the oldest of too many."""
+        queue, others = self._waiting[stream], self._waiting[1 - stream]
+        while queue:
+            stamp_s = queue[0][0]
+            near = any(abs(other_s - stamp_s) <= self._max_s for other_s, _ in others)
+            over = self._heard_s[1 - stream] > stamp_s + self._max_s and not near
+            if not over and len(queue) <= MAX_WAITING:
+                return
+            queue.popleft()
+            if stream == RGB:
+                self._counts.unpaired_rgb += 1
+            else:
+                self._counts.unpaired_depth += 1

@@ -1,0 +1,123 @@
+"""Images paired as they come, as they would be if all were known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graph.geometry import Array
+from graph.trajectory import associate_stamps
+from slam.live.sources.counts import SourceCounts
+from slam.live.sources.pairing import DEPTH, LATE_S, MAX_WAITING, RGB, Pair, Pairer
+
+
+def pairs_of(
+    rgb_s: Array, depth_s: Array, order: Array, counts: SourceCounts | None = None
+) -> list[Pair[int]]:
+    """Feed both streams; order (N,) says which stream's next image comes. Items are indices."""
+    counts = counts or SourceCounts()
+    pairer, streams, given = Pairer[int](counts), (rgb_s, depth_s), [0, 0]
+    pairs = []
+    for stream in order:
+        pairs += pairer.add(stream, streams[stream][given[stream]], given[stream])
+        given[stream] += 1
+    return pairs + pairer.finish()
+
+
+def by_time(rgb_s: Array, depth_s: Array) -> Array:
+    """The order in which images come if none is delayed."""
+    streams = np.repeat([RGB, DEPTH], (len(rgb_s), len(depth_s)))
+    return streams[np.argsort(np.concatenate([rgb_s, depth_s]), kind="stable")]
+
+
+def delayed(rgb_s: Array, depth_s: Array, rng: np.random.Generator) -> Array:
+    """An order in which either stream may come up to 0.3 s behind the other."""
+    lag_s = rng.uniform(-0.3, 0.3)
+    return by_time(rgb_s, depth_s + lag_s)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_as_if_all_stamps_were_known(seed: int) -> None:
+    """Two clocks that drift against each other, jitter, losses, delays: the pairs of TUM's rule."""
+    rng = np.random.default_rng(seed)
+    rgb_s = 1e9 + np.arange(150) / 30 + rng.uniform(-0.004, 0.004, 150)
+    depth_s = 1e9 + rng.uniform(0, 0.04) + np.arange(150) / 29.7 + rng.uniform(-0.004, 0.004, 150)
+    rgb_s, depth_s = (s[rng.random(150) < 0.9] for s in (rgb_s, depth_s))
+    counts = SourceCounts()
+    pairs = pairs_of(rgb_s, depth_s, delayed(rgb_s, depth_s, rng), counts)
+    i, j = associate_stamps(rgb_s, depth_s)
+    assert [(pair.rgb, pair.depth) for pair in pairs] == list(zip(i, j, strict=True))
+    assert [pair.stamp_s for pair in pairs] == list(rgb_s[i])
+    assert counts.unpaired_rgb == len(rgb_s) - len(i)
+    assert counts.unpaired_depth == len(depth_s) - len(j)
+    assert counts.duplicates == counts.late == counts.clock_jumps == 0
+
+
+def test_a_pair_is_given_as_soon_as_it_is_certain() -> None:
+    pairer = Pairer[str](SourceCounts())
+    assert not pairer.add(DEPTH, 1.000, "d0")
+    assert pairer.add(RGB, 1.000, "c0") == [Pair(1.000, "c0", "d0")]
+    assert not pairer.add(RGB, 1.033, "c1")
+    assert not pairer.add(DEPTH, 1.045, "d1")  # the next colour image might lie nearer
+    assert pairer.add(RGB, 1.066, "c2") == [Pair(1.033, "c1", "d1")]
+    assert not pairer.add(DEPTH, 1.060, "d2")  # and here the next depth image
+    assert pairer.add(DEPTH, 1.078, "d3") == [Pair(1.066, "c2", "d2")]
+
+
+def test_images_too_far_apart_are_no_pair() -> None:
+    counts = SourceCounts()
+    rgb_s, depth_s = np.array([0.0, 0.1, 0.2]), np.array([0.0201, 0.1199, 0.25])
+    pairs = pairs_of(rgb_s, depth_s, by_time(rgb_s, depth_s), counts)
+    assert [(pair.rgb, pair.depth) for pair in pairs] == [(1, 1)]
+    assert (counts.unpaired_rgb, counts.unpaired_depth) == (2, 2)
+
+
+def test_a_known_delay_of_depth_is_added_to_its_stamps() -> None:
+    pairer = Pairer[str](SourceCounts(), depth_offset_s=-0.05)
+    assert not pairer.add(RGB, 1.00, "c0")
+    assert not pairer.add(DEPTH, 1.00, "of 0.95")
+    assert pairer.add(DEPTH, 1.05, "of 1.00") == [Pair(1.00, "c0", "of 1.00")]
+
+
+def test_duplicates_and_late_images_are_left_out_and_counted() -> None:
+    counts = SourceCounts()
+    rgb_s = np.array([0.0, 0.0, 0.1, 0.05, 0.2])
+    depth_s = np.array([0.0, 0.1, 0.1, 0.2])
+    pairs = pairs_of(rgb_s, depth_s, np.array([0, 0, 1, 0, 1, 1, 0, 0, 1]), counts)
+    assert [(pair.rgb, pair.depth) for pair in pairs] == [(0, 0), (2, 1), (4, 3)]
+    assert (counts.duplicates, counts.late) == (2, 1)
+    assert counts.unpaired_rgb == counts.unpaired_depth == 0
+
+
+def test_time_goes_on_where_the_clock_was_set_back(caplog) -> None:
+    """Depth reaches the jump two images later than colour; nothing is paired across it."""
+    rgb_s = np.concatenate([100 + np.arange(10) / 10, 40 + np.arange(10) / 10])
+    depth_s = rgb_s + 0.003
+    counts = SourceCounts()
+    order = np.concatenate([[RGB] * 2, np.tile([RGB, DEPTH], 18), [DEPTH] * 2])
+    pairs = pairs_of(rgb_s, depth_s, order, counts)
+    assert [(pair.rgb, pair.depth) for pair in pairs] == [(k, k) for k in range(20)]
+    stamps_s = np.array([pair.stamp_s for pair in pairs])
+    assert np.allclose(stamps_s[:10], rgb_s[:10])
+    assert np.allclose(np.diff(stamps_s[10:]), 0.1)
+    assert 0.9 * LATE_S < stamps_s[10] - stamps_s[9] < 1.1 * LATE_S
+    assert (counts.clock_jumps, counts.late, counts.gaps) == (1, 0, 1)
+    assert "set back by 60.9" in caplog.text
+
+
+def test_gaps_are_counted_by_the_usual_step() -> None:
+    counts = SourceCounts()
+    stamps_s = np.cumsum([0, 0.1, 0.1, 0.25, 0.1, 0.5, 0.1, 60, 0.1])
+    assert len(pairs_of(stamps_s, stamps_s, by_time(stamps_s, stamps_s), counts)) == 9
+    assert counts.gaps == 2
+    assert counts.line() == "2 gaps"
+
+
+def test_a_stream_that_stays_away_costs_no_memory() -> None:
+    counts = SourceCounts()
+    pairer = Pairer[int](counts)
+    for k in range(1000):
+        pairer.add(RGB, k / 30, k)
+    assert counts.unpaired_rgb == 1000 - MAX_WAITING
+    pairs = pairer.add(DEPTH, 999 / 30, 0)
+    assert [pair.rgb for pair in pairs] == [999]
