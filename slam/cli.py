@@ -171,16 +171,21 @@ def _render(arguments: argparse.Namespace) -> int:
 
 
 def _add_info(commands: _Commands) -> None:
-    text = "say what a sequence holds: frames, camera, depth, ground truth"
+    text = "say what a sequence holds: frames, camera, depth, ground truth; of a bag its topics"
     parser = commands.add_parser("info", help=text, description=text)
     parser.set_defaults(handler=_info)
-    parser.add_argument("sequence", type=Path, help="folder in TUM layout")
+    parser.add_argument("sequence", type=Path, help="folder in TUM layout, or ROS bag")
 
 
 def _info(arguments: argparse.Namespace) -> int:
+    from slam.live.sources.bags import format_topics, is_bag, open_bag
     from slam.progress import console_log
     from slam.sequences import format_info, open_sequence, sequence_info
 
+    if is_bag(arguments.sequence):
+        with open_bag(arguments.sequence) as bag:
+            print(format_topics(bag))
+        return 0
     with console_log():
         info = sequence_info(open_sequence(arguments.sequence))
     print(format_info(info))

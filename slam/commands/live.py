@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from slam.commands.run import CONFIG_HELP, SET_HELP
 from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+
+if TYPE_CHECKING:
+    from slam.live.sources.opening import SourceOptions
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -17,12 +21,16 @@ MORE = """\
 Tracking is here; the map, its graph and loops, and segmentation have processes of their own. The
 run folder is that of `run`, with health.json, which is rewritten every second."""
 
+SOURCE_HELP = """\
+folder in TUM layout, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the RealSense that is
+plugged in, or opencv:N for device N of OpenNI 2"""
+
 
 def add_live(commands: _Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("live", help=TEXT, description=f"{TEXT}. {MORE}")
     parser.set_defaults(handler=_live)
-    parser.add_argument("source", type=Path, metavar="SOURCE", help="folder in TUM layout")
+    parser.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<source>, numbered)")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --out holds")
     parser.add_argument(
@@ -30,6 +38,7 @@ def add_live(commands: _Commands) -> None:
         action="store_true",
         help="play a recording at its own speed, dropping frames that there is no time for",
     )
+    _add_source_arguments(parser)
     parser.add_argument("--config", metavar="F", help=CONFIG_HELP)
     parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
     parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
@@ -38,32 +47,69 @@ def add_live(commands: _Commands) -> None:
     parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
 
 
+def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--follow", action="store_true", help="the folder is still being written")
+    parser.add_argument(
+        "--silence",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="end when a folder that is followed, or a camera, gives nothing for S s (default: 10)",
+    )
+    text = "of a bag: colour images (default: /camera/rgb/image_color)"
+    parser.add_argument("--rgb-topic", metavar="T", help=text)
+    text = "of a bag: depth images, registered to colour (default: /camera/depth/image)"
+    parser.add_argument("--depth-topic", metavar="T", help=text)
+    text = "of a bag: the colour camera (default: the camera_info beside the colour topic)"
+    parser.add_argument("--camera-info-topic", metavar="T", help=text)
+
+
+def _source_options(arguments: argparse.Namespace) -> SourceOptions:
+    from slam.live.sources.bag_source import BagTopics
+    from slam.live.sources.opening import SourceOptions
+
+    names = ("rgb", "depth", "camera_info")
+    topics = {name: getattr(arguments, f"{name}_topic") for name in names}
+    return SourceOptions(
+        camera=arguments.camera,
+        realtime=arguments.realtime,
+        max_frames=arguments.max_frames,
+        follow=arguments.follow,
+        silence_s=arguments.silence,
+        topics=BagTopics(**{name: topic for name, topic in topics.items() if topic}),
+    )
+
+
 def _live(arguments: argparse.Namespace) -> int:
     from slam.configuration import find_config, resolve
     from slam.evaluation import format_table
     from slam.live.live_slam import LiveOptions, LiveSlam
     from slam.live.play import PlayOptions, play
-    from slam.live.sources import RecordedSource
+    from slam.live.sources.opening import open_source
     from slam.progress import console_log
     from slam.run_folder import free_run_path
-    from slam.sequences import open_sequence
     from slam.system_config import SystemConfig
 
     file = find_config(arguments.config) if arguments.config else None
     plain = resolve(SystemConfig, file, arguments.set)
     segmenter = segmenter_options(arguments, plain.semantics.segmenter)
     config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
-    with console_log():
-        sequence = open_sequence(arguments.source, camera=arguments.camera)
-        source = RecordedSource(sequence, arguments.realtime, arguments.max_frames)
+    with (
+        console_log(),
+        closing(open_source(arguments.source, _source_options(arguments))) as source,
+    ):
         out = arguments.out or free_run_path(f"{source.name}-live")
-        options = LiveOptions(
-            out, arguments.overwrite, source.groundtruth, sequence.folder, source.name
-        )
+        folder = Path(arguments.source)
+        images = folder if folder.is_dir() else Path()
+        options = LiveOptions(out, arguments.overwrite, source.groundtruth, images, source.name)
         with LiveSlam(source.camera, config, options) as slam:
-            ended_by = play(slam, source, PlayOptions(arguments.realtime, quiet=arguments.quiet))
+            slam.source_counts = source.counts
+            ended_by = play(slam, source, PlayOptions(not source.waits, quiet=arguments.quiet))
     if arguments.quiet:
         print(out)
     else:
+        left_out = source.counts.line()
         print(f"{format_table(slam.rows)}\n\nRun folder  {out}")
+        if left_out:
+            print(f"Source      {left_out}")
     return 128 + ended_by if ended_by else 0

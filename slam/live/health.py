@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class Health:
         masks_dropped: keyframes that were passed over by the segmenter.
         lost_frames: without a pose. lost_episodes: how often tracking was lost.
         map_deaths, segmenter_deaths: of their processes, which were started again.
+        source: what the source counted, by name.
     """
 
     status: str = ""
@@ -49,6 +50,7 @@ class Health:
     lost_episodes: int = 0
     map_deaths: int = 0
     segmenter_deaths: int = 0
+    source: dict[str, int] = field(default_factory=dict)
 
     def as_json(self) -> str:
         """For a file that another program polls."""

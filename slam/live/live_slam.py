@@ -6,7 +6,7 @@ import logging
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -24,6 +24,7 @@ from slam.frame import Frame
 from slam.landmark_cloud import LandmarkCloud
 from slam.live.health import WINDOW, FrameMeter, Health
 from slam.live.segmentation import RemoteSegmenter
+from slam.live.sources.counts import SourceCounts
 from slam.live.system import LiveSystem
 from slam.results import FrameResult
 from slam.run_folder import HEALTH, RunFolder
@@ -76,6 +77,7 @@ class LiveSlam:
 
     Attributes:
         frames_dropped: by the source, which counts them here.
+        source_counts: of the source, for ``health``.
         rows: what metrics.json holds, once it is closed.
     """
 
@@ -91,6 +93,7 @@ class LiveSlam:
         self.config = config or SystemConfig()
         self.options = options or LiveOptions()
         self.frames_dropped = 0
+        self.source_counts = SourceCounts()
         self.rows: list[Row] = []
         self._tally, self._meter = Tally(), FrameMeter()
         self._refused = 0
@@ -207,6 +210,7 @@ class LiveSlam:
             lost_episodes=meter.lost_episodes,
             map_deaths=remote.deaths,
             segmenter_deaths=segmenter.deaths if segmenter else 0,
+            source=asdict(self.source_counts),
         )
 
     def close(self) -> None:

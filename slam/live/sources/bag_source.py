@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +59,6 @@ class BagSource:
         topics: BagTopics | None = None,
         camera: Path | None = None,
         realtime: bool = False,
-        max_frames: int | None = None,
     ) -> None:
         """Look at the first message of each topic.
 
@@ -72,15 +70,14 @@ class BagSource:
         self.groundtruth: Trajectory | None = None
         self.counts = SourceCounts()
         self.waits = not realtime
-        self._path, self._max_frames = path, max_frames
+        self._path = path
         with open_bag(path) as bag:
             self._topics = find_topics(bag, topics or BagTopics())
             self.camera = _find_camera(bag, self._topics, camera)
 
     def frames(self) -> Iterator[Frame]:
         """Each pair of images; what cannot be decoded is counted and left out."""
-        frames = islice(self._frames(), self._max_frames)
-        return frames if self.waits else paced(frames)
+        return self._frames() if self.waits else paced(self._frames())
 
     def close(self) -> None:
         """Nothing is held open between frames."""

@@ -109,8 +109,9 @@ class Pairer(Generic[T]):
         counts: SourceCounts,
         depth_offset_s: float = 0.0,
         max_difference_s: float = MAX_DIFFERENCE_S,
+        max_waiting: int = MAX_WAITING,
     ) -> None:
-        self._counts, self._max_s = counts, max_difference_s
+        self._counts, self._max_s, self._max_waiting = counts, max_difference_s, max_waiting
         self._offsets_s = (0.0, depth_offset_s)
         self._clock, self._gaps = StreamClock(counts), GapMeter(counts)
         self._waiting: tuple[deque[tuple[float, T]], ...] = (deque(), deque())
@@ -152,11 +153,11 @@ class Pairer(Generic[T]):
         """Pair the first images of the queues; those that stay alone are unpaired."""
         rgb = [self._waiting[RGB].popleft() for _ in range(rgb_count)]
         depth = [self._waiting[DEPTH].popleft() for _ in range(depth_count)]
-        stamps_s = (np.array([s for s, _ in images]) for images in (rgb, depth))
-        i, j = associate_stamps(*stamps_s, self._max_s)
+        rgb_s, depth_s = (np.array([s for s, _ in images]) for images in (rgb, depth))
+        i, j = associate_stamps(rgb_s, depth_s, self._max_s)
         self._counts.unpaired_rgb += rgb_count - len(i)
         self._counts.unpaired_depth += depth_count - len(j)
-        pairs = [Pair(*rgb[k], depth[m][1]) for k, m in zip(i, j, strict=True)]
+        pairs = [Pair(rgb[k][0], rgb[k][1], depth[m][1]) for k, m in zip(i, j, strict=True)]
         for pair in pairs:
             self._gaps.count(pair.stamp_s)
         return pairs
@@ -168,7 +169,7 @@ class Pairer(Generic[T]):
             stamp_s = queue[0][0]
             near = any(abs(other_s - stamp_s) <= self._max_s for other_s, _ in others)
             over = self._heard_s[1 - stream] > stamp_s + self._max_s and not near
-            if not over and len(queue) <= MAX_WAITING:
+            if not over and len(queue) <= self._max_waiting:
                 return
             queue.popleft()
             if stream == RGB:

@@ -130,9 +130,15 @@ def camera_of(info: Any, depth_scale: float, rectified: bool, where: str) -> Cam
         raise InputError(f"{where}: focal lengths of {K[0, 0]:g} and {K[1, 1]:g} px; {cure}")
     k1, k2, p1, p2, k3 = (float(value) for value in distortion)
     return Camera(
-        int(info.width), int(info.height), *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))),
-        distortion=(k1, k2, p1, p2, k3), depth_scale=depth_scale,
-    )  # fmt: skip
+        width=int(info.width),
+        height=int(info.height),
+        fx=float(K[0, 0]),
+        fy=float(K[1, 1]),
+        cx=float(K[0, 2]),
+        cy=float(K[1, 2]),
+        distortion=(k1, k2, p1, p2, k3),
+        depth_scale=depth_scale,
+    )
 
 
 def _field(info: Any, name: str) -> Any:

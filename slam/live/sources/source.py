@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
 from graph.camera import Camera
@@ -15,7 +16,6 @@ from slam.live.sources.counts import SourceCounts
 from slam.sequences import Sequence
 
 T = TypeVar("T")
-
 
 MAX_WAIT_S = 10.0
 """A longer pause in a recording is not played."""
@@ -64,6 +64,24 @@ class RecordedSource:
 
     def close(self) -> None:
         """Nothing waits long."""
+
+
+class Limited:
+    """The first frames of another source."""
+
+    def __init__(self, source: Source, max_frames: int | None) -> None:
+        self.name, self.camera = source.name, source.camera
+        self.groundtruth = source.groundtruth
+        self.counts, self.waits = source.counts, source.waits
+        self._source, self._max_frames = source, max_frames
+
+    def frames(self) -> Iterator[Frame]:
+        """Up to ``max_frames``; all if that is None."""
+        return islice(self._source.frames(), self._max_frames)
+
+    def close(self) -> None:
+        """Close the other."""
+        self._source.close()
 
 
 def paced(frames: Iterator[Frame]) -> Iterator[Frame]:

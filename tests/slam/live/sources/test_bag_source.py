@@ -56,7 +56,6 @@ def test_every_form_of_bag_gives_the_frames_back(tmp_path: Path, name: str, stor
     assert (camera.width, camera.height, camera.depth_scale) == (160, 120, 1.0)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (131.25, 130.0, 79.625, 60.375)
     assert camera.distortion == (0.1, -0.2, 0.001, 0.002, 0.05)
-    assert [frame.index for frame in BagSource(path, max_frames=2).frames()] == [0, 1]
 
 
 def test_realtime_keeps_the_recordings_pace(tmp_path: Path) -> None:
@@ -148,7 +147,7 @@ def test_what_a_bag_lacks_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no camera_info on /camera/rgb/camera_info.*/other"):
         BagSource(path)
     assert BagSource(path, BagTopics(camera_info="/other/camera_info")).camera.fx == 131.25
-    with pytest.raises(InputError, match="no images on /depth.*--depth-topic"):
+    with pytest.raises(InputError, match=r"no images on /depth.*--depth-topic"):
         BagSource(path, BagTopics(depth="/depth"))
     with pytest.raises(InputError, match="where depth is expected"):
         BagSource(path, BagTopics(depth=RGB, camera_info="/other/camera_info"))

@@ -1,0 +1,233 @@
+"""A TUM folder that is still being written, followed by looking again and again."""
+
+from __future__ import annotations
+
+import heapq
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.trajectory import Trajectory, check_seconds
+from slam.frame import Frame
+from slam.live.sources.counts import SourceCounts
+from slam.live.sources.pairing import DEPTH, RGB, Pairer
+from slam.sequences.cameras import find_camera
+from slam.sequences.images import read_depth, read_rgb
+from slam.sequences.lists import image_name
+
+logger = logging.getLogger(__name__)
+
+FINISHED = ".finished"
+"""A file of this name says that nothing more will come."""
+_FIRST_STAMPS = 5
+"""So many must look like seconds."""
+_MAX_LINES = 5000
+"""Lines of one list that wait for the other: a recorder may write them in blocks."""
+
+
+@dataclass(frozen=True)
+class FollowOptions:
+    """How long to wait.
+
+    Attributes:
+        silence_s: the folder is taken for finished when nothing is new for so long.
+        patience_s: an image that cannot be read so long after its line is left out.
+        poll_s: between two looks.
+    """
+
+    silence_s: float = 10.0
+    patience_s: float = 2.0
+    poll_s: float = 0.02
+
+
+class ListFollower:
+    """The lines of a list that grows; an unfinished one waits for its end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._position = 0
+        self._rest = b""
+
+    def new_lines(self, finished: bool) -> list[str]:
+        """The lines since the last call; the unfinished one too if nothing more will come."""
+        try:
+            with self.path.open("rb") as file:
+                file.seek(self._position)
+                data = file.read()
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read any more ({error.strerror})") from error
+        self._position += len(data)
+        lines = (self._rest + data).split(b"\n")
+        self._rest = b"" if finished else lines.pop()
+        text = (line.decode("utf-8-sig", errors="replace").strip() for line in lines)
+        return [line for line in text if line and not line.startswith("#")]
+
+
+class _Image(NamedTuple):
+    """An image that is listed; of the stream RGB or DEPTH."""
+
+    stamp_s: float
+    stream: int
+    path: Path
+
+
+class _Waiting(NamedTuple):
+    """A pair of images, and when it was listed."""
+
+    stamp_s: float
+    rgb: Path
+    depth: Path
+    listed_s: float
+
+
+class GrowingFolder:
+    """A folder in TUM layout, from its first line on, as lists and images grow.
+
+    Ends when a file ``.finished`` is there and all is read, or after a long silence. Lines must be
+    in the order of their stamps, as a recorder writes them.
+
+    Attributes:
+        counts: what was left out so far.
+        waits: False: what tracking has no time for is dropped, as with a camera.
+    """
+
+    waits = False
+
+    def __init__(
+        self, folder: Path, camera: Path | None = None, options: FollowOptions | None = None
+    ) -> None:
+        """Wait until the lists and the camera are there.
+
+        Raises:
+            InputError: no such folder, or they are not there before ``silence_s`` is over.
+        """
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder; make it before it is followed")
+        self.name = folder.resolve().name
+        self.groundtruth: Trajectory | None = None
+        self.counts = SourceCounts()
+        self._folder, self._options = folder, options or FollowOptions()
+        self._closed = threading.Event()
+        self.camera, lists = self._await(camera)
+        self._lists = [ListFollower(path) for path in lists]
+        offset_s = self.camera.depth_time_offset_s
+        self._pairer = Pairer[Path](self.counts, offset_s, max_waiting=_MAX_LINES)
+        self._first_s: list[float] = []
+
+    def frames(self) -> Iterator[Frame]:
+        """Each frame once both images can be read; what never can be is counted and left out.
+
+        Raises:
+            InputError: stamps that are not seconds.
+        """
+        waiting: deque[_Waiting] = deque()
+        index, heard_s, finished = 0, time.monotonic(), False
+        while not (finished or self._closed.is_set()):
+            silent = time.monotonic() - heard_s > self._options.silence_s
+            finished = silent or (self._folder / FINISHED).exists()
+            if listed := self._new_pairs(finished):
+                waiting.extend(listed)
+                heard_s = time.monotonic()
+            patience_s = 0.0 if finished else self._options.patience_s
+            while waiting and (frame := self._load(waiting[0], index, patience_s)) is not False:
+                waiting.popleft()
+                index += 1
+                if isinstance(frame, Frame):
+                    yield frame
+                heard_s = time.monotonic()
+            if not finished:
+                self._closed.wait(self._options.poll_s)
+
+    def close(self) -> None:
+        """Look no more."""
+        self._closed.set()
+
+    def _await(self, given: Path | None) -> tuple[Camera, list[Path]]:
+        deadline_s = time.monotonic() + self._options.silence_s
+        while True:
+            try:
+                return find_camera(self._folder, given)[0], _find_lists(self._folder)
+            except InputError:
+                if time.monotonic() > deadline_s:
+                    raise
+            time.sleep(self._options.poll_s)
+
+    def _new_pairs(self, finished: bool) -> list[_Waiting]:
+        """The pairs that are certain by what was written since the last look."""
+        listed_s = time.monotonic()
+        kinds = (RGB, DEPTH) if len(self._lists) == 2 else (None,)
+        new = [
+            [image for line in each.new_lines(finished) for image in self._images(kind, line, each)]
+            for kind, each in zip(kinds, self._lists, strict=True)
+        ]
+        pairs = []
+        for stamp_s, stream, path in heapq.merge(*new, key=lambda image: image[0]):
+            pairs += self._pairer.add(stream, stamp_s, path)
+        if finished:
+            pairs += self._pairer.finish()
+        return [_Waiting(pair.stamp_s, pair.rgb, pair.depth, listed_s) for pair in pairs]
+
+    def _images(self, kind: int | None, line: str, listed: ListFollower) -> list[_Image]:
+        """The images on a line; none of a broken one, which is counted.
+
+        ``kind`` is the stream of the list, None where lines hold both.
+        """
+        columns = line.split() if kind is None else line.split(maxsplit=1)
+        try:
+            stamps_s = [float(text) for text in columns[::2]]
+        except ValueError:
+            stamps_s = [np.nan]
+        if len(columns) != (4 if kind is None else 2) or not np.isfinite(stamps_s).all():
+            self.counts.broken += 1
+            logger.warning("%s: left out the line %r", listed.path, line[:60])
+            return []
+        files = columns[1::2]
+        streams: tuple[int, ...] = (RGB, DEPTH)
+        if kind is not None:
+            streams = (kind,)
+        elif files[0].startswith("depth") and files[1].startswith("rgb"):
+            streams = (DEPTH, RGB)
+        if RGB in streams:
+            self._check_seconds(stamps_s[streams.index(RGB)], listed.path)
+        paths = [listed.path.parent / file for file in files]
+        return [_Image(*entry) for entry in zip(stamps_s, streams, paths, strict=True)]
+
+    def _check_seconds(self, stamp_s: float, path: Path) -> None:
+        if len(self._first_s) < _FIRST_STAMPS:
+            self._first_s.append(stamp_s)
+            if len(self._first_s) == _FIRST_STAMPS:
+                check_seconds(np.sort(self._first_s), path)
+
+    def _load(self, pair: _Waiting, index: int, patience_s: float) -> Frame | bool:
+        """The frame; False if it may still come, True if it is given up and counted."""
+        try:
+            rgb = read_rgb(pair.rgb, self.camera)
+            depth_m = read_depth(pair.depth, self.camera)
+        except InputError as error:
+            if time.monotonic() - pair.listed_s < patience_s:
+                return False
+            self.counts.broken += 1
+            logger.warning("left out: %s", error)
+            return True
+        return Frame(index, pair.stamp_s, rgb, depth_m, image_name(pair.rgb, self._folder))
+
+
+def _find_lists(folder: Path) -> list[Path]:
+    """rgb.txt and depth.txt, or associations.txt."""
+    both, one = [folder / "rgb.txt", folder / "depth.txt"], folder / "associations.txt"
+    if all(path.is_file() for path in both):
+        return both
+    if one.is_file():
+        return [one]
+    raise InputError(
+        f"{folder}: neither rgb.txt and depth.txt nor associations.txt; the recorder writes them"
+    )

@@ -1,0 +1,73 @@
+"""A source by what it is called on the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from graph.errors import InputError
+from slam.live.sources.bag_source import BagSource, BagTopics
+from slam.live.sources.bags import is_bag
+from slam.live.sources.growing_folder import FollowOptions, GrowingFolder
+from slam.live.sources.opencv_camera import OpenCvSource
+from slam.live.sources.realsense_camera import RealSenseSource
+from slam.live.sources.source import Limited, RecordedSource, Source
+from slam.sequences import open_sequence
+
+REALSENSE, OPENCV = "realsense:", "opencv:"
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """How a source is read; what does not concern it is ignored.
+
+    Attributes:
+        camera: file in place of the source's own camera.
+        realtime: a recording comes at its own speed.
+        max_frames: end after so many.
+        follow: a folder is still being written.
+        silence_s: it, or a camera, has ended when nothing comes for so long.
+        topics: of a bag.
+    """
+
+    camera: Path | None = None
+    realtime: bool = False
+    max_frames: int | None = None
+    follow: bool = False
+    silence_s: float = 10.0
+    topics: BagTopics = field(default_factory=BagTopics)
+
+
+def open_source(text: str, options: SourceOptions) -> Source:
+    """A folder in TUM layout, a bag, ``realsense:`` or ``opencv:N``.
+
+    Raises:
+        InputError: it is none of these, or cannot be opened.
+    """
+    path = Path(text)
+    source: Source
+    if text == REALSENSE:
+        source = RealSenseSource(options.camera, options.silence_s)
+    elif text.startswith(OPENCV):
+        source = OpenCvSource(_device(text), options.camera, options.silence_s)
+    elif is_bag(path):
+        source = BagSource(path, options.topics, options.camera, options.realtime)
+    elif options.follow:
+        follow = FollowOptions(silence_s=options.silence_s)
+        source = GrowingFolder(path, options.camera, follow)
+    elif path.is_dir():
+        sequence = open_sequence(path, camera=options.camera)
+        source = RecordedSource(sequence, options.realtime)
+    else:
+        raise InputError(
+            f"{text}: no source; give a folder in TUM layout, a .bag, a bag folder, a .mcap, "
+            "realsense: or opencv:N"
+        )
+    return source if options.max_frames is None else Limited(source, options.max_frames)
+
+
+def _device(text: str) -> int:
+    number = text.removeprefix(OPENCV)
+    if not number.isdecimal():
+        raise InputError(f"{text}: no number of a device; write e.g. opencv:0")
+    return int(number)

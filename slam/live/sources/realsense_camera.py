@@ -1,0 +1,129 @@
+"""Frames from an Intel RealSense, depth aligned to colour."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.geometry import Array
+from slam.live.sources.camera_source import CameraSource, Shot
+from slam.live.sources.checks import check_depth_scale
+from slam.live.sources.optional import import_optional
+from slam.live.sources.pairing import MAX_DIFFERENCE_S
+from slam.sequences import read_camera
+from slam.sequences.images import depth_in_metres
+
+SIZE = (640, 480)
+FPS = 30
+POLL_MS = 200
+MAX_RESIDUAL_PX = 0.5
+"""The device's distortion must be described to this by OpenCV's five numbers."""
+
+
+class RealSenseSource(CameraSource):
+    """The first device that is plugged in, 640x480 at 30 Hz."""
+
+    def __init__(self, camera: Path | None = None, silence_s: float = 10.0) -> None:
+        """Start the device.
+
+        Raises:
+            InputError: pyrealsense2 is not installed, there is no device, or its distortion is not
+                OpenCV's.
+        """
+        super().__init__("realsense", silence_s)
+        self._rs: Any = import_optional("pyrealsense2", "realsense", "realsense:")
+        rs = self._rs
+        self._pipeline, self._align = rs.pipeline(), rs.align(rs.stream.color)
+        streams = rs.config()
+        streams.enable_stream(rs.stream.color, *SIZE, rs.format.rgb8, FPS)
+        streams.enable_stream(rs.stream.depth, *SIZE, rs.format.z16, FPS)
+        try:
+            profile = self._pipeline.start(streams)
+        except RuntimeError as error:
+            raise InputError(f"realsense: cannot start ({error}); plug the camera in") from error
+        try:
+            self.camera = self._find_camera(profile, camera)
+        except BaseException:
+            self._release()
+            raise
+
+    def _take(self) -> Shot | None:
+        came, images = self._pipeline.try_wait_for_frames(POLL_MS)
+        if not came:
+            return None
+        aligned = self._align.process(images)
+        colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()
+        if not colour or not depth or _lag_s(colour, depth) > MAX_DIFFERENCE_S:
+            self.counts.unpaired_rgb += bool(colour)
+            self.counts.unpaired_depth += bool(depth)
+            return None
+        rgb = np.array(np.asanyarray(colour.get_data()), np.uint8)
+        stored = np.asanyarray(depth.get_data())
+        return Shot(1e-3 * colour.get_timestamp(), rgb, depth_in_metres(stored, self.camera))
+
+    def _release(self) -> None:
+        self._pipeline.stop()
+
+    def _find_camera(self, profile: Any, given: Path | None) -> Camera:
+        """The camera that is given, or the device's."""
+        scale = 1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale())
+        if given is not None:
+            camera = read_camera(given)
+            check_depth_scale(camera, scale, str(given), "realsense's depth")
+            return camera
+        stream = profile.get_stream(self._rs.stream.color).as_video_stream_profile()
+        i = stream.get_intrinsics()
+        plain = Camera(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy, depth_scale=scale, fps=FPS)
+        if not any(i.coeffs):
+            return plain
+        pixels, rays = self._samples(i)
+        return fit_distortion(plain, pixels, rays)
+
+    def _samples(self, intrinsics: Any) -> tuple[Array, Array]:
+        """Pixels (N, 2) over the image, and their rays (N, 2) at z = 1 by the device's model."""
+        steps = np.linspace(0.02, 0.98, 20)
+        columns, rows = np.meshgrid(steps * intrinsics.width, steps * intrinsics.height)
+        pixels = np.column_stack([columns.ravel(), rows.ravel()])
+        deproject = self._rs.rs2_deproject_pixel_to_point
+        return pixels, np.array([deproject(intrinsics, list(p), 1.0)[:2] for p in pixels])
+
+
+def fit_distortion(camera: Camera, pixels: Array, rays: Array) -> Camera:
+    """The camera with OpenCV's distortion by which undistorted ``rays`` (N, 2) reach the pixels.
+
+    The model is linear in k1, k2, p1, p2, k3: x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6)
+    + 2 p1 x y + p2 (r^2 + 2 x^2), and y_d likewise with p1 and p2 exchanged.
+
+    Raises:
+        InputError: they do not fit, as for a fisheye.
+    """
+    x, y = rays.T
+    r2 = x**2 + y**2
+    for_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x**2, x * r2**3], axis=-1)
+    for_y = np.stack([y * r2, y * r2**2, r2 + 2 * y**2, 2 * x * y, y * r2**3], axis=-1)
+    A = np.concatenate([camera.fx * for_x, camera.fy * for_y])
+    shift = pixels - (rays * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+    b = shift.T.ravel()
+    solution = np.linalg.lstsq(A, b, rcond=None)[0]
+    residual_px = float(np.abs(A @ solution - b).max())
+    if residual_px > MAX_RESIDUAL_PX:
+        raise InputError(
+            f"the camera's distortion differs from OpenCV's by {residual_px:.1f} px; calibrate it "
+            "and give --camera F"
+        )
+    k1, k2, p1, p2, k3 = (float(value) for value in solution)
+    return Camera(
+        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
+        (k1, k2, p1, p2, k3), camera.depth_scale, camera.fps,
+    )  # fmt: skip
+
+
+def _lag_s(colour: Any, depth: Any) -> float:
+    """Between the two images; 0 where their clocks differ."""
+    if colour.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain():
+        return 0.0
+    return abs(1e-3 * (depth.get_timestamp() - colour.get_timestamp()))

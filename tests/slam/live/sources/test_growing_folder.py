@@ -1,0 +1,246 @@
+"""A folder that another thread writes while it is followed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from graph.errors import InputError
+from slam.frame import Frame
+from slam.live.sources.growing_folder import FINISHED, FollowOptions, GrowingFolder
+from slam.sequences import open_sequence
+
+CAMERA = "{width: 32, height: 24, fx: 30, fy: 31, cx: 15, cy: 12, depth_scale: 1000}\n"
+QUICK = FollowOptions(silence_s=1.0, patience_s=0.3, poll_s=0.002)
+WRITE_S = 0.004
+
+
+class Recorder:
+    """Writes a TUM folder step by step; image k has red 10 k and depth k + 1 decimetres."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / "rgb").mkdir(parents=True)
+        (folder / "depth").mkdir()
+        (folder / "camera.yaml").write_text(CAMERA)
+
+    def lists(self, *names: str) -> None:
+        """Empty lists."""
+        for name in names or ("rgb", "depth"):
+            (self.folder / f"{name}.txt").touch()
+
+    def line(self, name: str, text: str) -> None:
+        """More of a list, as it is given."""
+        with (self.folder / f"{name}.txt").open("a") as file:
+            file.write(text)
+
+    def images(self, k: int) -> dict[Path, bytes]:
+        """The files of frame k, as bytes."""
+        bgr = np.full((24, 32, 3), (200, 20, 10 * k), np.uint8)
+        depth = np.full((24, 32), (k + 1) * 100, np.uint16)
+        depth[0] = 0
+        kinds = {"rgb": bgr, "depth": depth}
+        return {
+            self.folder / kind / f"{k}.png": cv2.imencode(".png", pixels)[1].tobytes()
+            for kind, pixels in kinds.items()
+        }
+
+    def write_images(self, k: int) -> None:
+        """Whole and at once."""
+        for path, data in self.images(k).items():
+            path.write_bytes(data)
+
+    def frame(self, k: int, lag_s: float = 0.004) -> None:
+        """Images, then both lines."""
+        self.write_images(k)
+        self.line("rgb", f"{k / 10:.6f} rgb/{k}.png\n")
+        self.line("depth", f"{k / 10 + lag_s:.6f} depth/{k}.png\n")
+
+    def finish(self) -> None:
+        (self.folder / FINISHED).touch()
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Recorder:
+    return Recorder(tmp_path / "growing")
+
+
+def follow_while(recorder: Recorder, write: Callable[[], None]) -> tuple[list[Frame], list[float]]:
+    """The frames that come while ``write`` runs in a thread, and when each came."""
+    thread = threading.Thread(target=write)
+    thread.start()
+    try:
+        source = GrowingFolder(recorder.folder, options=QUICK)
+        frames, times_s = [], []
+        for frame in source.frames():
+            frames.append(frame)
+            times_s.append(time.monotonic())
+    finally:
+        thread.join()
+    recorder.counts = source.counts
+    return frames, times_s
+
+
+def numbers(frames: list[Frame]) -> list[int]:
+    """Which frames they are; colour and depth must be of one."""
+    found = [int(frame.rgb[0, 0, 0]) // 10 for frame in frames]
+    assert [round(10 * float(frame.depth_m[1, 0])) - 1 for frame in frames] == found
+    assert all(np.isnan(frame.depth_m[0]).all() for frame in frames)
+    return found
+
+
+def test_what_grows_is_what_is_read_afterwards(recorder: Recorder) -> None:
+    def write() -> None:
+        recorder.lists()
+        for k in range(12):
+            recorder.frame(k)
+            time.sleep(WRITE_S)
+        recorder.finish()
+
+    frames, _ = follow_while(recorder, write)
+    whole = list(open_sequence(recorder.folder).frames())
+    assert len(frames) == len(whole) == 12
+    for frame, expected in zip(frames, whole, strict=True):
+        assert (frame.index, frame.timestamp_s) == (expected.index, expected.timestamp_s)
+        assert frame.name == expected.name
+        assert np.array_equal(frame.rgb, expected.rgb)
+        assert np.array_equal(frame.depth_m, expected.depth_m, equal_nan=True)
+    assert recorder.counts.line() == ""
+
+
+def test_a_frame_is_there_before_the_next_but_one_is_written(recorder: Recorder) -> None:
+    written_s = []
+
+    def write() -> None:
+        recorder.lists()
+        for k in range(5):
+            recorder.frame(k, lag_s=0.0)
+            written_s.append(time.monotonic())
+            time.sleep(0.1)
+        recorder.finish()
+
+    frames, times_s = follow_while(recorder, write)
+    assert numbers(frames) == [0, 1, 2, 3, 4]
+    assert all(np.array(times_s[:3]) < written_s[2:])
+
+
+def test_lines_and_images_that_are_half_written_wait(recorder: Recorder) -> None:
+    """Lines come in pieces and before their images, images in two halves."""
+
+    def write() -> None:
+        recorder.lists()
+        for k in range(3):
+            recorder.line("rgb", f"{k / 10:.6f} rgb/")
+            recorder.line("depth", f"{k / 10:.4f}")
+            time.sleep(WRITE_S)
+            recorder.line("rgb", f"{k}.png\n")
+            recorder.line("depth", f" depth/{k}.png\n")
+            for path, data in recorder.images(k).items():
+                half = len(data) // 2
+                with path.open("wb") as file:
+                    for part in (data[:half], data[half:]):
+                        file.write(part)
+                        file.flush()
+                        time.sleep(WRITE_S)
+        recorder.finish()
+
+    frames, _ = follow_while(recorder, write)
+    assert numbers(frames) == [0, 1, 2]
+    assert recorder.counts.line() == ""
+
+
+def test_an_image_that_never_comes_costs_only_itself(recorder: Recorder) -> None:
+    def write() -> None:
+        recorder.lists()
+        for k in range(4):
+            recorder.frame(k)
+            if k == 1:
+                (recorder.folder / "rgb" / "1.png").unlink()
+        recorder.line("rgb", "no line\n")
+        time.sleep(2 * QUICK.patience_s)
+        recorder.frame(4)
+        recorder.finish()
+
+    frames, _ = follow_while(recorder, write)
+    assert numbers(frames) == [0, 2, 3, 4]
+    assert [frame.index for frame in frames] == [0, 2, 3, 4]
+    assert recorder.counts.broken == 2
+
+
+@pytest.mark.parametrize(
+    "line", ["{s} rgb/{k}.png {s} depth/{k}.png", "{s} depth/{k}.png {s} rgb/{k}.png"]
+)
+def test_associations_in_either_order(recorder: Recorder, line: str) -> None:
+    def write() -> None:
+        recorder.lists("associations")
+        for k in range(4):
+            recorder.write_images(k)
+            recorder.line("associations", line.format(s=k / 10, k=k) + "\n")
+            time.sleep(WRITE_S)
+        recorder.finish()
+
+    frames, _ = follow_while(recorder, write)
+    assert numbers(frames) == [0, 1, 2, 3]
+
+
+def test_silence_ends_it_and_the_last_frame_is_not_lost(recorder: Recorder) -> None:
+    """The last depth image is the later one, whose pair is certain only at the end."""
+
+    def write() -> None:
+        recorder.lists()
+        for k in range(3):
+            recorder.frame(k)
+
+    frames, times_s = follow_while(recorder, write)
+    assert numbers(frames) == [0, 1, 2]
+    assert QUICK.silence_s < time.monotonic() - times_s[1] < QUICK.silence_s + 1
+
+
+def test_a_list_may_be_far_ahead_of_the_other(recorder: Recorder) -> None:
+    def write() -> None:
+        recorder.lists()
+        for k in range(100):
+            recorder.line("rgb", f"{k / 10:.6f} rgb/{k % 4}.png\n")
+        time.sleep(20 * WRITE_S)
+        for k in range(100):
+            recorder.line("depth", f"{k / 10 + 0.004:.6f} depth/{k % 4}.png\n")
+        recorder.finish()
+
+    for k in range(4):
+        recorder.write_images(k)
+    frames, _ = follow_while(recorder, write)
+    assert numbers(frames) == [k % 4 for k in range(100)]
+
+
+def test_closing_ends_it_at_once(recorder: Recorder) -> None:
+    recorder.lists()
+    source = GrowingFolder(recorder.folder, options=FollowOptions(silence_s=60))
+    threading.Timer(0.1, source.close).start()
+    begin_s = time.monotonic()
+    assert list(source.frames()) == []
+    assert time.monotonic() - begin_s < 5
+
+
+def test_it_waits_for_lists_and_camera_but_not_for_ever(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        GrowingFolder(tmp_path / "none", options=QUICK)
+    short = FollowOptions(silence_s=0.05)
+    with pytest.raises(InputError, match=r"camera\.yaml"):
+        GrowingFolder(tmp_path, options=short)
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    with pytest.raises(InputError, match=r"neither rgb\.txt and depth\.txt nor"):
+        GrowingFolder(tmp_path, options=short)
+
+
+def test_stamps_in_milliseconds_are_refused(recorder: Recorder) -> None:
+    recorder.lists()
+    for k in range(6):
+        recorder.line("rgb", f"{33 * k} rgb/{k}.png\n")
+    with pytest.raises(InputError, match=r"rgb\.txt.*seconds"):
+        list(GrowingFolder(recorder.folder, options=QUICK).frames())

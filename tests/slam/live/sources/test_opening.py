@@ -1,0 +1,121 @@
+"""What a source is called decides what it is; ``bmask-slam live`` runs on each that can be made."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded_bags import DEPTH, INFO, RGB, BagMaker, camera_info, image, write_bag
+
+from graph.errors import InputError
+from graph.trajectory import read_tum
+from slam.cli import main
+from slam.live.sources import RecordedSource, Source
+from slam.live.sources.bag_source import BagSource
+from slam.live.sources.growing_folder import FINISHED, GrowingFolder
+from slam.live.sources.opening import SourceOptions, open_source
+from slam.sequences import Sequence, open_sequence
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Sequence:
+    path = tmp_path_factory.mktemp("sources") / "office"
+    assert main(["render", "office", "--frames", str(FRAMES), "--out", str(path), "--quiet"]) == 0
+    return open_sequence(path)
+
+
+@pytest.fixture(scope="module")
+def bag(recording: Sequence) -> Path:
+    """The recording as a bag; its third colour image lacks depth, the fifth comes twice."""
+    path = recording.folder.parent / "office.bag"
+    with BagMaker(path) as made:
+        info, camera = camera_info((0.0,) * 5), recording.camera
+        info.width, info.height, info.k = camera.width, camera.height, camera.K.ravel()
+        made.write(INFO, 1.0, info)
+        for frame in recording.frames():
+            stamp_s = 1000 + frame.timestamp_s
+            for _ in range(1 + (frame.index == 4)):
+                made.write(RGB, stamp_s, image("rgb8", frame.rgb))
+            if frame.index != 2:
+                made.write(DEPTH, stamp_s + 0.002, image("32FC1", frame.depth_m))
+    return path
+
+
+def source_of(path: Path | str, **options) -> Source:
+    return open_source(str(path), SourceOptions(**options))
+
+
+def test_the_form_decides(recording: Sequence, bag: Path, tmp_path: Path) -> None:
+    assert isinstance(source_of(recording.folder), RecordedSource)
+    assert isinstance(source_of(recording.folder, follow=True), GrowingFolder)
+    assert isinstance(source_of(bag), BagSource)
+    assert isinstance(source_of(write_bag(tmp_path / "folder")), BagSource)
+    assert isinstance(source_of(write_bag(tmp_path / "a.mcap")), BagSource)
+
+
+def test_recordings_wait_unless_they_play_at_their_own_speed(recording, bag: Path) -> None:
+    for path in (recording.folder, bag):
+        assert source_of(path).waits
+        assert not source_of(path, realtime=True).waits
+    assert not source_of(recording.folder, follow=True).waits
+
+
+def test_any_source_can_be_cut_short(recording: Sequence, bag: Path) -> None:
+    for path, follow in ((recording.folder, False), (recording.folder, True), (bag, False)):
+        source = source_of(path, max_frames=3, follow=follow)
+        assert [frame.index for frame in source.frames()] == [0, 1, 2]
+        source.close()
+
+
+def test_a_folder_counts_what_has_no_partner(recording: Sequence) -> None:
+    assert source_of(recording.folder).counts.line() == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("nowhere", "no source; give a folder"),
+        ("nowhere.bag", "no such bag"),
+        ("opencv:x", "write e.g. opencv:0"),
+        ("opencv:0", "give --camera F"),
+    ],
+)
+def test_what_is_no_source_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        source_of(text)
+
+
+def test_live_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, capsys) -> None:
+    assert main(["live", str(bag), "--out", str(tmp_path / "run")]) == 0
+    counts = "1 unpaired rgb, 1 duplicates"
+    assert f"Source      {counts}" in capsys.readouterr().out
+    found = read_tum(tmp_path / "run" / "trajectory.txt")
+    expected_s = 1000 + np.delete(recording.timestamps_s, 2)
+    assert np.allclose(found.timestamps_s, expected_s, atol=1e-6)
+    truth = recording.groundtruth
+    assert truth is not None
+    moved_m = np.linalg.norm(truth.positions_world[FRAMES - 1] - truth.positions_world[0])
+    assert np.linalg.norm(found.positions_world[-1]) == pytest.approx(moved_m, abs=0.005)
+    source = json.loads((tmp_path / "run" / "health.json").read_text())["source"]
+    assert (source["unpaired_rgb"], source["duplicates"], source["gaps"]) == (1, 1, 0)
+
+
+def test_live_on_a_folder_that_grew(recording: Sequence, tmp_path: Path) -> None:
+    (recording.folder / FINISHED).touch()
+    command = ["live", str(recording.folder), "--follow", "--out", str(tmp_path / "run")]
+    try:
+        assert main(command) == 0
+    finally:
+        (recording.folder / FINISHED).unlink()
+    assert len(read_tum(tmp_path / "run" / "trajectory.txt").timestamps_s) > 1
+
+
+def test_info_lists_the_topics_of_a_bag(bag: Path, capsys) -> None:
+    assert main(["info", str(bag)]) == 0
+    out = capsys.readouterr().out
+    assert [topic in out for topic in (RGB, DEPTH, INFO)] == [True] * 3
+    assert f"{FRAMES + 1} messages" in out
