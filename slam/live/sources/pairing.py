@@ -147,7 +147,7 @@ class Pairer(Generic[T]):
         found = np.flatnonzero(mutual)
         if not len(found):
             return []
-        return self._take(found[-1] + 1, to_depth[found[-1]] + 1)
+        return self._take(int(found[-1]) + 1, int(to_depth[found[-1]]) + 1)
 
     def _take(self, rgb_count: int, depth_count: int) -> list[Pair[T]]:
         """Pair the first images of the queues; those that stay alone are unpaired."""
