@@ -64,7 +64,8 @@ def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera-info-topic", metavar="T", help=text)
 
 
-def _source_options(arguments: argparse.Namespace) -> SourceOptions:
+def source_options(arguments: argparse.Namespace) -> SourceOptions:
+    """How the source is to be read."""
     from slam.live.sources.bag_source import BagTopics
     from slam.live.sources.opening import SourceOptions
 
@@ -96,7 +97,7 @@ def _live(arguments: argparse.Namespace) -> int:
     config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
     with (
         console_log(),
-        closing(open_source(arguments.source, _source_options(arguments))) as source,
+        closing(open_source(arguments.source, source_options(arguments))) as source,
     ):
         out = arguments.out or free_run_path(f"{source.name}-live")
         folder = Path(arguments.source)

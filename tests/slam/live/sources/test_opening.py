@@ -15,10 +15,11 @@ from synthetic_view import CAMERA, render_plane
 from graph.errors import InputError
 from graph.geometry import inverse, se3_exp
 from graph.trajectory import read_tum
-from slam.cli import main
+from slam.cli import main, make_parser
+from slam.commands import live as live_command
 from slam.live.sources import RecordedSource, Source
-from slam.live.sources.bag_source import BagSource
-from slam.live.sources.growing_folder import FINISHED, GrowingFolder
+from slam.live.sources.bag_source import BagSource, BagTopics
+from slam.live.sources.growing_folder import GrowingFolder
 from slam.live.sources.opening import SourceOptions, open_source
 from slam.sequences import Sequence, open_sequence, write_camera
 
@@ -121,14 +122,14 @@ def test_live_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, capsys) -
     assert (source["unpaired_rgb"], source["duplicates"], source["gaps"]) == (1, 1, 0)
 
 
-def test_live_on_a_folder_that_grew(recording: Sequence, tmp_path: Path) -> None:
-    (recording.folder / FINISHED).touch()
-    command = ["live", str(recording.folder), "--follow", "--out", str(tmp_path / "run")]
-    try:
-        assert main(command) == 0
-    finally:
-        (recording.folder / FINISHED).unlink()
-    assert len(read_tum(tmp_path / "run" / "trajectory.txt").timestamps_s) > 1
+def test_the_commands_options_reach_the_source() -> None:
+    plain = live_command.source_options(make_parser().parse_args(["live", "a"]))
+    assert plain == SourceOptions()
+    words = "live a --follow --silence 3 --realtime --max-frames 7 --camera c.yaml"
+    topics = "--rgb-topic /r --depth-topic /d --camera-info-topic /i"
+    given = live_command.source_options(make_parser().parse_args(f"{words} {topics}".split()))
+    expected = SourceOptions(Path("c.yaml"), True, 7, True, 3.0, BagTopics("/r", "/d", "/i"))
+    assert given == expected
 
 
 def test_info_lists_the_topics_of_a_bag(bag: Path, capsys) -> None:
