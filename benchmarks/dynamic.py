@@ -5,7 +5,8 @@
 The same camera path through the same room is rendered without people, with one, two and four who
 walk, and with one who carries a box of no class and pulls a chair along; sequences that are there
 already are used as they are. Each is run with nothing, with the labels of masks alone, with
-geometry alone, and with both. "x clean" compares with the same camera path without people, run with
+geometry alone, with both, and with the truth of every frame ("ideal"), which shows what the people
+cost by what they hide. "x clean" compares with the same camera path without people, run with
 nothing; "left out" is the share of the keypoints on people, the box, the chair while it is pulled,
 and on all the rest, that were not used. The check's time is the processor's, of all frames.
 """
@@ -21,12 +22,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from moving_points import KINDS, MovingTruth, WatchedSystem, strip
+from moving_points import KINDS, NEAR_PX, MovingTruth, WatchedSystem, strip
 from report import table
 
 from graph.camera import Camera
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
 from slam.configuration import resolve
+from slam.dynamics import Sifted
+from slam.features import Features, select
+from slam.frame import Frame
 from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.runner import RunOptions, run
 from slam.system_config import SystemConfig
@@ -38,11 +42,13 @@ SCENES = {
     "4 walk": {"people": 4},
     "box and chair": {"people": 1, "carry": True},
 }
+IDEAL = "ideal"
 VARIANTS = {
     "nothing": (False, False),
     "labels": (True, False),
     "geometry": (False, True),
     "both": (True, True),
+    IDEAL: (False, False),
 }
 """Name to whether labels and geometry count."""
 FPS_HZ = 15.0
@@ -68,6 +74,18 @@ class Outcome:
     left_out: dict[str, float | None]
     check_ms: tuple[float, float]
     mostly_moving: int
+
+
+class IdealSystem(WatchedSystem):
+    """Leaves out what the truth says, in every frame."""
+
+    def _sift(self, frame: Frame, features: Features) -> Sifted:
+        sifted = super()._sift(frame, features)
+        moves = np.any(list(self.truth.masks(frame).values()), axis=0).astype(np.uint8)
+        moves = cv2.dilate(moves, np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8))
+        columns, rows = np.rint(features.image_pixels).astype(np.int64).T
+        moving = moves[rows, columns] > 0
+        return Sifted(select(features, np.flatnonzero(~moving)), moving, False, sifted.view)
 
 
 def main() -> None:
@@ -114,7 +132,8 @@ def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespac
     frames = len((folder / "rgb.txt").read_text().splitlines()) - 2
 
     def make(camera: Camera, config: SystemConfig) -> WatchedSystem:
-        system = WatchedSystem(camera, config, segmenter)
+        kind = IdealSystem if variant == IDEAL else WatchedSystem
+        system = kind(camera, config, segmenter)
         systems.append(system.watch(MovingTruth(folder), frames // PICTURES))
         return system
 

@@ -63,6 +63,11 @@ REPORTS = {
         ),
         "rooms": ("Masks of rendered rooms", "segmentation.py rooms --rooms {sequences}/rooms"),
         "cost": ("Time and memory of the networks", "segmentation.py cost"),
+        "dynamic": (
+            "People who walk, a carried box and a pulled chair",
+            "dynamic.py --sequences {sequences} --segmenter light --out {sequences}/dynamic",
+        ),
+        "pairs": ("A real man who walks, by geometry alone", "dynamic_pairs.py"),
     }),
 }  # fmt: skip
 

@@ -18,6 +18,7 @@ from slam.configuration import resolve
 from slam.dynamics import Sifted
 from slam.features import Features
 from slam.frame import Frame
+from slam.results import TrackingStatus
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 
@@ -198,3 +199,20 @@ def test_when_nearly_everything_moves_all_is_used_and_said(frames: list[Frame]) 
     assert results[-1].mostly_moving
     assert results[-1].ignored == 0
     assert not results[3].mostly_moving
+
+
+def test_where_the_prediction_is_far_off_the_room_does_not_move() -> None:
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS))
+    for k in range(4):
+        system.process(view(k, with_card=False))
+    jumped = pose(4) @ se3_exp(np.array([0, 0, 0, 0, 0, 0.35]))
+    frame = render_plane(jumped, 4)
+    features = system.prepare(frame)
+    views = system.dynamics.memory.posed(0, system.mapper)
+    sifted = system.dynamics.sift(frame, features, system.localiser.prediction(), views)
+    assert sifted.moving.mean() > 0.5
+    result = system.process(frame, features)
+    assert result.status is TrackingStatus.OK
+    assert result.T_world_camera is not None
+    expected = inverse(pose(0)) @ jumped
+    np.testing.assert_allclose(result.T_world_camera[:3, 3], expected[:3, 3], atol=0.02)
