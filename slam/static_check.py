@@ -60,8 +60,8 @@ class StaticCheckConfig:
     def __post_init__(self) -> None:
         if self.margin_m <= 0 or self.depth_sigmas < 0 or self.window_px < 0:
             raise ValueError("margin_m must be positive, depth_sigmas and window_px not negative")
-        if self.views < 1 or self.neighbours < 1:
-            raise ValueError("views and neighbours must be at least 1")
+        if not 1 <= self.views <= 127 or self.neighbours < 1:
+            raise ValueError("views must be 1 to 127, neighbours at least 1")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,8 @@ class DepthView:
 
 def depth_view(depth_m: Depths, window_px: int) -> DepthView:
     """The view of a depth image (H, W), NaN where missing, at every second pixel."""
-    filled = np.nan_to_num(depth_m[::2, ::2], nan=0.0)
+    filled = depth_m[::2, ::2].copy()
+    cv2.patchNaNs(filled, 0.0)
     side = 2 * (window_px // 2) + 1
     window = np.ones((side, side), np.uint8)
     return DepthView(cv2.erode(filled, window), cv2.dilate(filled, window), 2)
@@ -133,7 +134,7 @@ class StaticCheck:
 
     def agree(self, verdicts: Verdicts) -> Verdicts:
         """What several views (K, N) say together (N,): the majority of those that say anything."""
-        return np.sign(verdicts.sum(axis=0, dtype=np.int64)).astype(np.int8)
+        return np.asarray(np.sign(verdicts.sum(axis=0, dtype=np.int8)))
 
     def spread(self, pixels: Array, depth_m: Array, verdicts: Verdicts) -> Verdicts:
         """Verdicts (N,) with those of keypoints that have none taken from their neighbours.
