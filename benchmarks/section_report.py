@@ -13,7 +13,7 @@ import re
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,11 +24,13 @@ from benchmarks.machine import describe_commit, now, processor  # noqa: E402
 
 @dataclass(frozen=True)
 class Report:
-    """A page of sections by name: each has a title and a command of this folder."""
+    """A page of sections by name: each has a title, a command of this folder and pictures."""
 
     path: Path
     title: str
     sections: dict[str, tuple[str, str]]
+    pictures: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Of a section: captions by their names in docs/images."""
 
     @property
     def head(self) -> str:
@@ -69,6 +71,22 @@ REPORTS = {
         ),
         "pairs": ("A real man who walks, by geometry alone", "dynamic_pairs.py"),
     }),
+    "mapping": Report(ROOT / "docs" / "mapping.md", "What the dense map reaches", {
+        "dense": ("Depth, surface, labels and time", "dense.py {sequences}/dense"),
+        "loop": ("Submaps follow a loop closure", "dense_session.py loop {sequences}/dense/office"),
+        "session": (
+            "Memory over a long session",
+            "dense_session.py session {sequences}/dense/office --keyframes 360",
+        ),
+        "pictures": ("What it looks like", "dense_pictures.py {sequences}/dense docs/images"),
+    }, {
+        "pictures": {
+            "dense_kitchen.jpg": "The red kitchen, a real Kinect's 300 frames: cloud and labels",
+            "dense_kitchen_mesh.jpg": "Its mesh, lit from the camera",
+            "dense_kitchen_plan.png": "Its floor plan: floor, what stands on it, the camera's path",
+            "dense_office.jpg": "A rendered office: cloud and labels",
+        },
+    }),
 }  # fmt: skip
 
 
@@ -86,7 +104,10 @@ def section(report: Report, name: str, sequences: Path) -> str:
     wall_s = time.perf_counter() - begin_s
     commit = describe_commit(ROOT, (str(report.path.relative_to(ROOT)),))
     when = f"{processor()}; commit {commit}; {now()}; {wall_s:.0f} s."
-    return f"## {title}\n\n`python {command}`\n\n```\n{done.stdout.strip()}\n```\n\n{when}\n"
+    captions = report.pictures.get(name, {})
+    pictures = "".join(f"\n![{text}](images/{file})\n{text}.\n" for file, text in captions.items())
+    printed = f"```\n{done.stdout.strip()}\n```"
+    return f"## {title}\n\n`python {command}`\n\n{printed}\n\n{when}\n{pictures}"
 
 
 def main() -> None:
