@@ -55,8 +55,8 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     pictures = {
-        "dense_kitchen.jpg": ("kitchen", ("view_middle.png", "view_overview_semantic.png")),
-        "dense_kitchen_mesh.jpg": ("kitchen", ("view_mesh.png", "view_overview.png")),
+        "dense_kitchen.jpg": ("kitchen", ("view_overview.png", "view_overview_semantic.png")),
+        "dense_kitchen_mesh.jpg": ("kitchen", ("view_mesh.png", "view_middle.png")),
         "dense_kitchen_plan.png": ("kitchen", ("plan.png",)),
         "dense_office.jpg": ("office", ("view_middle.png", "view_middle_semantic.png")),
     }
