@@ -82,7 +82,7 @@ REPORTS = {
     }, {
         "pictures": {
             "dense_kitchen.jpg": "The red kitchen, a real Kinect's 300 frames: cloud and labels",
-            "dense_kitchen_mesh.jpg": "Its mesh, lit from the camera, and the cloud in the same view",
+            "dense_kitchen_mesh.jpg": "Its mesh, lit from the camera, and the cloud",
             "dense_kitchen_plan.png": "Its floor plan: floor, what stands on it, the camera's path",
             "dense_office.jpg": "A rendered office: cloud and labels",
         },
