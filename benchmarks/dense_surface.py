@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from graph.geometry import Array, inverse, transform
-from graph.metrics import align
+from graph.geometry import Array, make_pose, transform
 from mapping.backprojection import back_project, surface_normals
 from mapping.dense import DenseKeyframe
 from mapping.inverse_depth import InverseDepthMap
@@ -34,15 +33,23 @@ class Truth:
     T_world_camera: Array
 
 
+def aligned(mine: Array, true: Array) -> Array:
+    """T_mine_true (4, 4) that brings true poses (N, 4, 4) nearest to mine, in turn and place.
+
+    By turns first: positions alone leave open the turn about a path that is nearly straight.
+    """
+    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", mine[:, :3, :3], true[:, :3, :3]))
+    R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    return make_pose(R, (mine[:, :3, 3] - true[:, :3, 3] @ R.T).mean(axis=0))
+
+
 def read_truth(run: MappedRun) -> list[Truth]:
     """True depth and poses of the keyframes, aligned to the estimate as a whole."""
     assert run.sequence.groundtruth is not None
     poses = run.sequence.groundtruth.poses_world_camera
     true = np.stack([poses[k.frame_index] for k in run.keyframes])
     mine = np.stack([k.T_world_camera for k in run.keyframes])
-    T_mine_true = align(true[:, :3, 3], mine[:, :3, 3]).T_reference_estimate
-    if len(mine) < 3:
-        T_mine_true = mine[0] @ inverse(true[0])
+    T_mine_true = aligned(mine, true)
     found = []
     for keyframe, T in zip(run.keyframes, true, strict=True):
         name = run.sequence.pairs.depth_files[keyframe.frame_index].name
