@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from typing import Any
 
 import cv2
@@ -107,18 +106,12 @@ def surface_errors(points: Array, true: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def open3d_points(run: MappedRun, keyframes: list[DenseKeyframe]) -> tuple[Array, float]:
-    """Open3D's TSDF of the sensor's depth, and its least processor milliseconds a keyframe."""
+def open3d_points(run: MappedRun, keyframes: list[DenseKeyframe]) -> Array:
+    """Points (N, 3) of Open3D's TSDF of the sensor's depth."""
     views = [(k.depth_m, k.rgb, k.T_world_camera) for k in keyframes]
-    integrated(views[:1], run.camera, VOXEL_M, 4.0)
-    times_s = []
-    for _ in range(3):
-        started_s = time.process_time()
-        volume = integrated(views, run.camera, VOXEL_M, 4.0)
-        times_s.append(time.process_time() - started_s)
-    elapsed_ms = 1e3 * min(times_s) / len(views)
+    volume = integrated(views, run.camera, VOXEL_M, 4.0)
     cloud = volume.extract_point_cloud(weight_threshold=1.0)
-    return cloud.point.positions.numpy().astype(float), elapsed_ms
+    return np.asarray(cloud.point.positions.numpy(), float)
 
 
 def label_errors(cloud: dict[str, Any], true: dict[str, Any]) -> dict[str, float]:

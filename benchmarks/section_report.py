@@ -122,7 +122,10 @@ def main() -> None:
     for name in chosen:
         new = section(report, name, arguments.sequences)
         old = report.path.read_text() if report.path.exists() else report.head
-        parts = {part.split("\n", 1)[0]: part for part in re.split(r"(?m)^(?=## )", old)[1:]}
+        parts = {
+            part.split("\n", 1)[0]: part.rstrip() + "\n\n"
+            for part in re.split(r"(?m)^(?=## )", old)[1:]
+        }
         parts[new.split("\n", 1)[0]] = new.rstrip() + "\n\n"
         titles = [f"## {title}" for title, _ in report.sections.values()]
         body = "".join(parts[title] for title in titles if title in parts)

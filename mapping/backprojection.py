@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import avg_pool2d
 
 from graph.camera import Camera
 from mapping.inverse_depth import InverseDepthMap
@@ -45,9 +45,12 @@ def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
     a, b = a / weight, b / weight
     u, v = image_grid(rho)
     u, v = u[:, 1:-1] - camera.cx, v[1:-1] - camera.cy
-    n = torch.stack([camera.fx * a, camera.fy * b, inner - a * u - b * v], dim=-1)
-    n = -n / torch.linalg.norm(n, dim=-1, keepdim=True)
-    return pad(n, (0, 0, 1, 1, 1, 1), value=torch.nan)
+    planes = camera.fx * a, camera.fy * b, inner - a * u - b * v
+    scale = (planes[0].square() + planes[1].square() + planes[2].square()).rsqrt_().neg_()
+    normals = torch.full((*rho.shape, 3), torch.nan, device=rho.device)
+    for k, plane in enumerate(planes):
+        normals[1:-1, 1:-1, k] = plane * scale
+    return normals
 
 
 def _window_mean(planes: Tensor) -> Tensor:
