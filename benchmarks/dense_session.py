@@ -102,7 +102,8 @@ def loop(sequence: Sequence) -> Iterator[str]:
             submap.placed(T)
         times_s.append(time.process_time() - started_s)
     points = sum(map(len, submaps))
-    yield f"{points} points of {len(submaps)} submaps follow in {1e3 * min(times_s):.0f} ms of processor time"
+    least_ms = 1e3 * min(times_s)
+    yield f"{points} points of {len(submaps)} submaps follow in {least_ms:.0f} ms of processor time"
     e = np.concatenate(errors)
     yield (
         f"against a map fused anew: median {1e3 * np.median(e):.2f} mm, mean {1e3 * e.mean():.2f} "
