@@ -70,6 +70,10 @@ REPORTS = {
             "dynamic.py --sequences {sequences} --segmenter light --out {sequences}/dynamic",
         ),
         "pairs": ("A real man who walks, by geometry alone", "dynamic_pairs.py"),
+        "composited": (
+            "A real man put into a real recording",
+            "composited.py --segmenter light --out {sequences}/composited",
+        ),
     }),
     "mapping": Report(ROOT / "docs" / "mapping.md", "What the dense map reaches", {
         "dense": ("Depth, surface, labels and time", "dense.py {sequences}/dense"),

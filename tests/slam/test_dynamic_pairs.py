@@ -6,13 +6,16 @@ import sys
 from itertools import permutations
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from slam.frame import Frame
 from slam.system_config import SystemConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+from composited import composed  # noqa: E402
 from dynamic_pairs import DATA, man_in, moving_points, read_pair  # noqa: E402
 from moving_points import Count, count  # noqa: E402
 
@@ -27,3 +30,18 @@ def test_the_man_moves_and_the_room_does_not_by_geometry_alone() -> None:
     assert total["man"].on > 400
     assert total["man"].share > 0.9
     assert total["rest"].share < 0.1
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the shared data are not here")
+def test_a_man_put_into_a_frame_hides_and_is_hidden() -> None:
+    man = read_pair(DATA / "test1")[0]
+    depth_m = np.full((480, 640), 4.0, np.float32)
+    depth_m[:, 320:] = 0.8
+    frame = Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), depth_m)
+    new = composed(frame, man, np.array([0.0, 0.0, 1.15]), (525.0, 319.5))
+    assert np.array_equal(new.depth_m[:, 320:], depth_m[:, 320:])
+    assert not new.rgb[:, 320:].any()
+    his = new.rgb[:, :320].any(axis=2)
+    assert his.sum() > 20000
+    assert abs(np.nanmedian(new.depth_m[:, :320][his]) - 1.15) < 0.1
+    assert np.array_equal(new.depth_m[:, :320][~his], depth_m[:, :320][~his])
