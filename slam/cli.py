@@ -26,6 +26,7 @@ from slam.commands.query import add_query
 from slam.commands.run import add_run
 from slam.commands.segment import add_segment
 from slam.commands.train import add_train
+from slam.commands.view import add_view
 
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
 EPILOG = """\
@@ -83,6 +84,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_calibrate(commands)
     add_map(commands)
     add_query(commands)
+    add_view(commands)
     add_segment(commands)
     add_train(commands)
     add_evaluate_segmentation(commands)

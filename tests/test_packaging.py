@@ -123,8 +123,11 @@ def test_every_import_is_a_declared_dependency() -> None:
         "yaml": "pyyaml",
         "faiss": "faiss-cpu",
         "mpl_toolkits": "matplotlib",
+        "rerun": "rerun-sdk",
     }
-    declared = {_canonical(re.split(r"[><=]", text)[0]) for text in PROJECT["dependencies"]}
+    extras = {k: v for k, v in PROJECT["optional-dependencies"].items() if k != "dev"}
+    texts = [*PROJECT["dependencies"], *(text for extra in extras.values() for text in extra)]
+    declared = {_canonical(re.split(r"[><=]", text)[0]) for text in texts}
     needed = set()
     for path in (p for k in PACKAGES for p in (ROOT / k).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from slam.commands.run import CONFIG_HELP, SET_HELP
 from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from slam.commands.view import add_view_arguments, view_options
 
 if TYPE_CHECKING:
     from slam.live.sources.opening import SourceOptions
@@ -44,6 +45,8 @@ def add_live(commands: _Commands) -> None:
     parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     add_segmenter_arguments(parser, "none")
+    parser.add_argument("--view", action="store_true", help="show it in Rerun's window")
+    add_view_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
 
 
@@ -102,7 +105,10 @@ def _live(arguments: argparse.Namespace) -> int:
         out = arguments.out or free_run_path(f"{source.name}-live")
         folder = Path(arguments.source)
         images = folder if folder.is_dir() else Path()
-        options = LiveOptions(out, arguments.overwrite, source.groundtruth, images, source.name)
+        view = view_options(arguments, arguments.view)
+        options = LiveOptions(
+            out, arguments.overwrite, source.groundtruth, view, images, source.name
+        )
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
             ended_by = play(slam, source, PlayOptions(not source.waits, quiet=arguments.quiet))

@@ -6,7 +6,11 @@ import logging
 import shutil
 import tempfile
 import time
+<<<<<<< HEAD
 from dataclasses import asdict, dataclass, replace
+=======
+from dataclasses import asdict, dataclass, field, replace
+>>>>>>> 5d44f37 (Viewer: runs and the live loop in Rerun; bmask-slam view)
 from pathlib import Path
 from types import TracebackType
 
@@ -30,11 +34,14 @@ from slam.results import FrameResult
 from slam.run_folder import HEALTH, RunFolder
 from slam.run_results import Tally, measure, row, save
 from slam.system_config import SystemConfig
+from slam.viewer.scene import Scene, ViewOptions
 
 logger = logging.getLogger(__name__)
 
 HEALTH_S = 1.0
 SNAPSHOT_S = 5.0
+IMAGE_EVERY = 3
+"""Frames from one image in the viewer to the next."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,7 @@ class LiveOptions:
         out: run folder, as an offline run's; None: nothing is written.
         overwrite: replace the run that it holds.
         reference: trajectory to compare with at the end.
+        view: where a viewer shows it, if anywhere.
         images: folder that a segmenter looks masks up for.
         title: of the picture.
     """
@@ -52,6 +60,7 @@ class LiveOptions:
     out: Path | None = None
     overwrite: bool = False
     reference: Trajectory | None = None
+    view: ViewOptions = field(default_factory=ViewOptions)
     images: Path = Path()
     title: str = "live"
 
@@ -97,15 +106,20 @@ class LiveSlam:
         self.rows: list[Row] = []
         self._tally, self._meter = Tally(), FrameMeter()
         self._refused = 0
+        self._shown = 0
         self._closed = False
         self._last_s = -np.inf
         self._begin_s = self._health_s = self._snapshot_s = time.monotonic()
+        self._scene: Scene | None = None
         self._scratch = Path(tempfile.mkdtemp(prefix="bmask-slam-"))
         self._folder: RunFolder | None = None
         try:
             if self.options.out is not None:
                 self._folder = RunFolder(self.options.out, self.options.overwrite).__enter__()
                 self._folder.write_text("config.yaml", dump(self.config))
+            if self.options.view.anywhere:
+                self._scene = Scene(self.options.title, self.options.view)
+                self._scene.camera(camera)
             self._system = self._start(self.config.semantics.segmenter)
         except BaseException:
             self._leave(None)
@@ -166,6 +180,7 @@ class LiveSlam:
         self._tally.count(result)
         self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
         self._write(result)
+        self._show(result, rgb)
         return result
 
     def trajectory(self) -> Trajectory:
@@ -269,6 +284,20 @@ class LiveSlam:
             self._snapshot_s = now_s
             self._folder.write_trajectory(self.trajectory())
 
+    def _show(self, result: FrameResult, rgb: NDArray[np.uint8]) -> None:
+        """The frame at once, the map when it was brought up to date."""
+        if self._scene is None:
+            return
+        self._scene.frame(result, rgb if self._meter.frames % IMAGE_EVERY == 1 else None)
+        if self._shown == self._system.remote.changes:
+            return
+        self._shown = self._system.remote.changes
+        cloud, path = self.map(), self._system.keyframe_trajectory().positions_world
+        self._scene.points("world/landmarks", cloud.points_world, cloud.colours, 0.008)
+        colours = np.full((len(path), 3), 200, np.uint8)
+        self._scene.points("world/keyframes", path, colours, 0.02)
+        self._scene.numbers("queues", asdict(self.health()) | {"status": 0.0})
+
     def _conclude(self, health: Health) -> None:
         """Save what an offline run saves; the trajectory at least, if the map cannot be had."""
         folder = self._folder
@@ -292,6 +321,8 @@ class LiveSlam:
         folder.complete()
 
     def _leave(self, error: BaseException | None) -> None:
+        if self._scene is not None:
+            self._scene.close()
         shutil.rmtree(self._scratch, ignore_errors=True)
         if self._folder is not None:
             self._folder.__exit__(None, error, None)

@@ -1,0 +1,177 @@
+"""A map and a camera in Rerun; entity paths follow the frame tree, world first.
+
+====================  ==============================================================================
+world/camera          the camera's pose; below it ``image``, and ``moving``, features left out
+world/trajectory      the path so far, ``world/reference`` the true one
+world/keyframes       their positions; ``world/loops`` lines between the ends of closed loops
+world/landmarks       points, coloured by their labels where they have one, else as they look
+world/objects         boxes with labels
+world/dense           the dense cloud
+plots/...             status, inliers, milliseconds of each stage, queues
+====================  ==============================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.camera import Camera
+from graph.errors import InputError
+from graph.geometry import Array
+from semantics.boxes3d import OrientedBox
+from slam.results import FrameResult, TrackingStatus
+
+TIMELINE = "time"
+IMAGE_STEP = 2
+JPEG_QUALITY = 70
+STATUS = {TrackingStatus.OK: 2, TrackingStatus.WEAK: 1, TrackingStatus.LOST: 0}
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Where it goes: a file, a viewer in the browser on a port (0: none), a viewer's own window."""
+
+    record: Path | None = None
+    serve: int = 0
+    window: bool = False
+
+    @property
+    def anywhere(self) -> bool:
+        """Whether it goes anywhere."""
+        return self.record is not None or self.serve > 0 or self.window
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A labelled box, with a colour (3,)."""
+
+    box: OrientedBox
+    text: str
+    colour: NDArray[np.uint8]
+
+
+class Scene:
+    """Sends what is given to Rerun, at once and without touching it."""
+
+    def __init__(self, name: str, options: ViewOptions) -> None:
+        """Raises InputError where Rerun is not installed, or the file cannot be written."""
+        self._rr = _import_rerun()
+        self._stream = self._rr.RecordingStream(f"bmask-slam {name}")
+        if options.record is not None:
+            if not options.record.parent.is_dir():
+                raise InputError(f"{options.record.parent}: no such folder; make it first")
+            self._stream.save(str(options.record))
+        elif options.serve:
+            address = self._stream.serve_grpc()
+            self._rr.serve_web_viewer(
+                web_port=options.serve, open_browser=False, connect_to=address
+            )
+        elif options.window:
+            self._stream.spawn()
+        self._path: list[Array] = []
+        self._log("world", self._rr.ViewCoordinates.RDF, static=True)
+
+    def camera(self, camera: Camera) -> None:
+        """The camera's field of view."""
+        size = [camera.width // IMAGE_STEP, camera.height // IMAGE_STEP]
+        K = camera.K / IMAGE_STEP
+        self._log(
+            "world/camera/image",
+            self._rr.Pinhole(image_from_camera=K, resolution=size, image_plane_distance=0.3),
+            static=True,
+        )
+
+    def frame(self, result: FrameResult, rgb: NDArray[np.uint8] | None = None) -> None:
+        """A frame's pose, its image (H, W, 3) red first, status and times."""
+        rr = self._rr
+        self._stream.set_time(TIMELINE, duration=result.timestamp_s)
+        T = result.T_world_camera
+        if T is not None:
+            transform = rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
+            self._log("world/camera", transform)
+            self._path.append(T[:3, 3])
+            if len(self._path) % 10 == 0:
+                self.line("world/trajectory", np.array(self._path), (80, 170, 255))
+        if rgb is not None:
+            small = np.ascontiguousarray(rgb[::IMAGE_STEP, ::IMAGE_STEP, ::-1])
+            quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+            contents = cv2.imencode(".jpg", small, quality)[1].tobytes()
+            picture = rr.EncodedImage(contents=contents, media_type="image/jpeg")
+            self._log("world/camera/image", picture)
+        self.numbers("status", {"status": STATUS[result.status]})
+        counted = {"matches": result.matches, "inliers": result.inliers, "moving": result.ignored}
+        self.numbers("features", counted)
+        self.numbers("ms", result.stage_ms)
+
+    def moving(self, pixels: Array) -> None:
+        """Features (N, 2) of the last frame that were left out since they move."""
+        points = pixels / IMAGE_STEP
+        self._log("world/camera/image/moving", self._rr.Points2D(points, colors=[255, 60, 60]))
+
+    def points(self, path: str, points: Array, colours: NDArray[np.uint8], radius_m: float) -> None:
+        """Points (N, 3) with colours (N, 3)."""
+        self._log(path, self._rr.Points3D(points, colors=colours, radii=radius_m))
+
+    def line(self, path: str, points: Array, colour: Sequence[int]) -> None:
+        """A line through points (N, 3)."""
+        if len(points) > 1:
+            self._log(path, self._rr.LineStrips3D([points], colors=[colour]))
+
+    def pairs(self, path: str, ends: Array, colour: Sequence[int]) -> None:
+        """Lines from ends[:, 0] to ends[:, 1], (N, 2, 3)."""
+        self._log(path, self._rr.LineStrips3D(ends, colors=[colour]))
+
+    def boxes(self, boxes: Sequence[Box]) -> None:
+        """The map's objects."""
+        rr = self._rr
+        self._log(
+            "world/objects",
+            rr.Boxes3D(
+                centers=[b.box.T_world_box[:3, 3] for b in boxes],
+                half_sizes=[b.box.size_m / 2 for b in boxes],
+                quaternions=[_quaternion(b.box.T_world_box[:3, :3]) for b in boxes],
+                colors=[b.colour for b in boxes],
+                labels=[b.text for b in boxes],
+            ),
+        )
+
+    def numbers(self, group: str, values: Mapping[str, float]) -> None:
+        """A moment of time series, by name."""
+        for name, value in values.items():
+            self._log(f"plots/{group}/{name}", self._rr.Scalars([float(value)]))
+
+    def at(self, timestamp_s: float) -> None:
+        """What follows is of this time."""
+        self._stream.set_time(TIMELINE, duration=timestamp_s)
+
+    def close(self) -> None:
+        """Write what waits."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _log(self, path: str, value: Any, static: bool = False) -> None:
+        self._stream.log(path, value, static=static)
+
+
+def _quaternion(rotation: Array) -> Array:
+    """x y z w of a rotation matrix (3, 3)."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - only where boxes are drawn
+
+    return np.asarray(Rotation.from_matrix(rotation).as_quat(), float)
+
+
+def _import_rerun() -> Any:
+    try:
+        import rerun  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise InputError(
+            "the viewer needs Rerun, which is not installed; pip install 'bmask-slam[view]'"
+        ) from error
+    return rerun
