@@ -6,11 +6,7 @@ import logging
 import shutil
 import tempfile
 import time
-<<<<<<< HEAD
-from dataclasses import asdict, dataclass, replace
-=======
 from dataclasses import asdict, dataclass, field, replace
->>>>>>> 5d44f37 (Viewer: runs and the live loop in Rerun; bmask-slam view)
 from pathlib import Path
 from types import TracebackType
 
@@ -296,7 +292,8 @@ class LiveSlam:
         self._scene.points("world/landmarks", cloud.points_world, cloud.colours, 0.008)
         colours = np.full((len(path), 3), 200, np.uint8)
         self._scene.points("world/keyframes", path, colours, 0.02)
-        self._scene.numbers("queues", asdict(self.health()) | {"status": 0.0})
+        numbers = {k: v for k, v in asdict(self.health()).items() if isinstance(v, int | float)}
+        self._scene.numbers("health", numbers)
 
     def _conclude(self, health: Health) -> None:
         """Save what an offline run saves; the trajectory at least, if the map cannot be had."""
