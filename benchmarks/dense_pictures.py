@@ -23,6 +23,7 @@ from slam.dense_folder import DenseFolder
 from slam.dense_input import load, open_run
 
 MAX_WIDTH_PX = 1400
+JPEG = [cv2.IMWRITE_JPEG_QUALITY, 85]
 
 
 def side_by_side(files: list[Path]) -> NDArray[np.uint8]:
@@ -62,7 +63,8 @@ def main() -> None:
     }
     for name, (room, files) in pictures.items():
         dense = args.root / f"{room}-run" / "dense"
-        cv2.imwrite(str(args.out / name), side_by_side([dense / f for f in files]))
+        picture = side_by_side([dense / f for f in files])
+        cv2.imwrite(str(args.out / name), picture, JPEG if name.endswith("jpg") else [])
     for room in ("kitchen", "office"):
         folder = args.root / f"{room}-run"
         counts = json.loads((folder / "dense" / "dense.json").read_text())
