@@ -30,6 +30,12 @@ from slam.sequences.images import depth_in_metres
 
 logger = logging.getLogger(__name__)
 
+_FIELDS = {
+    INFO_TYPE: {"width", "height", "distortion_model", "d", "k", "p"},
+    IMAGE_TYPES[0]: {"header", "encoding", "height", "width", "step", "is_bigendian", "data"},
+    IMAGE_TYPES[1]: {"header", "format", "data"},
+}
+
 
 @dataclass(frozen=True)
 class BagTopics:
@@ -165,4 +171,10 @@ def _camera_info(bag: Bag, name: str) -> Any:
 
 
 def _first(bag: Bag, name: str) -> Any:
-    return next(message for _, message in bag.messages(name))
+    """The first message of a topic, with all fields that its type must have."""
+    for _, message in bag.messages(name):
+        missing = _FIELDS[message.__msgtype__] - {field.lower() for field in vars(message)}
+        if missing:
+            raise InputError(f"{bag.path}: {name} has no {', '.join(sorted(missing))}")
+        return message
+    raise InputError(f"{bag.path}: no message on {name}, though its index says so; it is damaged")

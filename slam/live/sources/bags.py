@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,8 +16,8 @@ _CURE = (
     "if the recording was cut off, repair it with `rosbag reindex`, `ros2 bag reindex` or "
     "`mcap recover`"
 )
-IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
 
 class Topic(NamedTuple):
@@ -104,11 +103,13 @@ def _translated(path: Path) -> Iterator[None]:
     """What rosbags raises for bags that it cannot read, as InputError."""
     one, two = (import_optional(f"rosbags.rosbag{k}", "ros", str(path)) for k in (1, 2))
     reader = import_optional("rosbags.rosbag2.reader", "ros", str(path))
+    sqlite = import_optional("rosbags.rosbag2.storage_sqlite3", "ros", str(path))
     highlevel = import_optional("rosbags.highlevel", "ros", str(path))
-    known = (highlevel.AnyReaderError, one.ReaderError, two.ReaderError, reader.zstd.ZstdError)
-    damaged = (sqlite3.Error, struct.error, AssertionError, EOFError, LookupError)
+    known = (highlevel.AnyReaderError, one.ReaderError, two.ReaderError)
+    inside = (reader.zstd.ZstdError, sqlite.apsw.Error, struct.error, EOFError, OSError)
+    damaged = (ArithmeticError, AssertionError, LookupError, MemoryError, RuntimeError)
     try:
         yield
-    except (*known, *damaged, RuntimeError, ValueError, TypeError) as error:
+    except (*known, *inside, *damaged, TypeError, ValueError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: cannot be read ({reason}); {_CURE}") from error

@@ -165,13 +165,36 @@ def test_depth_that_is_not_registered_is_refused_or_warned_of(tmp_path: Path, ca
         BagSource(tmp_path / "b.bag")
 
 
+def file_of(path: Path) -> Path:
+    """The file with a bag's messages."""
+    return next(f for f in path.iterdir() if f.suffix != ".yaml") if path.is_dir() else path
+
+
+@pytest.mark.parametrize(("name", "storage"), FORMS)
+def test_damage_costs_images_or_is_refused(tmp_path: Path, name: str, storage: str) -> None:
+    """Bytes are changed in the headers at the begin, in the index at the end, and anywhere."""
+    path = write_bag(tmp_path / name, 3, storage)
+    file, rng = file_of(path), np.random.default_rng(5)
+    whole = np.frombuffer(file.read_bytes(), np.uint8)
+    for _ in range(25):
+        data = whole.copy()
+        ends = [rng.integers(0, 6000, 2), len(data) - rng.integers(1, 3000, 2)]
+        places = np.concatenate([*ends, rng.integers(0, len(data), 2)])
+        data[places] = rng.integers(0, 256, len(places))
+        file.write_bytes(data.tobytes())
+        try:
+            assert len(list(BagSource(path).frames())) <= 3
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
 @pytest.mark.parametrize(("name", "storage"), FORMS)
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_a_bag_that_was_cut_off_is_refused(
     tmp_path: Path, name: str, storage: str, share: float
 ) -> None:
     path = write_bag(tmp_path / name, storage=storage)
-    file = next(f for f in path.iterdir() if f.suffix != ".yaml") if path.is_dir() else path
+    file = file_of(path)
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
     with pytest.raises(InputError, match=str(path)) as refusal:
