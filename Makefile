@@ -19,6 +19,8 @@ export PIP_ROOT_USER_ACTION := ignore
 
 demo: $(DEMO)
 	@$(BIN)/bmask-slam run $(DEMO) --out runs/demo --overwrite
+	@$(BIN)/bmask-slam map runs/demo --mesh --plan
+	@$(BIN)/bmask-slam query runs/demo
 
 $(DEMO): | $(READY)
 	@$(BIN)/bmask-slam render office --frames 200 --out $@

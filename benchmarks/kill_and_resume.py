@@ -49,7 +49,8 @@ class Kill:
 
 def program(*arguments: object) -> subprocess.Popen[bytes]:
     """``bmask-slam run`` with these arguments, quietly."""
-    command = [sys.executable, "-m", "slam", "run", *map(str, arguments), "--quiet"]
+    given = [*map(str, arguments), "--segmenter", "none", "--quiet"]
+    command = [sys.executable, "-m", "slam", "run", *given]
     return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL)
 
 

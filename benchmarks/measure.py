@@ -107,8 +107,11 @@ def measure(job: Job, work: Path) -> Measurement:
     out = work / "results" / f"{job.sequence}-{job.variant}".replace(" ", "-")
     logger.info("running %s, %s", job.sequence, job.variant)
     where = [str(job.folder), "--out", str(out), "--overwrite", "--quiet"]
-    call(["-m", "slam", "run", *where, *job.options])
-    command = " ".join(["bmask-slam run", shown(job.folder), *job.options])
+    options = job.options
+    if "--segmenter" not in options:
+        options = (*options, "--segmenter", "none")  # as the systems beside it
+    call(["-m", "slam", "run", *where, *options])
+    command = " ".join(["bmask-slam run", shown(job.folder), *options])
     return read_run(out, job, command)
 
 

@@ -31,7 +31,7 @@ from slam.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_SEGMENTER = "none"
+DEFAULT_SEGMENTER = "light"
 DEPTH_STEP = 2
 """Of a keyframe's depth image every second pixel each way waits for its masks."""
 MAX_WAITING = 100

@@ -44,7 +44,7 @@ def add_live(commands: _Commands) -> None:
     parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
     parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
-    add_segmenter_arguments(parser, "none")
+    add_segmenter_arguments(parser, "light")
     parser.add_argument("--view", action="store_true", help="show it in Rerun's window")
     add_view_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")

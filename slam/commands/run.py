@@ -79,7 +79,7 @@ def add_run(commands: _Commands) -> None:
         const="covariances=true",
         help="also write covariances.txt: how sure the graph is of each keyframe",
     )
-    add_segmenter_arguments(parser, "none")
+    add_segmenter_arguments(parser, "light")
     parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
 
 
