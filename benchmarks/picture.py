@@ -1,10 +1,11 @@
 """The picture at the top of README.md, from a run folder and its sequence alone.
 
-    bmask-slam run SEQUENCE --out RUN
+    bmask-slam run SEQUENCE --out RUN && bmask-slam map RUN --mesh --plan
     python benchmarks/picture.py RUN SEQUENCE --out docs/images/overview.png [--frame N]
 
-Left: a frame with the map's landmarks projected into it by the frame's pose. Middle: the landmarks
-and the camera's path from above. Right: the path against the reference.
+Above: a frame with the map's landmarks projected into it by the frame's pose; the landmarks and the
+camera's path from above; the path against the reference. Below: the network's masks of the frame;
+the dense map; its floor plan with labels.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from graph.geometry import Array, inverse, make_pose, transform
 from graph.metrics import absolute_error
 from graph.ply import read_ply
 from graph.trajectory import Trajectory, associate, associate_stamps, read_tum
+from semantics.overlay import draw
+from semantics.segmenter_table import SegmenterOptions, make_segmenter
 from slam.evaluation.plot import draw_top_view
 from slam.frame import Frame
 from slam.sequences import open_sequence
@@ -126,6 +129,21 @@ def draw_path(picture: Image, view: Camera, T_view_world: Array, trajectory: Tra
             cv2.polylines(picture, [shape], True, (255, 196, 60), 2, cv2.LINE_AA, 4)
 
 
+def draw_masks(frame: Frame, sequence: Path) -> tuple[Image, int]:
+    """The frame with its instances, and how many there are."""
+    segmenter = make_segmenter(SegmenterOptions(), sequence)
+    instances = segmenter.segment(frame.rgb, frame.name)
+    return draw(frame.rgb, instances, segmenter.labels), len(instances)
+
+
+def read_image(path: Path) -> Image:
+    """A picture of the run folder, red first."""
+    picture = cv2.imread(str(path))
+    if picture is None:
+        raise SystemExit(f"error: {path}: no picture; make it with  bmask-slam map RUN --plan")
+    return np.asarray(picture[:, :, ::-1], np.uint8)
+
+
 def show(axis: Axes, picture: Image, title: str) -> None:
     """An image without axes, under a title."""
     axis.imshow(picture, interpolation="antialiased")
@@ -141,6 +159,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--frame", type=int, help="to show (default: the middle one)")
     parser.add_argument("--azimuth", type=float, default=-120, help="of the view, degrees")
+    parser.add_argument("--view", default="overview", help="of the dense map")
     arguments = parser.parse_args()
     sequence = open_sequence(arguments.sequence)
     if sequence.groundtruth is None:
@@ -157,13 +176,18 @@ def main() -> None:
     aligned = error.alignment.apply(estimate)
     points_reference = transform(error.alignment.T_reference_estimate, points)
     view = draw_cloud(points_reference[steady], colours[steady], aligned, arguments.azimuth)
-    figure = Figure(figsize=(15, 4.1), dpi=100, layout="constrained")
-    axes = figure.subplots(1, 3, width_ratios=(4, 4, 3.6))
+    figure = Figure(figsize=(15, 8.2), dpi=100, layout="constrained")
+    axes, below = figure.subplots(2, 3, width_ratios=(4, 4, 3.6))
     show(axes[0], overlay, f"frame {frame.index}: landmarks of the map, by depth")
     show(axes[1], view, f"{int(steady.sum())} of {len(points)} landmarks and the camera's path")
     draw_top_view(axes[2], aligned, sequence.groundtruth)
     rmse_mm, count = 1000 * error.translation_m.rmse, len(error.aligned)
     axes[2].set_title(f"ATE RMSE {rmse_mm:.1f} mm over {count} frames", fontsize=9)
+    masks, count = draw_masks(frame, arguments.sequence)
+    show(below[0], masks, f"{count} instances, by the network that comes with the project")
+    dense = arguments.run / "dense"
+    show(below[1], read_image(dense / f"view_{arguments.view}.png"), "the dense map")
+    show(below[2], read_image(dense / "plan.png"), "floor plan with labels")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(arguments.out)
 
