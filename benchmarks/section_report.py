@@ -65,6 +65,13 @@ REPORTS = {
         ),
         "rooms": ("Masks of rendered rooms", "segmentation.py rooms --rooms {sequences}/rooms"),
         "cost": ("Time and memory of the networks", "segmentation.py cost"),
+        "labels-truth": (
+            "Labels and objects from true masks", "labels.py {sequences}/office-300"
+        ),
+        "labels": (
+            "Labels and objects from the network's masks",
+            "labels.py {sequences}/office-300 --segmenter light",
+        ),
         "dynamic": (
             "People who walk, a carried box and a pulled chair",
             "dynamic.py --sequences {sequences} --segmenter light --out {sequences}/dynamic",

@@ -67,7 +67,12 @@ def photographs(weights: str) -> None:
     gains, aps = [], []
     for seed in SEEDS:
         _, truth = split(read_coco(excerpt / "instances.json"), HELD_OUT, seed)
-        file = str(Path(weights.format(seed)) / "weights.safetensors") if seed else None
+        folder = weights.format(seed)
+        file = str(Path(folder) / "weights.safetensors") if seed else None
+        if file and not Path(file).is_file():
+            options_given = f"--photographs --seed {seed} --out {folder}"
+            print(f"seed {seed}: not trained; python benchmarks/train_light.py {options_given}")
+            continue
         options = SegmenterOptions("light", weights=file, proposals=proposals, min_score=0.0)
         result = evaluated(options, truth, excerpt / "images")
         print(line(f"seed {seed}", result), flush=True)
