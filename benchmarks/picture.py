@@ -1,11 +1,11 @@
 """The picture at the top of README.md, from a run folder and its sequence alone.
 
-    bmask-slam run SEQUENCE --out RUN && bmask-slam map RUN --mesh --plan
+    bmask-slam run SEQUENCE --out RUN && bmask-slam map RUN
     python benchmarks/picture.py RUN SEQUENCE --out docs/images/overview.png [--frame N]
 
 Above: a frame with the map's landmarks projected into it by the frame's pose; the landmarks and the
 camera's path from above; the path against the reference. Below: the network's masks of the frame;
-the dense map; its floor plan with labels.
+the dense map; its labels.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def read_image(path: Path) -> Image:
     """A picture of the run folder, red first."""
     picture = cv2.imread(str(path))
     if picture is None:
-        raise SystemExit(f"error: {path}: no picture; make it with  bmask-slam map RUN --plan")
+        raise SystemExit(f"error: {path}: no picture; make it with  bmask-slam map RUN")
     return np.asarray(picture[:, :, ::-1], np.uint8)
 
 
@@ -187,7 +187,8 @@ def main() -> None:
     show(below[0], masks, f"{count} instances, by the network that comes with the project")
     dense = arguments.run / "dense"
     show(below[1], read_image(dense / f"view_{arguments.view}.png"), "the dense map")
-    show(below[2], read_image(dense / "plan.png"), "floor plan with labels")
+    labelled = read_image(dense / f"view_{arguments.view}_semantic.png")
+    show(below[2], labelled, "its labels")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(arguments.out)
 

@@ -44,13 +44,14 @@ RENDERED = {
 }
 KITCHEN = SHARED / "redkitchen"
 WITHOUT_SUBPIXEL = ("--set", "tracking.subpixel.enabled=false")
+LABELLED = "with labels"
 GROWING = ("redkitchen", "corridor")
 QUICK_FRAMES = 150
 OVERVIEW_FRAME = 60
 
 
 def plan(folders: dict[str, Path], quick: bool) -> list[Job]:
-    """What is run: all as it comes, again, at 10 Hz, and without sub-pixel registration."""
+    """What is run: all as it comes, again, at 10 Hz, without parts, and with the network."""
     if quick:
         options = ("--max-frames", str(QUICK_FRAMES))
         return [Job(name, folder, "default", options) for name, folder in folders.items()]
@@ -62,6 +63,8 @@ def plan(folders: dict[str, Path], quick: bool) -> list[Job]:
     for name, folder in folders.items():
         jobs.append(Job(name, folder, "without sub-pixel registration", WITHOUT_SUBPIXEL))
         jobs.append(Job(name, folder, "no loop closed", ("--set", "loops.enabled=false")))
+        if name in ("redkitchen", "living_room"):
+            jobs.append(Job(name, folder, LABELLED, ("--segmenter", "light")))
     return jobs
 
 
@@ -137,7 +140,8 @@ def repeats(measurements: list[Measurement]) -> dict[str, bool]:
 
 def draw_overview(folder: Path, arguments: argparse.Namespace) -> None:
     """The picture at the top of README.md, from the living room's run."""
-    run = arguments.work / "results" / "living_room-default"
+    run = arguments.work / "results" / f"living_room-{LABELLED}".replace(" ", "-")
+    call(["-m", "slam", "map", str(run), "--quiet"])
     out = image_path(arguments).with_name("overview.png")
     command = ["benchmarks/picture.py", str(run), str(folder), "--out", str(out)]
     call([*command, "--frame", str(OVERVIEW_FRAME)])
