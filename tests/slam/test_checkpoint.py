@@ -297,6 +297,7 @@ def test_the_real_program_killed_twice_on_real_frames(tmp_path: Path) -> None:
     common = RunOptions(KITCHEN, max_frames=24, checkpoint_every=EVERY, quiet=True)
     run(replace(common, out=whole))
     begin = ["run", str(KITCHEN), "--max-frames", "24", "--checkpoint-every", str(EVERY)]
+    begin += ["--segmenter", "none"]
     for command, lines in (
         ([*begin, "--out", str(out)], rng.randint(7, 12)),
         (["run", "--resume", str(out)], rng.randint(14, 25)),
