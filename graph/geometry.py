@@ -40,6 +40,15 @@ def orthonormalised(T: Array) -> Array:
     )
 
 
+def carried_along(T_world_a: Array, T_world_old: Array, T_world_new: Array) -> Array:
+    """Where a pose a (4, 4) is after a body that it is fixed to has moved from old to new.
+
+    The result is made rigid again: in a chain of such steps, each starting from the last, an error
+    of the rotations would double with every step.
+    """
+    return orthonormalised(T_world_new @ inverse(T_world_old) @ T_world_a)
+
+
 def transform(T_a_b: Array, points_b: Array) -> Array:
     """Points (..., N, 3) in metres from frame b to frame a."""
     return points_b @ np.swapaxes(T_a_b[..., :3, :3], -1, -2) + T_a_b[..., None, :3, 3]

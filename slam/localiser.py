@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graph.array_file import Arrays
-from graph.geometry import Array, inverse, orthonormalised, se3_exp, se3_log
+from graph.geometry import Array, carried_along, inverse, orthonormalised, se3_exp, se3_log
 from slam.features import Features
 from slam.landmarks import Ints
 from slam.local_mapping import MappingConfig, local_landmarks
@@ -130,12 +130,14 @@ class Localiser:
         self._recent_ids = seen_ids
         self.lost_frames = 0
 
-    def moved(self, T_new_old: Array, world: WorldMap) -> None:
-        """The map was moved by its owner: what was tracked in it goes along, fused ones too.
+    def moved(self, T_old: Array, T_new: Array, world: WorldMap) -> None:
+        """The map was moved by its owner, as a keyframe from T_old to T_new (4, 4).
+
+        What was tracked in it goes along, fused landmarks too.
 
         The owner may have begun anew with fewer landmarks.
         """
-        self._T_world_last = T_new_old @ self._T_world_last
+        self._T_world_last = carried_along(self._T_world_last, T_old, T_new)
         known = self._recent_ids[self._recent_ids < len(world.landmarks)]
         self._recent_ids = world.landmarks.living(world.landmarks.current(known))
 

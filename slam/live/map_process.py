@@ -19,7 +19,7 @@ import numpy as np
 from graph.array_file import FileKind, read_arrays, write_arrays
 from graph.camera import Camera
 from graph.errors import InputError
-from graph.geometry import inverse
+from graph.geometry import carried_along
 from semantics.labels import LabelSet
 from semantics.segmenter import NoSegmenter
 from slam.dynamics import Dynamics
@@ -195,14 +195,14 @@ class MapKeeper:
         reference_id, T_world_reference = message.reference
         heir_id, T_heir_reference = mapper.history.heir(reference_id)
         heir = mapper.world.keyframes[heir_id]
-        T_move = heir.T_world_camera @ T_heir_reference @ inverse(T_world_reference)
+        T_now = heir.T_world_camera @ T_heir_reference
         landmarks = mapper.world.landmarks
         ids = landmarks.current(tracked.landmark_ids)
         _, first = np.unique(ids, return_index=True)
         first = np.sort(first[landmarks.alive[ids[first]]])
         return replace(
             tracked,
-            T_world_camera=T_move @ tracked.T_world_camera,
+            T_world_camera=carried_along(tracked.T_world_camera, T_world_reference, T_now),
             keypoints=tracked.keypoints[first],
             landmark_ids=ids[first],
             visible_ids=landmarks.living(tracked.visible_ids),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.geometry import Array
+from graph.geometry import Array, carried_along
 from slam.features import Features
 from slam.history import FrameHistory
 from slam.landmarks import Ints, Mask
@@ -159,9 +159,9 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
     poses = dict(zip(delta.keyframe_ids.tolist(), delta.poses, strict=True))
     if pending and shared:
         newest = world.keyframes[shared[-1]]
-        T_move = poses[newest.id] @ np.linalg.inv(newest.T_world_camera)
+        T_old, T_new = newest.T_world_camera, poses[newest.id]
         for keyframe in pending:
-            keyframe.T_world_camera = T_move @ keyframe.T_world_camera
+            keyframe.T_world_camera = carried_along(keyframe.T_world_camera, T_old, T_new)
     segments = dict(zip(delta.keyframe_ids.tolist(), delta.segments.tolist(), strict=True))
     kept = {i: _keyframe(i, delta, world) for i in poses}
     for keyframe in kept.values():

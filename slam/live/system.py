@@ -7,7 +7,6 @@ from pathlib import Path
 
 from graph.array_file import nested, read_arrays
 from graph.camera import Camera
-from graph.geometry import inverse
 from semantics.segmenter import NoSegmenter
 from slam.features import Features
 from slam.frame import Frame
@@ -84,7 +83,7 @@ class LiveSystem(SlamSystem):
         heir_id, T_heir_reference = self.remote.history.heir(reference.id)
         heir = self.remote.world.keyframes[heir_id]
         T_now = heir.T_world_camera @ T_heir_reference
-        self.localiser.moved(T_now @ inverse(T_before), self.remote.world)
+        self.localiser.moved(T_before, T_now, self.remote.world)
         self.localiser.new_local_map(self.remote.world, heir)
         self._reference, self._segment = heir, heir.segment
 

@@ -8,6 +8,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from graph.geometry import (
+    carried_along,
     inverse,
     make_pose,
     orthonormalised,
@@ -181,3 +182,15 @@ def test_orthonormalised_changes_little_and_keeps_the_translation() -> None:
     assert max(deviation(one) for one in fixed) < 1e-14
     assert np.abs(fixed - T).max() < 1e-5
     np.testing.assert_array_equal(fixed[:, :3, 3], spoiled[:, :3, 3])
+
+
+def test_a_pose_that_is_carried_along_a_thousand_times_stays_rigid():
+    rng = np.random.default_rng(5)
+    step = se3_exp(np.array([0.02, -0.01, 0.03, 0.05, 0.0, 0.02]))
+    reference, T = np.eye(4), step
+    for _ in range(1000):
+        moved = reference @ se3_exp(0.01 * rng.normal(size=6))
+        T = carried_along(T, reference, moved)
+        np.testing.assert_allclose(inverse(moved) @ T, step, atol=1e-9)
+        reference, T = T, T @ step
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)

@@ -82,6 +82,10 @@ def test_live_is_as_good_as_offline_and_leaves_the_same_files(tmp_path, offline)
     assert len(trajectory) == len(FRAMES)
     allowed = 1.5 * error_m(offline.trajectory().poses_world_camera) + 1e-3
     assert error_m(trajectory.poses_world_camera) < allowed
+    turns = trajectory.poses_world_camera[:, :3, :3]
+    np.testing.assert_allclose(
+        turns @ turns.transpose(0, 2, 1), np.eye(3)[None] + 0 * turns, atol=1e-6
+    )
     assert isinstance(cloud, LandmarkCloud)
     assert len(cloud.ids) == health.landmarks > 100
     assert (health.frames, health.lost_frames, health.map_deaths) == (len(FRAMES), 0, 0)
