@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -191,6 +192,9 @@ def main() -> None:
     show(below[2], labelled, "its labels")
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(arguments.out)
+    with PIL.Image.open(arguments.out) as picture:
+        few = picture.convert("RGB").quantize(256, dither=PIL.Image.Dither.FLOYDSTEINBERG)
+    few.save(arguments.out, optimize=True)
 
 
 if __name__ == "__main__":
