@@ -145,7 +145,8 @@ class WatchedSystem(SlamSystem):
 
 
 def strip(pictures: list[Image], columns: int = 4) -> Image:
-    """Pictures in rows; an incomplete last row is left away."""
+    """Pictures, one or more, in rows; an incomplete last row is left away."""
+    columns = min(columns, len(pictures))
     rows = range(0, len(pictures) - columns + 1, columns)
     return np.vstack([np.hstack(pictures[k : k + columns]) for k in rows])
 
