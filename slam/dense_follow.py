@@ -36,17 +36,15 @@ class LastSegmentation:
         return self._found
 
 
-def dense_follower(
-    system: System, sequence: Sequence, run: Path, wanted: bool
-) -> Callable[[FrameResult], None]:
-    """A function to call after every frame; it does nothing unless that is ``wanted``.
+def dense_follower(system: System, sequence: Sequence, run: Path) -> Callable[[FrameResult], None]:
+    """A function to call after every frame; it does nothing with a system of another kind.
 
     It needs no state of its own: what a killed run has not fused is fused at the end.
 
     Raises:
         InputError: later, when the disk is full.
     """
-    if not wanted or not isinstance(system, SlamSystem):
+    if not isinstance(system, SlamSystem):
         return lambda result: None
     segmenter = system.semantics.segmenter = LastSegmentation(system.semantics.segmenter)
     masks = system.config.semantics.segmenter

@@ -106,16 +106,7 @@ class Mapper:
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Make a tracked frame a keyframe: landmarks are made, fused and culled."""
         world = self.world
-        keyframe = Keyframe(
-            id=world.next_keyframe_id,
-            frame_index=frame.index,
-            timestamp_s=frame.timestamp_s,
-            segment=segment,
-            T_world_camera=tracked.T_world_camera,
-            features=tracked.features,
-            landmark_ids=np.full(len(tracked.features), -1, np.int64),
-        )
-        world.add_keyframe(keyframe)
+        keyframe = add_keyframe(world, frame, tracked, segment)
         world.attach(keyframe, tracked.keypoints, tracked.landmark_ids)
         new_ids = create_landmarks(world, keyframe, self.camera)
         fused = fuse_into_neighbours(world, keyframe, new_ids, self._tracker, self._mapping)
@@ -249,6 +240,21 @@ class Mapper:
         self.world.remove_keyframe(redundant, heir)
         self._feed.forget_keyframe(redundant.id)
         self.loops.remove(redundant.id)
+
+
+def add_keyframe(world: WorldMap, frame: Frame, tracked: Tracked, segment: int) -> Keyframe:
+    """Put a tracked frame into a map; it observes nothing yet."""
+    keyframe = Keyframe(
+        id=world.next_keyframe_id,
+        frame_index=frame.index,
+        timestamp_s=frame.timestamp_s,
+        segment=segment,
+        T_world_camera=tracked.T_world_camera,
+        features=tracked.features,
+        landmark_ids=np.full(len(tracked.features), -1, np.int64),
+    )
+    world.add_keyframe(keyframe)
+    return keyframe
 
 
 def without_image(features: Features) -> Features:

@@ -25,14 +25,12 @@ from semantics.segmenter_table import make_segmenter
 from slam import __version__
 from slam.checkpoint import Checkpoints, read_checkpoint
 from slam.configuration import dump
-from slam.dense_follow import dense_follower
-from slam.dense_options import MapOptions
-from slam.dense_run import map_run
 from slam.evaluation import Row
 from slam.frame import Frame
 from slam.map_file import read_map
 from slam.map_localisation import MapLocalisation
 from slam.progress import Progress
+from slam.results import FrameResult
 from slam.run_folder import CHECKPOINT, RunFolder, free_run_path
 from slam.run_options import RunOptions
 from slam.run_results import Tally, measure, save
@@ -216,7 +214,7 @@ def track(
         begin * options.stride, end, options.stride, prepare=_timed(system.prepare)
     )
     checkpoints = Checkpoints(folder, options, sequence)
-    follow = dense_follower(system, sequence, folder.path, options.dense)
+    follow = _dense_follower(system, sequence, folder) if options.dense else None
     start_s = time.perf_counter() - tally.wall_s
     with (
         closing(frames),  # type: ignore[type-var]
@@ -230,7 +228,8 @@ def track(
             result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
             folder.write_frame(result)
             tally.count(result)
-            follow(result)
+            if follow is not None:
+                follow(result)
             tally.wall_s = time.perf_counter() - start_s
             bar.update(result.status, tally.keyframes, tally.lost)
             snapshot()
@@ -257,12 +256,24 @@ def conclude(
     title = "-".join(filter(None, (sequence.name, options.config_name)))
     save(system, folder, rows, reference, title)
     if options.dense:
+        from slam.dense_options import MapOptions  # noqa: PLC0415 - torch, as below
+        from slam.dense_run import map_run  # noqa: PLC0415
+
         map_run(MapOptions(folder.path))
     if stop.signal is None:
         folder.complete()
     skipped = sum(index < tally.next_index for index, _ in sequence.skipped)
     resumable = stop.signal is not None and options.checkpoint_every is not None
     return RunSummary(folder.path, rows, tally.frames, skipped, stop.signal, resumable)
+
+
+def _dense_follower(
+    system: System, sequence: Sequence, folder: RunFolder
+) -> Callable[[FrameResult], None]:
+    """Fuses keyframes on the way. Imports torch, which takes a second and 200 MB."""
+    from slam.dense_follow import dense_follower  # noqa: PLC0415 - only for those who need it
+
+    return dense_follower(system, sequence, folder.path)
 
 
 @contextmanager

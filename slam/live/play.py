@@ -55,7 +55,8 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
                 slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, prepared, frame.name)
             except InputError as error:
                 logger.warning("%s", error)
-            bar.set_postfix_str(slam.health().line(), refresh=False)
+            if not options.quiet:
+                bar.set_postfix_str(slam.health().line(), refresh=False)
             bar.update()
             if stop.signal is not None:
                 break

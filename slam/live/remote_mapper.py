@@ -36,7 +36,7 @@ from slam.live.messages import (
 from slam.live.replica import apply_delta
 from slam.live.worker import Failure, Worker
 from slam.loop_verification import LoopConstraint
-from slam.mapper import without_image
+from slam.mapper import add_keyframe, without_image
 from slam.place_recognition import DescriptorIndex
 from slam.semantic_mapping import kept_depth
 from slam.system_config import SystemConfig
@@ -130,18 +130,10 @@ class RemoteMapper:
 
         Until the answer comes it observes what was tracked, and nothing new.
         """
-        world, reference = self.world, self.reference
-        keyframe = Keyframe(
-            id=world.next_keyframe_id,
-            frame_index=frame.index,
-            timestamp_s=frame.timestamp_s,
-            segment=segment,
-            T_world_camera=tracked.T_world_camera,
-            features=without_image(tracked.features),
-            landmark_ids=np.full(len(tracked.features), -1, np.int64),
-        )
+        reference = self.reference
+        keyframe = add_keyframe(self.world, frame, tracked, segment)
+        keyframe.features = without_image(keyframe.features)
         keyframe.landmark_ids[tracked.keypoints] = tracked.landmark_ids
-        world.add_keyframe(keyframe)
         self.places.add(keyframe.id, keyframe.features.descriptors)
         self._pending.add(keyframe.id)
         self.tell(

@@ -1,8 +1,8 @@
 """A map and a camera in Rerun; entity paths follow the frame tree, world first.
 
 ====================  ==============================================================================
-world/camera          the camera's pose; below it ``image``, and ``moving``, features left out
-world/trajectory      the path so far, ``world/reference`` the true one
+world/camera          the camera's pose; below it ``image``
+world/trajectory      the path so far
 world/keyframes       their positions; ``world/loops`` lines between the ends of closed loops
 world/landmarks       points, coloured by their labels where they have one, else as they look
 world/objects         boxes with labels
@@ -109,11 +109,6 @@ class Scene:
         counted = {"matches": result.matches, "inliers": result.inliers, "moving": result.ignored}
         self.numbers("features", counted)
         self.numbers("ms", result.stage_ms)
-
-    def moving(self, pixels: Array) -> None:
-        """Features (N, 2) of the last frame that were left out since they move."""
-        points = pixels / IMAGE_STEP
-        self._log("world/camera/image/moving", self._rr.Points2D(points, colors=[255, 60, 60]))
 
     def points(self, path: str, points: Array, colours: NDArray[np.uint8], radius_m: float) -> None:
         """Points (N, 3) with colours (N, 3)."""
