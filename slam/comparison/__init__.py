@@ -1,0 +1,1 @@
+"""Research comparisons: sequences x methods x seeds, run, measured, tabulated, drawn."""
