@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "data"
-KEYFRAME_STAGES = ("keyframe", "graph")
+KEYFRAME_STAGES = ("keyframe", "graph", "loops", "semantics")
 TRAJECTORIES = (
     ("RGB-D SLAM v2 on freiburg1_xyz", "freiburg1_xyz-rgbdslam", "freiburg1_xyz-groundtruth"),
     ("ORB-SLAM on freiburg2_desk", "fr2_desk_ORB", "fr2_desk_groundtruth"),

@@ -27,8 +27,11 @@ TITLES = {
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """A Markdown table; ValueError when a row is not as wide as the header."""
     lines = [header, ["---"] * len(header), *rows]
+    for line in lines:
+        if len(line) != len(header):
+            raise ValueError(f"{len(line)} cells under {len(header)} headings: {line}")
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
@@ -186,19 +189,19 @@ def _kitchen(results: Results) -> str:
 
 
 def _stages(results: Results) -> str:
-    rows = []
+    rows, names = [], tuple(results["runs"][0]["stages"])
     for run in results["runs"]:
         if run["variant"] == "default":
             times = run["stages"]
-            cells = [f"{times[s][0]:.1f}, {times[s][1]:.1f}" for s in times]
+            cells = [f"{times[s][0]:.1f}, {times[s][1]:.1f}" for s in names]
             share = times["graph"][2] / max(run["frames"], 1)
             m = run["metrics"]
             update = f"{m['isam2_update_ms_median']:.1f}, {m['isam2_update_ms_p95']:.1f}"
             rows.append((title(run["sequence"]), *cells, update, f"{100 * share:.0f} %"))
-    header = ("sequence", "features", "tracking", "keyframe", "graph", "iSAM2 alone", "keyframes")
+    header = ("sequence", *names, "iSAM2 alone", "keyframes")
     return (
-        "## Time of each stage\n\nMilliseconds, median and 95 %; features and tracking over all "
-        "frames, the others over frames that became keyframes, whose share is in the last column."
+        "## Time of each stage\n\nMilliseconds, median and 95 %; features, moving and tracking "
+        "over all frames, the others over frames that became keyframes, whose share is in the last column."
         f"\n\n{table(header, rows)}"
     )
 
