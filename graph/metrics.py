@@ -164,6 +164,25 @@ def time_pairs(timestamps_s: Array, delta_s: float = 1.0) -> tuple[Indices, Indi
     return i[good], j[good]
 
 
+def distance_pairs(positions: Array, delta_m: float = 1.0) -> tuple[Indices, Indices]:
+    """For each i the later j to which the path over ``positions`` (N, 3) is nearest to ``delta_m``.
+
+    A pair whose path is off by more than a tenth of ``delta_m`` is left out. This is evo's delta in
+    metres with all pairs. Give the reference's positions, so that every estimate gets the same
+    pairs.
+    """
+    if len(positions) < 2:
+        return frame_pairs(0)
+    steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    path_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    after = np.minimum(np.searchsorted(path_m, path_m + delta_m), len(path_m) - 1)
+    before = np.searchsorted(path_m, path_m[after - 1])  # the first of those in one place
+    off_m = np.abs(path_m[np.stack([before, after])] - path_m - delta_m)
+    j = np.where(off_m[1] < off_m[0], after, before)
+    good = off_m.min(axis=0) <= RELATIVE_DELTA_TOLERANCE * delta_m
+    return np.flatnonzero(good), j[good]
+
+
 def _sizes(E: Array) -> tuple[ErrorStatistics, ErrorStatistics]:
     """Translation in metres and rotation angle in radians of error transforms (N, 4, 4)."""
     translation_m = np.linalg.norm(E[:, :3, 3], axis=-1)

@@ -8,9 +8,12 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from graph.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas
 
 RESULTS = "results.json"
 FORMAT_VERSION = 1
@@ -89,6 +92,8 @@ class Comparison:
         methods: in the order of the rows.
         cells: one for each sequence, method and seed that was asked for.
         provenance: commit, machine, versions, command, date, the resolved experiment; by name.
+        drawn: sequences whose images the seed draws, so that each seed is a sequence of its own;
+            of the others the seed is the system's alone.
     """
 
     name: str
@@ -98,10 +103,36 @@ class Comparison:
     methods: tuple[Method, ...]
     cells: tuple[Cell, ...]
     provenance: dict[str, Any] = field(default_factory=dict)
+    drawn: tuple[str, ...] = ()
 
     def of(self, sequence: str, method: str) -> Iterator[Cell]:
         """The cells of a sequence and a method, one for each seed."""
         return (c for c in self.cells if c.sequence == sequence and c.method == method)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A row a cell: sequence, method, kind, seed, status, error, and a column a metric.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            import pandas  # noqa: PLC0415 - optional
+        except ImportError as error:
+            raise InputError("a frame of the results needs pandas: pip install pandas") from error
+        kinds = {method.name: method.kind.value for method in self.methods}
+        rows = [
+            {
+                "sequence": cell.sequence,
+                "method": cell.method,
+                "kind": kinds[cell.method],
+                "seed": cell.seed,
+                "status": cell.status.value,
+                "error": cell.error,
+                **cell.metrics,
+            }
+            for cell in self.cells
+        ]
+        return pandas.DataFrame(rows)
 
 
 def write_results(path: Path, comparison: Comparison) -> None:
@@ -130,9 +161,8 @@ def read_results(path: Path) -> Comparison:
         raise InputError(f"{path}: not a comparison of format {FORMAT_VERSION}; compare again")
     methods = tuple(Method(**m | {"kind": Kind(m["kind"])}) for m in plain.pop("methods"))
     cells = tuple(_cell(cell) for cell in plain.pop("cells"))
-    return Comparison(
-        **plain | {"sequences": tuple(plain["sequences"])}, methods=methods, cells=cells
-    )
+    names = {key: tuple(plain.get(key, ())) for key in ("sequences", "drawn")}
+    return Comparison(**plain | names, methods=methods, cells=cells)
 
 
 def _cell(plain: dict[str, Any]) -> Cell:

@@ -17,6 +17,7 @@ from graph.metrics import (
     AbsoluteError,
     RelativeError,
     absolute_error,
+    distance_pairs,
     frame_pairs,
     relative_error,
     time_pairs,
@@ -51,12 +52,14 @@ class EvaluationResult:
         per_frame: relative error of consecutive associated poses; across a gap in the estimate
             such a pair spans the gap.
         per_second: relative error over one second, None where no two poses are that far apart.
+        per_metre: the same over one metre of the reference's path.
         rows: what is printed and saved.
     """
 
     absolute: AbsoluteError
     per_frame: RelativeError | None
     per_second: RelativeError | None
+    per_metre: RelativeError | None
     rows: list[Row]
 
     def value(self, name: str) -> float:
@@ -69,32 +72,35 @@ def evaluate_trajectory(
     reference: Trajectory,
     expected_frames: int | None = None,
     with_scale: bool = False,
+    max_time_difference_s: float = MAX_TIME_DIFFERENCE_S,
 ) -> EvaluationResult:
     """Compare an estimate with a reference whose world frame may be another.
 
-    Poses are associated by stamp (0.02 s); the alignment is SE(3), or Sim(3) with ``with_scale``
+    Poses are associated by stamp; the alignment is SE(3), or Sim(3) with ``with_scale``
     (for monocular systems only). ``expected_frames``, the frames that the system was given, adds
     the share that it tracked.
 
     Raises:
         InputError: fewer than three poses belong together.
     """
-    matched, truth = associate(estimate, reference)
+    matched, truth = associate(estimate, reference, max_time_difference_s)
     if len(matched) < MIN_POSES:
         raise InputError(
             f"{len(matched)} of {len(estimate)} poses have a reference pose within "
-            f"{MAX_TIME_DIFFERENCE_S:g} s, at least {MIN_POSES} are needed; estimate "
+            f"{max_time_difference_s:g} s, at least {MIN_POSES} are needed; estimate "
             f"{_span(estimate)}, reference {_span(reference)}: use the same clock in both"
         )
     absolute = absolute_error(matched, truth, with_scale)
     per_frame = relative_error(matched, truth, frame_pairs(len(matched)))
     per_second = relative_error(matched, truth, time_pairs(matched.timestamps_s))
+    path_pairs = distance_pairs(truth.positions_world)
+    per_metre = relative_error(matched, truth, path_pairs)
     rows = _absolute_rows(absolute) + _relative_rows("frame", per_frame)
-    rows += _relative_rows("second", per_second)
+    rows += _relative_rows("second", per_second) + _relative_rows("metre", per_metre)
     rows += _coverage_rows(estimate, reference, matched)
     if expected_frames:
         rows.append(_row("tracked_share", len(estimate) / expected_frames, "1"))
-    return EvaluationResult(absolute, per_frame, per_second, rows)
+    return EvaluationResult(absolute, per_frame, per_second, per_metre, rows)
 
 
 def evaluate(
@@ -177,13 +183,18 @@ def _row(name: str, value: float, unit: str) -> Row:
 
 def _absolute_rows(error: AbsoluteError) -> list[Row]:
     names = ("rmse", "mean", "median", "max")
-    return [_row(f"ate_{name}", getattr(error.translation_m, name), "m") for name in names]
+    rows = [_row(f"ate_{name}", getattr(error.translation_m, name), "m") for name in names]
+    return [*rows, _row("ate_rot_rmse", float(np.rad2deg(error.rotation_rad.rmse)), "deg")]
 
 
 def _relative_rows(step: str, error: RelativeError | None) -> list[Row]:
-    """Rows for the step "frame" or "second"; none, with a warning, when no pair was found."""
+    """Rows for a step, "frame", "second" or "metre"; none when no pair was found.
+
+    A warning tells of the first two; a camera that moves less than a metre is nothing unusual.
+    """
     if error is None:
-        logger.warning("no two associated poses one %s apart: no RPE per %s", step, step)
+        if step != "metre":
+            logger.warning("no two associated poses one %s apart: no RPE per %s", step, step)
         return []
     degrees = float(np.rad2deg(error.rotation_rad.rmse))
     return [

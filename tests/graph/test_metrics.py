@@ -13,6 +13,7 @@ from graph.metrics import (
     ErrorStatistics,
     absolute_error,
     align,
+    distance_pairs,
     frame_pairs,
     relative_error,
     time_pairs,
@@ -174,9 +175,27 @@ def test_time_pairs_pass_over_gaps():
     assert len(time_pairs(stamps[:0])[0]) == 0
 
 
+@given(seeds, st.floats(0.05, 3))
+@settings(max_examples=40, deadline=None)
+def test_distance_pairs_against_the_loop(seed, delta_m):
+    """Each i with the later j nearest in path length, stops on the way included."""
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(0, 0.05, (50, 3)) * (rng.random((50, 1)) < 0.7)
+    positions = np.cumsum(steps, axis=0)
+    path_m = np.r_[0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    expected = []
+    for i in range(len(positions) - 1):
+        off_m = np.abs(path_m[i + 1 :] - path_m[i] - delta_m)
+        if off_m.min() <= 0.1 * delta_m:
+            expected.append((i, i + 1 + int(off_m.argmin())))
+    found = distance_pairs(positions, delta_m)
+    assert list(zip(*(k.tolist() for k in found), strict=True)) == expected
+
+
 def test_no_pair_is_no_number():
     t = walk(1)
     assert relative_error(t, t, frame_pairs(1)) is None
+    assert not len(distance_pairs(t.positions_world)[0])
 
 
 @needs_shared
@@ -259,3 +278,69 @@ def test_rpe_agrees_with_evo(name, delta):
             assert ours.rmse == pytest.approx(
                 rpe.get_statistic(metrics.StatisticsType.rmse), abs=1e-6
             )
+
+
+def recording(seed: int) -> tuple[Trajectory, Trajectory]:
+    """An estimate with gaps and a reference at another rate that covers a part, both on one clock.
+
+    Poses of the estimate are more than two limits (0.01 s) apart, so that evo, which may use a
+    stamp twice, pairs one to one.
+    """
+    rng = np.random.default_rng(seed)
+    step_s, truth_step_s = 1 / rng.uniform(5, 40), 1 / rng.uniform(20, 120)
+    duration_s = 150 * step_s
+    stamps = np.arange(150) * step_s + rng.uniform(-0.1, 0.1, 150) * step_s
+    true_stamps = np.arange(0, duration_s, truth_step_s)
+    true_stamps += rng.uniform(-0.2, 0.2, len(true_stamps)) * truth_step_s
+    begin, end = rng.uniform(0, 0.3) * duration_s, rng.uniform(0.7, 1) * duration_s
+    hole = rng.uniform(0.3, 0.5) * duration_s
+    covered = (true_stamps > begin) & (true_stamps < end)
+    covered &= (true_stamps < hole) | (true_stamps > hole + 0.1 * duration_s)
+    xi = rng.normal(0, 1, (8, 6)) * [0.4, 0.4, 0.4, 1, 1, 1]
+    phase, speed = rng.uniform(0, 6, 8), rng.uniform(0.2, 2, 8)
+    speed *= 2 * np.pi / duration_s
+
+    def poses(t):
+        return se3_exp(np.sin(t[:, None] * speed + phase) @ xi)
+
+    estimate = noisy(Trajectory(stamps, poses(stamps)), seed, 0.01).moved(random_pose(seed))
+    kept = rng.random(150) < 0.9
+    kept[60:80] = False
+    return estimate.select(kept), Trajectory(true_stamps[covered], poses(true_stamps[covered]))
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_everything_agrees_with_evo(seed):
+    """From two trajectories on: association, ATE and RPE, translation and rotation."""
+    sync = pytest.importorskip("evo.core.sync")
+    metrics = pytest.importorskip("evo.core.metrics")
+    estimate, reference = recording(seed)
+    i, j = sync.matching_time_indices(estimate.timestamps_s, reference.timestamps_s, 0.01)
+    assert len(set(j)) == len(j) >= 10
+    e, g = associate(estimate, reference, 0.01)
+    np.testing.assert_array_equal(e.timestamps_s, estimate.timestamps_s[i])
+    np.testing.assert_array_equal(g.timestamps_s, reference.timestamps_s[j])
+    truth, ours = evo_pair(estimate.select(np.array(i)), reference.select(np.array(j)))
+    aligned = copy.deepcopy(ours)
+    aligned.align(truth)
+    absolute = absolute_error(e, g)
+    per_metre = relative_error(e, g, distance_pairs(g.positions_world))
+    per_frame = relative_error(e, g, frame_pairs(len(e)))
+    relations = metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad
+    for relation, part in zip(relations, ("translation_m", "rotation_rad"), strict=True):
+        ape = metrics.APE(relation)
+        ape.process_data((truth, aligned))
+        assert getattr(absolute, part).rmse == pytest.approx(rmse(ape), abs=1e-6)
+        for delta, unit, error in (
+            (1, metrics.Unit.frames, per_frame),
+            (1.0, metrics.Unit.meters, per_metre),
+        ):
+            rpe = metrics.RPE(relation, delta, unit, all_pairs=True, pairs_from_reference=True)
+            rpe.process_data((truth, ours))
+            assert len(rpe.error) == len(error.timestamps_s)
+            assert getattr(error, part).rmse == pytest.approx(rmse(rpe), abs=1e-6)
+
+
+def rmse(metric) -> float:
+    statistics = pytest.importorskip("evo.core.metrics").StatisticsType
+    return metric.get_statistic(statistics.rmse)

@@ -29,6 +29,7 @@ COMPARISON = Comparison(
         Cell("office", "other", None, CellStatus.DONE, {"ate_rmse": 0.02}, source="Table 1"),
     ),
     provenance={"commit": "abc", "versions": {"numpy": "2"}},
+    drawn=("office",),
 )
 
 
@@ -55,3 +56,10 @@ def test_what_is_no_comparison_is_refused(tmp_path, text):
 def test_a_missing_file_names_the_cure(tmp_path):
     with pytest.raises(InputError, match="bmask-slam compare"):
         read_results(tmp_path)
+
+
+def test_a_frame_has_a_row_a_cell_and_a_column_a_metric():
+    pytest.importorskip("pandas")
+    frame = COMPARISON.to_pandas()
+    assert list(frame["kind"]) == ["run", "run", "published"]
+    assert frame.groupby("method")["ate_rmse"].mean().to_dict() == {"default": 0.0123, "other": 0.02}

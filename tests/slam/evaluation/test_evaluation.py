@@ -35,6 +35,7 @@ def test_rows():
     units = {row["name"]: row["unit"] for row in result.rows}
     assert units == {
         "ate_rmse": "m", "ate_mean": "m", "ate_median": "m", "ate_max": "m",
+        "ate_rot_rmse": "deg", "rpe_trans_rmse_metre": "m", "rpe_rot_rmse_metre": "deg",
         "rpe_trans_rmse_frame": "m", "rpe_rot_rmse_frame": "deg",
         "rpe_trans_rmse_second": "m", "rpe_rot_rmse_second": "deg",
         "associated_poses": "poses", "estimate_share": "1", "reference_share": "1",
@@ -46,6 +47,9 @@ def test_rows():
     degrees = np.rad2deg(0.01 * np.sqrt(6))
     assert result.value("rpe_rot_rmse_frame") == pytest.approx(degrees, rel=0.06)
     assert result.value("rpe_rot_rmse_second") == pytest.approx(degrees, rel=0.06)
+    assert result.value("rpe_rot_rmse_metre") == pytest.approx(degrees, rel=0.06)
+    rotation_deg = np.rad2deg(0.01 * np.sqrt(3))
+    assert result.value("ate_rot_rmse") == pytest.approx(rotation_deg, rel=0.06)
     assert result.value("tracked_share") == pytest.approx(0.75)
     assert len(result.per_second.timestamps_s) > 250
 
