@@ -201,7 +201,8 @@ def _stages(results: Results) -> str:
     header = ("sequence", *names, "iSAM2 alone", "keyframes")
     return (
         "## Time of each stage\n\nMilliseconds, median and 95 %; features, moving and tracking "
-        "over all frames, the others over frames that became keyframes, whose share is in the last column."
+        "over all frames, the others over frames that became keyframes, whose share is in the "
+        "last column."
         f"\n\n{table(header, rows)}"
     )
 

@@ -62,4 +62,5 @@ def test_a_frame_has_a_row_a_cell_and_a_column_a_metric():
     pytest.importorskip("pandas")
     frame = COMPARISON.to_pandas()
     assert list(frame["kind"]) == ["run", "run", "published"]
-    assert frame.groupby("method")["ate_rmse"].mean().to_dict() == {"default": 0.0123, "other": 0.02}
+    means = frame.groupby("method")["ate_rmse"].mean()
+    assert means.to_dict() == {"default": 0.0123, "other": 0.02}
