@@ -64,10 +64,12 @@ def draw_top_view(
     estimate: Trajectory,
     reference: Trajectory | None = None,
     matched: tuple[Trajectory, Trajectory] | None = None,
+    joined_by: str = "difference",
 ) -> None:
     """Draw the plane of the two axes in which the camera moved most, both in one world frame.
 
-    ``matched`` are poses of estimate and reference that belong together; red lines join them.
+    ``matched`` are poses of estimate and reference that belong together; red lines join them, which
+    the legend calls ``joined_by``.
     """
     plane = view_plane((estimate if reference is None else reference).positions_world)
     if reference is not None:
@@ -76,7 +78,7 @@ def draw_top_view(
     if matched is not None:
         ends = np.stack([pose.positions_world[:, plane] for pose in matched], axis=1)
         axes.add_collection(LineCollection(list(ends), colors=DIFFERENCE, linewidths=0.5, zorder=1))
-        axes.plot([], [], color=DIFFERENCE, lw=0.8, label="difference")
+        axes.plot([], [], color=DIFFERENCE, lw=0.8, label=joined_by)
     axes.plot(*_path(estimate)[:, plane].T, color=ESTIMATE, lw=1.1, label="estimate", zorder=3)
     start = estimate.positions_world[:1, plane]
     axes.plot(*start.T, "o", color=ESTIMATE, ms=5, label="start", zorder=4)

@@ -1,0 +1,200 @@
+"""Error figures of a comparison: trajectory against truth, RPE over time (paper Figs. 10, 11)."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from graph.errors import InputError
+from graph.metrics import AbsoluteError, RelativeError, absolute_error, relative_error, time_pairs
+from graph.trajectory import Trajectory, associate
+from graph.trajectory_formats import read_trajectory
+from slam.comparison.report.section import Picture
+from slam.comparison.report.table import ATE, values
+from slam.comparison.result import Cell, CellStatus, Comparison, Method
+from slam.evaluation.plot import draw_top_view
+
+MIN_POSES = 3
+MAX_DIFFERENCES = 300
+VISIBLE_SHARE = 0.04  # of the path's extent, for an RMSE
+ENLARGED = (1, 2, 5, 10, 20, 50, 100)
+WIDTH_IN, HEIGHT_IN = 4.4, 5.0
+LEGEND_ROOM = 1.3
+SVG = "image/svg+xml"
+RPE_COLOUR = "#1f5fa8"
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none", "svg.hashsalt": "bmask-slam", "pdf.fonttype": 42, "font.size": 9.0,
+    "font.family": "sans-serif", "axes.spines.top": False, "axes.spines.right": False,
+    "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6,
+}  # fmt: skip
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """The errors of one cell's trajectory, with what they are drawn from.
+
+    Attributes:
+        cell: whose trajectory.
+        aligned: the whole estimate in the reference's world frame.
+        reference: the truth.
+        absolute: of the poses that belong together.
+        truth: the reference's poses that belong to those of ``absolute``.
+        per_second: relative error over a second, None where no poses are that far apart.
+    """
+
+    cell: Cell
+    aligned: Trajectory
+    reference: Trajectory
+    absolute: AbsoluteError
+    truth: Trajectory
+    per_second: RelativeError | None
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What the figures of a sequence share, so that they can be compared.
+
+    Attributes:
+        top_cm: end of the axes of relative errors.
+        enlarged: differences between the paths are drawn so many times longer.
+    """
+
+    top_cm: float
+    enlarged: int
+
+
+def error_pictures(comparison: Comparison, sequence: str, folder: Path) -> list[Picture]:
+    """A picture for each method that has a trajectory of the sequence, all in the same scales.
+
+    Of several seeds the one in the middle by ATE is drawn.
+    """
+    found = [
+        (method, errors)
+        for method in comparison.methods
+        if (errors := _middle_errors(comparison, sequence, method, folder)) is not None
+    ]
+    scales = common_scales([errors for _, errors in found])
+    return [error_picture(method, errors, scales) for method, errors in found]
+
+
+def common_scales(found: list[Errors]) -> Scales:
+    """Axes that hold all errors, and differences enlarged until the largest RMSE can be seen."""
+    tops = [100 * e.per_second.translation_m.max for e in found if e.per_second is not None]
+    ratios = [
+        VISIBLE_SHARE
+        * np.ptp(e.truth.positions_world, axis=0).max()
+        / e.absolute.translation_m.rmse
+        for e in found
+        if e.absolute.translation_m.rmse > 0
+    ]
+    fitting = [factor for factor in ENLARGED if factor <= min(ratios, default=1)]
+    return Scales(LEGEND_ROOM * max(tops, default=1.0), max(fitting, default=1))
+
+
+def error_picture(method: Method, errors: Errors, scales: Scales) -> Picture:
+    """Top view with the differences drawn, and the relative error over time below it."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
+        path_axes, rpe_axes = figure.subplots(2, 1, height_ratios=(2.1, 1))
+        step = draw_path(path_axes, errors, scales.enlarged)
+        draw_relative(rpe_axes, errors, scales.top_cm)
+        svg, pdf = as_svg(figure), as_pdf(figure)
+    cell = errors.cell
+    seed = f", seed {cell.seed}" if cell.seed is not None else ""
+    scale = ", aligned with scale" if method.with_scale else ""
+    larger = f", enlarged {scales.enlarged} times" if scales.enlarged > 1 else ""
+    caption = (
+        f"{method.name}{seed}: ATE {100 * errors.absolute.translation_m.rmse:.2f} cm over "
+        f"{len(errors.truth)} poses{scale}; {'each' if step == 1 else f'1 in {step}'} of the "
+        f"differences drawn{larger}. Below: relative translation error over a second."
+    )
+    size_px = (96 * WIDTH_IN, 96 * HEIGHT_IN)
+    return Picture(f"{method.name} on {cell.sequence}", caption, svg, SVG, size_px, pdf)
+
+
+def draw_path(axes: Axes, errors: Errors, enlarged: int) -> int:
+    """Draw estimate, reference and at most 300 differences; one of how many is drawn."""
+    step = -(-len(errors.truth) // MAX_DIFFERENCES)
+    every = np.arange(0, len(errors.truth), step)
+    truth, estimate = errors.truth.select(every), errors.absolute.aligned.select(every)
+    poses = truth.poses_world_camera.copy()
+    poses[:, :3, 3] += enlarged * (estimate.positions_world - truth.positions_world)
+    ends = (Trajectory(truth.timestamps_s, poses), truth)
+    name = "difference" if enlarged == 1 else f"difference × {enlarged}"
+    draw_top_view(axes, errors.aligned, errors.reference, ends, name)
+    return step
+
+
+def draw_relative(axes: Axes, errors: Errors, top_cm: float) -> None:
+    """Draw the relative translation error over a second in cm against time, and its RMSE."""
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("RPE a second (cm)")
+    axes.set_ylim(0, top_cm)
+    axes.grid(alpha=0.25, lw=0.5)
+    if errors.per_second is None:
+        return
+    stamps_s = errors.per_second.timestamps_s
+    error_cm = 100 * errors.per_second.translation_m.errors
+    axes.plot(
+        stamps_s - errors.absolute.aligned.timestamps_s[0], error_cm, color=RPE_COLOUR, lw=0.7
+    )
+    rmse_cm = 100 * errors.per_second.translation_m.rmse
+    axes.axhline(rmse_cm, color="black", lw=0.7, ls="--", label=f"RMSE {rmse_cm:.2f} cm")
+    axes.legend(frameon=False, fontsize=8, loc="upper right")
+
+
+def read_errors(cell: Cell, folder: Path, with_scale: bool) -> Errors | None:
+    """The errors of a cell's trajectory; None, with a warning, where they cannot be made."""
+    if cell.status is not CellStatus.DONE or not cell.trajectory or not cell.reference:
+        return None
+    try:
+        estimate, reference = (
+            read_trajectory(folder / f) for f in (cell.trajectory, cell.reference)
+        )
+        matched, truth = associate(estimate, reference)
+        if len(matched) < MIN_POSES:
+            raise InputError(f"{folder / cell.trajectory}: no {MIN_POSES} poses have a reference")
+    except InputError as error:
+        logger.warning("no error figure: %s", error)
+        return None
+    absolute = absolute_error(matched, truth, with_scale)
+    scaled = absolute.alignment.apply(matched)
+    relative = relative_error(scaled, truth, time_pairs(matched.timestamps_s))
+    return Errors(cell, absolute.alignment.apply(estimate), reference, absolute, truth, relative)
+
+
+def as_svg(figure: Figure) -> bytes:
+    """The figure as SVG; the same figure gives the same bytes."""
+    out = io.BytesIO()
+    figure.savefig(out, format="svg", metadata={"Date": None}, transparent=True)
+    return out.getvalue()
+
+
+def as_pdf(figure: Figure) -> bytes:
+    """The figure as a PDF page; the same figure gives the same bytes."""
+    out = io.BytesIO()
+    figure.savefig(out, format="pdf", metadata={"CreationDate": None})
+    return out.getvalue()
+
+
+def _middle_errors(
+    comparison: Comparison, sequence: str, method: Method, folder: Path
+) -> Errors | None:
+    """Of the cells of a method the one whose ATE is in the middle, if it can be drawn."""
+    cells = sorted(_measured(comparison, sequence, method), key=lambda c: values([c], ATE))
+    return read_errors(cells[(len(cells) - 1) // 2], folder, method.with_scale) if cells else None
+
+
+def _measured(comparison: Comparison, sequence: str, method: Method) -> Iterator[Cell]:
+    return (c for c in comparison.of(sequence, method.name) if c.trajectory and values([c], ATE))

@@ -1,0 +1,40 @@
+"""Write all formats of a comparison's report."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from slam.comparison.report.html import html_text
+from slam.comparison.report.sections import make_sections, summary
+from slam.comparison.report.table import metric_tables
+from slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
+from slam.comparison.result import Comparison
+
+PAGE = "report.html"
+
+
+def write_report(comparison: Comparison, folder: Path) -> list[Path]:
+    """Write report.html and tables.csv, .md, .tex to the comparison's folder; returns the paths.
+
+    Files of cells that are missing or broken leave their figure out, with a warning. The same
+    comparison and files give the same bytes.
+    """
+    sections, sentences = make_sections(comparison, folder), summary(comparison)
+    tables = metric_tables(comparison)
+    title = comparison.title or comparison.name
+    texts = {
+        PAGE: html_text(title, comparison.description, sentences, sections),
+        "tables.csv": csv_text(comparison),
+        "tables.md": markdown_text(tables, title),
+        "tables.tex": latex_text(tables),
+    }
+    return [_write(folder / name, text.encode("utf-8")) for name, text in texts.items()]
+
+
+def _write(path: Path, data: bytes) -> Path:
+    """Write a file that appears whole or not at all."""
+    temporary = path.with_name(f"{path.name}.tmp")
+    temporary.write_bytes(data)
+    os.replace(temporary, path)
+    return path

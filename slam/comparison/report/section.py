@@ -1,0 +1,75 @@
+"""What a report is made of, whatever its format: sections of text, tables, pictures, listings."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import dataclass
+
+from slam.comparison.report.table import Table
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture as the bytes of a file.
+
+    Attributes:
+        title: what it shows; its alternative text.
+        caption: how to read it.
+        data, mime: the file and its type.
+        size_px: width and height, at 96 px an inch.
+        pdf: the same as a page of PDF where it is a drawing.
+    """
+
+    title: str
+    caption: str
+    data: bytes
+    mime: str
+    size_px: tuple[float, float]
+    pdf: bytes | None = None
+
+    @property
+    def uri(self) -> str:
+        """The file as an address that needs no other."""
+        return f"data:{self.mime};base64,{base64.b64encode(self.data).decode('ascii')}"
+
+    @property
+    def width_px(self) -> int:
+        return round(self.size_px[0])
+
+    @property
+    def height_px(self) -> int:
+        return round(self.size_px[1])
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Text to be printed as it is, such as a log."""
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report under one heading; what is empty is left out."""
+
+    title: str
+    text: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    listings: tuple[Listing, ...] = ()
+
+    @property
+    def anchor(self) -> str:
+        """The heading as a name for links."""
+        return slug(self.title)
+
+    @property
+    def empty(self) -> bool:
+        return not (self.text or self.tables or self.pictures or self.listings)
+
+
+def slug(text: str) -> str:
+    """A text as a name for files and links: lower case letters, digits and hyphens."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "x"

@@ -1,0 +1,101 @@
+"""The sections of a comparison's report, in the order in which they are read."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from slam.comparison.report.figures import error_pictures
+from slam.comparison.report.section import Listing, Section
+from slam.comparison.report.table import ATE, cell_table, metric_table, metric_tables
+from slam.comparison.result import Cell, CellStatus, Comparison
+
+LOG_LINES = 25
+LINE_CHARACTERS = 400
+
+
+def make_sections(comparison: Comparison, folder: Path) -> list[Section]:
+    """All sections that have something to say; files are looked for in ``folder``."""
+    sections = [
+        _absolute_errors(comparison),
+        _failures(comparison, folder),
+        *_error_figures(comparison, folder),
+        _other_metrics(comparison),
+        Section("Every cell", tables=(cell_table(comparison),)),
+        _provenance(comparison),
+    ]
+    return [section for section in sections if not section.empty]
+
+
+def summary(comparison: Comparison) -> list[str]:
+    """What was compared, in sentences."""
+    states = Counter(cell.status for cell in comparison.cells)
+    counts = f"{_count(comparison.sequences, 'sequence')}, {_count(comparison.methods, 'method')}, "
+    counts += f"{_count(comparison.cells, 'cell')}"
+    failed, pending = states[CellStatus.FAILED], states[CellStatus.PENDING]
+    if not failed and not pending:
+        return [f"{counts}, all done."]
+    return [f"{counts}: {states[CellStatus.DONE]} done, {failed} failed, {pending} pending."]
+
+
+def log_tail(cell: Cell, folder: Path) -> str:
+    """The last lines of a cell's log, or a sentence saying that there is none."""
+    path = folder / cell.log
+    if not cell.log or not path.is_file():
+        return "(no log)"
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
+    return "\n".join(line[:LINE_CHARACTERS] for line in lines) or "(the log is empty)"
+
+
+def _absolute_errors(comparison: Comparison) -> Section:
+    table = metric_table(comparison, ATE)
+    text = (
+        "Best figures measured here are bold; published figures are quoted from their sources and "
+        "were not measured here. Alignment is SE(3) unless a row is marked Sim(3). A sequence with "
+        "a failed run is marked, and takes no part in what is best.",
+    )
+    return Section("Absolute trajectory error", text, (table,)) if table else Section("")
+
+
+def _failures(comparison: Comparison, folder: Path) -> Section:
+    failed = [cell for cell in comparison.cells if cell.status is CellStatus.FAILED]
+    listings = tuple(
+        Listing(f"{_cell_name(cell)}: {cell.error or 'no reason given'}", log_tail(cell, folder))
+        for cell in failed
+    )
+    return Section("Failed runs", listings=listings)
+
+
+def _error_figures(comparison: Comparison, folder: Path) -> list[Section]:
+    return [
+        Section(f"Errors on {name}", pictures=tuple(error_pictures(comparison, name, folder)))
+        for name in comparison.sequences
+    ]
+
+
+def _other_metrics(comparison: Comparison) -> Section:
+    tables = [table for table in metric_tables(comparison) if table.name != ATE.name]
+    return Section("Other metrics", tables=tuple(tables))
+
+
+def _provenance(comparison: Comparison) -> Section:
+    listings = [Listing(name, _as_text(value)) for name, value in comparison.provenance.items()]
+    return Section("How it was made", listings=tuple(listings))
+
+
+def _cell_name(cell: Cell) -> str:
+    seed = f", seed {cell.seed}" if cell.seed is not None else ""
+    return f"{cell.method} on {cell.sequence}{seed}"
+
+
+def _as_text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    return yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=100).strip()
+
+
+def _count(things: tuple[object, ...], name: str) -> str:
+    return f"{len(things)} {name}{'' if len(things) == 1 else 's'}"

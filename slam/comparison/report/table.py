@@ -1,0 +1,179 @@
+"""Tables of a comparison, as text and marks that every format prints in its own way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from math import isfinite
+from statistics import median
+
+from slam.comparison.metric_table import METRICS, Metric
+from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
+
+EMPTY = "–"
+FAILED = "failed"
+PENDING = "pending"
+ATE = METRICS[0]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One cell of a table.
+
+    Attributes:
+        text: the figure, or a word where there is none.
+        spread: range over seeds, "" with one.
+        note: what must be known to read the figure, such as "1 of 3 failed".
+        best: the best of its column among what was measured here.
+        failed: a run of it failed.
+    """
+
+    text: str
+    spread: str = ""
+    note: str = ""
+    best: bool = False
+    failed: bool = False
+
+    @property
+    def plain(self) -> str:
+        """All of it without marks."""
+        spread = f" ({self.spread})" if self.spread else ""
+        return f"{self.text}{spread}{f' {self.note}' if self.note else ''}"
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A line: its name, marks beside it, where its figures come from, and its entries."""
+
+    label: str
+    entries: tuple[Entry, ...]
+    tags: tuple[str, ...] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; ``name`` is its file-safe name, ``corner`` the heading of the first column."""
+
+    name: str
+    title: str
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[TableRow, ...]
+    corner: str = "method"
+
+
+def metric_tables(comparison: Comparison) -> list[Table]:
+    """A table of methods by sequences for each metric that some cell holds."""
+    tables = (metric_table(comparison, metric) for metric in METRICS)
+    return [table for table in tables if table is not None]
+
+
+def metric_table(comparison: Comparison, metric: Metric) -> Table | None:
+    """Methods by sequences: the median over seeds, and the range; None where no cell has it."""
+    if not any(metric.name in cell.metrics for cell in comparison.cells):
+        return None
+    columns = [_column(comparison, sequence, metric) for sequence in comparison.sequences]
+    rows = tuple(
+        TableRow(method.name, tuple(entries), method_tags(method), method_note(comparison, method))
+        for method, *entries in zip(comparison.methods, *columns, strict=True)
+        if any(entry != Entry(EMPTY) for entry in entries)
+    )
+    unit = f" ({metric.unit})" if metric.unit not in ("", "1") else ""
+    way = {True: "Lower is better.", False: "Higher is better.", None: ""}[metric.lower_is_better]
+    caption = f"{metric.title}{unit}: median over seeds (smallest to largest). {way}".strip()
+    title = f"{metric.title}{unit}"
+    return Table(metric.name, title, caption, comparison.sequences, rows)
+
+
+def cell_table(comparison: Comparison) -> Table:
+    """Every cell with each of its figures."""
+    held = {name for cell in comparison.cells for name in cell.metrics}
+    metrics = [metric for metric in METRICS if metric.name in held]
+    rows = tuple(
+        TableRow(
+            f"{cell.sequence}, {cell.method}"
+            + (f", seed {cell.seed}" if cell.seed is not None else ""),
+            tuple(_single(cell, metric) for metric in metrics),
+        )
+        for cell in comparison.cells
+    )
+    columns = tuple(f"{m.title} ({m.unit})" if m.unit else m.title for m in metrics)
+    return Table("cells", "Every cell", "Each run on its own.", columns, rows, corner="cell")
+
+
+def values(cells: Iterable[Cell], metric: Metric) -> list[float]:
+    """The finite values of a metric in the cells that are done, as printed (scaled)."""
+    found = [
+        c.metrics[metric.name]
+        for c in cells
+        if c.status is CellStatus.DONE and metric.name in c.metrics
+    ]
+    return [metric.scale * value for value in found if isfinite(value)]
+
+
+def number(value: float, metric: Metric) -> str:
+    """A value, scaled already, with the metric's digits."""
+    return f"{value:.{metric.digits}f}" if isfinite(value) else EMPTY
+
+
+def method_tags(method: Method) -> tuple[str, ...]:
+    """What marks a method's row: not run here, quoted, aligned with scale."""
+    kind = {Kind.RUN: (), Kind.TRAJECTORY: ("trajectory file",), Kind.PUBLISHED: ("published",)}
+    return (*kind[method.kind], *(("Sim(3)",) if method.with_scale else ()))
+
+
+def method_note(comparison: Comparison, method: Method) -> str:
+    """A method's note, and the sources of its figures."""
+    sources = dict.fromkeys(c.source for c in comparison.cells if c.method == method.name)
+    return "; ".join(text for text in (method.note, *sources) if text)
+
+
+def _column(comparison: Comparison, sequence: str, metric: Metric) -> list[Entry]:
+    """The entries of a sequence, one for each method, the best marked."""
+    groups = [list(comparison.of(sequence, method.name)) for method in comparison.methods]
+    entries = [_entry(cells, metric) for cells in groups]
+    middle = {
+        k: median(found)
+        for k, (cells, method) in enumerate(zip(groups, comparison.methods, strict=True))
+        if method.kind is not Kind.PUBLISHED
+        and not method.with_scale
+        and not entries[k].failed
+        and (found := values(cells, metric))
+    }
+    if metric.lower_is_better is None or len(middle) < 2:
+        return entries
+    best = (min if metric.lower_is_better else max)(middle.values())
+    return [
+        replace(e, best=k in middle and number(middle[k], metric) == number(best, metric))
+        for k, e in enumerate(entries)
+    ]
+
+
+def _entry(cells: list[Cell], metric: Metric) -> Entry:
+    failed = sum(cell.status is CellStatus.FAILED for cell in cells)
+    pending = sum(cell.status is CellStatus.PENDING for cell in cells)
+    found = values(cells, metric)
+    counts = ((failed, FAILED), (pending, PENDING))
+    for count, word in counts:
+        if count and count == len(cells):
+            return Entry(word, failed=failed > 0)
+    notes = [f"{count} of {len(cells)} {word}" for count, word in counts if count]
+    if not found:
+        return Entry(EMPTY, note=", ".join(notes), failed=failed > 0)
+    low, high = (number(limit(found), metric) for limit in (min, max))
+    notes += _share(cells) if metric is ATE else []
+    spread = f"{low} to {high}" if len(found) > 1 else ""
+    return Entry(number(median(found), metric), spread, ", ".join(notes), failed=failed > 0)
+
+
+def _share(cells: list[Cell]) -> list[str]:
+    """How much of the sequence was evaluated, where it was not all."""
+    shares = [c.metrics["evaluated_share"] for c in cells if "evaluated_share" in c.metrics]
+    return [f"over {100 * min(shares):.0f} %"] if shares and min(shares) < 0.995 else []
+
+
+def _single(cell: Cell, metric: Metric) -> Entry:
+    if cell.status is not CellStatus.DONE:
+        return Entry(cell.status.value, failed=cell.status is CellStatus.FAILED)
+    return Entry(number(metric.scale * cell.metrics.get(metric.name, float("nan")), metric))

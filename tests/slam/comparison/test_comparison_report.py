@@ -1,0 +1,166 @@
+"""The report holds every figure, averages no failure away, and escapes what it is given."""
+
+from __future__ import annotations
+
+import csv
+import html.parser
+import io
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_comparison import HOSTILE, WAVE_M, make_comparison
+
+from slam.comparison.metric_table import BY_NAME
+from slam.comparison.report import write_report
+from slam.comparison.report.figures import common_scales, read_errors
+from slam.comparison.report.table import ATE, metric_table
+from slam.comparison.result import CellStatus, Comparison
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("comparison")
+
+
+@pytest.fixture(scope="module")
+def comparison(folder: Path) -> Comparison:
+    return make_comparison(folder)
+
+
+@pytest.fixture(scope="module")
+def written(comparison: Comparison, folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in write_report(comparison, folder)}
+
+
+class Page(html.parser.HTMLParser):
+    """What a browser would make of a page: its text, its tags, the addresses it would load."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in ("src", "href")]
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def page(written: dict[str, bytes]) -> Page:
+    return Page(written["report.html"].decode())
+
+
+def test_every_figure_of_every_cell_is_in_the_page_and_the_csv(comparison, written, page):
+    rows = list(csv.DictReader(io.StringIO(written["tables.csv"].decode())))
+    for cell in comparison.cells:
+        if cell.status is not CellStatus.DONE:
+            continue
+        for name, value in cell.metrics.items():
+            metric = BY_NAME[name]
+            assert f"{metric.scale * value:.{metric.digits}f}" in page.text
+            assert any(
+                (row["sequence"], row["method"], row["metric"])
+                == (cell.sequence, cell.method, name)
+                and float(row["value"]) == value
+                for row in rows
+            )
+
+
+def test_a_failed_run_is_shown_with_its_log_and_never_averaged(comparison, written, page):
+    table = metric_table(comparison, ATE)
+    entry = table.rows[1].entries[0]
+    assert (entry.text, entry.note, entry.failed) == ("0.77", "1 of 2 failed", True)
+    assert not entry.best, "a method that failed is not the best"
+    assert table.rows[0].entries[0].text == "1.33", "median of 1.11 and 1.55"
+    assert "999" not in page.text
+    assert "Killed <b>here</b> & there" in page.text
+    assert "first line" not in page.text
+    assert "1 of 2 failed" in page.text
+
+
+def test_pending_cells_and_partial_truth_are_said(comparison):
+    first, second = metric_table(comparison, ATE).rows[:2]
+    assert first.entries[1].note == "1 of 2 pending"
+    assert second.entries[1].note == "over 62 %"
+
+
+def test_only_what_was_measured_without_scale_can_be_best(comparison):
+    table = metric_table(comparison, ATE)
+    best = [row.label for row in table.rows for entry in row.entries if entry.best]
+    assert best == [HOSTILE]
+    tags = {row.label: row.tags for row in table.rows}
+    assert tags["other"] == ("trajectory file", "Sim(3)")
+    assert tags["paper"] == ("published",)
+
+
+def test_published_rows_name_their_source(page):
+    assert "Table 3 of X & Y" in page.text
+
+
+def test_the_page_is_escaped_and_loads_nothing(page):
+    assert "script" not in page.tags
+    assert "b" not in page.tags
+    assert HOSTILE in page.text
+    assert page.addresses
+    assert all(address.startswith(("data:", "#")) for address in page.addresses)
+
+
+def test_latex_holds_no_bare_special_character(written):
+    text = written["tables.tex"].decode()
+    body = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
+    assert r"\textless{}script\textgreater{}" in body
+    assert r"50\%\_\{\textbackslash{}input\{a\}\}" in body
+    assert not re.search(r"(?<!\\)[%#_$^~]", body)
+    for row in re.findall(r"^.* & .*$", body, re.MULTILINE):
+        assert row.endswith(r"\\")
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex on this machine")
+def test_latex_compiles(written, tmp_path):
+    begin = "\\documentclass{article}\\usepackage{booktabs}\\begin{document}\n"
+    source = begin + written["tables.tex"].decode() + "\\end{document}\n"
+    (tmp_path / "paper.tex").write_text(source, encoding="utf-8")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+
+
+def test_markdown_tables_keep_their_columns(written):
+    rows = [x for x in written["tables.md"].decode().splitlines() if x.startswith("|")]
+    assert rows
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {4}
+
+
+def test_the_same_comparison_gives_the_same_bytes(comparison, written, folder):
+    again = {path.name: path.read_bytes() for path in write_report(comparison, folder)}
+    assert again == written
+
+
+def test_the_drawn_errors_are_those_of_the_trajectories(comparison, folder):
+    """The height swings by 5 cm: an RMSE of 5 cm / sqrt(2), which no alignment takes away."""
+    errors = read_errors(comparison.cells[0], folder, with_scale=False)
+    assert errors.absolute.translation_m.rmse == pytest.approx(WAVE_M / np.sqrt(2), rel=0.01)
+    step_m = 2 * WAVE_M * np.sin(3 * np.pi / 10)  # amplitude of a swing's difference over a second
+    assert errors.per_second.translation_m.max == pytest.approx(step_m, rel=0.02)
+
+
+def test_figures_of_a_sequence_share_their_scales(comparison, folder):
+    good, bad = (read_errors(comparison.cells[k], folder, with_scale=False) for k in (0, 2))
+    together = common_scales([good, bad])
+    assert together.top_cm == common_scales([bad]).top_cm > common_scales([good]).top_cm
+    assert together.enlarged == common_scales([bad]).enlarged <= common_scales([good]).enlarged
+
+
+def test_a_missing_trajectory_leaves_its_figure_out(comparison, folder, caplog):
+    assert read_errors(comparison.cells[-1], folder, with_scale=False) is None
+    assert "missing.txt" in caplog.text
