@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from slam.comparison.report.html import html_text
+from slam.comparison.report.pdf import pdf_bytes
 from slam.comparison.report.sections import make_sections, summary
 from slam.comparison.report.table import metric_tables
 from slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
@@ -15,10 +16,10 @@ PAGE = "report.html"
 
 
 def write_report(comparison: Comparison, folder: Path) -> list[Path]:
-    """Write report.html and tables.csv, .md, .tex to the comparison's folder; returns the paths.
+    """Write report.html, .pdf and tables.csv, .md, .tex to the comparison's folder.
 
-    Files of cells that are missing or broken leave their figure out, with a warning. The same
-    comparison and files give the same bytes.
+    Returns the paths. Files of cells that are missing or broken leave their figure out, with a
+    warning. The same comparison and files give the same bytes.
     """
     sections, sentences = make_sections(comparison, folder), summary(comparison)
     tables = metric_tables(comparison)
@@ -29,7 +30,9 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
         "tables.md": markdown_text(tables, title),
         "tables.tex": latex_text(tables),
     }
-    return [_write(folder / name, text.encode("utf-8")) for name, text in texts.items()]
+    written = [_write(folder / name, text.encode("utf-8")) for name, text in texts.items()]
+    pdf = pdf_bytes(title, comparison.description, sentences, sections)
+    return [*written, _write(folder / "report.pdf", pdf)]
 
 
 def _write(path: Path, data: bytes) -> Path:

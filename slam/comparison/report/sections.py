@@ -10,10 +10,10 @@ import yaml
 
 from slam.comparison.report.figures import error_pictures
 from slam.comparison.report.section import Listing, Section
-from slam.comparison.report.table import ATE, cell_table, metric_table, metric_tables
+from slam.comparison.report.table import ATE, cell_name, cell_tables, metric_table, metric_tables
 from slam.comparison.result import Cell, CellStatus, Comparison
 
-LOG_LINES = 25
+LOG_LINES = 15
 LINE_CHARACTERS = 400
 
 
@@ -24,7 +24,7 @@ def make_sections(comparison: Comparison, folder: Path) -> list[Section]:
         _failures(comparison, folder),
         *_error_figures(comparison, folder),
         _other_metrics(comparison),
-        Section("Every cell", tables=(cell_table(comparison),)),
+        Section("Every cell", tables=tuple(cell_tables(comparison))),
         _provenance(comparison),
     ]
     return [section for section in sections if not section.empty]
@@ -63,7 +63,10 @@ def _absolute_errors(comparison: Comparison) -> Section:
 def _failures(comparison: Comparison, folder: Path) -> Section:
     failed = [cell for cell in comparison.cells if cell.status is CellStatus.FAILED]
     listings = tuple(
-        Listing(f"{_cell_name(cell)}: {cell.error or 'no reason given'}", log_tail(cell, folder))
+        Listing(
+            f"{cell_name(cell)}, on {cell.sequence}: {cell.error or 'no reason given'}",
+            log_tail(cell, folder),
+        )
         for cell in failed
     )
     return Section("Failed runs", listings=listings)
@@ -84,11 +87,6 @@ def _other_metrics(comparison: Comparison) -> Section:
 def _provenance(comparison: Comparison) -> Section:
     listings = [Listing(name, _as_text(value)) for name, value in comparison.provenance.items()]
     return Section("How it was made", listings=tuple(listings))
-
-
-def _cell_name(cell: Cell) -> str:
-    seed = f", seed {cell.seed}" if cell.seed is not None else ""
-    return f"{cell.method} on {cell.sequence}{seed}"
 
 
 def _as_text(value: Any) -> str:

@@ -14,6 +14,7 @@ EMPTY = "–"
 FAILED = "failed"
 PENDING = "pending"
 ATE = METRICS[0]
+MAX_COLUMNS = 9  # of figures of single cells
 
 
 @dataclass(frozen=True)
@@ -86,20 +87,17 @@ def metric_table(comparison: Comparison, metric: Metric) -> Table | None:
     return Table(metric.name, title, caption, comparison.sequences, rows)
 
 
-def cell_table(comparison: Comparison) -> Table:
-    """Every cell with each of its figures."""
+def cell_tables(comparison: Comparison) -> list[Table]:
+    """For each sequence every cell with each of its figures, at most nine columns a table."""
     held = {name for cell in comparison.cells for name in cell.metrics}
     metrics = [metric for metric in METRICS if metric.name in held]
-    rows = tuple(
-        TableRow(
-            f"{cell.sequence}, {cell.method}"
-            + (f", seed {cell.seed}" if cell.seed is not None else ""),
-            tuple(_single(cell, metric) for metric in metrics),
-        )
-        for cell in comparison.cells
-    )
-    columns = tuple(f"{m.title} ({m.unit})" if m.unit else m.title for m in metrics)
-    return Table("cells", "Every cell", "Each run on its own.", columns, rows, corner="cell")
+    groups = [metrics[k : k + MAX_COLUMNS] for k in range(0, len(metrics), MAX_COLUMNS)]
+    return [_cell_table(comparison, s, group) for s in comparison.sequences for group in groups]
+
+
+def cell_name(cell: Cell) -> str:
+    """A cell's method and seed."""
+    return cell.method if cell.seed is None else f"{cell.method}, seed {cell.seed}"
 
 
 def values(cells: Iterable[Cell], metric: Metric) -> list[float]:
@@ -143,10 +141,12 @@ def _column(comparison: Comparison, sequence: str, metric: Metric) -> list[Entry
     }
     if metric.lower_is_better is None or len(middle) < 2:
         return entries
-    best = (min if metric.lower_is_better else max)(middle.values())
+    best = number((min if metric.lower_is_better else max)(middle.values()), metric)
+    if all(number(value, metric) == best for value in middle.values()):
+        return entries
     return [
-        replace(e, best=k in middle and number(middle[k], metric) == number(best, metric))
-        for k, e in enumerate(entries)
+        replace(entry, best=k in middle and number(middle[k], metric) == best)
+        for k, entry in enumerate(entries)
     ]
 
 
@@ -163,7 +163,7 @@ def _entry(cells: list[Cell], metric: Metric) -> Entry:
         return Entry(EMPTY, note=", ".join(notes), failed=failed > 0)
     low, high = (number(limit(found), metric) for limit in (min, max))
     notes += _share(cells) if metric is ATE else []
-    spread = f"{low} to {high}" if len(found) > 1 else ""
+    spread = f"{low} to {high}" if low != high else ""
     return Entry(number(median(found), metric), spread, ", ".join(notes), failed=failed > 0)
 
 
@@ -171,6 +171,14 @@ def _share(cells: list[Cell]) -> list[str]:
     """How much of the sequence was evaluated, where it was not all."""
     shares = [c.metrics["evaluated_share"] for c in cells if "evaluated_share" in c.metrics]
     return [f"over {100 * min(shares):.0f} %"] if shares and min(shares) < 0.995 else []
+
+
+def _cell_table(comparison: Comparison, sequence: str, metrics: list[Metric]) -> Table:
+    columns = tuple(f"{m.title} ({m.unit})" if m.unit else m.title for m in metrics)
+    cells = [cell for cell in comparison.cells if cell.sequence == sequence]
+    rows = tuple(TableRow(cell_name(c), tuple(_single(c, m) for m in metrics)) for c in cells)
+    title = f"{sequence}: {metrics[0].title} to {metrics[-1].title}"
+    return Table(f"cells-{sequence}", title, "Each run on its own.", columns, rows)
 
 
 def _single(cell: Cell, metric: Metric) -> Entry:

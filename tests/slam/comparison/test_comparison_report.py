@@ -8,17 +8,19 @@ import io
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pypdf import PdfReader
 from small_comparison import HOSTILE, WAVE_M, make_comparison
 
 from slam.comparison.metric_table import BY_NAME
 from slam.comparison.report import write_report
 from slam.comparison.report.figures import common_scales, read_errors
 from slam.comparison.report.table import ATE, metric_table
-from slam.comparison.result import CellStatus, Comparison
+from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +135,47 @@ def test_latex_compiles(written, tmp_path):
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-2000:]
+
+
+def test_the_pdf_holds_the_same_with_page_numbers(comparison, written):
+    pages = [
+        " ".join(page.extract_text().split())
+        for page in PdfReader(io.BytesIO(written["report.pdf"])).pages
+    ]
+    text = " ".join(pages)
+    for cell in comparison.cells:
+        if cell.status is CellStatus.DONE:
+            assert all(
+                f"{BY_NAME[n].scale * v:.{BY_NAME[n].digits}f}" in text
+                for n, v in cell.metrics.items()
+            )
+    assert HOSTILE[:25] in text
+    assert "Killed <b>here</b> & there" in text
+    assert "999" not in text
+    for number, page in enumerate(pages, start=1):
+        assert f"Small & <odd> {number}" in page
+    assert text.count("RPE a second (cm)") >= 5, "the drawings are on the pages, as drawings"
+
+
+def test_a_report_of_wide_tables_and_long_names_can_be_written(comparison, folder, tmp_path):
+    """Forty sequences, names without a place to break, a log of one endless line."""
+    names = tuple(f"freiburg3_walking_halfsphere_validation_{k}" for k in range(40))
+    log = tmp_path / "log.txt"
+    log.write_text("x" * 100_000, encoding="utf-8")
+    method = "m" * 300
+    cells = tuple(
+        Cell(name, method, 0, CellStatus.FAILED, log="log.txt", error="e" * 3000) if k == 3 else
+        Cell(name, method, 0, CellStatus.DONE, dict.fromkeys(BY_NAME, 12345.678))
+        for k, name in enumerate(names)
+    )  # fmt: skip
+    wide = replace(comparison, sequences=names, methods=(Method(method, Kind.RUN),), cells=cells)
+    assert all(path.stat().st_size for path in write_report(wide, tmp_path))
+
+
+def test_nothing_finished_is_a_report_too(comparison, tmp_path):
+    cells = tuple(replace(c, status=CellStatus.PENDING, metrics={}) for c in comparison.cells)
+    page = next(p for p in write_report(replace(comparison, cells=cells), tmp_path))
+    assert "10 pending" in page.read_text(encoding="utf-8")
 
 
 def test_markdown_tables_keep_their_columns(written):
