@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -178,6 +179,17 @@ def draw_precision_recall(result: SegmentationResult, picture: Path) -> None:
     axes.legend()
     axes.grid(alpha=0.3)
     figure.savefig(picture, dpi=120)
+
+
+def write_curves(result: SegmentationResult, path: Path) -> None:
+    """Write the curves as a table of kind, ranked_by, recall and precision at IoU 0.5."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("kind", "ranked_by", "recall", "precision"))
+        for curve in result.curves:
+            for k, precision in enumerate(curve.precision):
+                writer.writerow((curve.kind, curve.ranked_by, f"{k / 100:.2f}", f"{precision:.6f}"))
 
 
 def format_segmentation(result: SegmentationResult) -> str:

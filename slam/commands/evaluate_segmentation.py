@@ -29,6 +29,7 @@ def add_evaluate_segmentation(commands: _Commands) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="of that split")
     parser.add_argument("--plot", type=Path, metavar="F", help="picture of precision and recall")
+    parser.add_argument("--curves", type=Path, metavar="F", help="the same as a table (CSV)")
     parser.add_argument("--quiet", action="store_true", help="no bar")
 
 
@@ -38,6 +39,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         draw_precision_recall,
         evaluate_segmenter,
         format_segmentation,
+        write_curves,
     )
     from semantics.segmenter_table import SegmenterOptions, make_segmenter
     from semantics.training.dataset import split
@@ -52,5 +54,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         result = evaluate_segmenter(segmenter, truth, arguments.images, progress)
     if arguments.plot:
         draw_precision_recall(result, arguments.plot)
+    if arguments.curves:
+        write_curves(result, arguments.curves)
     print(format_segmentation(result))
     return 0

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from graph.errors import InputError
 from graph.metrics import AbsoluteError, RelativeError, absolute_error, relative_error, time_pairs
 from graph.trajectory import Trajectory, associate
 from graph.trajectory_formats import read_trajectory
+from slam.comparison.report.drawing import as_picture, figure
 from slam.comparison.report.section import Picture
 from slam.comparison.report.table import ATE, values
 from slam.comparison.result import Cell, CellStatus, Comparison, Method
@@ -29,13 +26,7 @@ VISIBLE_SHARE = 0.04  # of the path's extent, for an RMSE
 ENLARGED = (1, 2, 5, 10, 20, 50, 100)
 WIDTH_IN, HEIGHT_IN = 4.4, 5.0
 LEGEND_ROOM = 1.3
-SVG = "image/svg+xml"
 RPE_COLOUR = "#1f5fa8"
-STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none", "svg.hashsalt": "bmask-slam", "pdf.fonttype": 42, "font.size": 9.0,
-    "font.family": "sans-serif", "axes.spines.top": False, "axes.spines.right": False,
-    "axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6,
-}  # fmt: skip
 
 logger = logging.getLogger(__name__)
 
@@ -104,12 +95,10 @@ def common_scales(found: list[Errors]) -> Scales:
 
 def error_picture(method: Method, errors: Errors, scales: Scales) -> Picture:
     """Top view with the differences drawn, and the relative error over time below it."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
-        path_axes, rpe_axes = figure.subplots(2, 1, height_ratios=(2.1, 1))
+    with figure(WIDTH_IN, HEIGHT_IN) as drawn:
+        path_axes, rpe_axes = drawn.subplots(2, 1, height_ratios=(2.1, 1))
         step = draw_path(path_axes, errors, scales.enlarged)
         draw_relative(rpe_axes, errors, scales.top_cm)
-        svg, pdf = as_svg(figure), as_pdf(figure)
     cell = errors.cell
     seed = f", seed {cell.seed}" if cell.seed is not None else ""
     scale = ", aligned with scale" if method.with_scale else ""
@@ -119,8 +108,7 @@ def error_picture(method: Method, errors: Errors, scales: Scales) -> Picture:
         f"{len(errors.truth)} poses{scale}; {'each' if step == 1 else f'1 in {step}'} of the "
         f"differences drawn{larger}. Below: relative translation error over a second."
     )
-    size_px = (96 * WIDTH_IN, 96 * HEIGHT_IN)
-    return Picture(f"{method.name} on {cell.sequence}", caption, svg, SVG, size_px, pdf)
+    return as_picture(drawn, f"{method.name} on {cell.sequence}", caption)
 
 
 def draw_path(axes: Axes, errors: Errors, enlarged: int) -> int:
@@ -141,7 +129,7 @@ def draw_relative(axes: Axes, errors: Errors, top_cm: float) -> None:
     axes.set_xlabel("time (s)")
     axes.set_ylabel("RPE a second (cm)")
     axes.set_ylim(0, top_cm)
-    axes.grid(alpha=0.25, lw=0.5)
+    axes.grid()
     if errors.per_second is None:
         return
     stamps_s = errors.per_second.timestamps_s
@@ -151,7 +139,7 @@ def draw_relative(axes: Axes, errors: Errors, top_cm: float) -> None:
     )
     rmse_cm = 100 * errors.per_second.translation_m.rmse
     axes.axhline(rmse_cm, color="black", lw=0.7, ls="--", label=f"RMSE {rmse_cm:.2f} cm")
-    axes.legend(frameon=False, fontsize=8, loc="upper right")
+    axes.legend(loc="upper right")
 
 
 def read_errors(cell: Cell, folder: Path, with_scale: bool) -> Errors | None:
@@ -172,20 +160,6 @@ def read_errors(cell: Cell, folder: Path, with_scale: bool) -> Errors | None:
     scaled = absolute.alignment.apply(matched)
     relative = relative_error(scaled, truth, time_pairs(matched.timestamps_s))
     return Errors(cell, absolute.alignment.apply(estimate), reference, absolute, truth, relative)
-
-
-def as_svg(figure: Figure) -> bytes:
-    """The figure as SVG; the same figure gives the same bytes."""
-    out = io.BytesIO()
-    figure.savefig(out, format="svg", metadata={"Date": None}, transparent=True)
-    return out.getvalue()
-
-
-def as_pdf(figure: Figure) -> bytes:
-    """The figure as a PDF page; the same figure gives the same bytes."""
-    out = io.BytesIO()
-    figure.savefig(out, format="pdf", metadata={"CreationDate": None})
-    return out.getvalue()
 
 
 def _middle_errors(

@@ -7,16 +7,18 @@ from pathlib import Path
 
 from slam.comparison.report.html import html_text
 from slam.comparison.report.pdf import pdf_bytes
+from slam.comparison.report.section import Section, slug
 from slam.comparison.report.sections import make_sections, summary
 from slam.comparison.report.table import metric_tables
 from slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
 from slam.comparison.result import Comparison
 
 PAGE = "report.html"
+FIGURES = "figures"
 
 
 def write_report(comparison: Comparison, folder: Path) -> list[Path]:
-    """Write report.html, .pdf and tables.csv, .md, .tex to the comparison's folder.
+    """Write report.html, .pdf, tables.csv, .md, .tex and figures/ to the comparison's folder.
 
     Returns the paths. Files of cells that are missing or broken leave their figure out, with a
     warning. The same comparison and files give the same bytes.
@@ -32,7 +34,22 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
     }
     written = [_write(folder / name, text.encode("utf-8")) for name, text in texts.items()]
     pdf = pdf_bytes(title, comparison.description, sentences, sections)
-    return [*written, _write(folder / "report.pdf", pdf)]
+    written.append(_write(folder / "report.pdf", pdf))
+    return written + _write_figures(folder / FIGURES, sections)
+
+
+def _write_figures(folder: Path, sections: list[Section]) -> list[Path]:
+    """Every drawing as a PDF of its own, to be included in a paper; those of before are removed."""
+    folder.mkdir(exist_ok=True)
+    drawn = [p for section in sections for p in section.pictures if p.pdf is not None]
+    files = {}
+    for k, picture in enumerate(drawn):
+        name = slug(picture.title)
+        files[f"{name}-{k}.pdf" if f"{name}.pdf" in files else f"{name}.pdf"] = picture.pdf
+    for old in folder.glob("*.pdf"):
+        if old.name not in files:
+            old.unlink()
+    return [_write(folder / name, data) for name, data in files.items() if data is not None]
 
 
 def _write(path: Path, data: bytes) -> Path:

@@ -8,7 +8,9 @@ from typing import Any
 
 import yaml
 
+from slam.comparison.report.curves import network_pictures
 from slam.comparison.report.figures import error_pictures
+from slam.comparison.report.run_files import map_pictures, stage_table
 from slam.comparison.report.section import Listing, Section
 from slam.comparison.report.table import ATE, cell_name, cell_tables, metric_table, metric_tables
 from slam.comparison.result import Cell, CellStatus, Comparison
@@ -24,6 +26,9 @@ def make_sections(comparison: Comparison, folder: Path) -> list[Section]:
         _failures(comparison, folder),
         *_error_figures(comparison, folder),
         _other_metrics(comparison),
+        _stages(comparison, folder),
+        *_maps(comparison, folder),
+        Section("Networks", pictures=tuple(network_pictures(comparison, folder))),
         Section("Every cell", tables=tuple(cell_tables(comparison))),
         _provenance(comparison),
     ]
@@ -38,7 +43,13 @@ def summary(comparison: Comparison) -> list[str]:
     failed, pending = states[CellStatus.FAILED], states[CellStatus.PENDING]
     if not failed and not pending:
         return [f"{counts}, all done."]
-    return [f"{counts}: {states[CellStatus.DONE]} done, {failed} failed, {pending} pending."]
+    reasons = dict.fromkeys(
+        f"{cell.sequence}: {cell.error}"
+        for cell in comparison.cells
+        if cell.status is CellStatus.PENDING and cell.error
+    )
+    done = states[CellStatus.DONE]
+    return [f"{counts}: {done} done, {failed} failed, {pending} pending.", *reasons]
 
 
 def log_tail(cell: Cell, folder: Path) -> str:
@@ -82,6 +93,18 @@ def _error_figures(comparison: Comparison, folder: Path) -> list[Section]:
 def _other_metrics(comparison: Comparison) -> Section:
     tables = [table for table in metric_tables(comparison) if table.name != ATE.name]
     return Section("Other metrics", tables=tuple(tables))
+
+
+def _stages(comparison: Comparison, folder: Path) -> Section:
+    table = stage_table(comparison, folder)
+    return Section("Time", tables=(table,) if table else ())
+
+
+def _maps(comparison: Comparison, folder: Path) -> list[Section]:
+    return [
+        Section(f"Map of {name}", pictures=tuple(map_pictures(comparison, name, folder)))
+        for name in comparison.sequences
+    ]
 
 
 def _provenance(comparison: Comparison) -> Section:

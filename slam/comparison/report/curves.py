@@ -1,0 +1,109 @@
+"""Training losses and precision against recall of networks (the paper's Figs. 8 and 9)."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from graph.geometry import Array
+from slam.comparison.report.drawing import COLOURS, DASHES, as_picture, figure
+from slam.comparison.report.section import Picture
+from slam.comparison.result import Comparison
+
+LOSSES, CURVES = "losses.csv", "precision_recall.csv"
+TOTAL, MASKS = "total", "segm, by class score x MaskIoU"
+SMOOTHING_STEPS = 50
+SIZE_IN = (4.4, 3.2)
+Curves = dict[str, Array]
+"""(N, 2) abscissa and ordinate by name."""
+
+logger = logging.getLogger(__name__)
+
+
+def network_pictures(comparison: Comparison, folder: Path) -> list[Picture]:
+    """Losses and precision-recall curves of the networks that the provenance names.
+
+    ``provenance["networks"]`` gives the folder of each by name: that of ``bmask-slam train``, in
+    which ``evaluate-segmentation --curves`` has put its file.
+    """
+    named = comparison.provenance.get("networks") or {}
+    folders = {str(name): folder / str(path) for name, path in named.items()}
+    losses = _of_all(folders, LOSSES, read_losses, TOTAL)
+    precision = _of_all(folders, CURVES, read_precision, MASKS)
+    pictures = []
+    if losses:
+        text = f"Training loss, mean over {SMOOTHING_STEPS} steps."
+        pictures.append(curve_picture("Loss", text, losses, ("step", "loss")))
+    if precision:
+        text = "Precision against recall at IoU 0.5, mean over classes."
+        pictures.append(
+            curve_picture("Precision and recall", text, precision, ("recall", "precision"))
+        )
+    return pictures
+
+
+def curve_picture(title: str, caption: str, curves: Curves, names: tuple[str, str]) -> Picture:
+    """Lines in one figure with a legend; a loss has a logarithmic axis, a share the axis 0 to 1."""
+    with figure(*SIZE_IN) as drawn:
+        axes = drawn.add_subplot()
+        for k, (name, points) in enumerate(curves.items()):
+            dashes = DASHES[k // len(COLOURS) % len(DASHES)]
+            axes.plot(*points.T, dashes, color=COLOURS[k % len(COLOURS)], lw=1.2, label=name)
+        axes.set(xlabel=names[0], ylabel=names[1])
+        axes.set(yscale="log") if names[1] == "loss" else axes.set(xlim=(0, 1), ylim=(0, 1.02))
+        axes.grid()
+        axes.legend()
+        return as_picture(drawn, title, caption)
+
+
+def read_losses(path: Path) -> Curves:
+    """Of a losses.csv each loss, and their sum as "total", against the step, smoothed."""
+    parts: dict[str, dict[int, float]] = defaultdict(dict)
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            parts[row["loss"]][int(row["step"])] = float(row["value"])
+    shared = set.intersection(*(set(part) for part in parts.values())) if parts else set()
+    if len(parts) > 1 and shared:
+        parts[TOTAL] = {step: sum(p[step] for p in parts.values()) for step in sorted(shared)}
+    return {name: _smooth(np.array(sorted(part.items()), float)) for name, part in parts.items()}
+
+
+def read_precision(path: Path) -> Curves:
+    """Of a precision_recall.csv each curve, named by what it is of and what ranks it."""
+    points = defaultdict(list)
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            points[f"{row['kind']}, by {row['ranked_by']}"].append(
+                (float(row["recall"]), float(row["precision"]))
+            )
+    return {name: np.array(values) for name, values in points.items()}
+
+
+def _of_all(
+    folders: dict[str, Path], file: str, read: Callable[[Path], Curves], preferred: str
+) -> Curves:
+    """All curves of a single network, or of each of several the preferred one."""
+    found: dict[str, Curves] = {}
+    for name, folder in folders.items():
+        try:
+            found[name] = read(folder / file)
+        except FileNotFoundError:
+            continue
+        except (KeyError, ValueError, OSError) as error:
+            logger.warning("%s: no curves in it (%s); left out", folder / file, error)
+    if len(found) == 1:
+        return next(iter(found.values()))
+    first = {name: next(iter(curves.values()), None) for name, curves in found.items()}
+    chosen = {name: curves.get(preferred, first[name]) for name, curves in found.items()}
+    return {name: points for name, points in chosen.items() if points is not None}
+
+
+def _smooth(points: Array) -> Array:
+    width = min(SMOOTHING_STEPS, len(points))
+    mean = np.convolve(points[:, 1], np.full(width, 1 / width), mode="valid")
+    return np.column_stack([points[width - 1 :, 0], mean])

@@ -1,0 +1,97 @@
+"""What run folders add to a report: times of the stages, pictures of the maps."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections import defaultdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slam.comparison.report.section import Picture
+from slam.comparison.report.table import EMPTY, Entry, Table, TableRow
+from slam.comparison.result import Cell, CellStatus, Comparison, Kind
+from slam.run_folder import STAGES
+
+KEYFRAME_STAGES = ("keyframe", "graph", "loops", "semantics")
+PICTURE_WIDTH_PX = 900
+MAP_PICTURES = {
+    "dense/view_overview.png": "the dense map",
+    "dense/view_overview_semantic.png": "the dense map in the colours of its labels",
+    "dense/view_mesh.png": "the surface",
+    "dense/plan.png": "the floor plan",
+    "objects.png": "landmarks by label and the objects, from above",
+}
+Times = dict[str, list[float]]
+
+logger = logging.getLogger(__name__)
+
+
+def stage_table(comparison: Comparison, folder: Path) -> Table | None:
+    """Milliseconds of each stage by method over all its runs; None without a frames.csv."""
+    rows = []
+    for method in comparison.methods:
+        times: Times = defaultdict(list)
+        for cell in comparison.cells:
+            if cell.method == method.name and method.kind is Kind.RUN:
+                read_stage_times(cell, folder, times)
+        if times:
+            rows.append(TableRow(method.name, tuple(_times_entry(times[s]) for s in STAGES)))
+    caption = (
+        "Milliseconds, median and 95 % over all frames of all runs; "
+        f"{', '.join(KEYFRAME_STAGES)} over keyframes."
+    )
+    return (
+        Table("stages", "Time of each stage (ms)", caption, STAGES, tuple(rows)) if rows else None
+    )
+
+
+def read_stage_times(cell: Cell, folder: Path, times: Times) -> None:
+    """Append the times of a finished run's frames, of some stages those of its keyframes only."""
+    path = folder / cell.folder / "frames.csv"
+    if cell.status is not CellStatus.DONE or not cell.folder or not path.is_file():
+        return
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            for stage in STAGES:
+                if row.get(f"{stage}_ms") and (row["keyframe"] or stage not in KEYFRAME_STAGES):
+                    times[stage].append(float(row[f"{stage}_ms"]))
+
+
+def map_pictures(comparison: Comparison, sequence: str, folder: Path) -> list[Picture]:
+    """The maps of a sequence, of the first run that made any (the paper's Figs. 7, 13)."""
+    for method in comparison.methods:
+        for cell in comparison.of(sequence, method.name):
+            if cell.folder and cell.status is CellStatus.DONE:
+                run = folder / cell.folder
+                drawn = [_map_picture(run / n, cell, t) for n, t in MAP_PICTURES.items()]
+                if found := [picture for picture in drawn if picture is not None]:
+                    return found
+    return []
+
+
+def _times_entry(times_ms: list[float]) -> Entry:
+    if not times_ms:
+        return Entry(EMPTY)
+    median, high = np.percentile(times_ms, (50, 95))
+    return Entry(f"{median:.1f}", f"95 %: {high:.1f}")
+
+
+def _map_picture(path: Path, cell: Cell, shows: str) -> Picture | None:
+    """A picture file made smaller; None where there is none that can be read."""
+    if not path.is_file():
+        return None
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        logger.warning("%s: not a picture; left out of the report", path)
+        return None
+    height, width = image.shape[:2]
+    if width > PICTURE_WIDTH_PX:
+        height = round(height * PICTURE_WIDTH_PX / width)
+        width = PICTURE_WIDTH_PX
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    data = cv2.imencode(".png", image)[1].tobytes()
+    name = f"{cell.sequence}, {cell.method}"
+    return Picture(f"{name}: {shows}", f"{name}: {shows}.", data, "image/png", (width, height))
