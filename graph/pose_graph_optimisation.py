@@ -8,48 +8,19 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, Literal
 
-import gtsam
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.stats import chi2
 
 from graph.errors import InputError
 from graph.geometry import Array
-from graph.graduation import first_mu, graduate
-from graph.iteration import Progress, iterate
-from graph.loop_consistency import LoopSupport, loop_support
-from graph.pose_graph import (
-    Mask,
-    PoseGraph,
-    is_connected,
-    spanning_tree_poses,
-)
-from graph.pose_graph_factors import (
-    chordal_poses,
-    make_factors,
-    make_gauge,
-    make_values,
-    pose_graph_cost,
-    poses_of,
-)
+from graph.iteration import Progress
+from graph.loop_consistency import loop_support
+from graph.pose_graph import Mask, PoseGraph, spanning_tree_poses
+from graph.pose_graph_factors import chordal_poses, pose_graph_cost
+from graph.pose_graph_gnc import find_wrong_loops
+from graph.pose_graph_solver import Method, PoseGraphConfig, PoseGraphSolver
 
-Method = Literal["lm", "dogleg", "gnc"]
-LEAST_WEIGHT = 1e-6  # where odometry does not connect: what one edge alone holds stays solvable
-
-
-@dataclass(frozen=True)
-class PoseGraphConfig:
-    """How long to iterate, and what GNC takes for an outlier."""
-
-    method: Method = "lm"
-    max_iterations: int = 200
-    relative_tolerance: float = 1e-7
-    inlier_probability: float = 0.999
-    gnc_step: float = 1.4
-    gnc_inner_iterations: int = 3
+__all__ = ["Method", "PoseGraphConfig", "PoseGraphResult", "optimise_pose_graph"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +65,7 @@ def optimise_pose_graph(
     """
     config = config or PoseGraphConfig()
     begin_s = time.perf_counter()
-    solver = _Solver(graph, config, progress)
+    solver = PoseGraphSolver(graph, config, progress)
     try:
         is_outlier = np.zeros(len(graph.edges), bool)
         support, trusted = None, ~is_outlier
@@ -107,7 +78,7 @@ def optimise_pose_graph(
         start, poses = _best_start(graph, {given: given_poses}, trusted)
         solver.start_from(poses)
         if support is not None:
-            is_outlier = _graduated_non_convexity(graph, solver, config, support)
+            is_outlier = find_wrong_loops(graph, solver, config, support)
         solver.weigh(np.where(is_outlier, 0.0, 1.0))
         final_cost = solver.run(config.max_iterations)
     except RuntimeError as error:  # GTSAM's exceptions all arrive as this
@@ -127,68 +98,6 @@ def optimise_pose_graph(
     )
 
 
-class _Solver:
-    """A graph in GTSAM's terms, its current values, and the steps taken so far."""
-
-    def __init__(self, graph: PoseGraph, config: PoseGraphConfig, progress: Progress) -> None:
-        self._graph, self._config, self._progress = graph, config, progress
-        self._edges = make_factors(graph)
-        self._gauge = make_gauge(graph)
-        self._factors = self._edges
-        self.weigh(np.ones(len(graph.edges)))
-        self._values = make_values(graph, graph.poses)
-        self.iterations = 0
-
-    @property
-    def poses(self) -> Array:
-        """(N, 4, 4) where the solver stands."""
-        return poses_of(self._graph, self._values)
-
-    def start_from(self, poses: Array) -> None:
-        """Go to poses (N, 4, 4)."""
-        self._values = make_values(self._graph, poses)
-
-    def cost(self, poses: Array) -> float:
-        """Cost of all edges, weight 1, at poses (N, 4, 4)."""
-        return float(self._edges.error(make_values(self._graph, poses)))
-
-    def chi_squares(self) -> Array:
-        """(M,) squared whitened residuals of all edges, weight 1, at the current values."""
-        factors, values = self._edges, self._values
-        return 2 * np.array([factors.at(k).error(values) for k in range(factors.size())])
-
-    def weigh(self, weights: Array) -> None:
-        """Scale the information of each edge by weights (M,); edges of weight 0 are left out."""
-        factors = gtsam.NonlinearFactorGraph(self._gauge)
-        for k in np.flatnonzero(weights == 1.0).tolist():
-            factors.push_back(self._edges.at(k))
-        partly = np.flatnonzero((weights > 0) & (weights != 1.0))
-        scaled = self._graph.with_edges(partly)
-        information = weights[partly, None, None] * scaled.information
-        factors.push_back(make_factors(scaled, information))
-        self._factors = factors
-
-    def run(self, max_iterations: int) -> float:
-        """Iterate to convergence or for so many steps; returns the cost of the weighted edges."""
-        optimiser, done = self._optimiser(), self.iterations
-        cost, steps = iterate(
-            optimiser,
-            max_iterations,
-            self._config.relative_tolerance,
-            lambda step, cost: self._progress(done + step, cost),
-        )
-        self.iterations += steps
-        self._values = optimiser.values()
-        return cost
-
-    def _optimiser(self) -> Any:
-        if self._config.method == "dogleg":
-            return gtsam.DoglegOptimizer(self._factors, self._values, gtsam.DoglegParams())
-        return gtsam.LevenbergMarquardtOptimizer(
-            self._factors, self._values, gtsam.LevenbergMarquardtParams()
-        )
-
-
 # --- initial value -------------------------------------------------------------------------------
 
 
@@ -204,65 +113,3 @@ def _best_start(graph: PoseGraph, given: dict[str, Array], trusted: Mask) -> tup
     costs = {name: pose_graph_cost(judged.with_poses(T)) for name, T in candidates.items()}
     name = min(costs, key=lambda key: costs[key])
     return name, candidates[name]
-
-
-# --- graduated non-convexity ---------------------------------------------------------------------
-
-
-def _graduated_non_convexity(
-    graph: PoseGraph, solver: _Solver, config: PoseGraphConfig, support: LoopSupport
-) -> Mask:
-    """(M,) the wrong edges: GNC with truncated least squares (Yang et al., RA-L 2020).
-
-    mu starts where the cost is convex and grows until every weight is 0 or 1. From the solution of
-    odometry and the loops that others confirm it starts later, where the worst of these still
-    counts: what disagrees more is out at once. This is also what keeps it quick, since random edges
-    fill the factorisation. Odometry edges keep weight 1. The solver is left at the solution.
-    """
-    degrees = graph.information.shape[-1]
-    limit = support.noise_scale * float(chi2.ppf(config.inlier_probability, degrees))
-    known = graph.is_odometry
-    least = 0.0 if is_connected(graph.with_edges(known)) else LEAST_WEIGHT
-    confirmed = support.supported[~known]
-    if confirmed.any():
-        solver.weigh((known | support.supported).astype(float))
-        solver.run(config.max_iterations)
-    else:
-        solver.run(config.gnc_inner_iterations)
-    chi_squares = solver.chi_squares()[~known]
-    if not (chi_squares > limit).any():
-        return np.zeros(len(known), bool)
-    mu = first_mu(chi_squares, limit)
-    if confirmed.any():
-        worst = float(chi_squares[confirmed].max())
-        mu = max(mu, limit / max(worst - limit, limit))
-
-    def solve(weights: Array) -> Array:
-        all_weights = np.ones(len(known))
-        all_weights[~known] = np.maximum(weights, least)
-        solver.weigh(all_weights)
-        solver.run(config.gnc_inner_iterations)
-        return solver.chi_squares()[~known]
-
-    weights, chi_squares = graduate(
-        chi_squares, limit, mu, config.gnc_step, config.max_iterations, solve
-    )
-    is_outlier, costs = np.zeros(len(known), bool), np.full(len(known), 1e-3)
-    is_outlier[~known] = weights < 0.5
-    costs[is_outlier] = chi_squares[weights < 0.5]
-    return is_outlier & ~_needed(graph, costs)
-
-
-def _needed(graph: PoseGraph, costs: Array) -> Mask:
-    """(M,) edges of the cheapest tree: without them a vertex would hang loose."""
-    size = len(graph.ids)
-    low, high = np.sort(graph.edges, axis=1).T
-    order = np.lexsort((costs, high, low))
-    pairs = np.stack([low, high])[:, order]
-    cheapest = order[np.r_[True, (np.diff(pairs) != 0).any(axis=0)]]  # of edges of the same pair
-    weights = coo_array((costs[cheapest], (low[cheapest], high[cheapest])), shape=(size, size))
-    tree = minimum_spanning_tree(weights.tocsr()).tocoo()
-    in_tree = np.isin(low * size + high, tree.row.astype(np.int64) * size + tree.col)
-    needed = np.zeros(len(costs), bool)
-    needed[cheapest] = in_tree[cheapest]
-    return needed

@@ -11,6 +11,7 @@ from graph.g2o import read_g2o
 from graph.geometry import inverse, se3_exp, se3_log
 from graph.graduation import truncated_weights
 from graph.loop_consistency import loop_support
+from graph.loop_prediction import predicted_chi2
 from graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
 from graph.pose_graph_factors import chordal_poses, pose_graph_cost
 from graph.pose_graph_optimisation import (
@@ -165,6 +166,53 @@ def test_gnc_without_odometry_keeps_the_graph_connected() -> None:
     assert np.isfinite(result.graph.poses).all()
 
 
+def far_loops(graph: PoseGraph) -> PoseGraph:
+    """Odometry, the loops of the first lap, and one loop in nine of the others."""
+    loops = np.flatnonzero(~graph.is_odometry)
+    keep = graph.is_odometry.copy()
+    keep[loops[:PER_LAP]] = True
+    keep[loops[PER_LAP::9]] = True
+    return graph.with_edges(keep)
+
+
+@BOTH
+def test_a_prediction_is_what_the_cost_rises_by(planar: bool) -> None:
+    """Of poses that drifted, each loop is added alone to the odometry and all is solved again."""
+    graph = far_loops(ring(90, planar, seed=2, sigma=0.01))
+    used = graph.is_odometry
+    drifted = optimise_pose_graph(graph.with_edges(used)).graph.poses
+    asked = np.flatnonzero(~used)
+    predicted = predicted_chi2(graph.with_poses(drifted), used, asked)
+    rises = []
+    for k in asked:
+        with_one = used.copy()
+        with_one[k] = True
+        rises.append(2 * optimise_pose_graph(graph.with_edges(with_one)).final_cost)
+    assert max(rises) > 5
+    assert np.abs(np.log(predicted / rises)).max() < 0.7
+    assert abs(np.log(predicted / rises).mean()) < 0.2
+    alone = graph.with_poses(drifted)
+    E = inverse(alone.measurements) @ inverse(drifted[alone.edges[:, 0]])
+    r = se3_log(E @ drifted[alone.edges[:, 1]])[asked]
+    r = r[:, [3, 4, 2]] if planar else r
+    plain = np.einsum("mi,mij,mj->m", r, graph.information[asked], r)
+    assert plain.max() > 10 * predicted.max()
+
+
+@BOTH
+def test_right_loops_that_close_a_long_drift_are_kept_without_support(planar: bool) -> None:
+    graph = far_loops(ring(120, planar, seed=4, sigma=0.02))
+    loops = np.flatnonzero(~graph.is_odometry)
+    assert 0 < loop_support(graph).supported.sum() < len(loops) - 5
+    wrong = np.zeros(len(graph.edges), bool)
+    wrong[loops[PER_LAP + 2 :: 4]] = True
+    T = graph.measurements.copy()
+    shift = np.array([4.0, -5.0, 2.5])
+    T[wrong] = T[wrong] @ (planar_poses(shift) if planar else se3_exp(np.r_[1.5, -1, 1, shift]))
+    result = optimise_pose_graph(replace(graph, measurements=T), PoseGraphConfig(method="gnc"))
+    np.testing.assert_array_equal(result.is_outlier, wrong)
+
+
 @BOTH
 def test_loops_are_confirmed_by_their_neighbours(planar: bool) -> None:
     graph, wrong = with_wrong_loops(ring(90, planar, seed=2, sigma=0.01), 10)
@@ -215,8 +263,19 @@ COSTS = {  # plain GTSAM Levenberg-Marquardt from the best initial value: benchm
 
 @pytest.mark.parametrize("name", COSTS)
 def test_public_graphs_reach_their_optimum(name: str) -> None:
+    result = optimise_pose_graph(public(name))
+    assert result.final_cost <= COSTS[name] * (1 + 5e-5)
+
+
+@pytest.mark.parametrize("name", ["MIT", "intel", "manhattan", "smallGrid3D"])
+def test_public_graphs_have_no_wrong_loops(name: str) -> None:
+    graph = public(name)
+    result = optimise_pose_graph(graph, PoseGraphConfig(method="gnc"))
+    assert result.is_outlier.sum() <= 0.001 * (~graph.is_odometry).sum()
+
+
+def public(name: str) -> PoseGraph:
     file = FOLDER / f"{name}.g2o"
     if not file.is_file():
         pytest.skip(f"{file} is not there: the pose graphs are no part of the repository")
-    result = optimise_pose_graph(read_g2o(file))
-    assert result.final_cost <= COSTS[name] * (1 + 5e-5)
+    return read_g2o(file)
