@@ -35,9 +35,10 @@ def orthonormalised(T: Array) -> Array:
     Prediction and update feed each other (``T <- T @ inverse(T_last) @ T``), which doubles a
     deviation from orthonormality every frame; whoever closes such a loop must call this.
     """
-    return make_pose(
-        rotation_from_quaternion(quaternion_from_rotation(T[..., :3, :3])), T[..., :3, 3]
-    )
+    R = T[..., :3, :3]
+    for _ in range(3):  # Newton's iteration for the polar factor: the error e becomes 3/4 e^2
+        R = 1.5 * R - 0.5 * R @ (np.swapaxes(R, -1, -2) @ R)
+    return make_pose(R, T[..., :3, 3])
 
 
 def carried_along(T_world_a: Array, T_world_old: Array, T_world_new: Array) -> Array:

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph.camera import Camera
-from graph.geometry import Array, inverse, orthonormalised, se3_exp, transform
+from graph.geometry import Array, inverse, orthonormalised, transform
+from slam.reprojection import Reprojection, moved
 
 CHI2_3DOF = 7.815  # 95 %
 CHI2_2DOF = 5.991
-STEP_TOLERANCE = 3e-5  # rad and m: a fiftieth of a pixel
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class PoseOptimisationConfig:
     kernel_iterations: int = 3
     final_rounds: int = 2
     final_iterations: int = 5
+    step_tolerance: float = 3e-5  # rad and m: a fiftieth of a pixel
     max_noise_scale: float = 4.0
     min_points: int = 6
 
@@ -124,61 +125,50 @@ def optimise_pose(
     failed = PoseEstimate(T_world_camera, inliers & False, np.zeros((6, 6)), 1.0, False)
     if len(stereo) < config.min_points:
         return failed
+    matches = Reprojection.of(points_world, measured, weight, camera)
     for width in config.kernel_widths:
-        matches = (points_world, measured, weight)
-        T, H = _descend(T, matches, width * gate, camera, config.kernel_iterations)
-    scale = _noise_scale(T, points_world, measured, weight, gate, camera)
-    scale = min(scale, config.max_noise_scale)
-    weight = weight * np.array([scale**-2, scale**-2, 1.0])
+        T, H = _descend(T, matches, width * gate, config.kernel_iterations, config.step_tolerance)
+    scale = min(_noise_scale(T, matches, gate), config.max_noise_scale)
+    matches = matches.weighted(np.array([scale**-2, scale**-2, 1.0]))
     for _ in range(config.final_rounds):
-        inliers = _inliers(T, points_world, measured, weight, gate, camera)
+        inliers = _inliers(T, matches, gate)
         if inliers.sum() < config.min_points:
             return failed
-        matches = (points_world[inliers], measured[inliers], weight[inliers])
-        T, H = _descend(T, matches, None, camera, config.final_iterations)
-    inliers = _inliers(T, points_world, measured, weight, gate, camera)
+        T, H = _descend(T, matches[inliers], None, config.final_iterations, config.step_tolerance)
+    inliers = _inliers(T, matches, gate)
     ok = int(inliers.sum()) >= config.min_points and _well_conditioned(H)
     return PoseEstimate(orthonormalised(T), inliers, H, scale, ok) if ok else failed
 
 
 def _descend(
-    T: Array,
-    matches: tuple[Array, Array, Array],
-    kernel: Array | None,
-    camera: Camera,
-    iterations: int,
+    T: Array, matches: Reprojection, kernel: Array | None, iterations: int, tolerance: float
 ) -> tuple[Array, Array]:
-    """Gauss-Newton steps from a pose on (points, measurements, weights); its pose and H (6, 6).
+    """Gauss-Newton steps from a pose; its pose and H (6, 6).
 
     A direction that nothing observes is left alone, and shows in H.
     """
     for _ in range(iterations):
-        H, g = _normal_equations(T, *matches, kernel, camera)
+        H, g = matches.normal_equations(T, kernel)
         step = np.asarray(-np.linalg.solve(H + 1e-9 * np.eye(6), g), dtype=np.float64)
-        T = T @ se3_exp(step)
-        if np.abs(step).max() < STEP_TOLERANCE:
+        T = moved(T, step)
+        if np.abs(step).max() < tolerance:
             break
     return T, H
 
 
-def _inliers(
-    T: Array, points_world: Array, measured: Array, weight: Array, gate: Array, camera: Camera
-) -> NDArray[np.bool_]:
+def _inliers(T: Array, matches: Reprojection, gate: Array) -> NDArray[np.bool_]:
     """Points (N,) in front of the camera and within the chi-square gate, without any kernel."""
-    r, p = residuals(T, points_world, measured, camera)
-    return (np.einsum("ij,ij,ij->i", r, r, weight) < gate) & (p[:, 2] > 0.05)
+    chi2, _, z = matches.chi2(T)
+    return (chi2 < gate) & (z > 0.05)
 
 
-def _noise_scale(
-    T: Array, points_world: Array, measured: Array, weight: Array, gate: Array, camera: Camera
-) -> float:
+def _noise_scale(T: Array, matches: Reprojection, gate: Array) -> float:
     """How many times larger the pixel residuals are than their sigmas say, at least 1.
 
     The median of chi-square with 2 degrees of freedom is 1.386; gross outliers do not count.
     """
-    r, p = residuals(T, points_world, measured, camera)
-    chi2 = np.einsum("ij,ij,ij->i", r[:, :2], r[:, :2], weight[:, :2])
-    plausible = (chi2 < 16 * gate) & (p[:, 2] > 0.05)
+    _, chi2, z = matches.chi2(T)
+    plausible = (chi2 < 16 * gate) & (z > 0.05)
     if not plausible.any():
         return 1.0
     return max(1.0, float(np.sqrt(np.median(chi2[plausible]) / 1.386)))
@@ -190,22 +180,3 @@ def _well_conditioned(H: Array) -> bool:
     if not (np.isfinite(scale).all() and (scale > 0).all()):
         return False
     return bool(np.linalg.eigvalsh(H / np.outer(scale, scale))[0] > 1e-10)
-
-
-def _normal_equations(
-    T: Array,
-    points_world: Array,
-    measured: Array,
-    weight: Array,
-    kernel: Array | None,
-    camera: Camera,
-) -> tuple[Array, Array]:
-    """H (6, 6) and gradient (6,) of the weighted squares; with a kernel, Cauchy's weights."""
-    r, points_camera = residuals(T, points_world, measured, camera)
-    w = weight
-    if kernel is not None:
-        chi2 = np.einsum("ij,ij,ij->i", r, r, weight)
-        w = weight * (kernel / (kernel + chi2))[:, None]
-    J = jacobian(points_camera, camera).reshape(-1, 6)
-    weighted = J * w.reshape(-1, 1)
-    return weighted.T @ J, weighted.T @ r.reshape(-1)

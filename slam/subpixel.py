@@ -11,14 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from graph.geometry import Array
 
 PATCH_PX = 11  # side of a stored patch; the outermost ring only serves the gradients
 _RADIUS = PATCH_PX // 2
-_INNER = (PATCH_PX - 2) ** 2  # pixels without that ring
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,8 @@ class SubpixelConfig:
 
 def cut_patches(gray: NDArray[np.uint8], pixels: Array) -> NDArray[np.uint8]:
     """Patches (M, 11, 11) uint8 around pixels (M, 2), interpolated linearly."""
-    return np.rint(_sample(gray, pixels, _RADIUS)).astype(np.uint8)
+    window = np.rint(_sample(gray, pixels, _RADIUS)).astype(np.uint8)
+    return np.ascontiguousarray(window.transpose(2, 0, 1))
 
 
 def register_patches(
@@ -52,49 +51,60 @@ def register_patches(
 
     Each patch is aligned by translation, its brightness and contrast free. Returns the pixels
     (M, 2) and the correlation (M,) of patch and image there, -1 to 1.
+
+    Inside, the patches are the last axis, so that every operation runs along contiguous memory.
+    A gradient without its mean does not see the image's, and needs no normalised copy of it.
     """
-    template = patches.astype(np.float32)
-    gradient = np.stack(
-        [
-            (template[:, 1:-1, 2:] - template[:, 1:-1, :-2]).reshape(-1, _INNER) / 2,
-            (template[:, 2:, 1:-1] - template[:, :-2, 1:-1]).reshape(-1, _INNER) / 2,
-        ],
-        axis=1,
-    )
-    gradient -= gradient.mean(axis=2, keepdims=True)
-    inner, contrast = _normalised(template[:, 1:-1, 1:-1].reshape(-1, _INNER))
-    hessian = np.einsum("mik,mjk->mij", gradient, gradient).astype(float)
-    hessian += 1e-3 * np.eye(2)
-    inverse_hessian = np.linalg.inv(hessian)
-    moved = pixels.astype(float).copy()
+    template = patches.transpose(1, 2, 0).astype(np.float32, order="C")
+    gx = _centred((template[1:-1, 2:] - template[1:-1, :-2]) / 2)
+    gy = _centred((template[2:, 1:-1] - template[:-2, 1:-1]) / 2)
+    inner = _centred(template[1:-1, 1:-1])
+    contrast = _norm(inner)
+    inner /= contrast
+    xx, xy, yy = (_dot(gx, gx) + 1e-3, _dot(gx, gy), _dot(gy, gy) + 1e-3)
+    determinant = xx * yy - xy * xy
+    own_x, own_y = _dot(gx, inner), _dot(gy, inner)
+    moved = pixels.astype(float)
     for _ in range(iterations):
-        image = _normalised(_sample(gray, moved, _RADIUS - 1).reshape(-1, _INNER))[0]
-        error = (image - inner) * contrast[:, None]
-        steepest = np.einsum("mik,mk->mi", gradient, error)
-        moved -= np.clip(np.einsum("mij,mj->mi", inverse_hessian, steepest), -1.0, 1.0)
-    image = _normalised(_sample(gray, moved, _RADIUS - 1).reshape(-1, _INNER))[0]
-    return moved, np.einsum("mk,mk->m", image, inner).astype(float)
+        image = _centred(_sample(gray, moved, _RADIUS - 1))
+        norm = _norm(image)
+        bx = contrast * (_dot(gx, image) / norm - own_x)
+        by = contrast * (_dot(gy, image) / norm - own_y)
+        step = np.stack([yy * bx - xy * by, xx * by - xy * bx], axis=1) / determinant[:, None]
+        moved -= np.clip(step, -1.0, 1.0)
+    image = _centred(_sample(gray, moved, _RADIUS - 1))
+    return moved, _dot(image, inner) / _norm(image)
 
 
-def _normalised(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Rows of zero mean and unit norm, and the norms they had."""
-    centred = values - values.mean(axis=1, keepdims=True)
-    norm = np.sqrt(np.einsum("mk,mk->m", centred, centred)) + np.float32(1e-3)
-    return centred / norm[:, None], norm
+def _centred(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Windows (S, S, M) as columns (S * S, M) of zero mean."""
+    columns = values.reshape(values.shape[0] * values.shape[1], values.shape[2])
+    return columns - columns.mean(axis=0)
+
+
+def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> Array:
+    """Products (M,) of columns, in double precision from here on."""
+    return np.einsum("km,km->m", a, b).astype(float)
+
+
+def _norm(columns: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Norms (M,) of columns, never 0."""
+    return np.sqrt(np.einsum("km,km->m", columns, columns)) + np.float32(1e-3)
 
 
 def _sample(gray: NDArray[np.uint8], pixels: Array, radius: int) -> NDArray[np.float32]:
-    """Windows (M, 2r+1, 2r+1) float32 around pixels (M, 2), by linear interpolation.
+    """Windows (2r+1, 2r+1, M) float32 around pixels (M, 2), by linear interpolation.
 
     All pixels of a window share one fraction of a pixel. OpenCV's remap would round it to 1/32.
     """
-    side = 2 * radius + 1
-    if len(pixels) == 0:
-        return np.zeros((0, side, side), np.float32)
-    limit = np.array(gray.shape[::-1]) - side - 1
+    side = 2 * radius + 2
+    limit = np.array(gray.shape[::-1]) - side
     corner = np.clip(pixels - radius, 0, limit - 1e-3)
-    column, row = np.floor(corner).astype(np.int64).T
-    a, b = (corner - np.floor(corner)).astype(np.float32).T[:, :, None, None]
-    window = sliding_window_view(gray, (side + 1, side + 1))[row, column].astype(np.float32)
-    rows = window[:, :, :-1] + a * (window[:, :, 1:] - window[:, :, :-1])
-    return rows[:, :-1] + b * (rows[:, 1:] - rows[:, :-1])
+    whole = np.floor(corner)
+    column, row = whole.astype(np.int64).T
+    a, b = (corner - whole).astype(np.float32).T
+    steps = np.arange(side)
+    offsets = (steps[:, None] * gray.shape[1] + steps)[:, :, None]
+    window = gray.ravel()[offsets + (row * gray.shape[1] + column)].astype(np.float32)
+    rows = window[:, :-1] + a * (window[:, 1:] - window[:, :-1])
+    return rows[:-1] + b * (rows[1:] - rows[:-1])

@@ -16,6 +16,9 @@ from slam.results import TrackingStatus
 from slam.subpixel import SubpixelConfig, register_patches
 from slam.world_map import WorldMap
 
+COARSE_STEP = 1e-3
+"""Radians and metres: less than a pixel; nearer the first estimate need not come."""
+
 
 @dataclass(frozen=True)
 class TrackingConfig:
@@ -69,6 +72,7 @@ class Tracker:
         self.camera = camera
         self.config = config
         self._narrow = replace(config.pose, kernel_widths=config.pose.kernel_widths[-2:])
+        self._coarse = replace(config.pose, final_rounds=1, step_tolerance=COARSE_STEP)
 
     def track(
         self,
@@ -203,7 +207,7 @@ class Tracker:
         for ids, radius in ((recent_ids, near), (local_ids, near), (local_ids, wide)):
             visible, matches = self.search(features, index, T_predicted, ids, radius, landmarks)
             estimate = self._optimise(
-                features, matches, visible, T_predicted, landmarks, self.config.pose
+                features, matches, visible, T_predicted, landmarks, self._coarse
             )
             if estimate.ok and estimate.inliers.sum() >= self.config.weak_inliers:
                 return estimate

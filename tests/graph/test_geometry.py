@@ -167,6 +167,16 @@ def predicted_and_tracked(orthonormalise: bool) -> np.ndarray:
     return T
 
 
+def test_orthonormalised_is_the_nearest_rotation_for_a_stack() -> None:
+    T = se3_exp(RNG.normal(size=(2, 5, 6)))
+    disturbed = T.copy()
+    disturbed[..., :3, :3] += 1e-3 * RNG.normal(size=(2, 5, 3, 3))
+    U, _, Vt = np.linalg.svd(disturbed[..., :3, :3])
+    nearest = disturbed.copy()
+    nearest[..., :3, :3] = U @ Vt
+    np.testing.assert_allclose(orthonormalised(disturbed), nearest, atol=1e-12)
+
+
 def test_a_prediction_loop_stays_a_rotation_only_if_orthonormalised() -> None:
     assert deviation(predicted_and_tracked(True)) < 1e-14
     with np.errstate(all="ignore"):

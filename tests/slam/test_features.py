@@ -64,6 +64,26 @@ def test_the_same_frame_gives_the_same_arrays() -> None:
             np.testing.assert_array_equal(getattr(other, name), values, err_msg=name)
 
 
+@pytest.mark.parametrize("contrast", [1.0, 0.7, 0.5, 0.3])
+def test_corners_are_those_of_the_highest_threshold_with_enough(contrast: float) -> None:
+    """Against asking FAST at one threshold after the other, also for dull images."""
+    rgb = np.rint(128 + contrast * (FRONTAL.rgb.astype(float) - 128)).astype(np.uint8)
+    frame = dataclasses.replace(FRONTAL, rgb=rgb)
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    config = dataclasses.replace(CONFIG, border_px=40, bucket_px=640, max_keypoints=500)
+    inside = np.zeros_like(gray)
+    inside[40:-40, 40:-40] = 255
+    for threshold in config.thresholds:
+        found = cv2.FastFeatureDetector_create(threshold).detect(gray, inside)
+        if len(found) >= config.max_keypoints:
+            break
+    best = sorted(found, key=lambda k: -k.response)[: config.max_keypoints]
+    weakest = best[-1].response
+    expected = {k.pt for k in found if k.response > weakest}
+    pixels = {tuple(p) for p in extract(frame, config).image_pixels.tolist()}
+    assert expected <= pixels <= {k.pt for k in found if k.response >= weakest}
+
+
 def test_descriptors_are_those_of_opencv_at_these_keypoints() -> None:
     """Rows belong together: each descriptor is that of its own pixel, size and angle."""
     features = extract(FRONTAL)

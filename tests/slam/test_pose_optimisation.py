@@ -12,6 +12,7 @@ from slam.pose_optimisation import (
     optimise_pose,
     residuals,
 )
+from slam.reprojection import Reprojection, moved
 
 T_WORLD_CAMERA = se3_exp(np.array([0.2, -0.5, 0.1, 1.0, -2.0, 0.5]))
 SIGMAS_PX = np.array([0.7, 0.7, 0.12])
@@ -207,3 +208,31 @@ def test_the_pose_is_a_rigid_transform() -> None:
     ).T_world_camera
     np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-14)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+def test_the_fast_normal_equations_are_those_of_the_jacobian() -> None:
+    rng = np.random.default_rng(5)
+    points, measured = scene(50, rng)
+    weight = rng.uniform(0.1, 4.0, (50, 3))
+    weight[::3, 2] = 0.0
+    kernel = rng.uniform(5.0, 50.0, 50)
+    r, points_camera = residuals(T_WORLD_CAMERA, points, measured, CAMERA)
+    J = jacobian(points_camera, CAMERA)
+    chi2 = (r**2 * weight).sum(axis=1)
+    matches = Reprojection.of(points, measured, weight, CAMERA)
+    np.testing.assert_allclose(matches.chi2(T_WORLD_CAMERA)[0], chi2, rtol=1e-9)
+    np.testing.assert_allclose(matches.chi2(T_WORLD_CAMERA)[2], points_camera[:, 2])
+    for cauchy, factor in ((None, 1.0), (kernel, kernel / (kernel + chi2))):
+        w = weight * np.reshape(factor, (-1, 1))
+        H, g = matches.normal_equations(T_WORLD_CAMERA, cauchy)
+        slow_H = np.einsum("nij,nik,ni->jk", J, J, w)
+        np.testing.assert_allclose(H, slow_H, rtol=1e-8, atol=1e-8 * slow_H.max())
+        np.testing.assert_allclose(g, np.einsum("nij,ni,ni->j", J, r, w), rtol=1e-7)
+
+
+def test_a_step_moves_the_pose_as_its_tangent_says() -> None:
+    step = 1e-5 * np.array([1.0, -2.0, 0.5, 3.0, -1.0, 2.0])
+    expected = T_WORLD_CAMERA @ se3_exp(step)
+    np.testing.assert_allclose(moved(T_WORLD_CAMERA, step), expected, atol=1e-9)
+    R = moved(T_WORLD_CAMERA, 1e4 * step)[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
