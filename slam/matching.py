@@ -14,7 +14,7 @@ Ints = NDArray[np.int64]
 Bits = NDArray[np.uint64]
 
 _LOW_BYTES = np.uint64(0x00FF00FF00FF00FF)
-_ONE_A_LANE = np.uint64(0x0001000100010001)
+_LOWEST_SUM = np.uint64(0xFFFF)
 _INDEX_BITS = 24  # of a sort key: more keypoints than any image has
 _DISTANCE_BITS = 10  # up to 512
 
@@ -90,12 +90,13 @@ def expand_ranges(start: Ints, stop: Ints) -> tuple[Ints, Ints]:
 def hamming(a: Bits, b: Bits) -> Ints:
     """Hamming distances (...,) of descriptors (..., 8) uint64.
 
-    The eight counts of a row, a byte each, are added inside one word: pairs of bytes to four
-    lanes of 16 bits, and those by a multiplication whose highest lane is their sum.
+    The eight counts of a row, a byte each, are added inside one word: first to four sums of 16
+    bits, then to two, then to one.
     """
     counts = np.bitwise_count(a ^ b).view(np.uint64)[..., 0]
-    lanes = (counts & _LOW_BYTES) + ((counts >> np.uint64(8)) & _LOW_BYTES)
-    return ((lanes * _ONE_A_LANE) >> np.uint64(48)).astype(np.int64)
+    four = (counts & _LOW_BYTES) + ((counts >> np.uint64(8)) & _LOW_BYTES)
+    two = four + (four >> np.uint64(32))
+    return ((two + (two >> np.uint64(16))) & _LOWEST_SUM).astype(np.int64)
 
 
 def match_pairs(
