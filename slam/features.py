@@ -98,7 +98,9 @@ class BriskExtractor:
         kept = self._strongest_spread(self._detect(gray), gray.shape)
         return self._assemble(frame, gray, *self._describe(gray, kept))
 
-    def _describe(self, gray: NDArray[np.uint8], keypoints: list) -> tuple[Array, Array]:
+    def _describe(
+        self, gray: NDArray[np.uint8], keypoints: list
+    ) -> tuple[Array, NDArray[np.uint8]]:
         """Columns (N, 4) u, v, size, angle in degrees and descriptors (N, 64) uint8.
 
         BRISK works through its keypoints one by one, most of a frame's time; so in parts, which

@@ -108,8 +108,8 @@ class Reprojection:
         np.multiply(sd_i, -nx, out=J[1, 2])
         np.multiply(sd_i, i, out=J[5, 2])
         np.multiply(root, r, out=J[6])
-        J = J.reshape(7, -1)
-        products = J @ J.T
+        rows = J.reshape(7, -1)
+        products = rows @ rows.T
         return products[:6, :6], products[:6, 6]
 
 

@@ -56,8 +56,9 @@ def register_patches(
     A gradient without its mean does not see the image's, and needs no normalised copy of it.
     """
     template = patches.transpose(1, 2, 0).astype(np.float32, order="C")
-    gx = _centred((template[1:-1, 2:] - template[1:-1, :-2]) / 2)
-    gy = _centred((template[2:, 1:-1] - template[:-2, 1:-1]) / 2)
+    half = np.float32(0.5)
+    gx = _centred((template[1:-1, 2:] - template[1:-1, :-2]) * half)
+    gy = _centred((template[2:, 1:-1] - template[:-2, 1:-1]) * half)
     inner = _centred(template[1:-1, 1:-1])
     contrast = _norm(inner)
     inner /= contrast
