@@ -17,6 +17,7 @@ from typing import TypeAlias
 from graph.errors import InputError
 from slam import __version__
 from slam.commands.calibrate import add_calibrate
+from slam.commands.download import add_download
 from slam.commands.evaluate_segmentation import add_evaluate_segmentation
 from slam.commands.export import add_export
 from slam.commands.live import add_live
@@ -79,6 +80,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     _add_render(commands)
     _add_info(commands)
+    add_download(commands)
     add_optimise(commands)
     add_export(commands)
     add_calibrate(commands)

@@ -43,6 +43,26 @@ def counting_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextmanager
+def byte_bars(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A function ``(what, done, total)`` that moves a bar of bytes, one for each ``what``."""
+    bars: dict[str, tqdm] = {}
+
+    def show(what: str, done: int, total: int) -> None:
+        if what not in bars:
+            bars[what] = make_bar(total or None, quiet, done)
+            bars[what].unit, bars[what].unit_scale = "B", True
+            bars[what].set_description(what, refresh=False)
+        bars[what].total = total or None
+        bars[what].update(done - bars[what].n)
+
+    try:
+        yield show
+    finally:
+        for bar in bars.values():
+            bar.close()
+
+
+@contextmanager
 def iteration_bar(quiet: bool) -> Iterator[Callable[[int, float], None]]:
     """A function ``(iteration, cost)`` that shows both, on a terminal alone."""
     with tqdm(unit="step", disable=quiet or not sys.stderr.isatty()) as bar:

@@ -1,0 +1,244 @@
+"""A file from a web address: resumed where it stopped, checked, and there whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import logging
+import os
+import shutil
+import socket
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from graph.errors import InputError
+
+CHUNK_BYTES = 1 << 20
+TIMEOUT_S = 30.0
+TRIES = 5
+FIRST_PAUSE_S = 1.0
+"""Before the second try; twice as long before each that follows."""
+HOPELESS = (400, 401, 403, 404, 410, 451)
+"""Answers that another try will not change."""
+RANGE_REFUSED = 416
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]
+"""Called with the bytes that are there and those of the whole file, 0 where unknown."""
+
+
+@dataclass(frozen=True)
+class WebFile:
+    """A file on the web and what is known of it.
+
+    Attributes:
+        url: its address.
+        sha256: its SHA-256 in hexadecimal, or the beginning; "" where it is not known.
+        size: its bytes; None where they are not known.
+    """
+
+    url: str
+    sha256: str = ""
+    size: int | None = None
+
+
+class _InterruptedError(Exception):
+    """The connection ended before the file did."""
+
+
+CONNECTION_ERRORS = (
+    _InterruptedError,
+    http.client.HTTPException,
+    urllib.error.URLError,
+    TimeoutError,
+    ConnectionError,
+)
+
+
+def download(file: WebFile, path: Path, progress: Progress | None = None) -> str:
+    """Bring a file to ``path`` unless it is there already and whole; its SHA-256.
+
+    What arrives is kept as NAME.part, and the next call goes on from there if the server can and
+    its file is the same. Two processes wait for each other.
+
+    Raises:
+        InputError: no connection, another size or SHA-256, or no room on the disk.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _alone(path.parent):
+        if path.is_file() and not _difference(file, path):
+            return sha256(path)
+        part = path.with_name(f"{path.name}.part")
+        _fill(file, part, progress or (lambda done, total: None))
+        difference = _difference(file, part)
+        if difference:
+            _forget(part)
+            raise InputError(
+                f"{file.url}: {difference}: the file was changed on the way, or is another by "
+                f"now; try again, or {_by_hand(part)}"
+            )
+        os.replace(part, path)
+        _forget(part)
+        return sha256(path)
+
+
+def sha256(path: Path) -> str:
+    """The SHA-256 of a file in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _difference(file: WebFile, path: Path) -> str:
+    """What a file on disk has another of than it should; "" where nothing."""
+    size = path.stat().st_size
+    if file.size is not None and size != file.size:
+        return f"{size} bytes, not {file.size}"
+    found = sha256(path) if file.sha256 else ""
+    if not found.startswith(file.sha256):
+        return f"the SHA-256 begins with {found[: len(file.sha256)]}, not {file.sha256}"
+    return ""
+
+
+def _fill(file: WebFile, part: Path, progress: Progress) -> None:
+    """Try until all is there; five times without a byte end it, at once what has no hope."""
+    failures = 0
+    while True:
+        before = _size(part)
+        try:
+            return _receive(file, part, progress)
+        except (_InterruptedError, http.client.HTTPException, OSError) as error:
+            if not isinstance(error, CONNECTION_ERRORS):
+                raise  # the disk's
+            failures = 1 if _size(part) > before else failures + 1
+            if failures == TRIES or _hopeless(error):
+                raise _given_up(file, part, error) from error
+            pause_s = FIRST_PAUSE_S * 2 ** (failures - 1)
+            logger.warning("%s: %s; trying again in %g s", file.url, _reason(error), pause_s)
+            time.sleep(pause_s)
+
+
+def _hopeless(error: Exception) -> bool:
+    """Whether another try would end alike: no such file, no such server, nobody there."""
+    if isinstance(error, urllib.error.HTTPError):
+        return error.code in HOPELESS
+    return isinstance(getattr(error, "reason", error), (socket.gaierror, ConnectionRefusedError))
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, urllib.error.HTTPError):
+        return f"{error.code} {error.reason}"
+    return str(getattr(error, "reason", error)) or type(error).__name__
+
+
+def _by_hand(part: Path) -> str:
+    return f"fetch it otherwise and put it to {part.with_suffix('')}"
+
+
+def _given_up(file: WebFile, part: Path, error: Exception) -> InputError:
+    size = _size(part)
+    kept = f"; {size} bytes are kept, the same command goes on from there" if size else ""
+    return InputError(
+        f"{file.url}: cannot be downloaded ({_reason(error)}){kept}; {_by_hand(part)}"
+    )
+
+
+def _receive(file: WebFile, part: Path, progress: Progress) -> None:
+    """Append what the server has beyond the part, or begin anew where it cannot."""
+    request = urllib.request.Request(file.url)
+    mark, begin = _mark_file(part), _size(part)
+    if begin and mark.is_file():
+        request.add_header("Range", f"bytes={begin}-")
+        request.add_header("If-Range", mark.read_text(encoding="utf-8"))
+    try:
+        response = urllib.request.urlopen(request, timeout=TIMEOUT_S)
+    except urllib.error.HTTPError as error:
+        if error.code != RANGE_REFUSED:
+            raise
+        _forget(part)  # longer than the server's file
+        raise _InterruptedError("the part on disk does not belong to the file") from error
+    with response:
+        begin = begin if _continues(response, begin) else 0
+        length = response.headers.get("Content-Length")
+        total = begin + int(length) if length and length.isdigit() else file.size or 0
+        _check_room(file, part, total)
+        _remember(response.headers, mark)
+        with part.open("r+b" if begin else "wb") as out:
+            out.seek(begin)
+            done = _copy(response, out, begin, total, progress)
+    if done < total:
+        raise _InterruptedError(f"the connection ended after {done} of {total} bytes")
+
+
+def _continues(response: http.client.HTTPResponse, begin: int) -> bool:
+    """Whether an answer begins where the part on disk ends."""
+    stated = response.headers.get("Content-Range", "")
+    return response.status == http.HTTPStatus.PARTIAL_CONTENT and f"bytes {begin}-" in stated
+
+
+def _copy(source: IO[bytes], out: IO[bytes], done: int, total: int, progress: Progress) -> int:
+    """Copy to the end; how many bytes are there then."""
+    while chunk := source.read(CHUNK_BYTES):
+        out.write(chunk)
+        done += len(chunk)
+        progress(done, total)
+    return done
+
+
+def _check_room(file: WebFile, part: Path, total: int) -> None:
+    """Refuse at once what will not be the file, or has no room."""
+    if file.size is not None and total not in (0, file.size):
+        raise InputError(
+            f"{file.url}: {total} bytes, not {file.size}: another file; {_by_hand(part)}"
+        )
+    free, needed = shutil.disk_usage(part.parent).free, total - _size(part)
+    if needed > free:
+        raise InputError(
+            f"{part.parent}: {free / 1e9:.2f} GB free, {needed / 1e9:.2f} GB of {file.url} are "
+            "still to come; free some space or choose another folder"
+        )
+
+
+def _remember(headers: http.client.HTTPMessage, mark: Path) -> None:
+    """Keep what tells the server's file from a later one; without it nothing is resumed."""
+    strong = headers.get("ETag", "")
+    known = strong if strong and not strong.startswith("W/") else headers.get("Last-Modified", "")
+    if known:
+        mark.write_text(known, encoding="utf-8")
+    else:
+        mark.unlink(missing_ok=True)
+
+
+def _mark_file(part: Path) -> Path:
+    return part.with_name(f"{part.name}.mark")
+
+
+def _forget(part: Path) -> None:
+    part.unlink(missing_ok=True)
+    _mark_file(part).unlink(missing_ok=True)
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else 0
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock, where the system has locks."""
+    try:
+        import fcntl  # noqa: PLC0415 - Unix only
+    except ImportError:
+        yield
+        return
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
