@@ -140,6 +140,8 @@ def _add_render(commands: _Commands) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder to make")
     parser.add_argument("--frames", type=int, metavar="N", help="number of frames (default: all)")
     parser.add_argument("--fps", type=float, default=30.0, help="frame rate (default: 30)")
+    parser.add_argument("--width", type=int, default=640, metavar="PX", help="default: 640")
+    parser.add_argument("--height", type=int, default=480, metavar="PX", help="default: 480")
     parser.add_argument("--seed", type=int, default=0, help="of people, noise, textures, room")
     parser.add_argument("--people", type=int, default=0, metavar="N", help="people in the scene")
     parser.add_argument(
@@ -161,7 +163,7 @@ def _render(arguments: argparse.Namespace) -> int:
     from slam.progress import console_log, counting_bar
     from slam.rendering.sequence import RenderConfig, render_sequence
 
-    names = ("name", "frames", "fps", "seed", "people", "depth_delay_ms")
+    names = ("name", "frames", "fps", "seed", "people", "depth_delay_ms", "width", "height")
     flags = ("carry", "sweeping", "exposure_change", "motion_blur", "true_depth", "normals")
     given = {name: getattr(arguments, name) for name in names + flags}
     config = RenderConfig(noise=not arguments.no_noise, **given)

@@ -69,6 +69,15 @@ def resolve(
     return _build(cls, None, given)
 
 
+def from_tree(cls: type[Config], tree: Any, source: str) -> Config:
+    """The configuration ``cls()`` with the values of a nested mapping; ``source`` names it.
+
+    Raises:
+        InputError: as `resolve`.
+    """
+    return _build(cls, None, _flatten(cls, tree, source))
+
+
 def dump(config: Any) -> str:
     """YAML text of a resolved configuration; resolving it gives an equal configuration."""
     return format_yaml(_plain(config))

@@ -1,0 +1,204 @@
+"""Carrying out an experiment: render, run, evaluate, and keep what is done."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from graph.errors import InputError
+from slam.comparison.bar import JobBar
+from slam.comparison.cells import Key
+from slam.comparison.errors import Rules, run_figures, trajectory_errors
+from slam.comparison.experiment import Configuration, Experiment
+from slam.comparison.experiment_file import read_experiment
+from slam.comparison.external import other_methods, published_cells, trajectory_cells
+from slam.comparison.job import Job, Outcome, finished
+from slam.comparison.options import CompareOptions, chosen
+from slam.comparison.plan import Plan, make_plan
+from slam.comparison.pool import LocalPool, Pool
+from slam.comparison.provenance import provenance
+from slam.comparison.ray_pool import RayPool
+from slam.comparison.result import (
+    RESULTS,
+    Cell,
+    CellStatus,
+    Comparison,
+    Kind,
+    Method,
+    write_results,
+)
+
+logger = logging.getLogger(__name__)
+
+Cells = dict[Key, Cell]
+
+
+def compare(
+    experiment: str | Path | Experiment, out: str | Path, options: CompareOptions | None = None
+) -> Comparison:
+    """Carry out an experiment, a file's or the shipped one of a name, in the folder ``out``.
+
+    Cells that are done there, with the same code, configuration and images, are not run again.
+    ``out`` then holds ``results.json``, ``sequences/`` (rendered) and ``cells/`` with a run folder
+    and a log each. A cell that fails is FAILED and does not end the others.
+
+    Raises:
+        InputError: an experiment or an option that cannot be, or another comparison is at work in
+            ``out``.
+    """
+    options = options or CompareOptions()
+    if not isinstance(experiment, Experiment):
+        experiment = read_experiment(experiment)
+    experiment = chosen(experiment, options)
+    with _locked(Path(out).absolute()) as folder:
+        plan = make_plan(experiment, folder, options)
+        pool: Pool = RayPool(options.ray) if options.ray else LocalPool(options.workers)
+        origin = provenance(experiment, pool.workers)
+        cells: Cells = {key: _pending(plan, key) for key in plan.cells()}
+        others = (*_other_cells(plan),)
+
+        def save() -> Comparison:
+            comparison = _comparison(plan, (*cells.values(), *others), origin)
+            write_results(folder / RESULTS, comparison)
+            return comparison
+
+        save()
+        _carry_out(plan, pool, cells, save, options.quiet)
+        return save()
+
+
+def _carry_out(
+    plan: Plan, pool: Pool, cells: Cells, save: Callable[[], object], quiet: bool
+) -> None:
+    """Render what is missing, then run what is missing; each cell is saved when it ends."""
+    keys = {job.record: key for key, job in plan.jobs.items()}
+    for key, job in plan.jobs.items():
+        outcome = finished(job)
+        if outcome is not None:
+            cells[key] = _run_cell(plan, key, outcome)
+    save()
+    runs = [job for key, job in plan.jobs.items() if cells[key].status is not CellStatus.DONE]
+    drawn = [p.render for p in plan.places if p.render and not finished(p.render)]
+    with JobBar([*drawn, *runs], pool.workers, quiet) as bar:
+        undrawn = _draw(pool, drawn, bar)
+        for key, job in plan.jobs.items():
+            render = plan.place(key[0], key[2]).render
+            if render is not None and render.record in undrawn:
+                error = f"rendering failed: {undrawn[render.record].error}"
+                log = _shown(plan, render.log)
+                cells[key] = replace(cells[key], status=CellStatus.FAILED, error=error, log=log)
+                runs = [run for run in runs if run != job]
+        for job, outcome in pool.run(runs):
+            key = keys[job.record]
+            cells[key] = _run_cell(plan, key, outcome)
+            bar.update(job, outcome)
+            save()
+
+
+def _draw(pool: Pool, jobs: list[Job], bar: JobBar) -> dict[str, Outcome]:
+    """Render sequences; those that failed, by their records."""
+    failed = {}
+    for job, outcome in pool.run(jobs):
+        bar.update(job, outcome)
+        if outcome.status is not CellStatus.DONE:
+            failed[job.record] = outcome
+    return failed
+
+
+# --- Cells ---------------------------------------------------------------------------------------
+
+
+def _pending(plan: Plan, key: Key) -> Cell:
+    """A cell before it is run, with the reason where it cannot be."""
+    sequence, method, seed = key
+    problem = plan.place(sequence, seed).problem
+    return Cell(sequence, method, seed, CellStatus.PENDING, error=problem)
+
+
+def _run_cell(plan: Plan, key: Key, outcome: Outcome) -> Cell:
+    """What a run that has ended gives."""
+    job, (sequence, method, seed) = plan.jobs[key], key
+    cell = Cell(sequence, method, seed, outcome.status, log=_shown(plan, job.log))
+    if outcome.status is not CellStatus.DONE:
+        return replace(cell, error=outcome.error)
+    run = Path(job.run)
+    metrics = run_figures(run) | outcome.figures
+    cell = replace(cell, folder=_shown(plan, job.run))
+    trajectory, reference = run / "trajectory.txt", plan.place(sequence, seed).reference
+    if reference is None:
+        return replace(cell, metrics=metrics, trajectory=_shown(plan, str(trajectory)))
+    experiment = plan.experiment
+    rules = Rules(experiment.max_time_difference_s, experiment.with_scale)
+    cell = replace(
+        cell, trajectory=_shown(plan, str(trajectory)), reference=_shown(plan, str(reference))
+    )
+    try:
+        errors = trajectory_errors(trajectory, reference, rules)
+    except InputError as error:
+        return replace(cell, status=CellStatus.FAILED, error=str(error))
+    return replace(cell, metrics=metrics | errors)
+
+
+def _other_cells(plan: Plan) -> Iterator[Cell]:
+    yield from trajectory_cells(plan.experiment, plan.place, plan.files)
+    yield from published_cells(plan.experiment)
+
+
+def _comparison(plan: Plan, cells: Iterable[Cell], origin: dict[str, Any]) -> Comparison:
+    experiment = plan.experiment
+    own = (
+        Method(name, Kind.RUN, _note(configuration), experiment.with_scale)
+        for name, configuration in experiment.configurations.items()
+    )
+    return Comparison(
+        experiment.name,
+        experiment.title,
+        experiment.description,
+        tuple(s.name for s in experiment.sequences),
+        (*own, *other_methods(experiment)),
+        tuple(cells),
+        origin,
+        tuple(s.name for s in experiment.sequences if s.render is not None),
+    )
+
+
+def _note(configuration: Configuration) -> str:
+    """What a configuration is for, and the options that make it."""
+    words = " ".join(configuration.arguments())
+    return "; ".join(filter(None, (configuration.note, words)))
+
+
+def _shown(plan: Plan, path: str) -> str:
+    """A path relative to the comparison's folder; absolute outside it."""
+    inside = Path(path).is_relative_to(plan.folder)
+    return str(Path(path).relative_to(plan.folder)) if inside else str(Path(path).absolute())
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[Path]:
+    """The folder, made if need be, for this process alone. Raises InputError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / ".lock").open("w")
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be written ({error.strerror}); choose another --out"
+        ) from error
+    with file:
+        if sys.platform != "win32":
+            import fcntl  # noqa: PLC0415 - Unix only
+
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise InputError(
+                    f"{folder}: another bmask-slam compare is at work there; wait for it"
+                ) from error
+        file.write(str(os.getpid()))
+        yield folder

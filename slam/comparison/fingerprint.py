@@ -1,0 +1,78 @@
+"""What a cell's result depends on, as short texts: equal ones mean that nothing has changed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+from graph.data_files import data_path
+from slam.comparison.experiment import Configuration
+from slam.configuration import dump, find_config, resolve
+from slam.rendering.sequence import RenderConfig
+from slam.system_config import SystemConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+LAYERS = ("graph", "semantics", "mapping", "slam")
+ELSEWHERE = ("comparison", "viewer", "live", "rendering")  # folders of slam that no run needs
+LIBRARIES = ("gtsam", "numpy", "opencv-python-headless", "torch", "scipy", "faiss-cpu")
+CONTENTS = ("rgb.txt", "depth.txt", "associations.txt", "camera.yaml", "annotations.json")
+
+
+@cache
+def code_print() -> str:
+    """Of the code that runs, the network's weights, and the libraries."""
+    folders = [ROOT / layer for layer in LAYERS]
+    files = (p for folder in folders for p in folder.rglob("*.py"))
+    used = (p for p in files if p.relative_to(ROOT).parts[1] not in ELSEWHERE)
+    weights = data_path("weights").glob("*.safetensors")
+    versions = ",".join(f"{name} {version(name)}" for name in LIBRARIES)
+    return _digest([versions, *_contents([*used, *weights], ROOT)])
+
+
+@cache
+def rendering_print() -> str:
+    """Of the code that renders."""
+    folder = ROOT / "slam" / "rendering"
+    return _digest(_contents(folder.glob("*.py"), folder))
+
+
+def drawn_print(config: RenderConfig) -> str:
+    """Of a rendered sequence."""
+    return _digest([rendering_print(), json.dumps(asdict(config))])
+
+
+def folder_print(folder: Path, camera: Path | None) -> str:
+    """Of a recorded sequence: its lists and camera by content, its images by name and size."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    sizes = (
+        f"{p.relative_to(folder)} {p.stat().st_size}" for p in files if p.name != "groundtruth.txt"
+    )
+    lists = _contents((p for p in files if p.name in CONTENTS), folder)
+    given = [camera.read_text(encoding="utf-8")] if camera else []
+    return _digest([*sizes, *lists, *given])
+
+
+def configuration_print(configuration: Configuration, settings: tuple[str, ...]) -> str:
+    """Of the resolved parameters and the other options of a run."""
+    file = find_config(configuration.config) if configuration.config else None
+    resolved = dump(resolve(SystemConfig, file, (*configuration.set, *settings)))
+    names = ("segmenter", "weights", "max_frames", "stride", "dense")
+    return _digest([resolved, *(str(getattr(configuration, name)) for name in names)])
+
+
+def _contents(files: Iterable[Path], root: Path) -> Iterator[str]:
+    for path in sorted(files):
+        yield f"{path.relative_to(root) if path.is_relative_to(root) else path.name} "
+        yield hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _digest(texts: Iterable[str]) -> str:
+    whole = hashlib.sha256()
+    for text in texts:
+        whole.update(text.encode() + b"\0")
+    return whole.hexdigest()[:16]
