@@ -18,6 +18,7 @@ from graph.errors import InputError
 from slam import __version__
 from slam.commands.calibrate import add_calibrate
 from slam.commands.download import add_download
+from slam.commands.compare import add_compare
 from slam.commands.evaluate_segmentation import add_evaluate_segmentation
 from slam.commands.export import add_export
 from slam.commands.live import add_live
@@ -90,6 +91,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_segment(commands)
     add_train(commands)
     add_evaluate_segmentation(commands)
+    add_compare(commands)
     return parser
 
 

@@ -24,6 +24,7 @@ from slam.comparison.plan import Plan, make_plan
 from slam.comparison.pool import LocalPool, Pool
 from slam.comparison.provenance import provenance
 from slam.comparison.ray_pool import RayPool
+from slam.comparison.report import write_report
 from slam.comparison.result import (
     RESULTS,
     Cell,
@@ -45,8 +46,8 @@ def compare(
     """Carry out an experiment, a file's or the shipped one of a name, in the folder ``out``.
 
     Cells that are done there, with the same code, configuration and images, are not run again.
-    ``out`` then holds ``results.json``, ``sequences/`` (rendered) and ``cells/`` with a run folder
-    and a log each. A cell that fails is FAILED and does not end the others.
+    ``out`` then holds ``results.json``, ``sequences/`` (rendered), ``cells/`` with a run folder and
+    a log each, and the report. A cell that fails is FAILED and does not end the others.
 
     Raises:
         InputError: an experiment or an option that cannot be, or another comparison is at work in
@@ -56,9 +57,8 @@ def compare(
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
     experiment = chosen(experiment, options)
-    with _locked(Path(out).absolute()) as folder:
+    with _locked(Path(out).absolute()) as folder, _pool(options) as pool:
         plan = make_plan(experiment, folder, options)
-        pool: Pool = RayPool(options.ray) if options.ray else LocalPool(options.workers)
         origin = provenance(experiment, pool.workers)
         cells: Cells = {key: _pending(plan, key) for key in plan.cells()}
         others = (*_other_cells(plan),)
@@ -70,7 +70,13 @@ def compare(
 
         save()
         _carry_out(plan, pool, cells, save, options.quiet)
-        return save()
+        comparison = save()
+        write_report(comparison, folder)
+        return comparison
+
+
+def _pool(options: CompareOptions) -> LocalPool | RayPool:
+    return RayPool(options.ray) if options.ray else LocalPool(options.workers)
 
 
 def _carry_out(

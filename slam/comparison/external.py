@@ -103,6 +103,5 @@ def other_methods(experiment: Experiment) -> Iterator[Method]:
     for name, system in experiment.systems.items():
         yield Method(name, Kind.TRAJECTORY, system.note, system.with_scale)
     for name in dict.fromkeys(q.method for q in experiment.published):
-        quoted = [q for q in experiment.published if q.method == name]
-        sources = "; ".join(dict.fromkeys(q.source for q in quoted))
-        yield Method(name, Kind.PUBLISHED, sources, any(q.with_scale for q in quoted))
+        with_scale = any(q.with_scale for q in experiment.published if q.method == name)
+        yield Method(name, Kind.PUBLISHED, with_scale=with_scale)

@@ -1,0 +1,199 @@
+"""What a comparison lets one say: summaries over seeds, and which of two methods is better.
+
+Two methods are compared in pairs: the same images, once by each. Of a rendered sequence every seed
+draws other images and gives a pair; the seeds of a recorded one share their images and give one
+pair, the medians. What is found is said of these sequences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from math import comb, isfinite, isnan, nan
+from statistics import fmean, median
+
+import numpy as np
+
+from graph.geometry import Array
+from slam.comparison.experiment import VERDICT_METRICS
+from slam.comparison.metric_table import BY_NAME
+from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
+
+LEVEL = 0.05
+RESAMPLES = 10_000
+FEWER_TRACKED = 0.01
+BETTER, WORSE, NOTHING = "better", "worse", "no difference shown"
+TRACKED = "tracked_share"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Median and range of a metric over the cells that are done, and how many those are."""
+
+    median: float
+    low: float
+    high: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A method against the first one in a metric.
+
+    Attributes:
+        metric, method, baseline: names.
+        judgement: BETTER or WORSE than the baseline, if the interval excludes 0 and the sign test
+            agrees, else NOTHING.
+        difference: mean of method minus baseline over the pairs, in the unit of metrics.json;
+            NaN without a pair.
+        low, high: 95 % bootstrap interval of it.
+        pairs: compared; wins: those in which the method is better; losses: worse.
+        left_out: pairs that one of the two has no figure for, as when its run failed.
+        p_value: of the exact two-sided sign test, after Holm's correction for all that is judged.
+        note: what must be known beside it.
+    """
+
+    metric: str
+    method: str
+    baseline: str
+    judgement: str
+    difference: float
+    low: float
+    high: float
+    pairs: int
+    wins: int
+    losses: int
+    left_out: int
+    p_value: float
+    note: str = ""
+
+
+def summarise(cells: Iterable[Cell], metric: str) -> Summary | None:
+    """A metric's median and range; None where no cell that is done has it."""
+    values = [v for v in (value_of(cell, metric) for cell in cells) if isfinite(v)]
+    return Summary(median(values), min(values), max(values), len(values)) if values else None
+
+
+def verdicts(comparison: Comparison, metrics: Sequence[str] | None = None) -> tuple[Verdict, ...]:
+    """Every other method that was evaluated here against the first configuration.
+
+    ``metrics`` None: those that the experiment names. Methods aligned otherwise (Sim(3)) are left
+    out, as are metrics that the two do not share.
+    """
+    if metrics is None:
+        stated = comparison.provenance.get("experiment", {}).get("verdicts", VERDICT_METRICS)
+        metrics = tuple(stated)
+    rows = [m for m in comparison.methods if m.kind is not Kind.PUBLISHED]
+    if not rows or rows[0].kind is not Kind.RUN:
+        return ()
+    others = [m for m in rows[1:] if m.with_scale == rows[0].with_scale]
+    found = (_verdict(comparison, rows[0], m, metric) for metric in metrics for m in others)
+    return _corrected([v for v in found if v.pairs])
+
+
+def pairs(
+    comparison: Comparison, methods: tuple[str, str], metric: str
+) -> tuple[Array, Array, int]:
+    """Values (N,) of two methods on the same images, and how many pairs lack one of the two."""
+    values: list[tuple[float, float]] = []
+    for sequence in comparison.sequences:
+        cells = [list(comparison.of(sequence, method)) for method in methods]
+        if not all(cells):
+            continue
+        if sequence in comparison.drawn:
+            by_seed = [{c.seed: value_of(c, metric) for c in own} for own in cells]
+            values += [(by_seed[0][s], by_seed[1][s]) for s in by_seed[0] if s in by_seed[1]]
+        else:
+            middle = [summarise(own, metric) for own in cells]
+            values.append(tuple(s.median if s else nan for s in middle))  # type: ignore[arg-type]
+    table = np.array(values, float).reshape(-1, 2)
+    whole = np.isfinite(table).all(axis=1)
+    return table[whole, 0], table[whole, 1], int((~whole).sum())
+
+
+def value_of(cell: Cell, metric: str) -> float:
+    """A cell's value; NaN where it has none or is not done."""
+    return cell.metrics.get(metric, nan) if cell.status is CellStatus.DONE else nan
+
+
+def bootstrap_interval(differences: Array, level: float = LEVEL) -> tuple[float, float]:
+    """Percentile interval of the mean of differences (N,), by resampling the pairs.
+
+    Efron & Tibshirani 1993, ch. 13. The same differences give the same interval.
+    """
+    count = len(differences)
+    if not count:
+        return nan, nan
+    chosen = np.random.default_rng(0).integers(0, count, (RESAMPLES, count))
+    means = differences[chosen].mean(axis=1)
+    low, high = np.quantile(means, (level / 2, 1 - level / 2))
+    return float(low), float(high)
+
+
+def sign_test(wins: int, losses: int) -> float:
+    """Two-sided p-value of so many signs either way, if both were equally likely; ties left out."""
+    count = wins + losses
+    tail = sum(comb(count, k) for k in range(min(wins, losses) + 1))
+    return float(min(1.0, 2 * tail / 2**count))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Corrected p-values (Holm 1979), in their order: one false one at all is as rare as told."""
+    order = sorted(range(len(p_values)), key=lambda k: p_values[k])
+    corrected, highest = [0.0] * len(p_values), 0.0
+    for rank, k in enumerate(order):
+        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[k]))
+        corrected[k] = highest
+    return corrected
+
+
+def _verdict(comparison: Comparison, base: Method, method: Method, metric: str) -> Verdict:
+    """With the p-value as it is, and no judgement."""
+    theirs, own, left_out = pairs(comparison, (base.name, method.name), metric)
+    difference = own - theirs
+    good = -1 if BY_NAME[metric].lower_is_better else 1
+    wins, losses = int((good * difference > 0).sum()), int((good * difference < 0).sum())
+    low, high = bootstrap_interval(difference)
+    return Verdict(
+        metric,
+        method.name,
+        base.name,
+        NOTHING,
+        float(difference.mean()) if len(difference) else nan,
+        low,
+        high,
+        len(difference),
+        wins,
+        losses,
+        left_out,
+        sign_test(wins, losses),
+        _note(comparison, base, method),
+    )
+
+
+def _corrected(found: list[Verdict]) -> tuple[Verdict, ...]:
+    """Judged, after the correction for their number."""
+    p_values = holm([v.p_value for v in found])
+    return tuple(
+        replace(v, p_value=p, judgement=_judgement(replace(v, p_value=p)))
+        for v, p in zip(found, p_values, strict=True)
+    )
+
+
+def _judgement(verdict: Verdict) -> str:
+    """Interval and sign test must both say so, and in the same direction."""
+    good = -1 if BY_NAME[verdict.metric].lower_is_better else 1
+    if verdict.p_value > LEVEL or isnan(verdict.low) or verdict.low <= 0 <= verdict.high:
+        return NOTHING
+    by_mean, by_signs = good * verdict.low > 0, verdict.wins > verdict.losses
+    if by_mean != by_signs:
+        return NOTHING
+    return BETTER if by_mean else WORSE
+
+
+def _note(comparison: Comparison, base: Method, method: Method) -> str:
+    """A method that tracks less of a sequence may leave out its hard parts."""
+    theirs, own, _ = pairs(comparison, (base.name, method.name), TRACKED)
+    if not len(own) or abs(fmean(own) - fmean(theirs)) < FEWER_TRACKED:
+        return ""
+    return f"tracked {100 * fmean(own):.0f} % against {100 * fmean(theirs):.0f} %"
