@@ -17,8 +17,8 @@ from typing import TypeAlias
 from graph.errors import InputError
 from slam import __version__
 from slam.commands.calibrate import add_calibrate
-from slam.commands.download import add_download
 from slam.commands.compare import add_compare
+from slam.commands.download import add_download
 from slam.commands.evaluate_segmentation import add_evaluate_segmentation
 from slam.commands.export import add_export
 from slam.commands.live import add_live
