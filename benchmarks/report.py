@@ -49,7 +49,7 @@ def results_block(results: Results) -> str:
     where = (
         f"{machine['processor']}, {machine['cores']} cores, no GPU used; "
         f"commit {commit}{' and uncommitted changes' if changes else ''}; "
-        f"{results['date']}; by `{results['command']}`."
+        f"code {results['code']}; {results['date']}; by `{results['command']}`."
     )
     return "\n".join([BEGIN, table(header, rows), "", where, END])
 

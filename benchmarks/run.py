@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from figures import growth_rows, plot_growth, read_growth
+from freshness import code_print
 from machine import brisk_ms, describe_commit, describe_machine, load_average, now
 from measure import (
     ROOT,
@@ -117,6 +118,7 @@ def measure_all(arguments: argparse.Namespace) -> dict[str, Any]:
     return {
         "machine": describe_machine(),
         "commit": describe_commit(ROOT, WRITTEN),
+        "code": code_print(Path(__file__)),
         "date": now(),
         "command": command_line(arguments),
         "render_commands": commands,

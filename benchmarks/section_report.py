@@ -19,6 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from benchmarks.freshness import code_print  # noqa: E402
 from benchmarks.machine import describe_commit, now, processor  # noqa: E402
 
 
@@ -115,7 +116,8 @@ def section(report: Report, name: str, sequences: Path) -> str:
         raise SystemExit(f"{command} failed:\n{done.stderr[-2000:]}")
     wall_s = time.perf_counter() - begin_s
     commit = describe_commit(ROOT, (str(report.path.relative_to(ROOT)),))
-    when = f"{processor()}; commit {commit}; {now()}; {wall_s:.0f} s."
+    code = code_print(ROOT / command.split()[0])
+    when = f"{processor()}; commit {commit}; code {code}; {now()}; {wall_s:.0f} s."
     captions = report.pictures.get(name, {})
     pictures = "".join(f"\n![{text}](images/{file})\n{text}.\n" for file, text in captions.items())
     printed = f"```\n{done.stdout.strip()}\n```"
