@@ -1,13 +1,15 @@
 """Both directions of a socket between two processes, each with a thread of its own.
 
-Messages are pickled. Neither side ever waits for the other: what is sent waits in a queue, what
-has come waits in another. The end of the other process, however it came, ends the channel.
+Messages are pickled; large arrays in them go through shared memory. Neither side ever waits for the
+other: what is sent waits in a queue, what has come waits in another. The end of the other process,
+however it came, ends the channel.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import pickle
 import queue
 import socket
 import threading
@@ -17,6 +19,10 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
+from slam.live.shared_memory import Ring
+
+LARGE = 1 << 15
+"""Bytes from which an array goes through shared memory."""
 _END = object()
 
 
@@ -27,9 +33,11 @@ class Channel:
         open: False once the other side has gone or this one was closed.
     """
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: Connection, rings: tuple[Ring, Ring]) -> None:
+        """Over a connection, and the memory that it writes to and reads from."""
         self.open = True
         self._connection = connection
+        self._outgoing, self._incoming = rings
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._sender = threading.Thread(target=self._send_all, daemon=True)
@@ -78,7 +86,7 @@ class Channel:
     def _send_all(self) -> None:
         while (message := self._outbox.get()) is not _END:
             try:
-                self._connection.send(message)
+                self._connection.send(self._packed(message))
             except OSError:  # the other side has gone
                 self.open = False
                 return
@@ -87,7 +95,7 @@ class Channel:
     def _read_all(self) -> None:
         try:
             while True:
-                message = self._connection.recv()
+                message = self._unpacked(*self._connection.recv())
                 if isinstance(message, logging.LogRecord):
                     logging.getLogger(message.name).handle(message)
                 else:
@@ -95,6 +103,28 @@ class Channel:
         except (EOFError, OSError):
             self.open = False
             self._inbox.put(_END)
+
+    def _packed(self, message: Any) -> tuple[bytes, list[bytes | tuple[int, int]]]:
+        """The pickled message, and its large buffers: where in the memory, or themselves."""
+        buffers: list[memoryview] = []
+
+        def keep_small(buffer: pickle.PickleBuffer) -> bool:
+            raw = buffer.raw()
+            if raw.nbytes < LARGE:
+                return True
+            buffers.append(raw)
+            return False
+
+        data = pickle.dumps(message, protocol=5, buffer_callback=keep_small)
+        places = ((self._outgoing.put(raw), raw) for raw in buffers)
+        return data, [bytes(raw) if at is None else (at, raw.nbytes) for at, raw in places]
+
+    def _unpacked(self, data: bytes, places: list[bytes | tuple[int, int]]) -> Any:
+        buffers = [
+            bytearray(place) if isinstance(place, bytes) else self._incoming.take(*place)
+            for place in places
+        ]
+        return pickle.loads(data, buffers=buffers)
 
     def _shutdown(self, how: int) -> None:
         with suppress(OSError), socket.socket(fileno=os.dup(self._connection.fileno())) as end:

@@ -17,7 +17,7 @@ from slam.live.worker import Failure, Worker
 
 logger = logging.getLogger(__name__)
 
-NICENESS = 5
+NICENESS = 15
 
 
 @dataclass(frozen=True)

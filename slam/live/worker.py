@@ -23,6 +23,7 @@ from types import TracebackType
 from typing import Any
 
 from slam.live.channel import Channel, ForwardedLog
+from slam.live.shared_memory import SIZE, Ring, nameless_file
 
 logger = logging.getLogger(__name__)
 
@@ -49,15 +50,21 @@ class Worker:
         self.name = name
         ours, theirs = socket.socketpair()
         path = os.pathsep.join([str(ROOT), *sys.path])
-        with theirs:
+        files = [nameless_file(SIZE) for _ in range(2)]
+        descriptors = [theirs.fileno(), *files]
+        try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", f"from {__name__} import serve; serve({theirs.fileno()})"],
-                pass_fds=[theirs.fileno()],
+                [sys.executable, "-c", f"from {__name__} import serve; serve(*{descriptors})"],
+                pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 env=os.environ | ONE_THREAD | {"PYTHONPATH": path},
                 start_new_session=True,  # Ctrl-C in a terminal is for the owner to act on
             )
-        self._channel = Channel(Connection(ours.detach()))
+            self._channel = Channel(Connection(ours.detach()), (Ring(files[0]), Ring(files[1])))
+        finally:
+            theirs.close()
+            for file in files:
+                os.close(file)
         self.send((target, arguments))
 
     @property
@@ -96,10 +103,12 @@ class Worker:
         self._channel.close()
 
 
-def serve(descriptor: int) -> None:
-    """The worker's own process: the first message says what to run."""
+def serve(connection: int, theirs: int, ours: int) -> None:
+    """The worker's own process, given descriptors: the first message says what to run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    channel = Channel(Connection(descriptor))
+    channel = Channel(Connection(connection), (Ring(ours), Ring(theirs)))
+    os.close(theirs)
+    os.close(ours)
     logging.getLogger().addHandler(ForwardedLog(channel))
     logging.getLogger().setLevel(logging.INFO)
 

@@ -57,12 +57,15 @@ def answers(worker: Worker, count: int) -> list:
 
 def test_messages_of_any_size_come_back_in_order(caplog) -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
-    big = np.arange(2_000_000)
-    for message in (1, big, "three"):
+    sizes = [10, 100_000, 5_000_000, 400_000, 0, *[300_000] * 12]  # more than the memory holds
+    arrays = [np.arange(size) for size in sizes]
+    for message in (1, *arrays, "three"):
         worker.send(message)
-    first, second, third = answers(worker, 3)
-    assert (first, third) == (("a", 1), ("a", "three"))
-    np.testing.assert_array_equal(second[1], big)
+    first, *middle, last = answers(worker, len(arrays) + 2)
+    assert (first, last) == (("a", 1), ("a", "three"))
+    for (_, found), array in zip(middle, arrays, strict=True):
+        np.testing.assert_array_equal(found, array)
+        found[:] = 0  # it is the receiver's own
     assert worker.alive
     worker.stop()
     assert not worker.alive
