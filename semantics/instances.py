@@ -30,6 +30,15 @@ class Instance:
     class_score: float
     mask_score: float
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To other processes and machines with a bit a pixel."""
+        rest = (self.box, self.label, self.distribution, self.class_score, self.mask_score)
+        return _from_bits, (np.packbits(self.mask), self.mask.shape, rest)
+
+
+def _from_bits(bits: NDArray[np.uint8], shape: tuple[int, int], rest: tuple) -> Instance:
+    return Instance(np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape) > 0, *rest)
+
 
 def mask_box(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """The box (4,) around the pixels of a mask that has at least one."""

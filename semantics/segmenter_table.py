@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from graph.data_files import data_path
@@ -33,6 +33,7 @@ class SegmenterOptions:
         masks: COCO file or folder of label PNGs, for "precomputed".
         labels: label set of the weights or the PNGs, where it is not in the file.
         min_score: class score below which a network's detection is dropped.
+        ray: address of a Ray cluster that it runs on, see `semantics.ray_segmenter`; "" for here.
     """
 
     name: str = "light"
@@ -41,6 +42,7 @@ class SegmenterOptions:
     masks: Path | None = None
     labels: str | None = None
     min_score: float = 0.5
+    ray: str = ""
 
     def described(self) -> dict[str, str]:
         """The options as text, to compare with those of an earlier run."""
@@ -57,6 +59,10 @@ def make_segmenter(options: SegmenterOptions, sequence: Path) -> Segmenter:
         raise InputError(f"segmenter {options.name!r}: not known; there are: {', '.join(NAMES)}")
     if options.name == "none":
         return NoSegmenter()
+    if options.ray:
+        from semantics.ray_segmenter import RaySegmenter  # noqa: PLC0415
+
+        return RaySegmenter(replace(options, ray=""), sequence, options.ray)
     if options.name == "truth":
         path = sequence / TRUTH_FILE
         if not path.is_file():

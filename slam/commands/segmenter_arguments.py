@@ -23,12 +23,15 @@ def add_segmenter_arguments(parser: argparse.ArgumentParser, default: str) -> No
     parser.add_argument(
         "--masks", type=Path, metavar="F", help="of precomputed: COCO file or folder of label PNGs"
     )
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="segment on a Ray cluster: host:port, auto or local"
+    )
     parser.add_argument("--labels", metavar="F", help="label set: file, or coco, coco91, paper")
 
 
 def segmenter_options(arguments: argparse.Namespace, base: SegmenterOptions) -> SegmenterOptions:
     """The options with what was given on the command line; files by their absolute paths."""
-    given = {name: getattr(arguments, name) for name in ("weights", "labels")}
+    given = {name: getattr(arguments, name) for name in ("weights", "labels", "ray")}
     given["name"] = arguments.segmenter
     for name in ("proposals", "masks"):
         path = getattr(arguments, name)

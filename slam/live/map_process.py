@@ -39,7 +39,6 @@ from slam.live.messages import (
     SaveState,
     Sightings,
     StateSaved,
-    unpacked,
 )
 from slam.live.replica import DeltaMaker
 from slam.mapper import Mapper
@@ -170,7 +169,7 @@ class MapKeeper:
         """Use a keyframe's masks; those that cannot be used are passed over."""
         semantics, mapper = self.system.semantics, self.system.mapper
         try:
-            semantics.attach(message.keyframe_id, unpacked(message.instances), mapper)
+            semantics.attach(message.keyframe_id, message.instances, mapper)
         except InputError as error:
             logger.warning("keyframe %d has no masks: %s", message.keyframe_id, error)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -81,20 +80,11 @@ class Began:
 
 
 @dataclass(frozen=True, eq=False)
-class PackedInstance:
-    """An instance whose mask, of ``shape``, is a bit a pixel."""
-
-    bits: NDArray[np.uint8]
-    shape: tuple[int, int]
-    rest: tuple[NDArray[np.float32], int, NDArray[np.float32], float, float]
-
-
-@dataclass(frozen=True, eq=False)
 class Masks:
     """Of a keyframe: from the segmenter, and on to the map. ``segmentation_ms``: time it took."""
 
     keyframe_id: int
-    instances: list[PackedInstance]
+    instances: list[Instance]
     segmentation_ms: float = 0.0
 
 
@@ -174,23 +164,3 @@ class Ready:
     """From a worker: it has started."""
 
     labels: tuple[str, ...] = field(default=())
-
-
-def packed(instances: Sequence[Instance]) -> list[PackedInstance]:
-    """Instances in an eighth of the bytes."""
-    return [
-        PackedInstance(
-            np.packbits(i.mask),
-            (i.mask.shape[0], i.mask.shape[1]),
-            (i.box, i.label, i.distribution, i.class_score, i.mask_score),
-        )
-        for i in instances
-    ]
-
-
-def unpacked(instances: Sequence[PackedInstance]) -> list[Instance]:
-    """The instances again."""
-    return [
-        Instance(np.unpackbits(i.bits, count=i.shape[0] * i.shape[1]).reshape(i.shape) > 0, *i.rest)
-        for i in instances
-    ]

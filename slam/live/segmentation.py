@@ -12,7 +12,7 @@ from graph.errors import InputError
 from semantics.labels import LabelSet
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
 from slam.live.channel import Channel
-from slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready, packed
+from slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready
 from slam.live.worker import Failure, Worker
 
 logger = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ def serve_segmenter(
                 channel.send(NotSegmented(image.keyframe_id, str(error)))
                 continue
             elapsed_ms = 1e3 * (time.perf_counter() - started_s)
-            channel.send(Masks(image.keyframe_id, packed(instances), elapsed_ms))
+            channel.send(Masks(image.keyframe_id, instances, elapsed_ms))
 
 
 class RemoteSegmenter:

@@ -1,0 +1,90 @@
+"""A segmenter through Ray: what one here would find, and a lost one costs only its image."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from graph.errors import InputError
+from semantics.instances import Instance, certain, mask_box
+from semantics.ray_segmenter import RaySegmenter
+from semantics.segmenter_table import SegmenterOptions, make_segmenter
+
+ray = pytest.importorskip("ray", reason="needs Ray: pip install 'bmask-slam[ray]'")
+
+IMAGE = np.full((48, 64, 3), 100, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("masks")
+    values = np.zeros((48, 64), np.uint8)
+    values[5:20, 10:30], values[25:40, 33:60] = 1, 2
+    cv2.imwrite(str(path / "a.png"), values)
+    return path
+
+
+@pytest.fixture(scope="module")
+def options(folder: Path) -> SegmenterOptions:
+    return SegmenterOptions("precomputed", masks=folder, ray="local")
+
+
+@pytest.fixture(scope="module")
+def segmenter(options: SegmenterOptions, folder: Path) -> Iterator[RaySegmenter]:
+    found = make_segmenter(options, folder)
+    assert isinstance(found, RaySegmenter)
+    yield found
+    ray.shutdown()
+
+
+def equal(a: list[Instance], b: list[Instance]) -> bool:
+    return [(i.mask.tolist(), i.box.tolist(), i.label, i.mask_score) for i in a] == [
+        (i.mask.tolist(), i.box.tolist(), i.label, i.mask_score) for i in b
+    ]
+
+
+def test_an_instance_travels_with_a_bit_a_pixel() -> None:
+    mask = np.random.default_rng(0).random((37, 51)) > 0.5
+    sent = Instance(mask, mask_box(mask), 2, certain(2, 4), 0.75, 0.5)
+    data = pickle.dumps(sent, protocol=5)
+    assert len(data) < mask.size / 8 + 500
+    assert equal([pickle.loads(data)], [sent])
+    np.testing.assert_array_equal(pickle.loads(data).distribution, sent.distribution)
+
+
+def test_it_finds_what_one_here_finds(segmenter, options, folder) -> None:
+    here = make_segmenter(replace(options, ray=""), folder)
+    assert segmenter.labels == here.labels
+    found = segmenter.segment(IMAGE, "a.png")
+    assert len(found) == 2
+    assert equal(found, here.segment(IMAGE, "a.png"))
+
+
+def test_what_it_refuses_there_is_said_here(segmenter) -> None:
+    with pytest.raises(InputError, match=r"b\.png"):
+        segmenter.segment(IMAGE, "b.png")
+    with pytest.raises(InputError, match="8 bits"):
+        segmenter.segment(IMAGE.astype(float), "a.png")
+
+
+def test_one_that_is_killed_costs_its_image_alone(segmenter) -> None:
+    pid = ray.get(segmenter._actor.__ray_call__.remote(lambda _: os.getpid()))
+    os.kill(pid, signal.SIGKILL)
+    with pytest.raises(InputError, match="lost"):
+        for _ in range(20):  # until the death is known
+            segmenter.segment(IMAGE, "a.png")
+    assert len(segmenter.segment(IMAGE, "a.png")) == 2
+
+
+def test_one_that_cannot_start_says_why(segmenter, options, folder) -> None:
+    broken = replace(options, masks=folder / "none.json")
+    with pytest.raises(InputError, match=r"none\.json"):
+        make_segmenter(broken, folder)
