@@ -42,9 +42,14 @@ def connect(address: str) -> Any:
         raise InputError("--ray needs Ray: pip install 'bmask-slam[ray]'") from error
     if ray.is_initialized():
         return ray
-    where = {"include_dashboard": False} if address == "local" else {}
+    dashboard = False if address == "local" else None
     try:
-        ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **where)
+        ray.init(
+            address,
+            include_dashboard=dashboard,
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+        )
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"--ray {address}: no Ray cluster answers ({reason})") from error

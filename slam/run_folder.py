@@ -151,8 +151,11 @@ class RunFolder:
         for name, level in self._levels.items():
             logging.getLogger(name).removeHandler(self._log)
             logging.getLogger(name).setLevel(level)
-        self._log.close()
-        self._frames.close()
+        for file in (self._log, self._frames):
+            try:
+                file.close()
+            except OSError as unwritten:
+                error = error or unwritten
         if isinstance(error, InputError) and not self._begun:
             _remove(self.path, (*SOMETIMES, *FILES))
             _remove_empty(self._made)

@@ -28,6 +28,7 @@ class Health:
         frames_dropped: by the source, since tracking was busy.
         frames_refused: that were broken, or not later than the one before.
         masks_dropped: keyframes that were passed over by the segmenter.
+        unwritten: how often a full disk kept something from being written.
         lost_frames: without a pose. lost_episodes: how often tracking was lost.
         map_deaths, segmenter_deaths: of their processes, which were started again.
         source: what the source counted, by name.
@@ -46,6 +47,7 @@ class Health:
     frames_dropped: int = 0
     frames_refused: int = 0
     masks_dropped: int = 0
+    unwritten: int = 0
     lost_frames: int = 0
     lost_episodes: int = 0
     map_deaths: int = 0
@@ -59,8 +61,9 @@ class Health:
     def line(self) -> str:
         """For a person."""
         waiting = f"{self.keyframes_waiting} keyframes and {self.masks_waiting} masks waiting"
+        full = ", DISK FULL" if self.unwritten else ""
         return (
-            f"{self.status}, {self.frames_per_second:.0f} frames/s, "
+            f"{self.status}{full}, {self.frames_per_second:.0f} frames/s, "
             f"{self.latency_ms_median:.0f} ms, {self.keyframes} keyframes, {waiting}, "
             f"{self.frames_dropped} frames dropped"
         )

@@ -23,19 +23,18 @@ from slam.features import Features
 from slam.frame import Frame
 from slam.landmark_cloud import LandmarkCloud
 from slam.live.health import WINDOW, FrameMeter, Health
+from slam.live.recorder import Recorder, rescued
 from slam.live.segmentation import RemoteSegmenter
 from slam.live.sources.counts import SourceCounts
 from slam.live.system import LiveSystem
 from slam.results import FrameResult
-from slam.run_folder import HEALTH, RunFolder
+from slam.run_folder import DISK_ERRORS, HEALTH, RunFolder
 from slam.run_results import Tally, measure, row, save
 from slam.system_config import SystemConfig
 from slam.viewer.scene import Scene, ViewOptions
 
 logger = logging.getLogger(__name__)
 
-HEALTH_S = 1.0
-SNAPSHOT_S = 5.0
 IMAGE_EVERY = 3
 """Frames from one image in the viewer to the next."""
 
@@ -105,20 +104,21 @@ class LiveSlam:
         self._shown = 0
         self._closed = False
         self._last_s = -np.inf
-        self._begin_s = self._health_s = self._snapshot_s = time.monotonic()
+        self._begin_s = time.monotonic()
         self._scene: Scene | None = None
         self._scratch = Path(tempfile.mkdtemp(prefix="bmask-slam-"))
-        self._folder: RunFolder | None = None
+        self._recorder: Recorder | None = None
         try:
             if self.options.out is not None:
-                self._folder = RunFolder(self.options.out, self.options.overwrite).__enter__()
-                self._folder.write_text("config.yaml", dump(self.config))
+                folder = RunFolder(self.options.out, self.options.overwrite).__enter__()
+                self._recorder = Recorder(folder)
+                folder.write_text("config.yaml", dump(self.config))
             if self.options.view.anywhere:
                 self._scene = Scene(self.options.title, self.options.view)
                 self._scene.camera(camera)
             self._system = self._start(self.config.semantics.segmenter)
         except BaseException:
-            self._leave(None)
+            self._leave()
             raise
 
     def __enter__(self) -> LiveSlam:
@@ -175,7 +175,8 @@ class LiveSlam:
             result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
         self._tally.count(result)
         self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
-        self._write(result)
+        if self._recorder is not None:
+            self._recorder.frame(result, self.health, self.trajectory)
         self._show(result, rgb)
         return result
 
@@ -217,6 +218,7 @@ class LiveSlam:
             frames_dropped=self.frames_dropped,
             frames_refused=self._refused,
             masks_dropped=segmenter.dropped if segmenter else 0,
+            unwritten=self._recorder.unwritten if self._recorder else 0,
             lost_frames=meter.lost_frames,
             lost_episodes=meter.lost_episodes,
             map_deaths=remote.deaths,
@@ -225,7 +227,11 @@ class LiveSlam:
         )
 
     def close(self) -> None:
-        """End the processes and save everything. Safe to call twice."""
+        """End the processes and save everything. Safe to call twice.
+
+        Raises:
+            InputError: the disk is full; it says where the trajectory is.
+        """
         if self._closed:
             return
         self._closed = True
@@ -233,9 +239,14 @@ class LiveSlam:
         self._tally.wall_s = max(time.monotonic() - self._begin_s, 1e-9)
         try:
             self._conclude(health)
+        except OSError as error:
+            if self.options.out is None or error.errno not in DISK_ERRORS:
+                raise
+            where = rescued(self.trajectory())
+            raise InputError(f"{self.options.out}: {error.strerror}; {where}") from error
         finally:
             self._system.close()
-            self._leave(None)
+            self._leave()
 
     def _start(self, segmenter: SegmenterOptions) -> LiveSystem:
         remote = None
@@ -268,18 +279,6 @@ class LiveSlam:
         known = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype(np.float32, copy=False)
         return Frame(self._meter.frames, timestamp_s, rgb, known, name)
 
-    def _write(self, result: FrameResult) -> None:
-        if self._folder is None:
-            return
-        self._folder.write_frame(result)
-        now_s = time.monotonic()
-        if now_s - self._health_s >= HEALTH_S:
-            self._health_s = now_s
-            self._folder.write_text(HEALTH, self.health().as_json())
-        if now_s - self._snapshot_s >= SNAPSHOT_S:
-            self._snapshot_s = now_s
-            self._folder.write_trajectory(self.trajectory())
-
     def _show(self, result: FrameResult, rgb: NDArray[np.uint8]) -> None:
         """The frame at once, the map when it was brought up to date."""
         if self._scene is None:
@@ -297,13 +296,14 @@ class LiveSlam:
 
     def _conclude(self, health: Health) -> None:
         """Save what an offline run saves; the trajectory at least, if the map cannot be had."""
-        folder = self._folder
-        if folder is None:
+        if self._recorder is None:
             return
+        folder = self._recorder.folder
+        if self._tally.frames:
+            folder.write_trajectory(self.trajectory())
         folder.write_text(HEALTH, health.as_json())
         if not self._tally.frames:
             return
-        folder.write_trajectory(self.trajectory())
         try:
             self._system.finish()
         except InputError as error:
@@ -317,9 +317,9 @@ class LiveSlam:
         save(self._system, folder, rows, self.options.reference, self.options.title)
         folder.complete()
 
-    def _leave(self, error: BaseException | None) -> None:
+    def _leave(self) -> None:
         if self._scene is not None:
             self._scene.close()
         shutil.rmtree(self._scratch, ignore_errors=True)
-        if self._folder is not None:
-            self._folder.__exit__(None, error, None)
+        if self._recorder is not None:
+            self._recorder.folder.__exit__(None, None, None)

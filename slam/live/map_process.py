@@ -122,8 +122,12 @@ class MapKeeper:
                 mask = np.unpackbits(message.bits, count=size).reshape(message.shape) > 0
                 pruner.prune_mask(message.keyframe_id, mask)
             case SaveState():
-                write_arrays(message.path, STATE_FILE, {}, self.system.state())
-                self._send(StateSaved(number, message.path))
+                try:
+                    write_arrays(message.path, STATE_FILE, {}, self.system.state())
+                except OSError as error:  # a later one may find room
+                    logger.warning("%s: cannot be written (%s)", message.path, error.strerror)
+                else:
+                    self._send(StateSaved(number, message.path))
             case Finish():
                 self.system.mapper.history.extend(message.history)
                 self.system.finish()

@@ -1,0 +1,81 @@
+"""What a live run writes while it goes on; a full disk costs files, not the run."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from graph.trajectory import Trajectory, write_tum
+from slam.live.health import Health
+from slam.results import FrameResult
+from slam.run_folder import DISK_ERRORS, HEALTH, RunFolder
+
+logger = logging.getLogger(__name__)
+
+HEALTH_S = 1.0
+SNAPSHOT_S = 5.0
+
+
+class Recorder:
+    """Writes frames.csv, and now and then health.json and trajectory.txt, into a run folder.
+
+    Attributes:
+        unwritten: how often something could not be written, for want of room.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self.folder = folder
+        self.unwritten = 0
+        self._is_full = False
+        self._health_s = self._snapshot_s = time.monotonic()
+
+    def frame(
+        self,
+        result: FrameResult,
+        health: Callable[[], Health],
+        trajectory: Callable[[], Trajectory],
+    ) -> None:
+        """Write a frame, and the other files where they are due; a full disk is said once."""
+        try:
+            self._write(result, health, trajectory)
+            self._is_full = False
+        except OSError as error:
+            if error.errno not in DISK_ERRORS:
+                raise
+            self.unwritten += 1
+            if not self._is_full:
+                self._is_full = True
+                logger.error(
+                    "%s: %s; tracking goes on, free some space before it ends",
+                    self.folder.path,
+                    error.strerror,
+                )
+
+    def _write(
+        self,
+        result: FrameResult,
+        health: Callable[[], Health],
+        trajectory: Callable[[], Trajectory],
+    ) -> None:
+        self.folder.write_frame(result)
+        now_s = time.monotonic()
+        if now_s - self._snapshot_s >= SNAPSHOT_S:
+            self._snapshot_s = now_s
+            self.folder.write_trajectory(trajectory())
+        if now_s - self._health_s >= HEALTH_S:
+            self._health_s = now_s
+            self.folder.write_text(HEALTH, health().as_json())
+
+
+def rescued(trajectory: Trajectory) -> str:
+    """Write a trajectory where there may be room; says where, or that there was none."""
+    path = Path(tempfile.gettempdir()) / f"bmask-slam-{os.getpid()}-trajectory.txt"
+    try:
+        write_tum(path, trajectory)
+    except OSError as error:
+        return f"nor could {path} be written ({error.strerror})"
+    return f"the whole trajectory is in {path}"

@@ -1,0 +1,219 @@
+"""What goes wrong around the live loop, really caused: the trajectory is saved, nothing is left."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_plane
+
+from graph.errors import InputError
+from graph.geometry import se3_exp
+from graph.trajectory import read_tum
+from semantics.segmenter_table import SegmenterOptions
+from slam.configuration import resolve
+from slam.frame import Frame
+from slam.live.live_slam import LiveOptions, LiveSlam
+from slam.live.messages import ImageToSegment
+from slam.live.play import PlayOptions, play
+from slam.live.recorder import HEALTH_S
+from slam.live.segmentation import RemoteSegmenter, SegmentationConfig
+from slam.live.sources.counts import SourceCounts
+from slam.results import TrackingStatus
+from slam.system_config import SystemConfig
+
+SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
+CONFIG = resolve(SystemConfig, None, SETTINGS)
+FRAMES = [
+    render_plane(se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a, 0, 0])), index)
+    for index, a in enumerate(np.arange(20) * 0.02)
+]
+
+
+def feed(slam: LiveSlam, frames: list[Frame]) -> set[TrackingStatus]:
+    """Frames at a rate that a map on a busy machine can follow."""
+    statuses = set()
+    for frame in frames:
+        statuses.add(slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, name="a.png").status)
+        deadline_s = time.monotonic() + 2
+        while slam.health().keyframes_waiting > 1 and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+            slam.catch_up()
+    return statuses
+
+
+def running(pids: list[int]) -> list[int]:
+    """Those that are not gone, but for zombies."""
+    states = {}
+    for pid in pids:
+        path = Path(f"/proc/{pid}/stat")
+        if path.is_file():
+            states[pid] = path.read_text().rsplit(")", 1)[1].split()[0]
+    return [pid for pid, state in states.items() if state != "Z"]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 300 kB, which a run folder's map does not fit into."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=300k", "none", str(path)]
+    if shutil.which("mount") is None or subprocess.call(command, stderr=-3):
+        pytest.skip("a small file system cannot be mounted: not root, or not Linux")
+    yield path
+    subprocess.run(["umount", str(path)], check=True)
+
+
+def fill(disk: Path) -> Path:
+    """Use up all that is left."""
+    ballast = disk / "ballast"
+    with ballast.open("wb", buffering=0) as file:
+        try:
+            while True:
+                file.write(bytes(1024))
+        except OSError:
+            return ballast
+
+
+def test_tracking_goes_on_while_the_disk_is_full(small_disk, caplog) -> None:
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(small_disk / "run")) as slam:
+        feed(slam, FRAMES[:4])
+        ballast = fill(small_disk)
+        time.sleep(HEALTH_S)
+        assert feed(slam, FRAMES[4:16]) == {TrackingStatus.OK}
+        assert slam.health().unwritten > 0
+        assert "DISK FULL" in slam.health().line()
+        ballast.unlink()
+        assert feed(slam, FRAMES[16:]) == {TrackingStatus.OK}
+        assert sum("tracking goes on" in r.message for r in caplog.records) == 1
+        rows = (small_disk / "run" / "frames.csv").read_text().splitlines()
+        assert len(rows) == 1 + len(FRAMES)
+        fill(small_disk)
+        pids = list(slam.processes().values())
+        with pytest.raises(InputError, match="the whole trajectory is in") as told:
+            slam.close()
+    path = Path(str(told.value).rsplit(" ", 1)[1])
+    assert len(read_tum(path)) == len(FRAMES)
+    path.unlink()
+    assert not running(pids)
+
+
+class Camera:
+    """Gives some frames and is then unplugged."""
+
+    name = "camera"
+    camera = CAMERA
+    waits = False
+    groundtruth = None
+
+    def __init__(self, frames: int) -> None:
+        self.counts = SourceCounts()
+        self._frames = frames
+
+    def frames(self) -> Iterator[Frame]:
+        for frame in FRAMES[: self._frames]:
+            time.sleep(0.1)
+            yield frame
+        raise InputError("camera: gone; plug it in again")
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_an_unplugged_camera_ends_the_run_with_everything_saved(tmp_path) -> None:
+    slam = LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run"))
+    pids = list(slam.processes().values())
+    with pytest.raises(InputError, match="plug it in again"), slam:
+        play(slam, Camera(10), PlayOptions(quiet=True))
+    assert len(read_tum(tmp_path / "run" / "trajectory.txt")) + slam.frames_dropped == 10
+    assert (tmp_path / "run" / "map").is_file()
+    assert not running(pids)
+
+
+def test_five_seconds_without_a_frame_do_no_harm() -> None:
+    with LiveSlam(CAMERA, CONFIG) as slam:
+        feed(slam, FRAMES[:10])
+        time.sleep(5.0)
+        for k, frame in enumerate(FRAMES[10:14]):
+            stamp_s = FRAMES[9].timestamp_s + 5.0 + 0.03 * k
+            result = slam.track(stamp_s, frame.rgb, frame.depth_m)
+            assert result.status is TrackingStatus.OK
+        assert slam.health().map_deaths == 0
+
+
+def label_image(folder: Path) -> SegmenterOptions:
+    import cv2
+
+    values = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    values[100:300, 200:400] = 3
+    cv2.imwrite(str(folder / "a.png"), values)
+    return SegmenterOptions("precomputed", masks=folder)
+
+
+def test_a_killed_segmenter_costs_masks_alone(tmp_path) -> None:
+    semantics = {"semantics": CONFIG.semantics.__class__(segmenter=label_image(tmp_path))}
+    config = CONFIG.__class__(**{**vars(CONFIG), **semantics})
+    with LiveSlam(CAMERA, config, LiveOptions(tmp_path / "run")) as slam:
+        feed(slam, FRAMES[:6])
+        os.kill(slam.processes()["segmenter"], signal.SIGKILL)
+        assert feed(slam, FRAMES[6:]) == {TrackingStatus.OK}
+        deadline_s = time.monotonic() + 60
+        while slam.health().masks_waiting and time.monotonic() < deadline_s:
+            time.sleep(0.05)
+            slam.catch_up()
+        health, pids = slam.health(), list(slam.processes().values())
+        assert (health.segmenter_deaths, health.map_deaths, health.masks_waiting) == (1, 0, 0)
+    assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == len(FRAMES)
+    assert len((tmp_path / "run" / "labels.csv").read_text().splitlines()) > 20
+    assert not running(pids)
+
+
+def test_a_segmenter_that_hangs_is_started_again(tmp_path) -> None:
+    options = SegmentationConfig(patience_s=2.0)
+    segmenter = RemoteSegmenter(label_image(tmp_path), tmp_path, options)
+    first = segmenter.pid
+    try:
+        os.kill(first, signal.SIGSTOP)
+        segmenter.ask(ImageToSegment(7, FRAMES[0].rgb, "a.png"))
+        found, deadline_s = [], time.monotonic() + 60
+        while not found and time.monotonic() < deadline_s:
+            time.sleep(0.05)
+            found = segmenter.answers()
+        assert [masks.keyframe_id for masks in found] == [7]
+        assert (segmenter.deaths, segmenter.waiting) == (1, 0)
+        assert segmenter.pid != first
+    finally:
+        segmenter.close()
+    assert not running([first, segmenter.pid])
+
+
+def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:
+    rerun = pytest.importorskip("rerun", reason="needs Rerun: pip install 'bmask-slam[view]'")
+    from slam.viewer.scene import ViewOptions
+
+    viewers: list[subprocess.Popen[bytes]] = []
+
+    def spawn(stream: rerun.RecordingStream) -> None:
+        """A viewer without a window in place of one with, since tests have no display."""
+        command = [sys.executable, "-m", "rerun", "--serve-grpc", "--port", "19876"]
+        viewers.append(subprocess.Popen(command, stdout=-3, stderr=-3))
+        stream.connect_grpc("rerun+http://127.0.0.1:19876/proxy")
+
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", spawn)
+    options = LiveOptions(tmp_path / "run", view=ViewOptions(window=True))
+    with LiveSlam(CAMERA, CONFIG, options) as slam:
+        feed(slam, FRAMES[:8])
+        viewers[0].kill()
+        viewers[0].wait()
+        assert feed(slam, FRAMES[8:]) == {TrackingStatus.OK}
+        started_s = time.monotonic()
+    assert time.monotonic() - started_s < 30
+    assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == len(FRAMES)
