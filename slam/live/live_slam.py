@@ -237,16 +237,18 @@ class LiveSlam:
         self._closed = True
         health = self.health()
         self._tally.wall_s = max(time.monotonic() - self._begin_s, 1e-9)
+        failure: InputError | None = None
         try:
             self._conclude(health)
         except OSError as error:
             if self.options.out is None or error.errno not in DISK_ERRORS:
                 raise
             where = rescued(self.trajectory())
-            raise InputError(f"{self.options.out}: {error.strerror}; {where}") from error
+            failure = InputError(f"{self.options.out}: {error.strerror}; {where}")
+            raise failure from error
         finally:
             self._system.close()
-            self._leave()
+            self._leave(failure)
 
     def _start(self, segmenter: SegmenterOptions) -> LiveSystem:
         remote = None
@@ -317,9 +319,9 @@ class LiveSlam:
         save(self._system, folder, rows, self.options.reference, self.options.title)
         folder.complete()
 
-    def _leave(self) -> None:
+    def _leave(self, failure: InputError | None = None) -> None:
         if self._scene is not None:
             self._scene.close()
         shutil.rmtree(self._scratch, ignore_errors=True)
         if self._recorder is not None:
-            self._recorder.folder.__exit__(None, None, None)
+            self._recorder.folder.__exit__(None, failure, None)
