@@ -16,7 +16,8 @@ _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # 
 TEXT = "compare configurations and other systems on sequences, with a report"
 MORE = """\
 Every cell of sequences x configurations x seeds is run in a process of its own and kept in --out:
-called again, it goes on where it stopped, and only what has changed is run anew."""
+called again, it goes on where it stopped, and only what has changed is run anew. The
+exit status is 1 if a cell failed."""
 EPILOG = """\
 examples:
   bmask-slam compare rendered --out runs/rendered      needs nothing but this program
@@ -59,6 +60,7 @@ def add_compare(commands: _Commands) -> None:
 def _compare(arguments: argparse.Namespace) -> int:
     from slam.comparison.comparing import compare
     from slam.comparison.experiment_file import find_experiment
+    from slam.comparison.result import CellStatus
     from slam.comparison.text import format_comparison
     from slam.progress import console_log
 
@@ -66,11 +68,9 @@ def _compare(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path("runs") / f"compare-{name}"
     with console_log():
         comparison = compare(arguments.experiment, out, _options(arguments))
-    if arguments.quiet:
-        print(out)
-        return 0
-    print(f"{format_comparison(comparison)}\n\nReport  {out / 'report.html'}")
-    return 0
+    text = f"{format_comparison(comparison)}\n\nReport  {out / 'report.html'}"
+    print(out if arguments.quiet else text)
+    return int(any(cell.status is CellStatus.FAILED for cell in comparison.cells))
 
 
 def _options(arguments: argparse.Namespace) -> CompareOptions:

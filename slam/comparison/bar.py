@@ -24,7 +24,7 @@ class JobBar:
         self._failed = 0
         self._bar = tqdm(
             total=len(self._left),
-            disable=quiet,
+            disable=quiet or not self._left,
             unit="job",
             dynamic_ncols=True,
             mininterval=0,

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slam.comparison.experiment import Experiment, SequenceSource
+from slam.datasets import read_catalogue
 
 ENVIRONMENT = "BMASK_SLAM_DATA"
 DEFAULT = Path("data")
 TRUTH = "groundtruth.txt"
-PREFIX = "rgbd_dataset_"  # of the folders in TUM's archives
+PREFIXES = ("", "rgbd_dataset_", "rgbd_bonn_")  # of the folders in the archives
 
 
 @dataclass(frozen=True)
@@ -66,11 +67,11 @@ def find_file(name: str, experiment: Experiment, folders: Iterable[Path]) -> Pat
 
 
 def _places(root: Path, name: str) -> Iterator[Path]:
-    """``tum/freiburg1_xyz`` as such, by its last part, and as TUM's archives call it."""
+    """``tum/freiburg1_xyz`` as such, by its last part, and as the archives call it."""
     path = Path(name)
-    prefixed = path.with_name(PREFIX + path.name)
-    for choice in (path, prefixed, Path(path.name), Path(prefixed.name)):
-        yield root / choice
+    for prefix in PREFIXES:
+        yield root / path.with_name(prefix + path.name)
+        yield root / (prefix + path.name)
 
 
 def _associated(folder: Path) -> bool:
@@ -92,6 +93,6 @@ def _problem(source: SequenceSource, found: list[Path]) -> str:
     if found:
         return f"{found[0]}: holds no rgb.txt; restore it, or give the folder of the images"
     cure = f"{source.folder}: not found; give DIR by --data, where DIR/{source.folder} lies"
-    if source.folder.startswith("tum/"):
+    if source.folder in read_catalogue():
         cure += f", or bmask-slam download {source.folder}"
     return cure

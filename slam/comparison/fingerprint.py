@@ -18,7 +18,13 @@ from slam.system_config import SystemConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 LAYERS = ("graph", "semantics", "mapping", "slam")
-ELSEWHERE = ("comparison", "viewer", "live", "rendering")  # folders of slam that no run needs
+ELSEWHERE = (
+    "comparison",
+    "viewer",
+    "live",
+    "rendering",
+    "datasets",
+)  # folders of slam that no run needs
 LIBRARIES = ("gtsam", "numpy", "opencv-python-headless", "torch", "scipy", "faiss-cpu")
 CONTENTS = ("rgb.txt", "depth.txt", "associations.txt", "camera.yaml", "annotations.json")
 

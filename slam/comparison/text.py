@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from slam.comparison.metric_table import BY_NAME
-from slam.comparison.report.table import TableRow, metric_table
+from slam.comparison.report.table import TableRow, cell_name, metric_table
 from slam.comparison.result import CellStatus, Comparison
 from slam.comparison.statistics import NOTHING, Verdict, verdicts
 
@@ -49,18 +49,17 @@ def format_verdict(v: Verdict) -> str:
 
 
 def format_problems(comparison: Comparison) -> str:
-    """A line for each cell that failed or is not there, alike ones of several seeds together."""
-    seeds: dict[tuple[str, ...], list[str]] = {}
+    """What failed or is not there, a line for each reason with all cells that it holds for."""
+    found: dict[tuple[str, ...], list[str]] = {}
     for cell in comparison.cells:
         if cell.status is not CellStatus.DONE:
             log = f" (log: {cell.log})" if cell.log else ""
-            key = cell.status.value, cell.sequence, cell.method, f"{cell.error}{log}"
-            seeds.setdefault(key, []).append("" if cell.seed is None else str(cell.seed))
-    lines = []
-    for (status, sequence, method, error), numbers in seeds.items():
-        which = f", seed {', '.join(numbers)}" if any(numbers) else ""
-        lines.append(f"{status}: {sequence}, {method}{which}: {error or 'not run'}")
-    return "\n".join(lines)
+            key = cell.status.value, cell.sequence, f"{cell.error or 'not run'}{log}"
+            found.setdefault(key, []).append(cell_name(cell))
+    return "\n".join(
+        f"{status}: {sequence}: {'; '.join(dict.fromkeys(names))}: {error}"
+        for (status, sequence, error), names in found.items()
+    )
 
 
 def _cells(row: TableRow) -> tuple[str, ...]:

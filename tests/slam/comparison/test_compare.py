@@ -1,0 +1,199 @@
+"""A whole comparison: run, kept, killed, gone on with, evaluated, reported."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from graph.errors import InputError
+from graph.geometry import se3_exp
+from graph.trajectory import read_tum, write_tum
+from slam.comparison import CellStatus, CompareOptions, Comparison, compare, read_results
+from slam.comparison.job import environment
+from slam.comparison.text import format_comparison
+from slam.rendering.sequence import RenderConfig, render_sequence
+
+ROOT = Path(__file__).resolve().parents[3]
+EXPERIMENT = """\
+sequences: {office: office}
+configurations:
+  default: {segmenter: none}
+  broken: {segmenter: precomputed}
+systems:
+  other: {trajectories: {office: moved.txt}}
+published:
+  - {method: paper, source: Table 1, ate_rmse: {office: 0.02}}
+"""
+SEEDS = EXPERIMENT.partition("  broken")[0] + "seeds: [0, 1, 2]\n"
+DONE, FAILED = CellStatus.DONE, CellStatus.FAILED
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """A small sequence, its truth seen from another world, and experiments on it."""
+    folder = tmp_path_factory.mktemp("data")
+    render_sequence(RenderConfig("office", frames=15, width=160, height=120), folder / "office")
+    truth = read_tum(folder / "office" / "groundtruth.txt")
+    write_tum(folder / "moved.txt", truth.moved(se3_exp([1, -2, 0.5, 3, 2, 1])))
+    (folder / "mine.yaml").write_text(EXPERIMENT)
+    (folder / "seeds.yaml").write_text(SEEDS)
+    return folder
+
+
+def run_again(data: Path, out: Path) -> Comparison:
+    return compare(data / "mine.yaml", out, CompareOptions(quiet=True))
+
+
+def test_a_comparison(data, tmp_path):
+    out = tmp_path / "out"
+    found = run_again(data, out)
+    cells = {cell.method: cell for cell in found.cells}
+    assert [m.name for m in found.methods] == ["default", "broken", "other", "paper"]
+    status = {name: cell.status for name, cell in cells.items()}
+    assert status == {"default": DONE, "broken": FAILED, "other": DONE, "paper": DONE}
+    own = cells["default"].metrics
+    assert 0 < own["ate_rmse"] < 0.02
+    assert own["tracked_share"] == own["evaluated_share"] == 1
+    assert {"rpe_rot_rmse_frame", "ate_rot_rmse", "tracking_ms_median", "peak_rss_mb"} <= set(own)
+    assert cells["other"].metrics["ate_rmse"] == pytest.approx(0, abs=1e-6)
+    assert "rpe_trans_rmse_frame" in cells["other"].metrics
+    assert cells["paper"].metrics == {"ate_rmse": 0.02}
+    assert "masks" in cells["broken"].error
+    assert cells["broken"].error in (out / cells["broken"].log).read_text()
+    assert (out / cells["default"].trajectory).is_file()
+    assert read_results(out) == found
+    assert {"report.html", "report.pdf", "tables.csv"} <= {path.name for path in out.iterdir()}
+    assert {"commit", "machine", "packages", "date"} <= set(found.provenance)
+    text = format_comparison(found)
+    assert "failed: office: broken" in text
+    assert "2.00" in text
+
+    record = out / "cells/office/default/0/cell.json"
+    before = record.stat().st_mtime_ns
+    assert run_again(data, out).cells[0] == found.cells[0]
+    assert record.stat().st_mtime_ns == before, "a finished cell was run again"
+    changed = json.loads(record.read_text())
+    changed["depends"]["code"] = "another"
+    record.write_text(json.dumps(changed))
+    run_again(data, out)
+    assert json.loads(record.read_text())["depends"]["code"] != "another"
+
+
+def start(data: Path, out: Path) -> subprocess.Popen:
+    words = ["compare", str(data / "seeds.yaml"), "--out", str(out), "--jobs", "1"]
+    return subprocess.Popen(
+        [sys.executable, "-m", "slam", *words],
+        cwd=ROOT,
+        env=environment(1),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+
+
+def wait_for(path: Path, process: subprocess.Popen) -> None:
+    end_s = time.monotonic() + 60
+    while not path.exists():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def processes_on(folder: Path) -> list[str]:
+    """Processes other than zombies whose command line names a folder."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words = (entry / "cmdline").read_bytes()
+            except OSError:
+                continue
+            if os.fsencode(str(folder)) in words:
+                found.append(entry.name)
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="looks into /proc")
+def test_killed_and_interrupted_it_goes_on_without_repeating(data, tmp_path):
+    """Killed in its second cell, interrupted in its third, then left to its end."""
+    out = tmp_path / "out"
+    records = [out / f"cells/office/default/{seed}/cell.json" for seed in range(3)]
+    logs = [record.with_name("log.txt") for record in records]
+    with start(data, out) as process:
+        wait_for(logs[1], process)
+        process.send_signal(signal.SIGKILL)
+    statuses = [cell.status for cell in read_results(out).cells]
+    assert statuses == [DONE, CellStatus.PENDING, CellStatus.PENDING]
+    first = records[0].stat().st_mtime_ns
+    with start(data, out) as process:
+        wait_for(logs[2], process)
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
+    assert process.returncode == 130
+    assert not processes_on(out)
+    second = records[1].stat().st_mtime_ns
+    with start(data, out) as process:
+        process.wait(60)
+    assert process.returncode == 0
+    assert [cell.status for cell in read_results(out).cells] == [DONE] * 3
+    assert [r.stat().st_mtime_ns for r in records[:2]] == [first, second]
+
+
+def test_a_sequence_that_is_not_there_leaves_the_others(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    truth = "".join(f"{k} {k % 3} {k % 5} {k % 7} 0 0 0 1\n" for k in range(10))
+    (tmp_path / "freiburg1_xyz-groundtruth.txt").write_text(truth)
+    (tmp_path / "freiburg1_xyz-rgbdslam.txt").write_text(truth)
+    found = compare("paper", tmp_path / "out", CompareOptions((tmp_path,), quiet=True))
+    cells = {(cell.sequence, cell.method): cell for cell in found.cells}
+    missing = cells["freiburg1_xyz", "default"]
+    assert missing.status is CellStatus.PENDING
+    assert "bmask-slam download tum/freiburg1_xyz" in missing.error
+    assert cells["freiburg1_xyz", "RGB-D SLAM (run)"].metrics["ate_rmse"] == pytest.approx(0)
+
+
+SHARED = ROOT / "../shared/data/trajectories"
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data/trajectories here")
+@pytest.mark.parametrize("given", ["data", "trajectory"])
+def test_rgbd_slam_on_freiburg1_xyz(given, tmp_path, monkeypatch):
+    """The shipped experiment prints 1.35 cm; truth is found beside the trajectory."""
+    monkeypatch.chdir(tmp_path)
+    row = "RGB-D SLAM (run)"
+    file = SHARED / "freiburg1_xyz-rgbdslam.txt"
+    options = CompareOptions(trajectories={(row, "freiburg1_xyz"): file}, quiet=True)
+    if given == "data":
+        options = CompareOptions(data=(SHARED,), quiet=True)
+    found = compare("paper", tmp_path / "out", options)
+    (line,) = (t for t in format_comparison(found).splitlines() if t.startswith(row))
+    assert "1.35" in line
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (CompareOptions(sequences=("attic",)), "--sequences attic: .* there are: office"),
+        (CompareOptions(configurations=("x",)), "--configurations x: .* there are: default"),
+        (CompareOptions(references={"x": Path("y")}), "--reference x"),
+        (CompareOptions(references={"office": Path("y")}), "--reference y: no such file"),
+        (CompareOptions(trajectories={("a", "attic"): Path("y")}), "a:attic: no such sequence"),
+        (CompareOptions(trajectories={("a", "office"): Path("y")}), "y: no such file"),
+        (CompareOptions(trajectories={("default", "office"): Path("y")}), "another row's name"),
+    ],
+)
+def test_what_the_experiment_does_not_have_is_refused(data, tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        compare(data / "mine.yaml", tmp_path / "out", options)
+
+
+def test_impossible_options_are_refused():
+    for wrong in ({"workers": 0}, {"seeds": ()}, {"seeds": (-1,)}):
+        with pytest.raises(InputError):
+            CompareOptions(**wrong)
