@@ -13,6 +13,7 @@ from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
 EMPTY = "–"
 FAILED = "failed"
 PENDING = "pending"
+RANGE = " (smallest to largest)"
 ATE = METRICS[0]
 MAX_COLUMNS = 9  # of figures of single cells
 
@@ -82,7 +83,7 @@ def metric_table(comparison: Comparison, metric: Metric) -> Table | None:
     )
     unit = f" ({metric.unit})" if metric.unit not in ("", "1") else ""
     way = {True: "Lower is better.", False: "Higher is better.", None: ""}[metric.lower_is_better]
-    caption = f"{metric.title}{unit}: median over seeds (smallest to largest). {way}".strip()
+    caption = f"{metric.title}{unit}: median over seeds{RANGE}. {way}".strip()
     title = f"{metric.title}{unit}"
     return Table(metric.name, title, caption, comparison.sequences, rows)
 

@@ -7,11 +7,14 @@ import io
 import re
 
 from slam.comparison.metric_table import BY_NAME
-from slam.comparison.report.table import Entry, Table, TableRow
+from slam.comparison.report.section import slug
+from slam.comparison.report.table import RANGE, Entry, Table, TableRow
 from slam.comparison.result import Comparison
 
 CSV_COLUMNS = ("sequence", "method", "kind", "with_scale", "seed", "status", "metric", "value",
                "unit", "error", "source")  # fmt: skip
+NARROW = 4  # columns of a table in which ranges have room
+HEAD_LETTERS = 12
 STORED_UNITS = {"cm": "m", "mm": "m", "%": "1", "°": "deg"}
 LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -69,7 +72,8 @@ def _markdown_table(table: Table) -> str:
     for row in table.rows:
         entries = [_markdown_entry(entry) for entry in row.entries]
         lines.append(f"| {' | '.join([_markdown(_label(row)), *entries])} |")
-    return "\n".join([*lines, ""])
+    notes = [f"- {_markdown(f'{row.label}: {row.note}')}" for row in table.rows if row.note]
+    return "\n".join([*lines, "", *notes, *([""] if notes else [])])
 
 
 def _markdown_entry(entry: Entry) -> str:
@@ -78,22 +82,49 @@ def _markdown_entry(entry: Entry) -> str:
 
 
 def _latex_table(table: Table) -> str:
-    rows = [" & ".join([latex(table.corner), *map(latex, table.columns)]) + r" \\"]
-    for row in table.rows:
-        entries = [_latex_entry(entry) for entry in row.entries]
-        rows.append(" & ".join([latex(_label(row)), *entries]) + r" \\")
-    head, *body = rows
+    """Small and close, heads broken at their underscores; ranges only in narrow tables."""
+    narrow = len(table.columns) <= NARROW
+    heads = [latex(table.corner), *map(_latex_head, table.columns)]
+    rows = [
+        [_latex_label(row), *(_latex_entry(e, narrow) for e in row.entries)] for row in table.rows
+    ]
+    notes = " ".join(f"{row.label}: {row.note}." for row in table.rows if row.note and row.tags)
+    caption = table.caption if narrow else table.caption.replace(RANGE, "")
     lines = [
-        r"\begin{table}", r"\centering", rf"\caption{{{latex(table.caption)}}}",
-        rf"\label{{tab:{re.sub(r'[^a-zA-Z0-9]+', '-', table.name)}}}",
-        rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}", r"\toprule", head, r"\midrule",
-        *body, r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
+        r"\begin{table}", r"\centering\small\setlength{\tabcolsep}{3pt}",
+        rf"\caption{{{latex(f'{caption} {notes}'.strip())}}}\par\smallskip",
+        rf"\label{{tab:{slug(table.name)}}}",
+        rf"\begin{{tabular}}{{l{'r' * len(table.columns)}}}", r"\toprule",
+        *_latex_rows([heads]), r"\midrule", *_latex_rows(rows), r"\bottomrule",
+        r"\end{tabular}", r"\end{table}", "",
     ]  # fmt: skip
     return "\n".join(lines)
 
 
-def _latex_entry(entry: Entry) -> str:
-    return rf"\textbf{{{latex(entry.plain)}}}" if entry.best else latex(entry.plain)
+def _latex_rows(rows: list[list[str]]) -> list[str]:
+    return [" & ".join(row) + r" \\" for row in rows]
+
+
+def _latex_head(text: str) -> str:
+    """A name in lines of at most about twelve letters, broken after _ or at spaces."""
+    lines = [""]
+    for piece in re.findall(r"[^_ ]+[_ ]?", text):
+        if lines[-1] and len(lines[-1]) + len(piece) > HEAD_LETTERS + 1:
+            lines.append("")
+        lines[-1] += piece
+    stacked = r" \\ ".join(latex(line.strip()) for line in lines)
+    return rf"\shortstack[r]{{{stacked}}}" if len(lines) > 1 else stacked
+
+
+def _latex_label(row: TableRow) -> str:
+    tags = rf" {{\scriptsize ({latex(', '.join(row.tags))})}}" if row.tags else ""
+    return latex(row.label) + tags
+
+
+def _latex_entry(entry: Entry, with_spread: bool) -> str:
+    text = rf"\textbf{{{latex(entry.text)}}}" if entry.best else latex(entry.text)
+    beside = [entry.spread.replace(" to ", "–")] * with_spread + [entry.note]
+    return text + "".join(rf" {{\scriptsize {latex(note)}}}" for note in beside if note)
 
 
 def _label(row: TableRow) -> str:
