@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from graph.trajectory import Trajectory, write_tum
 from slam.live.health import Health
 from slam.results import FrameResult
@@ -18,6 +20,8 @@ logger = logging.getLogger(__name__)
 
 HEALTH_S = 1.0
 SNAPSHOT_S = 5.0
+SAY_S = 60.0
+"""A disk that stays full is said again after so long."""
 
 
 class Recorder:
@@ -30,7 +34,7 @@ class Recorder:
     def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
         self.unwritten = 0
-        self._is_full = False
+        self._said_s = -np.inf
         self._health_s = self._snapshot_s = time.monotonic()
 
     def frame(
@@ -39,16 +43,15 @@ class Recorder:
         health: Callable[[], Health],
         trajectory: Callable[[], Trajectory],
     ) -> None:
-        """Write a frame, and the other files where they are due; a full disk is said once."""
+        """Write a frame, and the other files where they are due; a full disk is said."""
         try:
             self._write(result, health, trajectory)
-            self._is_full = False
         except OSError as error:
             if error.errno not in DISK_ERRORS:
                 raise
             self.unwritten += 1
-            if not self._is_full:
-                self._is_full = True
+            if time.monotonic() - self._said_s > SAY_S:
+                self._said_s = time.monotonic()
                 logger.error(
                     "%s: %s; tracking goes on, free some space before it ends",
                     self.folder.path,
