@@ -59,6 +59,9 @@ REPORTS = {
     }),
     "live": Report(ROOT / "docs" / "live.md", "What the live loop reaches", {
         "speed": ("Red kitchen, offline and live", "live.py --repeats 1"),
+        "session": (
+            "Thirty minutes", "live_session.py {sequences}/office-300 --minutes 30 --hz 10"
+        ),
     }),
     "semantics": Report(ROOT / "docs" / "semantics.md", "What the semantics reach", {
         "photographs": (
