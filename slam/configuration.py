@@ -83,6 +83,21 @@ def dump(config: Any) -> str:
     return format_yaml(_plain(config))
 
 
+def differences(config: Any, other: Any) -> dict[str, Any]:
+    """Plain values of ``config`` by dotted path where ``other``, of the same class, has another."""
+    values, others = (dict(_leaves(_plain(c))) for c in (config, other))
+    return {path: value for path, value in values.items() if value != others[path]}
+
+
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value that is no group of keys, by dotted path."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
+
+
 def _plain(value: Any) -> Any:
     """A configuration value as what YAML can hold."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -54,6 +54,7 @@ def add_compare(commands: _Commands) -> None:
     parser.add_argument("--seeds", metavar="0,1", help="in place of the experiment's")
     parser.add_argument("--jobs", type=int, metavar="N", help="at a time (default: one a core)")
     parser.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster: address, or auto")
+    parser.add_argument("--with-scale", action="store_true", help="align by Sim(3): monocular")
     parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
 
 
@@ -86,6 +87,7 @@ def _options(arguments: argparse.Namespace) -> CompareOptions:
         configurations=_names(arguments.configurations),
         workers=arguments.jobs,
         ray=arguments.ray,
+        with_scale=arguments.with_scale,
         quiet=arguments.quiet,
     )
 

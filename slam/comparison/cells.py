@@ -20,7 +20,6 @@ from slam.rendering.sequence import RenderConfig
 
 SEQUENCES, CELLS = "sequences", "cells"
 SEED_SETTING = "loops.verification.seed={}"
-TRUE_LABELS = "annotations.json"
 Key = tuple[str, str, int]
 """A cell of this system: sequence, configuration, seed."""
 _VALUES = ("frames", "fps", "people", "depth_delay_ms", "width", "height")
@@ -106,7 +105,7 @@ def _run_job(place: Place, named: tuple[str, Configuration], seed: int, out: Pat
     words += [*configuration.arguments(), "--set", setting]
     if source.camera is not None:
         words += ["--camera", str(source.camera.absolute())]
-    labelled = place.seed is not None and configuration.segmenter != "none"
+    judged = place.seed is not None and (configuration.segmenter != "none" or configuration.dense)
     return Job(
         f"{source.name}, {name}, seed {seed}",
         f"{source.name}, {name}",
@@ -119,6 +118,6 @@ def _run_job(place: Place, named: tuple[str, Configuration], seed: int, out: Pat
             "sequence": place.contents,
             "configuration": configuration_print(configuration, (setting,)),
         },
-        sequence=str(place.folder) if labelled else "",
+        sequence=str(place.folder) if judged else "",
         run=str(run),
     )

@@ -26,6 +26,7 @@ class CompareOptions:
         seeds, sequences, configurations: only these of the experiment's; None for all.
         workers: jobs at a time; None: as many as there are cores.
         ray: address of a Ray cluster to use instead of this machine.
+        with_scale: align all runs by Sim(3), whatever the experiment says.
         quiet: no progress bar.
     """
 
@@ -37,6 +38,7 @@ class CompareOptions:
     configurations: tuple[str, ...] | None = None
     workers: int | None = None
     ray: str | None = None
+    with_scale: bool = False
     quiet: bool = False
 
     def __post_init__(self) -> None:
@@ -74,6 +76,7 @@ def chosen(experiment: Experiment, options: CompareOptions) -> Experiment:
             k: v for k, v in experiment.configurations.items() if rows is None or k in rows
         },
         seeds=options.seeds or experiment.seeds,
+        with_scale=experiment.with_scale or options.with_scale,
     )
 
 

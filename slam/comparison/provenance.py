@@ -15,11 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from slam import __version__
-from slam.comparison.experiment import Experiment
+from slam.comparison.experiment import Configuration, Experiment
 from slam.comparison.fingerprint import code_print
 from slam.comparison.pool import available_cores
+from slam.configuration import differences, find_config, resolve
+from slam.system_config import SystemConfig
 
 PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "open3d", "scipy", "torch", "faiss-cpu")
+OPTIONS = ("segmenter", "weights", "max_frames", "stride", "dense")
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -37,8 +40,17 @@ def provenance(experiment: Experiment, workers: int) -> dict[str, Any]:
         "workers": workers,
         "machine": machine(),
         "packages": dict(_versions()),
+        "configurations": {k: _changed(v) for k, v in experiment.configurations.items()},
         "experiment": _plain(asdict(experiment)),
     }
+
+
+def _changed(configuration: Configuration) -> dict[str, Any]:
+    """What differs from the defaults of the code, parameters by dotted path, and the options."""
+    file = find_config(configuration.config) if configuration.config else None
+    found = differences(resolve(SystemConfig, file, configuration.set), SystemConfig())
+    options = {name: getattr(configuration, name) for name in OPTIONS}
+    return found | {name: value for name, value in options.items() if value}
 
 
 def commit() -> str:

@@ -1,7 +1,8 @@
-"""What a run on a rendered sequence says of things, against what was drawn."""
+"""What a run on a rendered sequence says of things and surfaces, against what was drawn."""
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -16,47 +17,81 @@ from graph.trajectory import Trajectory, associate, nearest_indices, read_tum
 from semantics.labels import LabelSet
 from semantics.segmenter_table import make_segmenter
 from slam.configuration import resolve
+from slam.dense_folder import DenseFolder
 from slam.semantic_files import LABELS, read_labels
 from slam.sequences import Sequence, open_sequence
 from slam.system_config import SystemConfig
 
-MIN_DEPTH_M = 0.1
+MIN_DEPTH_M, OUTLIER_M = 0.1, 0.05
 NEAR_M = (0.02, 0.01)  # at 0 m, and what the square of the depth adds
 
 
 def truth_figures(run: Path, folder: Path) -> dict[str, float]:
-    """Figures by metric; none where the run has no labels or the sequence no truth of them.
+    """Figures by metric; none where the run has none to compare or the sequence no truth."""
+    sequence = open_sequence(folder)
+    found = {"label_accuracy": label_accuracy(run, sequence)}
+    found["depth_rmse_ratio"] = depth_ratio(run, sequence)
+    return {name: value for name, value in found.items() if value is not None}
 
-    ``label_accuracy``: of the landmarks that lie on an object of a class that the segmenter knows,
-    the share with its label. A landmark lies where most keyframes that can see it show it.
+
+def label_accuracy(run: Path, sequence: Sequence) -> float | None:
+    """Of landmarks on an object of a class that the segmenter knows, the share with its label.
+
+    A landmark lies where most keyframes that can see it show it.
     """
+    folder = sequence.folder
     if not (run / LABELS).is_file() or not (folder / "annotations.json").is_file():
-        return {}
+        return None
     config = resolve(SystemConfig, run / "config.yaml")
     names = make_segmenter(config.semantics.segmenter, folder).labels
-    sequence = open_sequence(folder)
     if sequence.groundtruth is None:
-        return {}
+        return None
     keyframes, truth = associate(read_tum(run / "keyframes.txt"), sequence.groundtruth)
     if not len(keyframes):
-        return {}
+        return None
     cloud, labels = read_ply(run / "landmarks.ply"), read_labels(run)
     points_world = np.column_stack([cloud[axis] for axis in "xyz"]).astype(float)
     points_truth = transform(truth_from_world(keyframes, truth), points_world)
     classes = true_classes(folder, names)
     counts = np.zeros((len(points_truth), len(names)), int)
-    for stamp_s, T_truth_camera in zip(truth.timestamps_s, truth.poses_world_camera, strict=True):
-        index = int(nearest_indices(sequence.timestamps_s, np.array([stamp_s]))[0])
-        instances, depth_m = _true_images(sequence, index)
+    indices = nearest_indices(sequence.timestamps_s, truth.timestamps_s)
+    for index, T_truth_camera in zip(indices.tolist(), truth.poses_world_camera, strict=True):
+        instances = _image(sequence, "instances", index).astype(np.int64)
         points_camera = transform(inverse(T_truth_camera), points_truth)
-        rows, pixels = visible(points_camera, depth_m, sequence.camera)
+        rows, pixels = visible(points_camera, true_depth(sequence, index), sequence.camera)
         counts[rows, classes[instances[pixels[:, 1], pixels[:, 0]]]] += 1
     true = counts.argmax(axis=1)  # the background, 0, for those that no keyframe sees
     found = np.array([names.number(name) for name in labels.labels])
     on_objects = true > 0
-    if not on_objects.any():
-        return {}
-    return {"label_accuracy": float((found[on_objects] == true[on_objects]).mean())}
+    return float((found[on_objects] == true[on_objects]).mean()) if on_objects.any() else None
+
+
+def depth_ratio(run: Path, sequence: Sequence) -> float | None:
+    """RMSE of the dense map's depth over that of the sensor's, at the same pixels.
+
+    These are the pixels of keyframes where both and the truth are known and neither is off by more
+    than 5 cm, which are outliers of another kind.
+    """
+    exact, finished = sequence.folder / "depth_true", run / "dense" / "dense.json"
+    if not exact.is_dir() or not finished.is_file():
+        return None
+    dense = DenseFolder.opened(run)
+    squares = np.zeros(2)
+    for index, keyframe in keyframe_frames(run):
+        if dense.is_done(keyframe):
+            truth = true_depth(sequence, index)
+            both = np.stack([dense.fused(keyframe).depth_m(), sequence.load(index).depth_m])
+            errors = both - truth
+            near = (np.abs(errors) < OUTLIER_M).all(axis=0)  # False where one is NaN
+            squares += (errors[:, near].astype(float) ** 2).sum(axis=1)
+    return float(np.sqrt(squares[0] / squares[1])) if squares[1] > 0 else None
+
+
+def keyframe_frames(run: Path) -> list[tuple[int, int]]:
+    """(index of the frame, id) of every keyframe that was made."""
+    with (run / "frames.csv").open(encoding="utf-8", newline="") as file:
+        made = [row for row in csv.DictReader(file) if row["keyframe"]]
+    return [(int(row["index"]), int(row["keyframe"])) for row in made]
 
 
 def truth_from_world(keyframes: Trajectory, truth: Trajectory) -> Array:
@@ -88,12 +123,13 @@ def visible(
     return rows[near], pixels[near]
 
 
-def _true_images(sequence: Sequence, index: int) -> tuple[NDArray[np.int64], Array]:
-    """Instances (H, W) and depth (H, W) in metres, NaN where nothing is; exact if it was kept."""
+def true_depth(sequence: Sequence, index: int) -> Array:
+    """Depth (H, W) in metres, NaN where nothing is; the sensor's if the exact one was not kept."""
+    kept = (sequence.folder / "depth_true").is_dir()
+    depth = _image(sequence, "depth_true" if kept else "depth", index)
+    return np.where(depth > 0, depth / sequence.camera.depth_scale, np.nan)
+
+
+def _image(sequence: Sequence, kind: str, index: int) -> NDArray[np.uint16]:
     name = sequence.pairs.rgb_files[index].name
-    exact = sequence.folder / "depth_true" / name
-    stored = exact if exact.is_file() else sequence.pairs.depth_files[index]
-    depth = cv2.imread(str(stored), cv2.IMREAD_UNCHANGED)
-    instances = cv2.imread(str(sequence.folder / "instances" / name), cv2.IMREAD_UNCHANGED)
-    depth_m = np.where(depth > 0, depth / sequence.camera.depth_scale, np.nan)
-    return instances.astype(np.int64), depth_m
+    return np.asarray(cv2.imread(str(sequence.folder / kind / name), cv2.IMREAD_UNCHANGED))

@@ -1,0 +1,134 @@
+"""Labels and depth against what was drawn, in a world that is not the truth's."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from graph.geometry import inverse, se3_exp, transform
+from graph.ply import write_ply
+from graph.trajectory import write_tum
+from mapping.inverse_depth import InverseDepthMap
+from semantics.labels import label_set
+from slam.comparison.truth_figures import (
+    depth_ratio,
+    label_accuracy,
+    true_classes,
+    true_depth,
+    truth_from_world,
+    visible,
+)
+from slam.rendering.classes import CLASSES
+from slam.rendering.sequence import RenderConfig, render_sequence
+from slam.sequences import open_sequence
+
+T_WORLD_TRUTH = se3_exp([0.4, -1.1, 0.3, 2.0, -3.0, 1.0])
+NAMES = label_set(CLASSES)
+WRONG = 4  # every fourth label
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("truth") / "office"
+    config = RenderConfig("office", frames=3, width=160, height=120, fps=15, true_depth=True)
+    return render_sequence(config, path)
+
+
+@pytest.fixture
+def run(folder, tmp_path):
+    """A run folder whose landmarks are pixels of the first frame, labelled right but for some."""
+    sequence = open_sequence(folder)
+    truth = sequence.groundtruth
+    write_tum(tmp_path / "keyframes.txt", truth.moved(T_WORLD_TRUTH))
+    (tmp_path / "config.yaml").write_text("semantics: {segmenter: {name: truth}}\n")
+    depth_m = true_depth(sequence, 0)
+    rows, columns = np.mgrid[2:118:3, 2:158:3].reshape(2, -1)
+    known = np.isfinite(depth_m[rows, columns])
+    rows, columns = rows[known], columns[known]
+    camera, z = sequence.camera, depth_m[rows, columns]
+    points = np.column_stack(
+        [(columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z]
+    )
+    points = transform(T_WORLD_TRUTH @ truth.poses_world_camera[0], points)
+    file = folder / "instances" / sequence.pairs.rgb_files[0].name
+    instances = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[rows, columns]
+    labels = [
+        NAMES.of_thing(k) for k in true_classes(folder, NAMES)[instances.astype(int)].tolist()
+    ]
+    labels = ["umbrella" if k % WRONG == 0 else name for k, name in enumerate(labels)]
+    columns = dict(zip("xyz", points.T.astype(np.float32), strict=True))
+    write_ply(tmp_path / "landmarks.ply", columns | {"id": np.arange(len(points), dtype=np.int32)})
+    with (tmp_path / "labels.csv").open("w", newline="") as out:
+        writer = csv.writer(out)
+        writer.writerow(("id", "label", "probability", "entropy", "views"))
+        writer.writerows((k, name, 1, 0, 3) for k, name in enumerate(labels))
+    return tmp_path
+
+
+def test_labels_in_another_world(run, folder):
+    """Three of four are right, up to landmarks at edges that most frames show as something else."""
+    assert label_accuracy(run, open_sequence(folder)) == pytest.approx(1 - 1 / WRONG, abs=0.03)
+
+
+def test_labels_of_a_wrong_world_are_wrong(run, folder):
+    """Keyframes that are not where the landmarks believe them to be."""
+    sequence = open_sequence(folder)
+    moved = sequence.groundtruth.moved(T_WORLD_TRUTH @ se3_exp([0, 0.5, 0, 0, 0, 0]))
+    write_tum(run / "keyframes.txt", moved)
+    found = label_accuracy(run, sequence)
+    assert found is None or found < 0.6
+
+
+def test_a_run_without_labels_has_no_figure(run, folder):
+    (run / "labels.csv").unlink()
+    assert label_accuracy(run, open_sequence(folder)) is None
+    assert depth_ratio(run, open_sequence(folder)) is None
+
+
+def test_the_mean_transform(folder):
+    truth = open_sequence(folder).groundtruth
+    found = truth_from_world(truth.moved(T_WORLD_TRUTH), truth)
+    np.testing.assert_allclose(found, inverse(T_WORLD_TRUTH), atol=1e-9)
+
+
+def test_hidden_points_are_not_visible(folder):
+    camera = open_sequence(folder).camera
+    depth_m = np.full((camera.height, camera.width), 2.0)
+    points = np.array([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 1.0], [0, 0, -2.0], [9, 0, 2.0]])
+    rows, pixels = visible(points, depth_m, camera)
+    assert rows.tolist() == [0]
+    assert pixels.tolist() == [[round(camera.cx), round(camera.cy)]]
+
+
+def test_depth_against_the_sensor(run, folder, monkeypatch):
+    """A map that halves the sensor's error gives one half; NaN and outliers do not count."""
+    sequence = open_sequence(folder)
+    (run / "frames.csv").write_text("index,keyframe\n0,0\n1,\n2,1\n")
+    (run / "dense").mkdir()
+    (run / "dense/dense.json").write_text(json.dumps({}))
+
+    class Dense:
+        def is_done(self, keyframe):
+            return keyframe < 2
+
+        def fused(self, keyframe):
+            index = 2 * keyframe
+            exact, sensor = true_depth(sequence, index), sequence.load(index).depth_m
+            depth_m = exact + (sensor - exact) / 2
+            depth_m[:20] = np.nan
+            depth_m[20:30] = 9.0
+            return Fixed(depth_m)
+
+    class Fixed(InverseDepthMap):
+        def __init__(self, depth_m):
+            object.__setattr__(self, "given", depth_m)
+
+        def depth_m(self):
+            return self.given
+
+    monkeypatch.setattr("slam.comparison.truth_figures.DenseFolder.opened", lambda run: Dense())
+    assert depth_ratio(run, sequence) == pytest.approx(0.5, rel=1e-6)
