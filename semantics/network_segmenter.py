@@ -44,7 +44,7 @@ class NetworkSegmenter:
         check_image(image, name)
         tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1).float() / 255
         if self._detector is None:
-            detections = self._model([tensor])[0]
+            detections = self._model([tensor], self._min_score)[0]
         else:
             boxes = self._detector.detect(image, self.labels).to(self._device)
             detections = self._model.segment([tensor], [boxes])[0]

@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from graph.errors import InputError
 from semantics.labels import LabelSet, read_label_set
 from semantics.network.box_head import ClassifiedBoxes
+from semantics.network.boxes import iou
 from semantics.network.nms import grouped_nms
 from semantics.segmenter import Image
 
@@ -26,11 +28,22 @@ GEOMETRY = 5
 
 @dataclass(frozen=True)
 class YoloxConfig:
-    """Which boxes are kept."""
+    """Which boxes are kept.
 
-    min_score: float = 0.01
+    Attributes:
+        min_score: class probability times objectness below which a box is dropped.
+        nms_iou: overlap above which the worse of two boxes of a class goes.
+        vote_iou: overlap from which boxes of a class, also those that went, count in the place of
+            the one that stays.
+        max_count: at most so many boxes stay.
+        mirror: the mirror image is looked at as well, for twice the time.
+    """
+
+    min_score: float = 0.001
     nms_iou: float = 0.65
+    vote_iou: float = 0.8
     max_count: int = 100
+    mirror: bool = True
 
 
 class YoloxDetector:
@@ -54,13 +67,21 @@ class YoloxDetector:
 
     def detect(self, image: Image, labels: LabelSet) -> ClassifiedBoxes:
         """Boxes in an image (H, W, 3), red first, of the classes that ``labels`` knows."""
+        boxes, probabilities = self._look(image)
+        if self._config.mirror:
+            mirrored, more = self._look(np.ascontiguousarray(image[:, ::-1]))
+            mirrored[:, [2, 0]] = image.shape[1] - mirrored[:, [0, 2]]
+            boxes, probabilities = np.r_[boxes, mirrored], np.r_[probabilities, more]
+        numbers = np.array([labels.number(name) for name in self._classes.names[1:]])
+        return self._select(boxes, probabilities, numbers, len(labels))
+
+    def _look(self, image: Image) -> tuple[NDArray, NDArray]:
+        """Boxes (P, 4) in the image's pixels and class probabilities (P, 80), as they come."""
         blob, factor = letterbox(image, self._side_px)
         self._network.setInput(blob)
         boxes, probabilities = decode(self._network.forward()[0], self._side_px)
         height, width = image.shape[:2]
-        boxes = np.clip(boxes / factor, 0, [width, height, width, height])
-        numbers = np.array([labels.number(name) for name in self._classes.names[1:]])
-        return self._select(boxes, probabilities, numbers, len(labels))
+        return np.clip(boxes / factor, 0, [width, height, width, height]), probabilities
 
     def _select(
         self, boxes: NDArray, probabilities: NDArray, numbers: NDArray, classes: int
@@ -81,8 +102,9 @@ class YoloxDetector:
         label_tensor = torch.from_numpy(label[chosen])
         keep = grouped_nms(box_tensor, score_tensor, label_tensor, self._config.nms_iou)
         keep = keep[: self._config.max_count]
+        best = voted(box_tensor, score_tensor, label_tensor, keep, self._config.vote_iou)
         return ClassifiedBoxes(
-            box_tensor[keep], label_tensor[keep], score_tensor[keep],
+            best, label_tensor[keep], score_tensor[keep],
             torch.from_numpy(distribution)[keep],
         )  # fmt: skip
 
@@ -101,6 +123,16 @@ class YoloxDetector:
             f"{self._path}: not a YOLOX network for COCO's 80 classes at one of {SIZES_PX} pixels; "
             "give such a one"
         )
+
+
+def voted(boxes: Tensor, scores: Tensor, labels: Tensor, keep: Tensor, min_iou: float) -> Tensor:
+    """The kept boxes (K, 4), each the mean of those of its class that lie almost on it.
+
+    Weights are the scores (Gidaris and Komodakis 2015, section 4).
+    """
+    alike = (labels[keep, None] == labels) & (iou(boxes[keep], boxes) >= min_iou)
+    weights = alike * scores
+    return (weights @ boxes) / weights.sum(dim=1, keepdim=True)
 
 
 def letterbox(image: Image, side_px: int) -> tuple[NDArray[np.float32], float]:

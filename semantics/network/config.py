@@ -119,7 +119,7 @@ LIGHT = NetworkConfig(
     class_agnostic=True,
     mask_context=1.2,
     image=ImageConfig(480, 800, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
-    proposals=ProposalConfig(before_nms=300, after_nms=100),
-    detections=DetectionConfig(max_count=30),
+    proposals=ProposalConfig(before_nms=600, after_nms=300),
+    detections=DetectionConfig(max_count=100),
 )
 """For robots without a GPU: MobileNetV2 and narrow heads; 640x480 is not enlarged."""

@@ -79,13 +79,17 @@ class MaskRCNN(nn.Module):
         self.roi_heads = RoIHeads(config)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, images: Sequence[Tensor]) -> list[Detections]:
-        """Detections of each image (3, H, W), float32, red green blue in 0..1."""
+    def forward(self, images: Sequence[Tensor], min_score: float = 0.0) -> list[Detections]:
+        """Detections of each image (3, H, W), float32, red green blue in 0..1.
+
+        Those of a class score below ``min_score``, or below the network's own limit, get no mask
+        and are left out.
+        """
         batch = prepare(images, self.config.image)
         levels = self.backbone(batch.tensor)
         table = feature_table(levels[:ROI_LEVELS], batch.size[0])
         proposals = self.rpn(levels, batch)
-        return self._with_masks(table, self._classified(table, proposals, batch), batch)
+        return self._with_masks(table, self._classified(table, proposals, batch, min_score), batch)
 
     def segment(
         self, images: Sequence[Tensor], given: Sequence[ClassifiedBoxes]
@@ -97,15 +101,21 @@ class MaskRCNN(nn.Module):
         return self._with_masks(table, [_moved(g, old, new) for g, old, new in sizes], batch)
 
     def _classified(
-        self, table: FeatureTable, proposals: Sequence[Tensor], batch: ImageBatch
+        self,
+        table: FeatureTable,
+        proposals: Sequence[Tensor],
+        batch: ImageBatch,
+        min_score: float,
     ) -> list[ClassifiedBoxes]:
         """The box head's detections in each image, in pixels of the batch."""
+        usual = self.config.detections
+        config = replace(usual, min_score=max(usual.min_score, min_score))
         counts = [len(p) for p in proposals]
         logits, offsets = self.roi_heads.boxes(table, proposals)
         outputs = zip(
             logits.split(counts), offsets.split(counts), proposals, batch.sizes, strict=True
         )
-        return [classify(*output, self.config.detections) for output in outputs]
+        return [classify(*output, config) for output in outputs]
 
     def _with_masks(
         self, table: FeatureTable, found: Sequence[ClassifiedBoxes], batch: ImageBatch

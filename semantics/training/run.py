@@ -33,11 +33,13 @@ class Source:
     Attributes:
         file, images: COCO file and the folder of its images.
         held_out: share of the images that is left for testing.
+        split_seed: says which; None: the training's own seed does.
     """
 
     file: Path
     images: Path
     held_out: float = 0.0
+    split_seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,10 @@ def run_training(run: TrainingRun, progress: Callable[[int, int], None]) -> Path
     except ValueError as error:
         raise InputError(f"training: {error}") from error
     labels = read_label_set(run.labels)
+    seeds = [config.seed if s.split_seed is None else s.split_seed for s in run.data]
     parts = [
-        Dataset(split(read_coco(s.file), s.held_out, config.seed)[0], s.images, labels)
-        for s in run.data
+        Dataset(split(read_coco(s.file), s.held_out, seed)[0], s.images, labels)
+        for s, seed in zip(run.data, seeds, strict=True)
     ]
     network = _start(run, labels, config.seed)
     weights = train(network, JoinedDatasets(parts), run.out, config, progress)

@@ -69,20 +69,31 @@ def match(boxes: Tensor, objects: Tensor, rule: MatchRule) -> Tensor:
 
 
 def draw_samples(
-    matched: Tensor, rule: MatchRule, generator: torch.Generator
+    matched: Tensor, labels: Tensor, rule: MatchRule, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Indices of positive and of negative boxes, drawn at random from matches (N,)."""
+    """Indices of positive and of negative boxes, drawn at random from matches (N,).
+
+    ``labels`` (G,) are the objects' classes, which have equal chances among the positives.
+    """
     positive, negative = torch.nonzero(matched >= 0)[:, 0], torch.nonzero(matched == NOTHING)[:, 0]
     count = min(int(rule.count * rule.positive_share), len(positive))
+    chosen = torch.randperm(len(negative), generator=generator)[: rule.count - count]
     return (
-        _draw(positive, count, generator),
-        _draw(negative, min(rule.count - count, len(negative)), generator),
+        positive[draw_evenly(labels[matched[positive]], count, generator)],
+        negative[chosen.to(negative.device)],
     )
 
 
-def _draw(indices: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    order = torch.randperm(len(indices), generator=generator)[:count]
-    return indices[order.to(indices.device)]
+def draw_evenly(labels: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Up to ``count`` places in ``labels`` (N,) at random, of each label equally many if it can be.
+
+    A shelf holds a hundred books: drawn one by one from all objects of an image, they would leave
+    no room for the chair in front of it.
+    """
+    order = torch.randperm(len(labels), generator=generator).to(labels.device)
+    by_label, place = labels[order].sort(stable=True)
+    turn = torch.arange(len(labels), device=labels.device) - torch.searchsorted(by_label, by_label)
+    return order[place[turn.argsort(stable=True)[:count]]]
 
 
 def mask_targets(masks: Tensor, owner: Tensor, boxes: Tensor, bins: int) -> Tensor:

@@ -86,7 +86,7 @@ def test_a_good_mask_score_ranks_bad_masks_last(
 ) -> None:
     """A loose mask has the better class score, but its predicted IoU is low."""
     found = [
-        instance(disc(30, 45, 28), 0.9, 0.5),  # IoU about 0.51
+        instance(disc(30, 45, 28), 0.9, 0.5),  # IoU about 0.51, of the boxes as well
         instance(disc(30, 45, 20), 0.6, 1.0),
         instance(disc(85, 45, 24), 0.8, 0.7),
         instance(disc(85, 45, 20), 0.7, 0.95),
@@ -97,9 +97,27 @@ def test_a_good_mask_score_ranks_bad_masks_last(
     assert by_class.ap75 < 0.7
     assert by_mask.ap > by_class.ap + 0.1
     assert result.iou_correlation > 0.95
+    assert result.iou_correlation_of_good == result.iou_correlation
     assert f"{by_mask.ap:.4f}" in format_segmentation(result)
     draw_precision_recall(result, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 1000
+
+
+def test_the_correlation_counts_bad_masks_in_good_boxes(truth: tuple[CocoFile, Path]) -> None:
+    ring = disc(30, 45, 20) & ~disc(30, 45, 16)  # the disc's box, a third of its area
+    small = disc(85, 45, 5)  # not even the box
+    found = [
+        instance(disc(30, 45, 20), 0.9, 1.0),
+        instance(disc(85, 45, 24), 0.8, 0.7),
+        instance(disc(85, 45, 22), 0.8, 0.8),
+        instance(ring, 0.7, 0.35),
+        instance(small, 0.7, 1.0),
+    ]
+    result = evaluate_segmenter(Scripted(found), *truth, quiet)
+    assert result.iou_correlation > 0.99
+    without_ring = evaluate_segmenter(Scripted(found[:3] + found[4:]), *truth, quiet)
+    assert result.iou_correlation_of_good == pytest.approx(without_ring.iou_correlation)
+    assert result.iou_correlation_of_good != pytest.approx(result.iou_correlation, abs=1e-4)
 
 
 def test_the_command_finds_the_truth_perfect(

@@ -15,13 +15,14 @@ from semantics.network.box_head import ClassifiedBoxes
 from semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
 from semantics.network.model import MaskRCNN
 from semantics.network.paste import paste
-from semantics.training.losses import network_losses
+from semantics.training.losses import dice_loss, network_losses
 from semantics.training.targets import (
     BOX_RULE,
     IGNORED,
     NOTHING,
     RPN_RULE,
     Target,
+    draw_evenly,
     draw_samples,
     iou_targets,
     mask_targets,
@@ -52,13 +53,39 @@ def test_matching_and_the_rescue_of_an_object_without_a_good_box() -> None:
 def test_samples_keep_the_share_of_positives_and_fill_up_with_negatives() -> None:
     matched = torch.cat([torch.zeros(300), torch.full((900,), NOTHING)]).long()
     rule = replace(BOX_RULE, count=100)
-    positive, negative = draw_samples(matched, rule, torch.Generator().manual_seed(0))
+    one = torch.tensor([3])
+    positive, negative = draw_samples(matched, one, rule, torch.Generator().manual_seed(0))
     assert (len(positive), len(negative)) == (25, 75)
     assert (matched[positive] == 0).all()
     assert (matched[negative] == NOTHING).all()
     assert len(positive.unique()) == 25
-    few, rest = draw_samples(matched[295:], rule, torch.Generator().manual_seed(0))
+    few, rest = draw_samples(matched[295:], one, rule, torch.Generator().manual_seed(0))
     assert (len(few), len(rest)) == (5, 95)
+
+
+def test_classes_have_equal_chances_however_many_objects_they_have() -> None:
+    labels = torch.tensor([7] * 100 + [2] * 4 + [5] * 40)
+    drawn = draw_evenly(labels, 24, torch.Generator().manual_seed(0))
+    assert len(drawn.unique()) == 24
+    assert labels[drawn].bincount()[[2, 5, 7]].tolist() == [4, 10, 10]
+    again = draw_evenly(labels, 24, torch.Generator().manual_seed(1))
+    assert set(again.tolist()) != set(drawn.tolist())
+    everything = draw_evenly(labels, 500, torch.Generator().manual_seed(0))
+    assert sorted(everything.tolist()) == list(range(144))
+
+
+def test_dice_counts_the_share_of_a_mask_that_is_right() -> None:
+    wanted = torch.zeros(2, 28, 28)
+    wanted[0, 4:24, 3] = 1  # thin
+    wanted[1, 4:24, 4:24] = 1
+    assert float(dice_loss(wanted, wanted)) == pytest.approx(0, abs=1e-6)
+    half = wanted.clone()
+    half[0, 14:] = 0
+    thin = float(dice_loss(half[:1], wanted[:1]))
+    assert thin == pytest.approx(1 - 21 / 31)
+    wide = wanted[1:].clone()
+    wide[0, 14:] = 0
+    assert float(dice_loss(wide, wanted[1:])) == pytest.approx(thin, abs=0.02)
 
 
 def test_mask_targets_are_exact_shares() -> None:
@@ -112,7 +139,7 @@ def test_losses_are_finite_also_without_objects(rois: str) -> None:
     for targets in ([target, empty],) if rois == "proposals" else ([empty, empty],):
         boxes = rois == "proposals"
         losses = network_losses(model, [image, image], targets, generator, rois, boxes)  # type: ignore[arg-type]
-        names = {"mask", "maskiou"}
+        names = {"mask", "dice", "maskiou"}
         names |= {"objectness", "rpn_box", "class", "box"} if rois == "proposals" else set()
         assert set(losses) == names
         assert all(torch.isfinite(v) for v in losses.values())

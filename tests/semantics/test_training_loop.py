@@ -162,7 +162,7 @@ def test_an_interrupted_training_goes_on_as_if_nothing_had_been(
         torch.testing.assert_close(resumed.model.state_dict()[name], value)
     assert (tmp_path / "b" / CURVES).read_text() == (tmp_path / "a" / CURVES).read_text()
     rows = list(csv.DictReader((tmp_path / "a" / CURVES).open()))
-    assert {row["loss"] for row in rows} == {"mask", "maskiou"}
+    assert {row["loss"] for row in rows} == {"mask", "dice", "maskiou"}
     assert [int(row["step"]) for row in rows if row["loss"] == "mask"] == [0, 1, 2, 3]
     with pytest.raises(InputError, match=r"a training with rate 0\.001, now it is 0\.5"):
         train(network(), dataset, tmp_path / "a", replace(CONFIG, rate=0.5), quiet)

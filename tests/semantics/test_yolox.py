@@ -13,7 +13,7 @@ from semantics.coco_files import read_coco
 from semantics.image_files import read_colour
 from semantics.labels import label_set, read_label_set
 from semantics.network.boxes import iou
-from semantics.yolox import STRIDES, YoloxDetector, decode, letterbox
+from semantics.yolox import STRIDES, YoloxConfig, YoloxDetector, decode, letterbox, voted
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 ONNX = SHARED / "weights" / "yolox_nano.onnx"
@@ -59,6 +59,33 @@ def test_the_real_network_finds_large_objects_in_real_photographs() -> None:
             hits += bool((overlap > 0.6).any())
     assert total > 10
     assert hits / total > 0.6
+
+
+def test_a_kept_box_is_the_mean_of_those_of_its_class_that_lie_on_it() -> None:
+    boxes = torch.tensor([
+        [0.0, 0.0, 100.0, 100.0],
+        [0.0, 0.0, 110.0, 100.0],  # IoU 0.91 with the first
+        [0.0, 0.0, 100.0, 98.0],  # of another class
+        [0.0, 0.0, 100.0, 60.0],  # 0.6
+    ])  # fmt: skip
+    labels, scores = torch.tensor([1, 1, 2, 1]), torch.tensor([0.6, 0.2, 0.9, 0.5])
+    found = voted(boxes, scores, labels, torch.tensor([2, 0]), 0.8)
+    mean = 0.75 * boxes[0] + 0.25 * boxes[1]
+    torch.testing.assert_close(found, torch.stack([boxes[2], mean]))
+
+
+def test_with_the_mirror_image_a_mirrored_scene_has_the_mirrored_boxes() -> None:
+    detector = YoloxDetector(ONNX, YoloxConfig(min_score=0.2))
+    labels = read_label_set("coco")
+    image = read_colour(sorted((SHARED / "coco_excerpt" / "images").iterdir())[0])
+    one = detector.detect(image, labels)
+    other = detector.detect(np.ascontiguousarray(image[:, ::-1]), labels)
+    assert len(one.boxes) > 0
+    x1, y1, x2, y2 = other.boxes.unbind(1)
+    width = image.shape[1]
+    back = torch.stack([width - x2, y1, width - x1, y2], dim=1)
+    torch.testing.assert_close(back, one.boxes, atol=0.01, rtol=1e-4)
+    torch.testing.assert_close(other.scores, one.scores, atol=1e-4, rtol=1e-4)
 
 
 def test_only_classes_of_the_label_set_are_found() -> None:
