@@ -278,7 +278,9 @@ class LiveSlam:
                 f"frame at {timestamp_s}: not later than the one before, at {self._last_s}; leave "
                 "it out, or begin anew if the clock was set back"
             )
-        known = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype(np.float32, copy=False)
+        known = depth_m.astype(np.float32, copy=False)
+        if (missing := known <= 0).any():  # most sources say NaN, and a copy costs a millisecond
+            known = np.where(missing, np.float32(np.nan), known)
         return Frame(self._meter.frames, timestamp_s, rgb, known, name)
 
     def _show(self, result: FrameResult, rgb: NDArray[np.uint8]) -> None:

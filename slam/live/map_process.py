@@ -8,6 +8,7 @@ and with landmarks that may have been fused meanwhile, and are brought up to dat
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -50,6 +51,8 @@ from slam.tracker import Tracked
 logger = logging.getLogger(__name__)
 
 STATE_FILE = FileKind("live state", 1)
+NICENESS = 3
+"""Tracking goes first where there is a processor too few."""
 
 
 class LabelledNothing(NoSegmenter):
@@ -79,6 +82,7 @@ def serve_map(
     state: Path | None,
 ) -> None:
     """Keep a map, from a saved state on if there is one, until the channel ends."""
+    os.nice(NICENESS)
     segmenter = LabelledNothing(names)
     system = SlamSystem(camera, config, segmenter)
     system.semantics = SemanticMapper(
