@@ -1,0 +1,187 @@
+"""Where sequences, truths and trajectories are found; what is said where they are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graph.errors import InputError
+from graph.geometry import se3_exp
+from graph.trajectory import Trajectory, write_tum
+from slam.comparison.bar import JobBar
+from slam.comparison.cells import drawn_place, run_jobs
+from slam.comparison.data_folders import data_folders, find_site
+from slam.comparison.errors import Rules, trajectory_errors
+from slam.comparison.experiment import Configuration, Experiment, Quotation, SequenceSource
+from slam.comparison.external import parse_trajectory, published_cells, with_files
+from slam.comparison.job import Job, Outcome
+from slam.comparison.options import CompareOptions
+from slam.comparison.plan import make_plan
+from slam.comparison.result import CellStatus
+from slam.rendering.sequence import RenderConfig
+
+XYZ = SequenceSource("xyz", "tum/freiburg1_xyz")
+OFFICE = SequenceSource("office", render=RenderConfig("office", 5))
+
+
+def experiment(folder: Path, *sources: SequenceSource, **changes: object) -> Experiment:
+    return Experiment("mine", "", folder / "mine.yaml", sources or (XYZ,), **changes)
+
+
+def make(folder: Path, *names: str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / name).write_text("")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "place", ["tum/freiburg1_xyz", "freiburg1_xyz", "rgbd_dataset_freiburg1_xyz"]
+)
+@pytest.mark.parametrize("lists", [("rgb.txt",), ("associations.txt",)])
+def test_a_sequence_is_found_by_each_of_its_names(tmp_path, place, lists):
+    folder = make(tmp_path / "data" / place, *lists, "groundtruth.txt")
+    site = find_site(XYZ, experiment(tmp_path), [tmp_path / "data"], [])
+    assert (site.folder, site.reference, site.problem) == (folder, folder / "groundtruth.txt", "")
+
+
+@pytest.mark.parametrize("name", ["xyz-groundtruth.txt", "freiburg1_xyz_groundtruth.txt",
+                                  "fr1_xyz-groundtruth.txt"])  # fmt: skip
+def test_truth_without_images_is_found_beside_a_trajectory(tmp_path, name):
+    folder = make(tmp_path / "elsewhere", name)
+    site = find_site(XYZ, experiment(tmp_path), [], [folder / "estimate.txt"])
+    assert (site.folder, site.reference) == (None, folder / name)
+    assert "bmask-slam download tum/freiburg1_xyz" in site.problem
+
+
+def test_a_folder_without_lists_is_told(tmp_path):
+    folder = make(tmp_path / "freiburg1_xyz", "groundtruth.txt")
+    site = find_site(XYZ, experiment(tmp_path), [tmp_path], [])
+    assert site.folder is None
+    assert site.reference == folder / "groundtruth.txt"
+    assert site.problem.startswith(f"{folder}: holds no rgb.txt")
+
+
+def test_data_folders_come_from_options_and_environment(monkeypatch):
+    monkeypatch.setenv("BMASK_SLAM_DATA", "a:b")
+    assert data_folders([Path("c")]) == (Path("c"), Path("a"), Path("b"), Path("data"))
+
+
+@pytest.mark.parametrize("text", ["", "a=b", "a:=b", ":a=b", "a:b=", "a:b"])
+def test_a_trajectory_is_written_in_one_way(text):
+    with pytest.raises(InputError, match="METHOD:SEQUENCE=FILE"):
+        parse_trajectory(text)
+
+
+def test_a_method_may_have_a_colon():
+    assert parse_trajectory("A: b:xyz@2=f=1") == (("A: b", "xyz@2"), Path("f=1"))
+
+
+def test_a_given_file_replaces_the_experiments(tmp_path):
+    file = make(tmp_path, "f.txt") / "f.txt"
+    found = with_files(experiment(tmp_path), {("ORB", "xyz"): file})
+    assert found.systems["ORB"].trajectories == {"xyz": str(file)}
+
+
+def test_a_sequence_may_have_figures_from_two_sources(tmp_path):
+    quoted = (
+        Quotation("DVO", "one", figures={"ate_rmse": {"xyz": 0.01}, "tracked_share": {"xyz": 1}}),
+        Quotation("DVO", "two", True, {"ate_rmse": {"xyz": 0.02}}),
+    )
+    cells = list(published_cells(experiment(tmp_path, published=quoted)))
+    assert [(c.source, c.metrics) for c in cells] == [
+        ("one", {"ate_rmse": 0.01, "tracked_share": 1}),
+        ("two", {"ate_rmse": 0.02}),
+    ]
+
+
+def test_a_seed_draws_a_rendered_sequence_and_only_seeds_a_recorded_one(tmp_path):
+    folder = make(tmp_path / "freiburg1_xyz", "rgb.txt")
+    rows = {
+        "default": Configuration(segmenter="none"),
+        "other": Configuration(set=("covariances=true",)),
+    }
+    given = experiment(tmp_path, XYZ, OFFICE, configurations=rows, seeds=(3, 7))
+    plan = make_plan(given, tmp_path / "out", CompareOptions(data=(tmp_path,)))
+    assert set(plan.cells()) == set(plan.jobs)
+    assert len(plan.jobs) == 8
+    recorded = [plan.jobs["xyz", "default", seed] for seed in (3, 7)]
+    assert all(str(folder) in job.arguments for job in recorded)
+    assert [job.arguments[-1] for job in recorded] == [
+        f"loops.verification.seed={seed}" for seed in (3, 7)
+    ]
+    assert recorded[0].depends["sequence"] == recorded[1].depends["sequence"]
+    drawn = [plan.jobs["office", "default", seed] for seed in (3, 7)]
+    assert drawn[0].depends["sequence"] != drawn[1].depends["sequence"]
+    renders = [plan.place("office", seed).render for seed in (3, 7)]
+    for job, render, seed in zip(drawn, renders, (3, 7), strict=True):
+        assert str(Path(render.product).parent) in job.arguments
+        assert render.arguments[:4] == ("render", "office", "--seed", str(seed))
+    assert not drawn[0].sequence
+    assert plan.jobs["office", "other", 3].sequence, "labels are compared with the truth"
+
+
+def test_what_a_cell_depends_on(tmp_path):
+    """Each change of configuration or images is seen; a moved folder is not."""
+
+    def depends(source: SequenceSource, configuration: Configuration) -> dict[str, str]:
+        given = experiment(tmp_path, source, configurations={"default": configuration})
+        place = drawn_place(source, source.render, 0, tmp_path)
+        return run_jobs(given, [place], tmp_path)["office", "default", 0].depends
+
+    base = depends(OFFICE, Configuration())
+    assert base == depends(OFFICE, Configuration(note="told otherwise"))
+    assert base != depends(OFFICE, Configuration(set=("tracking.min_inliers=21",)))
+    assert base != depends(OFFICE, Configuration(max_frames=3))
+    assert base != depends(
+        SequenceSource("office", render=RenderConfig("office", 6)), Configuration()
+    )
+
+
+def test_truth_that_covers_a_part(tmp_path):
+    """Only what has a truth within the limit is compared, and how much that is, is told."""
+    stamps = np.arange(100) / 10
+    xi = np.column_stack(
+        [0.1 * np.sin(stamps), 0 * stamps, 0 * stamps, stamps, stamps**2 / 9, 0 * stamps]
+    )
+    truth = Trajectory(stamps, se3_exp(xi))
+    write_tum(tmp_path / "estimate.txt", truth.moved(se3_exp([1, 0, 0, 5, 5, 5])))
+    late = Trajectory(stamps[40:90] + 0.015, truth.poses_world_camera[40:90])
+    write_tum(tmp_path / "truth.txt", late)
+    files = tmp_path / "estimate.txt", tmp_path / "truth.txt"
+    found = trajectory_errors(*files, Rules(0.02), frames=200)
+    assert found["evaluated_share"] == 0.5
+    assert found["tracked_share"] == 0.5
+    assert found["ate_rmse"] == pytest.approx(0, abs=1e-6)
+    assert found["rpe_trans_rmse_metre"] == pytest.approx(0, abs=1e-6)
+    with pytest.raises(InputError, match="0 of 100 poses"):
+        trajectory_errors(*files, Rules(0.01))
+
+
+def test_sim3_only_where_it_is_asked_for(tmp_path):
+    stamps = np.arange(50) / 10
+    truth = Trajectory(stamps, se3_exp(np.random.default_rng(0).normal(0, 1, (50, 6))))
+    half = truth.poses_world_camera.copy()
+    half[:, :3, 3] /= 2
+    write_tum(tmp_path / "estimate.txt", Trajectory(stamps, half))
+    write_tum(tmp_path / "truth.txt", truth)
+    files = tmp_path / "estimate.txt", tmp_path / "truth.txt"
+    assert trajectory_errors(*files, Rules(0.02))["ate_rmse"] > 0.1
+    assert trajectory_errors(*files, Rules(0.02, True))["ate_rmse"] == pytest.approx(0, abs=1e-6)
+
+
+def test_the_time_left_follows_from_jobs_of_the_same_group():
+    def job(group: str, command: str = "run") -> Job:
+        return Job(group, group, (command,), "", "", "")
+
+    jobs = [job("a"), job("a"), job("b"), job("r", "render")]
+    with JobBar(jobs, 2, quiet=True) as bar:
+        assert bar.left_s() == 0
+        bar.update(jobs[0], Outcome(CellStatus.DONE, wall_s=10))
+        assert bar.left_s() == (10 + 10 + 10) / 2
+        bar.update(jobs[3], Outcome(CellStatus.DONE, wall_s=100))
+        assert bar.left_s() == (10 + 10) / 2
+        bar.update(jobs[2], Outcome(CellStatus.FAILED, wall_s=1))
+        assert bar.left_s() == 5
