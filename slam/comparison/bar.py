@@ -54,6 +54,12 @@ class JobBar:
         self._bar.set_postfix_str(f"{_minutes(self.left_s())} left{failed}, {job.name}", False)
         self._bar.update()
 
+    def drop(self, job: Job) -> None:
+        """A job will not be run."""
+        self._left.remove(job)
+        self._failed += 1
+        self._bar.update()
+
     def left_s(self) -> float:
         """Expected seconds until all jobs are done; 0 while nothing is known."""
         known = [mean(took) for took in self._took_s.values()]

@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ def compare(
         plan = make_plan(experiment, folder, options)
         origin = provenance(experiment, pool.workers)
         cells: Cells = {key: _pending(plan, key) for key in plan.cells()}
-        others = (*_other_cells(plan),)
+        others = tuple(_other_cells(plan))
 
         def save() -> Comparison:
             comparison = _comparison(plan, (*cells.values(), *others), origin)
@@ -70,6 +70,7 @@ def compare(
 
         save()
         _carry_out(plan, pool, cells, save, options.quiet)
+        others = tuple(_other_cells(plan))  # the truth of what is rendered is there only then
         comparison = save()
         write_report(comparison, folder)
         return comparison
@@ -83,37 +84,34 @@ def _carry_out(
     plan: Plan, pool: Pool, cells: Cells, save: Callable[[], object], quiet: bool
 ) -> None:
     """Render what is missing, then run what is missing; each cell is saved when it ends."""
-    keys = {job.record: key for key, job in plan.jobs.items()}
-    for key, job in plan.jobs.items():
-        outcome = finished(job)
-        if outcome is not None:
-            cells[key] = _run_cell(plan, key, outcome)
+    before = {key: finished(job) for key, job in plan.jobs.items()}
+    cells |= {key: _run_cell(plan, key, outcome) for key, outcome in before.items() if outcome}
     save()
-    runs = [job for key, job in plan.jobs.items() if cells[key].status is not CellStatus.DONE]
-    drawn = [p.render for p in plan.places if p.render and not finished(p.render)]
-    with JobBar([*drawn, *runs], pool.workers, quiet) as bar:
-        undrawn = _draw(pool, drawn, bar)
-        for key, job in plan.jobs.items():
+    left = {plan.jobs[key].record: key for key, outcome in before.items() if outcome is None}
+    undrawn = [p.render for p in plan.places if p.render and not finished(p.render)]
+    with JobBar([*undrawn, *(plan.jobs[key] for key in left.values())], pool.workers, quiet) as bar:
+        failed = _draw(pool, undrawn, bar)
+        for record, key in list(left.items()):
             render = plan.place(key[0], key[2]).render
-            if render is not None and render.record in undrawn:
-                error = f"rendering failed: {undrawn[render.record].error}"
-                log = _shown(plan, render.log)
-                cells[key] = replace(cells[key], status=CellStatus.FAILED, error=error, log=log)
-                runs = [run for run in runs if run != job]
-        for job, outcome in pool.run(runs):
-            key = keys[job.record]
-            cells[key] = _run_cell(plan, key, outcome)
-            bar.update(job, outcome)
-            save()
+            if render is not None and render.record in failed:
+                cells[key] = _not_drawn(plan, cells[key], render, failed[render.record])
+                bar.drop(plan.jobs[left.pop(record)])
+        with closing(pool.run([plan.jobs[key] for key in left.values()])) as ended:
+            for job, outcome in ended:
+                key = left[job.record]
+                cells[key] = _run_cell(plan, key, outcome)
+                bar.update(job, outcome)
+                save()
 
 
 def _draw(pool: Pool, jobs: list[Job], bar: JobBar) -> dict[str, Outcome]:
     """Render sequences; those that failed, by their records."""
     failed = {}
-    for job, outcome in pool.run(jobs):
-        bar.update(job, outcome)
-        if outcome.status is not CellStatus.DONE:
-            failed[job.record] = outcome
+    with closing(pool.run(jobs)) as ended:
+        for job, outcome in ended:
+            bar.update(job, outcome)
+            if outcome.status is not CellStatus.DONE:
+                failed[job.record] = outcome
     return failed
 
 
@@ -125,6 +123,12 @@ def _pending(plan: Plan, key: Key) -> Cell:
     sequence, method, seed = key
     problem = plan.place(sequence, seed).problem
     return Cell(sequence, method, seed, CellStatus.PENDING, error=problem)
+
+
+def _not_drawn(plan: Plan, cell: Cell, render: Job, outcome: Outcome) -> Cell:
+    """A cell whose sequence could not be rendered."""
+    error, log = f"rendering failed: {outcome.error}", _shown(plan, render.log)
+    return replace(cell, status=CellStatus.FAILED, error=error, log=log)
 
 
 def _run_cell(plan: Plan, key: Key, outcome: Outcome) -> Cell:

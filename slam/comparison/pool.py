@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from types import TracebackType
@@ -22,7 +22,7 @@ class Pool(Protocol):
     @property
     def workers(self) -> int: ...
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Done]:
+    def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
         """Yield each job with its outcome as it ends; when closed early, the others are ended."""
         ...
 
@@ -62,7 +62,7 @@ class LocalPool:
     def workers(self) -> int:
         return self._workers
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Done]:
+    def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
         """See `Pool.run`."""
         self._stopping = False
         with ThreadPoolExecutor(self._workers) as executor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from types import TracebackType
 from typing import Any
 
@@ -59,7 +59,7 @@ class RayPool:
         """CPUs of the cluster."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Done]:
+    def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
         """See `slam.comparison.pool.Pool.run`."""
         waiting = {self._remote.remote(job): job for job in jobs}
         try:

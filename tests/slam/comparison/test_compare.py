@@ -48,12 +48,13 @@ def data(tmp_path_factory) -> Path:
 
 
 def run_again(data: Path, out: Path) -> Comparison:
-    return compare(data / "mine.yaml", out, CompareOptions(quiet=True))
+    options = CompareOptions(configurations=("default",), quiet=True)
+    return compare(data / "mine.yaml", out, options)
 
 
 def test_a_comparison(data, tmp_path):
     out = tmp_path / "out"
-    found = run_again(data, out)
+    found = compare(data / "mine.yaml", out, CompareOptions(quiet=True))
     cells = {cell.method: cell for cell in found.cells}
     assert [m.name for m in found.methods] == ["default", "broken", "other", "paper"]
     status = {name: cell.status for name, cell in cells.items()}
@@ -84,6 +85,20 @@ def test_a_comparison(data, tmp_path):
     record.write_text(json.dumps(changed))
     run_again(data, out)
     assert json.loads(record.read_text())["depends"]["code"] != "another"
+
+
+def test_a_sequence_that_cannot_be_rendered_fails_its_cells_alone(data, tmp_path):
+    """The path of the office has fewer frames; a trajectory of a rendered room finds its truth."""
+    text = EXPERIMENT.partition("  broken")[0].replace(
+        "sequences: {office: office}",
+        "sequences: {office: office, long: {render: {name: office, frames: 9999, width: 160}}}",
+    )
+    (data / "long.yaml").write_text(text)
+    found = compare(data / "long.yaml", tmp_path / "out", CompareOptions(quiet=True))
+    office, long = found.cells
+    assert (office.status, long.status) == (DONE, FAILED)
+    assert long.error.startswith("rendering failed: frames=9999: the path of 'office' has")
+    assert "9999" in (tmp_path / "out" / long.log).read_text()
 
 
 def start(data: Path, out: Path) -> subprocess.Popen:
@@ -128,8 +143,7 @@ def test_killed_and_interrupted_it_goes_on_without_repeating(data, tmp_path):
     with start(data, out) as process:
         wait_for(logs[1], process)
         process.send_signal(signal.SIGKILL)
-    statuses = [cell.status for cell in read_results(out).cells]
-    assert statuses == [DONE, CellStatus.PENDING]
+    assert not records[1].exists()
     first = records[0].stat().st_mtime_ns
     logs[1].unlink()
     with start(data, out) as process:
