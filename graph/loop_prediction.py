@@ -49,11 +49,13 @@ def _draws(A: csr_array, used: Mask, d: int) -> Array:
     """Draws (N d, SAMPLES) of all tangents: normal equations with random right-hand sides.
 
     ``x = H^-1 A^T e`` with ``H = A^T A`` and white e has the covariance ``H^-1``: a factorisation
-    and one solve a draw, where covariances would need one for each pair of poses asked.
+    and one solve a draw, where covariances would need one for each pair of poses asked. The gauge
+    does not err, so that the world stays where it is.
     """
     with_gauge = np.append(used, np.ones(A.shape[0] // d - len(used), bool))
     rows = np.repeat(with_gauge, d)
     noise = np.random.default_rng(SEED).normal(size=(len(rows), SAMPLES))
+    noise[len(used) * d :] = 0.0
     A, noise = A[rows], noise[rows]
     symmetric = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     factor = splu(csc_array(A.T @ A), permc_spec="MMD_AT_PLUS_A", **symmetric)
