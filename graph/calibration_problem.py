@@ -63,6 +63,11 @@ class CalibrationState:
     points: Array
     calibration: Array
 
+    @property
+    def values(self) -> tuple[Array, Array, Array]:
+        """All three, as ``linearise`` takes them."""
+        return self.poses, self.points, self.calibration
+
 
 def prior_residuals(problem: CalibrationProblem, state: CalibrationState) -> tuple[Array, Array]:
     """Of the first pose (6,) and of the calibration (12,), zero for what is held fixed."""

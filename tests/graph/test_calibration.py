@@ -9,8 +9,10 @@ import pytest
 from calibration_scene import PRIORS, TRUTH, make_problem
 
 from graph.calibration import calibrate
+from graph.calibration_covariance import _clustered_variance
+from graph.calibration_equations import normal_equations
 from graph.calibration_model import FACTOR, OFFSET, PARAMETERS, TIME, linearise
-from graph.calibration_problem import Anchors, CalibrationProblem
+from graph.calibration_problem import Anchors, CalibrationProblem, CalibrationState
 from graph.geometry import Array, se3_exp
 
 START = TRUTH + np.array([15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010])
@@ -144,3 +146,34 @@ def test_stated_uncertainty_is_honest() -> None:
     assert 0.55 < np.sqrt(np.mean(np.square(z))) < 1.2
     assert np.abs(z).max() < 4
     assert 0.5 * len(free) < np.mean(nees) < 1.5 * len(free)
+
+
+def test_errors_that_a_stretch_of_the_path_shares_widen_the_bounds() -> None:
+    """Each pair of keyframes sees the images a little too large or too small."""
+
+    def ratio(spread: float) -> Array:
+        """Stated sigmas of the focal lengths over those of independent errors, (2,)."""
+        problem, poses, _ = make_problem(seed=1, noise=0.3, keyframes=16, points=80)
+        views, rng = problem.views, np.random.default_rng(1)
+        larger = 1 + spread * rng.standard_normal(8)[views.keyframes // 2]
+        pixels = TRUTH[2:4] + larger[:, None] * (views.pixels - TRUTH[2:4])
+        problem = dataclasses.replace(problem, views=dataclasses.replace(views, pixels=pixels))
+        problem = anchored(problem, poses, 0.01)
+        result = calibrate(problem)
+        state = CalibrationState(result.poses_world_camera, result.points_world, result.calibration)
+        S = normal_equations(problem, state, result.noise_scales, 0.0).S
+        independent = np.sqrt(np.diag(np.linalg.inv(S))[-12:-10])
+        return np.sqrt(np.diag(result.covariance)[:2]) / independent
+
+    assert (ratio(0.0) < 1.5).all()
+    assert (ratio(0.004) > 1.7).all()
+
+
+def test_clustered_variances_are_sums_of_squares_raised_to_students_bound() -> None:
+    scores = np.random.default_rng(0).standard_normal((40, 12))
+    clusters = np.repeat(np.arange(5), 8)
+    total = sum(scores[clusters == c].sum(axis=0) ** 2 for c in range(5))
+    bound = 2.776445 / 1.959964  # Student's t, 4 degrees of freedom
+    np.testing.assert_allclose(
+        _clustered_variance(scores, clusters), total * 5 / 4 * bound**2, rtol=1e-5
+    )
