@@ -32,6 +32,8 @@ from slam.evaluation import (
 )
 from slam.evaluation.plot import plot_trajectory
 from slam.landmark_cloud import LANDMARKS_COMMENT
+from slam.map_file import MAP, read_map, write_map
+from slam.optimised_map import optimised_map
 from slam.run_folder import RunFolder
 from slam.run_results import EVALUATION_ROWS
 from slam.saved_run import SavedRun, read_run
@@ -137,6 +139,11 @@ def _write(
     write_ply(folder.path / "landmarks.ply", columns, LANDMARKS_COMMENT)
     with folder.replacing("graph") as graph:
         write_graph(graph, run.shadow, run.camera)
+    if (run.path / MAP).is_file():
+        state, camera = read_map(run.path)
+        state = optimised_map(state, run.shadow, adjustment, camera, run.path / MAP)
+        with folder.replacing(MAP) as file:
+            write_map(file, state, camera)
     result = RunAdjustment(
         folder.path,
         adjustment,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graph.array_file import part
 from graph.errors import InputError
 from graph.g2o_landmarks_reader import read_landmark_graph
 from graph.geometry import inverse, make_pose, se3_exp, so3_exp
@@ -14,6 +15,8 @@ from graph.ply import read_ply
 from graph.storage import read_graph, write_graph
 from graph.trajectory import Trajectory, read_tum, write_tum
 from slam import cli
+from slam.map_file import read_map
+from slam.map_state import world_of
 from slam.run_adjustment import carry_along
 from slam.runner import RunOptions, run
 from slam.saved_run import read_run
@@ -93,8 +96,7 @@ def test_a_run_folder_becomes_a_better_one(capsys, kitchen: Path, tmp_path: Path
     assert "wrong views" in printed
     assert str(out / "before_after.png") in printed
     assert {p.name: p.read_bytes() for p in kitchen.iterdir()} == before
-    missing = {"map"}  # its values would have to be those of the new graph
-    assert {p.name for p in out.iterdir()} >= {*before, "before_after.png"} - missing
+    assert {p.name for p in out.iterdir()} >= {*before, "before_after.png"}
     assert value(out, "cost_final") < value(out, "cost_initial")
     assert value(out, "ate_rmse") < 1.05 * value(kitchen, "ate_rmse")
     old, new = (read_tum(folder / "trajectory.txt") for folder in (kitchen, out))
@@ -128,6 +130,37 @@ def test_keyframes_landmarks_and_graph_fit_together(kitchen: Path, tmp_path: Pat
     assert optimise(out, "--out", again, "--quiet") == 0
     T = read_tum(again / "trajectory.txt").poses_world_camera
     assert np.abs(T - frames.poses_world_camera).max() < 5e-3
+
+
+def test_the_map_that_is_left_is_the_adjusted_one(kitchen: Path, tmp_path: Path) -> None:
+    """Its poses are the graph's, and other runs are localised in it, or go on with it."""
+    out = tmp_path / "adjusted"
+    assert optimise(kitchen, "--out", out, "--quiet") == 0
+    state, camera = read_map(out)
+    assert camera == read_map(kitchen)[1]
+    shadow, _ = read_graph(out / "graph")
+    poses, given = (
+        of["mapper.world.keyframes.T_world_camera"] for of in (state, read_map(kitchen)[0])
+    )
+    np.testing.assert_array_equal(poses, shadow.keyframes.values)
+    assert (
+        np.abs(poses - read_map(kitchen)[0]["mapper.world.keyframes.T_world_camera"]).max() > 1e-5
+    )
+    world = world_of(part(state, "mapper.world"))
+    inside = np.flatnonzero(world.landmarks.in_graph)
+    np.testing.assert_array_equal(inside, shadow.landmarks.ids)
+    np.testing.assert_array_equal(world.landmarks.points_world[inside], shadow.landmarks.values)
+    config = SystemConfig(final_adjustment=False)
+    for name in ("localise", "map"):
+        options = RunOptions(
+            KITCHEN, config, out=tmp_path / name, max_frames=12, quiet=True, **{name: out}
+        )
+        found = read_tum(run(options).folder / "trajectory.txt")
+        expected = read_tum(out / "trajectory.txt")
+        assert len(found) >= 10
+        at = np.searchsorted(found.timestamps_s, expected.timestamps_s[:5])
+        error_m = found.positions_world[at] - expected.positions_world[:5]
+        assert np.linalg.norm(error_m, axis=1).max() < 0.02
 
 
 def test_the_exported_graph_is_adjusted_to_the_same_cost(kitchen: Path, tmp_path: Path) -> None:
