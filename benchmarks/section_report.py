@@ -46,6 +46,11 @@ REPORTS = {
     "graph": Report(ROOT / "docs" / "graph.md", "What the graph reaches", {
         "session": ("A long session with bounded cost", "long_session.py"),
         "loops": ("Loops closed, and wrong ones survived", "loop_closing.py {sequences}/corridor"),
+        "loop-limits": (
+            "How much closed loops can take away",
+            "loop_limits.py {sequences}/results/corridor-default "
+            "{sequences}/results/corridor-no-loop-closed --reference {sequences}/corridor",
+        ),
         "pose-graphs": ("Pose graphs, clean and with wrong loops", "pose_graphs.py"),
         "kills": (
             "Killed and resumed",
