@@ -103,6 +103,7 @@ class Experiment:
         with_scale: align all runs by Sim(3).
         max_time_difference_s: largest difference of the stamps of poses that belong together.
         verdicts: metrics by which configurations are judged.
+        networks: folders of trained networks by name, whose curves the report draws.
     """
 
     name: str
@@ -117,3 +118,4 @@ class Experiment:
     with_scale: bool = False
     max_time_difference_s: float = MAX_TIME_DIFFERENCE_S
     verdicts: tuple[str, ...] = VERDICT_METRICS
+    networks: dict[str, Path] = field(default_factory=dict)

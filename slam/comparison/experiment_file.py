@@ -26,7 +26,7 @@ from slam.system_config import SystemConfig
 from slam.yaml_text import read_yaml
 
 NAME = re.compile(r"[^/\\@=:\n]{1,60}")
-GROUPS = ("sequences", "configurations", "systems", "published")
+GROUPS = ("sequences", "configurations", "systems", "published", "networks")
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,7 @@ def read_experiment(name: str | Path) -> Experiment:
         plain.with_scale,
         plain.max_time_difference_s,
         plain.verdicts,
+        dict(_networks(file, tree.get("networks"))),
     )
 
 
@@ -160,6 +161,16 @@ def _systems(file: Path, tree: Any) -> Iterator[tuple[str, OtherSystem]]:
                 raise InputError(f"{where}.trajectories.{sequence} = {path!r}: give a file's path")
         plain = from_tree(OtherSystem, keys, where)
         yield name, OtherSystem(plain.note, plain.with_scale, files)
+
+
+def _networks(file: Path, tree: Any) -> Iterator[tuple[str, Path]]:
+    """A folder each, as a path from the experiment's file on."""
+    for name, path in _mapping(tree or {}, str(file), "networks").items():
+        if not isinstance(path, str) or not (file.parent / path).is_dir():
+            raise InputError(
+                f"{file}: networks.{name} = {path!r}: no such folder; give that of a training"
+            )
+        yield name, (file.parent / path).absolute()
 
 
 def _quotations(file: Path, tree: Any) -> Iterator[Quotation]:

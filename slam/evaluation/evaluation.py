@@ -76,9 +76,9 @@ def evaluate_trajectory(
 ) -> EvaluationResult:
     """Compare an estimate with a reference whose world frame may be another.
 
-    Poses are associated by stamp; the alignment is SE(3), or Sim(3) with ``with_scale``
-    (for monocular systems only). ``expected_frames``, the frames that the system was given, adds
-    the share that it tracked.
+    Poses are associated by stamp; the alignment is SE(3), or Sim(3) with ``with_scale`` (for
+    monocular systems only), whose scale relative errors are taken with too. ``expected_frames``,
+    the frames that the system was given, adds the share that it tracked.
 
     Raises:
         InputError: fewer than three poses belong together.
@@ -91,10 +91,11 @@ def evaluate_trajectory(
             f"{_span(estimate)}, reference {_span(reference)}: use the same clock in both"
         )
     absolute = absolute_error(matched, truth, with_scale)
-    per_frame = relative_error(matched, truth, frame_pairs(len(matched)))
-    per_second = relative_error(matched, truth, time_pairs(matched.timestamps_s))
+    scaled = absolute.alignment.apply(matched) if with_scale else matched
+    per_frame = relative_error(scaled, truth, frame_pairs(len(matched)))
+    per_second = relative_error(scaled, truth, time_pairs(matched.timestamps_s))
     path_pairs = distance_pairs(truth.positions_world)
-    per_metre = relative_error(matched, truth, path_pairs)
+    per_metre = relative_error(scaled, truth, path_pairs)
     rows = _absolute_rows(absolute) + _relative_rows("frame", per_frame)
     rows += _relative_rows("second", per_second) + _relative_rows("metre", per_metre)
     rows += _coverage_rows(estimate, reference, matched)

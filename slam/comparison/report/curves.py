@@ -26,12 +26,12 @@ logger = logging.getLogger(__name__)
 
 
 def network_pictures(comparison: Comparison, folder: Path) -> list[Picture]:
-    """Losses and precision-recall curves of the networks that the provenance names.
+    """Losses and precision-recall curves of the networks that the experiment names.
 
-    ``provenance["networks"]`` gives the folder of each by name: that of ``bmask-slam train``, in
-    which ``evaluate-segmentation --curves`` has put its file.
+    Each name has a folder: that of ``bmask-slam train``, in which ``evaluate-segmentation
+    --curves`` has put its file.
     """
-    named = comparison.provenance.get("networks") or {}
+    named = (comparison.provenance.get("experiment") or {}).get("networks") or {}
     folders = {str(name): folder / str(path) for name, path in named.items()}
     losses = _of_all(folders, LOSSES, read_losses, TOTAL)
     precision = _of_all(folders, CURVES, read_precision, MASKS)

@@ -11,16 +11,17 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from graph.errors import InputError
-from graph.metrics import AbsoluteError, RelativeError, absolute_error, relative_error, time_pairs
-from graph.trajectory import Trajectory, associate
+from graph.metrics import AbsoluteError, RelativeError
+from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate
 from graph.trajectory_formats import read_trajectory
+from slam.comparison.errors import Rules
 from slam.comparison.report.drawing import as_picture, figure
 from slam.comparison.report.section import Picture
 from slam.comparison.report.table import ATE, values
 from slam.comparison.result import Cell, CellStatus, Comparison, Method
+from slam.evaluation import evaluate_trajectory, read_reference
 from slam.evaluation.plot import draw_top_view
 
-MIN_POSES = 3
 MAX_DIFFERENCES = 300
 VISIBLE_SHARE = 0.04  # of the path's extent, for an RMSE
 ENLARGED = (1, 2, 5, 10, 20, 50, 100)
@@ -142,24 +143,28 @@ def draw_relative(axes: Axes, errors: Errors, top_cm: float) -> None:
     axes.legend(loc="upper right")
 
 
-def read_errors(cell: Cell, folder: Path, with_scale: bool) -> Errors | None:
+def read_errors(cell: Cell, folder: Path, rules: Rules) -> Errors | None:
     """The errors of a cell's trajectory; None, with a warning, where they cannot be made."""
     if cell.status is not CellStatus.DONE or not cell.trajectory or not cell.reference:
         return None
+    largest_s = rules.max_time_difference_s
     try:
-        estimate, reference = (
-            read_trajectory(folder / f) for f in (cell.trajectory, cell.reference)
-        )
-        matched, truth = associate(estimate, reference)
-        if len(matched) < MIN_POSES:
-            raise InputError(f"{folder / cell.trajectory}: no {MIN_POSES} poses have a reference")
+        estimate = read_trajectory(folder / cell.trajectory)
+        reference = read_reference(folder / cell.reference)
+        result = evaluate_trajectory(estimate, reference, None, rules.with_scale, largest_s)
     except InputError as error:
         logger.warning("no error figure: %s", error)
         return None
-    absolute = absolute_error(matched, truth, with_scale)
-    scaled = absolute.alignment.apply(matched)
-    relative = relative_error(scaled, truth, time_pairs(matched.timestamps_s))
-    return Errors(cell, absolute.alignment.apply(estimate), reference, absolute, truth, relative)
+    truth = associate(estimate, reference, largest_s)[1]
+    aligned = result.absolute.alignment.apply(estimate)
+    return Errors(cell, aligned, reference, result.absolute, truth, result.per_second)
+
+
+def stated_rules(comparison: Comparison, method: Method) -> Rules:
+    """How a method's trajectories were compared."""
+    experiment = comparison.provenance.get("experiment") or {}
+    largest_s = experiment.get("max_time_difference_s", MAX_TIME_DIFFERENCE_S)
+    return Rules(float(largest_s), method.with_scale)
 
 
 def _middle_errors(
@@ -167,7 +172,8 @@ def _middle_errors(
 ) -> Errors | None:
     """Of the cells of a method the one whose ATE is in the middle, if it can be drawn."""
     cells = sorted(_measured(comparison, sequence, method), key=lambda c: values([c], ATE))
-    return read_errors(cells[(len(cells) - 1) // 2], folder, method.with_scale) if cells else None
+    rules = stated_rules(comparison, method)
+    return read_errors(cells[(len(cells) - 1) // 2], folder, rules) if cells else None
 
 
 def _measured(comparison: Comparison, sequence: str, method: Method) -> Iterator[Cell]:

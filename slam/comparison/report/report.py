@@ -11,6 +11,7 @@ from slam.comparison.report.section import Section, slug
 from slam.comparison.report.sections import make_sections, summary
 from slam.comparison.report.table import metric_tables
 from slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
+from slam.comparison.report.verdict_tables import ablation_table, verdict_tables
 from slam.comparison.result import Comparison
 
 PAGE = "report.html"
@@ -24,7 +25,9 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
     warning. The same comparison and files give the same bytes.
     """
     sections, sentences = make_sections(comparison, folder), summary(comparison)
-    tables = metric_tables(comparison)
+    ablation = ablation_table(comparison)
+    tables = [*metric_tables(comparison), *([ablation] if ablation else [])]
+    tables += verdict_tables(comparison)
     title = comparison.title or comparison.name
     texts = {
         PAGE: html_text(title, comparison.description, sentences, sections),

@@ -13,6 +13,12 @@ from slam.comparison.report.figures import error_pictures
 from slam.comparison.report.run_files import map_pictures, stage_table
 from slam.comparison.report.section import Listing, Section
 from slam.comparison.report.table import ATE, cell_name, cell_tables, metric_table, metric_tables
+from slam.comparison.report.verdict_tables import (
+    RULE,
+    ablation_table,
+    verdict_sentences,
+    verdict_tables,
+)
 from slam.comparison.result import Cell, CellStatus, Comparison
 
 LOG_LINES = 15
@@ -23,6 +29,7 @@ def make_sections(comparison: Comparison, folder: Path) -> list[Section]:
     """All sections that have something to say; files are looked for in ``folder``."""
     sections = [
         _absolute_errors(comparison),
+        _differences(comparison),
         _failures(comparison, folder),
         *_error_figures(comparison, folder),
         _other_metrics(comparison),
@@ -42,14 +49,18 @@ def summary(comparison: Comparison) -> list[str]:
     counts += f"{_count(comparison.cells, 'cell')}"
     failed, pending = states[CellStatus.FAILED], states[CellStatus.PENDING]
     if not failed and not pending:
-        return [f"{counts}, all done."]
+        return [f"{counts}, all done.", *verdict_sentences(comparison)]
     reasons = dict.fromkeys(
         f"{cell.sequence}: {cell.error}"
         for cell in comparison.cells
         if cell.status is CellStatus.PENDING and cell.error
     )
     done = states[CellStatus.DONE]
-    return [f"{counts}: {done} done, {failed} failed, {pending} pending.", *reasons]
+    return [
+        f"{counts}: {done} done, {failed} failed, {pending} pending.",
+        *verdict_sentences(comparison),
+        *reasons,
+    ]
 
 
 def log_tail(cell: Cell, folder: Path) -> str:
@@ -69,6 +80,13 @@ def _absolute_errors(comparison: Comparison) -> Section:
         "a failed run is marked, and takes no part in what is best.",
     )
     return Section("Absolute trajectory error", text, (table,)) if table else Section("")
+
+
+def _differences(comparison: Comparison) -> Section:
+    tables = verdict_tables(comparison)
+    ablation = ablation_table(comparison)
+    text = (RULE,) if tables else ()
+    return Section("Differences", text, (*([ablation] if ablation else []), *tables))
 
 
 def _failures(comparison: Comparison, folder: Path) -> Section:

@@ -16,11 +16,15 @@ import pytest
 from pypdf import PdfReader
 from small_comparison import HOSTILE, WAVE_M, make_comparison
 
+from graph.trajectory import Trajectory, read_tum, write_tum
+from slam.comparison.errors import Rules, trajectory_errors
 from slam.comparison.metric_table import BY_NAME
 from slam.comparison.report import write_report
 from slam.comparison.report.figures import common_scales, read_errors
 from slam.comparison.report.table import ATE, metric_table
 from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
+
+RULES = Rules(0.02)
 
 
 @pytest.fixture(scope="module")
@@ -179,9 +183,11 @@ def test_nothing_finished_is_a_report_too(comparison, tmp_path):
 
 
 def test_markdown_tables_keep_their_columns(written):
-    rows = [x for x in written["tables.md"].decode().splitlines() if x.startswith("|")]
-    assert rows
-    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {4}
+    tables = written["tables.md"].decode().split("\n## ")[1:]
+    assert len(tables) > 2
+    for table in tables:
+        rows = [line for line in table.splitlines() if line.startswith("|")]
+        assert len({len(re.findall(r"(?<!\\)\|", row)) for row in rows}) == 1, table
 
 
 def test_the_same_comparison_gives_the_same_bytes(comparison, written, folder):
@@ -191,19 +197,34 @@ def test_the_same_comparison_gives_the_same_bytes(comparison, written, folder):
 
 def test_the_drawn_errors_are_those_of_the_trajectories(comparison, folder):
     """The height swings by 5 cm: an RMSE of 5 cm / sqrt(2), which no alignment takes away."""
-    errors = read_errors(comparison.cells[0], folder, with_scale=False)
+    errors = read_errors(comparison.cells[0], folder, RULES)
     assert errors.absolute.translation_m.rmse == pytest.approx(WAVE_M / np.sqrt(2), rel=0.01)
     step_m = 2 * WAVE_M * np.sin(3 * np.pi / 10)  # amplitude of a swing's difference over a second
     assert errors.per_second.translation_m.max == pytest.approx(step_m, rel=0.02)
 
 
+@pytest.mark.parametrize("with_scale", [False, True])
+def test_the_drawn_errors_are_those_of_the_tables(comparison, folder, with_scale):
+    """Of a path half as large: its scale must be found for relative errors too."""
+    small = read_tum(folder / "bad.txt")
+    poses = small.poses_world_camera.copy()
+    poses[:, :3, 3] *= 0.5
+    write_tum(folder / "small.txt", Trajectory(small.timestamps_s, poses))
+    rules = Rules(0.02, with_scale)
+    drawn = read_errors(replace(comparison.cells[0], trajectory="small.txt"), folder, rules)
+    table = trajectory_errors(folder / "small.txt", folder / "truth.txt", rules)
+    assert drawn.absolute.translation_m.rmse == pytest.approx(table["ate_rmse"])
+    assert drawn.per_second.translation_m.rmse == pytest.approx(table["rpe_trans_rmse_second"])
+    assert (table["rpe_trans_rmse_second"] < 0.2) == with_scale
+
+
 def test_figures_of_a_sequence_share_their_scales(comparison, folder):
-    good, bad = (read_errors(comparison.cells[k], folder, with_scale=False) for k in (0, 2))
+    good, bad = (read_errors(comparison.cells[k], folder, RULES) for k in (0, 2))
     together = common_scales([good, bad])
     assert together.top_cm == common_scales([bad]).top_cm > common_scales([good]).top_cm
     assert together.enlarged == common_scales([bad]).enlarged <= common_scales([good]).enlarged
 
 
 def test_a_missing_trajectory_leaves_its_figure_out(comparison, folder, caplog):
-    assert read_errors(comparison.cells[-1], folder, with_scale=False) is None
+    assert read_errors(comparison.cells[-1], folder, RULES) is None
     assert "missing.txt" in caplog.text

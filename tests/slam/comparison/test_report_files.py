@@ -98,7 +98,7 @@ def test_networks_are_drawn_beside_each_other(comparison, tmp_path, caplog):
     write_losses(tmp_path / "a", 1.0)
     write_losses(tmp_path / "b", 2.0)
     (tmp_path / "b/precision_recall.csv").write_text("kind,recall\n1,2\n")
-    named = {"networks": {"small": "a", "large": "b", "absent": "c"}}
+    named = {"experiment": {"networks": {"small": "a", "large": "b", "absent": "c"}}}
     (picture,) = network_pictures(replace(comparison, provenance=named), tmp_path)
     text = picture.data.decode()
     assert ">small<" in text

@@ -1,0 +1,102 @@
+"""Which differences from the first configuration are more than chance, and how large they are."""
+
+from __future__ import annotations
+
+from slam.comparison.metric_table import BY_NAME, Metric
+from slam.comparison.report.table import ATE, EMPTY, Entry, Table, TableRow
+from slam.comparison.result import CellStatus, Comparison, Kind
+from slam.comparison.statistics import (
+    BETTER,
+    LEVEL,
+    NOTHING,
+    RESAMPLES,
+    WORSE,
+    Verdict,
+    summarise,
+    verdicts,
+)
+
+COLUMNS = ("difference", "95 % interval", "better / worse of pairs", "p", "judgement")
+RULE = (
+    f"A method is called better or worse only where the bootstrap interval of the mean difference "
+    f"over paired images ({RESAMPLES} resamples) leaves out 0 and the sign test agrees, "
+    f"p < {LEVEL:g} after Holm's correction for all that is judged here. "
+    f'"{NOTHING.capitalize()}" does not mean equal. All of it is said of these sequences.'
+)
+
+
+def verdict_tables(comparison: Comparison) -> list[Table]:
+    """A table for each metric that is judged: methods against the first configuration."""
+    found = verdicts(comparison)
+    metrics = dict.fromkeys(verdict.metric for verdict in found)
+    return [_table(BY_NAME[name], [v for v in found if v.metric == name]) for name in metrics]
+
+
+def verdict_sentences(comparison: Comparison) -> list[str]:
+    """What is shown of the main metric, in words; one sentence where nothing is."""
+    found = [v for v in verdicts(comparison) if v.metric == ATE.name]
+    shown = [
+        f"{ATE.title}: {v.method} is {v.judgement} than {v.baseline} by "
+        f"{ATE.scale * abs(v.difference):.{ATE.digits}f} {ATE.unit} on the mean of {v.pairs} pairs."
+        for v in found
+        if v.judgement != NOTHING
+    ]
+    if found and not shown:
+        return [f"{ATE.title}: no difference from {found[0].baseline} is shown."]
+    return shown
+
+
+def ablation_table(comparison: Comparison) -> Table | None:
+    """By how much each configuration's median ATE is larger than the first one's, in per cent."""
+    runs = [method for method in comparison.methods if method.kind is Kind.RUN]
+    if len(runs) < 2:
+        return None
+    rows = tuple(
+        TableRow(
+            method.name,
+            tuple(_change(comparison, s, runs[0].name, method.name) for s in comparison.sequences),
+            note=method.note,
+        )
+        for method in runs[1:]
+    )
+    if all(entry.text == EMPTY for row in rows for entry in row.entries):
+        return None
+    caption = (
+        f"Median ATE against that of {runs[0].name} (%): above 0, it is worse without. "
+        "Empty where a run of either failed."
+    )
+    return Table("ablation", f"ATE against {runs[0].name} (%)", caption, comparison.sequences, rows)
+
+
+def _change(comparison: Comparison, sequence: str, base: str, method: str) -> Entry:
+    cells = [list(comparison.of(sequence, name)) for name in (base, method)]
+    if any(cell.status is not CellStatus.DONE for own in cells for cell in own):
+        return Entry(EMPTY)
+    before, after = (summarise(own, ATE.name) for own in cells)
+    if before is None or after is None or before.median <= 0:
+        return Entry(EMPTY)
+    return Entry(f"{100 * (after.median / before.median - 1):+.0f}")
+
+
+def _table(metric: Metric, found: list[Verdict]) -> Table:
+    unit = f" ({metric.unit})" if metric.unit not in ("", "1") else ""
+    title = f"{metric.title}{unit} against {found[0].baseline}"
+    rows = tuple(TableRow(v.method, _entries(metric, v), note=v.note) for v in found)
+    way = "Lower is better." if metric.lower_is_better else "Higher is better."
+    return Table(
+        f"verdict-{metric.name}", title, f"Method minus {found[0].baseline}. {way}", COLUMNS, rows
+    )
+
+
+def _entries(metric: Metric, verdict: Verdict) -> tuple[Entry, ...]:
+    def shown(value: float) -> str:
+        return f"{metric.scale * value:+.{metric.digits + 1}f}"
+
+    left_out = f"{verdict.left_out} left out" if verdict.left_out else ""
+    return (
+        Entry(shown(verdict.difference)),
+        Entry(f"{shown(verdict.low)} to {shown(verdict.high)}"),
+        Entry(f"{verdict.wins} / {verdict.losses} of {verdict.pairs}", note=left_out),
+        Entry(f"{verdict.p_value:.2g}"),
+        Entry(verdict.judgement, best=verdict.judgement in (BETTER, WORSE)),
+    )
