@@ -86,7 +86,12 @@ def test_losses_are_summed_and_smoothed(tmp_path):
 def test_precision_survives_its_file(tmp_path):
     precision = np.linspace(1, 0, 101) ** 2
     curve = ApCurve("segm", "class score x MaskIoU", 0.5, 0.6, 0.7, precision)
-    write_curves(SegmentationResult((curve,), 0.1, 3, 4), tmp_path / "new/precision_recall.csv")
+    write_curves(
+        SegmentationResult(
+            (curve,), iou_correlation=0.1, iou_correlation_of_good=0.1, images=3, instances=4
+        ),
+        tmp_path / "new/precision_recall.csv",
+    )
     ((name, points),) = read_precision(tmp_path / "new/precision_recall.csv").items()
     assert name == "segm, by class score x MaskIoU"
     np.testing.assert_allclose(
