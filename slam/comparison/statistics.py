@@ -24,6 +24,7 @@ RESAMPLES = 10_000
 FEWER_TRACKED = 0.01
 BETTER, WORSE, NOTHING = "better", "worse", "no difference shown"
 TRACKED = "tracked_share"
+TOO_FEW = "too few pairs for a verdict"
 
 
 @dataclass(frozen=True)
@@ -173,11 +174,15 @@ def _verdict(comparison: Comparison, base: Method, method: Method, metric: str) 
 
 def _corrected(found: list[Verdict]) -> tuple[Verdict, ...]:
     """Judged, after the correction for their number."""
-    p_values = holm([v.p_value for v in found])
-    return tuple(
-        replace(v, p_value=p, judgement=_judgement(replace(v, p_value=p)))
-        for v, p in zip(found, p_values, strict=True)
-    )
+    corrected = holm([v.p_value for v in found])
+    judged = (replace(v, p_value=p) for v, p in zip(found, corrected, strict=True))
+    return tuple(replace(v, judgement=_judgement(v), note=_with_number(v)) for v in judged)
+
+
+def _with_number(verdict: Verdict) -> str:
+    """The note, which also says where no outcome of so few pairs could be a verdict."""
+    few = sign_test(verdict.pairs, 0) > LEVEL
+    return "; ".join(filter(None, [TOO_FEW if few else "", verdict.note]))
 
 
 def _judgement(verdict: Verdict) -> str:
@@ -196,4 +201,4 @@ def _note(comparison: Comparison, base: Method, method: Method) -> str:
     theirs, own, _ = pairs(comparison, (base.name, method.name), TRACKED)
     if not len(own) or abs(fmean(own) - fmean(theirs)) < FEWER_TRACKED:
         return ""
-    return f"tracked {100 * fmean(own):.0f} % against {100 * fmean(theirs):.0f} %"
+    return f"tracks {100 * fmean(own):.0f} % against {100 * fmean(theirs):.0f} %"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 from slam.comparison.metric_table import BY_NAME
 from slam.comparison.report.table import TableRow, cell_name, metric_table
 from slam.comparison.result import CellStatus, Comparison
-from slam.comparison.statistics import NOTHING, Verdict, verdicts
+from slam.comparison.statistics import Verdict, verdicts
 
 MAIN_METRIC = "ate_rmse"
 
@@ -22,30 +24,49 @@ def format_table(comparison: Comparison, metric: str) -> str:
     if table is None:
         return ""
     lines = [("", *table.columns), *(_cells(row) for row in table.rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    rows = ["  ".join(t.ljust(w) for t, w in zip(line, widths, strict=True)) for line in lines]
-    return "\n".join([table.caption, *(row.rstrip() for row in rows)])
+    return "\n".join([table.caption, *_aligned(lines)])
 
 
 def format_verdicts(found: tuple[Verdict, ...]) -> str:
-    """A line for each; "" without any."""
-    return "\n".join(format_verdict(verdict) for verdict in found)
+    """A line for each, the metrics under each other; "" without any."""
+    if not found:
+        return ""
+    lines = [_verdict(v, v.metric != before) for before, v in _with_previous(found)]
+    head = (
+        f"Against {found[0].baseline}: mean difference with 95 % bootstrap interval, pairs "
+        "in which better : worse of all,\np of the exact sign test after Holm's correction"
+    )
+    return "\n".join([head, *_aligned(lines)])
 
 
-def format_verdict(v: Verdict) -> str:
-    """One sentence with the figures that it rests on."""
+def _with_previous(found: tuple[Verdict, ...]) -> Iterator[tuple[str, Verdict]]:
+    """Each verdict after the metric of the one before it."""
+    before = ""
+    for verdict in found:
+        yield before, verdict
+        before = verdict.metric
+
+
+def _verdict(v: Verdict, first: bool) -> tuple[str, ...]:
+    """The columns of a verdict; its metric is named in the first line of each."""
     metric = BY_NAME[v.metric]
+    shown = [f"{metric.scale * x:+.{metric.digits + 1}f}" for x in (v.difference, v.low, v.high)]
+    notes = [f"{v.left_out} pairs without figures"] * bool(v.left_out) + [v.note] * bool(v.note)
+    return (
+        f"{metric.title} ({metric.unit})" if first else "",
+        v.method,
+        v.judgement,
+        f"{shown[0]} [{shown[1]}, {shown[2]}]",
+        f"{v.wins} : {v.losses} of {v.pairs}",
+        f"p = {v.p_value:.2g}",
+        "; ".join(notes),
+    )
 
-    def shown(value: float) -> str:
-        return f"{metric.scale * value:+.{metric.digits + 1}f}"
 
-    said = NOTHING if v.judgement == NOTHING else f"{v.judgement} than {v.baseline}"
-    interval = f"{shown(v.difference)} {metric.unit} [{shown(v.low)}, {shown(v.high)}]"
-    text = f"{metric.title}: {v.method}: {said} ({interval}, better in {v.wins} and worse in "
-    text += f"{v.losses} of {v.pairs} pairs, p = {v.p_value:.2g})"
-    if v.left_out:
-        text += f"; {v.left_out} pairs without figures left out"
-    return f"{text}; {v.note}" if v.note else text
+def _aligned(lines: Sequence[tuple[str, ...]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    rows = ("  ".join(t.ljust(w) for t, w in zip(line, widths, strict=True)) for line in lines)
+    return [row.rstrip() for row in rows]
 
 
 def format_problems(comparison: Comparison) -> str:

@@ -1,5 +1,6 @@
 """What is said of two methods: tests against slow references, and how often it is false."""
 
+import re
 from dataclasses import replace
 from itertools import product
 
@@ -19,6 +20,7 @@ from slam.comparison.statistics import (
     summarise,
     verdicts,
 )
+from slam.comparison.text import format_verdicts
 
 SEQUENCES = ("a", "b", "c", "d", "e", "f")
 METHODS = (Method("default", Kind.RUN), Method("other", Kind.RUN))
@@ -100,6 +102,32 @@ def test_an_outlier_alone_proves_nothing():
     values[1] = values[0]
     values[1, 0, 0] = 5.0
     assert verdicts(comparison(values))[0].judgement == NOTHING
+
+
+def test_too_few_pairs_are_told():
+    given = comparison(noise(3, 1), drawn=())
+    assert verdicts(given)[0].note == ""
+    few = replace(given, sequences=SEQUENCES[:5])
+    assert verdicts(few)[0].note == "too few pairs for a verdict"
+
+
+def test_a_method_that_tracks_less_is_told():
+    given = comparison(noise(4))
+    cells = tuple(
+        replace(c, metrics=c.metrics | {"tracked_share": 0.6 if c.method == "other" else 1.0})
+        for c in given.cells
+    )
+    assert verdicts(replace(given, cells=cells))[0].note == "tracks 60 % against 100 %"
+
+
+def test_the_verdicts_as_text():
+    values = noise(1)
+    values[1] = values[0] * 1.5
+    head, _, line = format_verdicts(verdicts(comparison(values))).splitlines()
+    assert head.startswith("Against default")
+    assert re.match(
+        r"ATE \(cm\)  other  worse  \+\d\.\d{3} \[\+.*\]  0 : 18 of 18  p = 7.6e-06$", line
+    )
 
 
 def test_seeds_of_a_recording_are_one_pair():
