@@ -41,6 +41,8 @@ from slam.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
 
+MEDIAN_CHI2_6DOF = 5.348
+
 
 class Mapper:
     """Holds map, graph and frame history, and keeps the three consistent."""
@@ -176,16 +178,25 @@ class Mapper:
         self._apply(self.smoother.update(update))
 
     def _refuted_loops(self) -> set[tuple[int, int]]:
-        """Loops that are not in the graph, or do not fit it and are not believed against it."""
+        """Loops that are not in the graph, or do not fit it.
+
+        A strong set is believed against the path, but not one of its loops against the others:
+        their bound is as much wider as their median says that the set fits worse than it should.
+        """
         errors = self.smoother.relative_pose_errors("loop")
-        ends = np.stack([errors.keyframe_a, errors.keyframe_b], axis=1)
-        fits = (errors.chi2 <= self.loops.config.gate).tolist()
-        inside = dict(zip(map(tuple, ends.tolist()), fits, strict=True))
+        pairs = list(zip(errors.keyframe_a.tolist(), errors.keyframe_b.tolist(), strict=True))
+        believed = np.array([self.loops.closed.get(pair, False) for pair in pairs], bool)
+        wider = np.ones(len(pairs))
+        if believed.any():
+            ratio = float(np.median(errors.chi2[believed])) / MEDIAN_CHI2_6DOF
+            wider[believed] = max(ratio, 1.0)
+        fits = (errors.chi2 <= wider * self.loops.config.gate).tolist()
+        inside = dict(zip(pairs, fits, strict=True))
         return {
             pair
-            for pair, believed in self.loops.closed.items()
+            for pair in self.loops.closed
             if self.world.keyframes.keys() >= set(pair)  # else it left with a culled keyframe
-            and not (inside.get(pair, False) or (believed and pair in inside))
+            and not inside.get(pair, False)
         }
 
     def _remove_loops(self, refuted: set[tuple[int, int]], fresh: set[tuple[int, int]]) -> None:

@@ -154,6 +154,22 @@ def test_a_wrong_loop_that_entered_is_removed_again(monkeypatch: pytest.MonkeyPa
     assert ring.error_rad() == pytest.approx(sound.error_rad(), rel=0.01)
 
 
+def test_wrong_loops_among_a_strong_set_are_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A strong set is believed against the path; what contradicts the set itself is not."""
+    sound, ring = Ring(), Ring()
+    right = sound.run(ONCE_ROUND)
+    last = max(loop.keyframe_b for loop in right)
+    rng = np.random.default_rng(5)
+    noise = rng.normal(size=(2, 6)) * [0.3, 0.3, 0.3, 1, 1, 1]
+    wrong = [constraint(4 + 3 * k, last, se3_exp(xi)) for k, xi in enumerate(noise)]
+    monkeypatch.setattr(ring.mapper.loops, "loops_of", lambda *_: [])
+    ring.run(last)
+    monkeypatch.setattr(ring.mapper.loops, "loops_of", lambda *_: [*right, *wrong])
+    kept = ring.step()[1]
+    assert [loop.ends for loop in kept] == [loop.ends for loop in right]
+    assert ring.error_rad() < 2 * sound.error_rad()
+
+
 def constraint(a: int, b: int, T_a_b: Array) -> LoopConstraint:
     covariance = np.diag([1e-3] * 3 + [2e-3] * 3) ** 2
     return LoopConstraint(a, b, T_a_b, covariance, 50, 1.0, np.zeros((0, 2), np.int64))
