@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,14 @@ from slam.comparison.report.curves import network_pictures
 from slam.comparison.report.figures import error_pictures
 from slam.comparison.report.run_files import map_pictures, stage_table
 from slam.comparison.report.section import Listing, Section
-from slam.comparison.report.table import ATE, cell_name, cell_tables, metric_table, metric_tables
+from slam.comparison.report.table import (
+    ATE,
+    Table,
+    cell_name,
+    cell_tables,
+    metric_table,
+    metric_tables,
+)
 from slam.comparison.report.verdict_tables import (
     RULE,
     ablation_table,
@@ -23,6 +31,7 @@ from slam.comparison.result import Cell, CellStatus, Comparison
 
 LOG_LINES = 15
 LINE_CHARACTERS = 400
+EMPTY: tuple[Any, ...] = (None, "", [], {})
 
 
 def make_sections(comparison: Comparison, folder: Path) -> list[Section]:
@@ -110,7 +119,12 @@ def _error_figures(comparison: Comparison, folder: Path) -> list[Section]:
 
 def _other_metrics(comparison: Comparison) -> Section:
     tables = [table for table in metric_tables(comparison) if table.name != ATE.name]
-    return Section("Other metrics", tables=tuple(tables))
+    return Section("Other metrics", tables=tuple(_without_notes(table) for table in tables))
+
+
+def _without_notes(table: Table) -> Table:
+    """A table whose rows' notes stand beside the main one."""
+    return replace(table, rows=tuple(replace(row, note="") for row in table.rows))
 
 
 def _stages(comparison: Comparison, folder: Path) -> Section:
@@ -126,13 +140,28 @@ def _maps(comparison: Comparison, folder: Path) -> list[Section]:
 
 
 def _provenance(comparison: Comparison) -> Section:
-    listings = [Listing(name, _as_text(value)) for name, value in comparison.provenance.items()]
+    """What is short on one listing, each of the others on its own."""
+    given = {name: _without_empty(value) for name, value in comparison.provenance.items()}
+    long = {name: value for name, value in given.items() if isinstance(value, (dict, list))}
+    short = {name: value for name, value in given.items() if name not in long and value != ""}
+    listings = [Listing("Run", _as_text(short))] if short else []
+    listings += [
+        Listing(name.capitalize(), _as_text(value)) for name, value in long.items() if value
+    ]
     return Section("How it was made", listings=tuple(listings))
 
 
+def _without_empty(value: Any) -> Any:
+    """The same without what says nothing: None, empty texts, empty collections."""
+    if isinstance(value, dict):
+        kept = {key: _without_empty(item) for key, item in value.items()}
+        return {key: item for key, item in kept.items() if item not in EMPTY}
+    if isinstance(value, (list, tuple)):
+        return [_without_empty(item) for item in value]
+    return value
+
+
 def _as_text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
     return yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=100).strip()
 
 

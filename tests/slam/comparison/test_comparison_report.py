@@ -21,7 +21,9 @@ from slam.comparison.errors import Rules, trajectory_errors
 from slam.comparison.metric_table import BY_NAME
 from slam.comparison.report import write_report
 from slam.comparison.report.figures import common_scales, read_errors
+from slam.comparison.report.sections import make_sections, summary
 from slam.comparison.report.table import ATE, metric_table
+from slam.comparison.report.verdict_tables import ablation_table
 from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
 
 RULES = Rules(0.02)
@@ -92,6 +94,57 @@ def test_a_failed_run_is_shown_with_its_log_and_never_averaged(comparison, writt
     assert "Killed <b>here</b> & there" in page.text
     assert "first line" not in page.text
     assert "1 of 2 failed" in page.text
+
+
+def judged(comparison: Comparison, ratio: float) -> Comparison:
+    """Ten sequences, two methods, the second with errors so many times as large."""
+    names = tuple(f"room {k}" for k in range(10))
+    errors_m = {name: 0.01 * (1 + k / 10) for k, name in enumerate(names)}
+    methods = (Method("default", Kind.RUN), Method(HOSTILE, Kind.RUN))
+    cells = tuple(
+        Cell(name, method.name, 0, CellStatus.DONE, {"ate_rmse": value * (ratio if k else 1)})
+        for name, value in errors_m.items()
+        for k, method in enumerate(methods)
+    )
+    return replace(comparison, sequences=names, methods=methods, cells=cells, provenance={})
+
+
+def test_a_difference_is_called_one_where_it_is_shown(comparison, tmp_path):
+    sections = make_sections(judged(comparison, 1.5), tmp_path)
+    tables = {table.name: table for section in sections for table in section.tables}
+    (row,) = tables["verdict-ate_rmse"].rows
+    difference, interval, counts, _, judgement = (entry.text for entry in row.entries)
+    assert float(difference) == pytest.approx(0.5 * 1.45, abs=1e-3), "0.5 times the mean, in cm"
+    low, high = (float(limit) for limit in interval.split(" to "))
+    assert 0 < low < float(difference) < high
+    assert counts == "0 / 10 of 10"
+    assert judgement == "worse"
+    assert {entry.text for entry in tables["ablation"].rows[0].entries} == {"+50"}
+    (counted, said) = summary(judged(comparison, 1.5))
+    assert "20 cells, all done" in counted
+    assert said == f"ATE: {HOSTILE} is worse than default by 0.72 cm on the mean of 10 pairs."
+
+
+def test_no_difference_is_called_none(comparison, tmp_path):
+    same = judged(comparison, 1.0)
+    assert summary(same)[1] == "ATE: no difference from default is shown."
+    page = Page(next(p for p in write_report(same, tmp_path)).read_text(encoding="utf-8"))
+    assert "no difference shown" in page.text
+
+
+def test_a_method_that_failed_has_no_place_among_the_ablations(comparison):
+    assert ablation_table(comparison) is None, "failed once, pending once"
+
+
+def test_the_provenance_is_told_in_full_without_what_is_empty(comparison, tmp_path):
+    given = {
+        "commit": "abc",
+        "workers": 2,
+        "experiment": {"seeds": [0], "note": "", "render": None},
+    }
+    *_, made = make_sections(replace(comparison, provenance=given), tmp_path)
+    told = {listing.title: listing.text for listing in made.listings}
+    assert told == {"Run": "commit: abc\nworkers: 2", "Experiment": "seeds:\n- 0"}
 
 
 def test_pending_cells_and_partial_truth_are_said(comparison):
