@@ -36,6 +36,7 @@ def as_picture(drawn: Figure, title: str, caption: str) -> Picture:
     svg, pdf = io.BytesIO(), io.BytesIO()
     with matplotlib.rc_context(STYLE):
         drawn.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)
+        drawn.set_layout_engine("none")  # what has been found holds for both
         drawn.savefig(pdf, format="pdf", metadata={"CreationDate": None})
     width_in, height_in = drawn.get_size_inches()
     size_px = (96 * width_in, 96 * height_in)

@@ -16,7 +16,7 @@ from slam.comparison.statistics import (
     verdicts,
 )
 
-COLUMNS = ("difference", "95 % interval", "better / worse of pairs", "p", "judgement")
+COLUMNS = ("judgement", "difference", "95 % interval", "better / worse of pairs", "p")
 RULE = (
     f"A method is called better or worse only where the bootstrap interval of the mean difference "
     f"over paired images ({RESAMPLES} resamples) leaves out 0 and the sign test agrees, "
@@ -94,9 +94,9 @@ def _entries(metric: Metric, verdict: Verdict) -> tuple[Entry, ...]:
 
     left_out = f"{verdict.left_out} left out" if verdict.left_out else ""
     return (
+        Entry(verdict.judgement, best=verdict.judgement in (BETTER, WORSE)),
         Entry(shown(verdict.difference)),
         Entry(f"{shown(verdict.low)} to {shown(verdict.high)}"),
         Entry(f"{verdict.wins} / {verdict.losses} of {verdict.pairs}", note=left_out),
         Entry(f"{verdict.p_value:.2g}"),
-        Entry(verdict.judgement, best=verdict.judgement in (BETTER, WORSE)),
     )

@@ -113,7 +113,7 @@ def test_a_difference_is_called_one_where_it_is_shown(comparison, tmp_path):
     sections = make_sections(judged(comparison, 1.5), tmp_path)
     tables = {table.name: table for section in sections for table in section.tables}
     (row,) = tables["verdict-ate_rmse"].rows
-    difference, interval, counts, _, judgement = (entry.text for entry in row.entries)
+    judgement, difference, interval, counts, _ = (entry.text for entry in row.entries)
     assert float(difference) == pytest.approx(0.5 * 1.45, abs=1e-3), "0.5 times the mean, in cm"
     low, high = (float(limit) for limit in interval.split(" to "))
     assert 0 < low < float(difference) < high
