@@ -30,7 +30,7 @@ SPLIT_SEED = 0
 ROOMS = range(32)
 VIEWS = ("--fps", "0.5", "--people", "2", "--quiet")
 STEPS, RATE = 4000, 1e-3
-PHOTOGRAPHS_STEPS, PHOTOGRAPHS_RATE = 350, 5e-4
+PHOTOGRAPHS_STEPS, PHOTOGRAPHS_RATE = 300, 5e-4
 EDGES = tuple(f"backbone.body.features.{k}." for k in range(4))
 """The body's blocks up to stride 4 stay as ImageNet made them; on photographs alone all do."""
 
@@ -57,7 +57,7 @@ def training(arguments: argparse.Namespace) -> TrainingRun:
         "batch": 4,
         "body_rate": 0.4,
         "rois": "objects",
-        "only": "masks" if alone else "",
+        "only": arguments.only or ("masks" if alone else ""),
     }
     return TrainingRun(
         (coco,) if alone else (coco, *rooms(arguments.rooms)),
@@ -80,6 +80,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float)
     parser.add_argument("--seed", type=int, default=0, help="of batches and augmentation")
     parser.add_argument("--photographs", action="store_true")
+    parser.add_argument("--only", default="", choices=("", "masks", "maskiou"))
     with console_log(), counting_bar(False) as progress:
         print(run_training(training(parser.parse_args()), progress))
 

@@ -35,8 +35,9 @@ PROPOSALS_FACTOR = 2
 """So many times as many proposals are looked at in training."""
 JITTERS = 3
 """Boxes drawn around each object, if masks are learnt there."""
-JITTER_SHARE = 0.12
-"""Their corners move by up to this share of the box's size."""
+JITTER_SHARE = 0.25
+"""Their corners move by up to a share of the box's size that is drawn from 0 to this, so that there
+are good boxes and bad ones: the MaskIoU head must have seen masks of both."""
 MAX_ROIS = 64
 """Of them at most so many are drawn from an image."""
 
@@ -163,6 +164,7 @@ def around_objects(
         owner = owner[draw_evenly(target.labels[owner], MAX_ROIS, generator)]
         near = boxes[owner]
         noise = torch.rand(near.shape, generator=generator).to(near) * 2 - 1
+        noise *= torch.rand((len(near), 1), generator=generator).to(near)
         sides = (near[:, 2:] - near[:, :2]).repeat(1, 2)
         moved = box_ops.clip(near + noise * JITTER_SHARE * sides, size)
         kept = box_ops.at_least(moved, 1.0)
