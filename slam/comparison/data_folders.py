@@ -94,5 +94,5 @@ def _problem(source: SequenceSource, found: list[Path]) -> str:
         return f"{found[0]}: holds no rgb.txt; restore it, or give the folder of the images"
     cure = f"{source.folder}: not found; give DIR by --data, where DIR/{source.folder} lies"
     if source.folder in read_catalogue():
-        cure += f", or bmask-slam download {source.folder}"
+        cure += f", or bmask-slam download {source.folder} --to DIR"
     return cure

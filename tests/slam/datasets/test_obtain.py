@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 from range_server import Served, serve
 
+from graph.data_files import data_path
 from graph.errors import InputError
 from graph.trajectory import read_tum
 from semantics import http_file
 from slam.cli import main
+from slam.comparison.experiment_file import read_experiment
 from slam.datasets.catalogue import Recording, find, read_catalogue
 from slam.datasets.obtain import SUMS, obtain, read_sums
 from slam.sequences import open_sequence
@@ -162,6 +164,14 @@ def test_the_shipped_catalogue_is_sound(capsys):
     )
     assert main(["download", "--list"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == len(catalogue)
+
+
+def test_what_the_shipped_experiments_compare_can_be_downloaded():
+    catalogue = read_catalogue()
+    files = sorted(data_path("experiments").glob("*.yaml"))
+    named = {s.folder for file in files for s in read_experiment(file).sequences if s.folder}
+    assert named
+    assert named <= set(catalogue)
 
 
 @pytest.mark.parametrize(
