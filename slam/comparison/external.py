@@ -11,7 +11,8 @@ from slam.comparison.cells import Place
 from slam.comparison.errors import Rules, trajectory_errors
 from slam.comparison.experiment import Experiment, OtherSystem
 from slam.comparison.result import Cell, CellStatus, Kind, Method
-from slam.sequences import open_sequence
+from slam.sequences.lists import read_pairs
+from slam.sequences.sequence import SequenceConfig
 
 Files = dict[tuple[str, str], Path]
 """Trajectory file by method and SEQUENCE or SEQUENCE@SEED."""
@@ -78,11 +79,18 @@ def _evaluated(cell: Cell, file: Path, place: Place, rules: Rules) -> Cell:
         )
     cell = replace(cell, reference=str(place.reference.absolute()))
     try:
-        frames = len(open_sequence(place.folder)) if place.folder else None
-        metrics = trajectory_errors(file, place.reference, rules, frames)
+        metrics = trajectory_errors(file, place.reference, rules, _frame_count(place.folder))
     except InputError as error:
         return replace(cell, error=str(error))
     return replace(cell, status=CellStatus.DONE, metrics=metrics)
+
+
+def _frame_count(folder: Path | None) -> int | None:
+    """Frames of a sequence, None where its images are not there."""
+    if folder is None:
+        return None
+    limit_s = SequenceConfig().max_time_difference_s
+    return len(read_pairs(folder, limit_s, 0.0).timestamps_s)
 
 
 def published_cells(experiment: Experiment) -> Iterator[Cell]:

@@ -15,6 +15,7 @@ import pytest
 from graph.errors import InputError
 from graph.geometry import se3_exp
 from graph.trajectory import read_tum, write_tum
+from slam.cli import main
 from slam.comparison import CellStatus, CompareOptions, Comparison, compare, read_results
 from slam.comparison.job import environment
 from slam.comparison.text import format_comparison
@@ -65,6 +66,7 @@ def test_a_comparison(data, tmp_path):
     assert {"rpe_rot_rmse_frame", "ate_rot_rmse", "tracking_ms_median", "peak_rss_mb"} <= set(own)
     assert cells["other"].metrics["ate_rmse"] == pytest.approx(0, abs=1e-6)
     assert "rpe_trans_rmse_frame" in cells["other"].metrics
+    assert cells["other"].metrics["tracked_share"] == 1
     assert cells["paper"].metrics == {"ate_rmse": 0.02}
     assert "masks" in cells["broken"].error
     assert cells["broken"].error in (out / cells["broken"].log).read_text()
@@ -205,6 +207,24 @@ def test_rgbd_slam_on_freiburg1_xyz(given, tmp_path, monkeypatch):
 def test_what_the_experiment_does_not_have_is_refused(data, tmp_path, options, message):
     with pytest.raises(InputError, match=message):
         compare(data / "mine.yaml", tmp_path / "out", options)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["rendred"], "no such file; there are: bonn"),
+        (["rendered", "--seeds", "0,x"], "--seeds 0,x: write whole numbers"),
+        (["rendered", "--reference", "x"], "--reference x: write it as SEQUENCE=FILE"),
+        (["rendered", "--trajectory", "x"], "--trajectory x: write it as METHOD:SEQUENCE=FILE"),
+        (["rendered", "--jobs", "0"], "--jobs 0: must be at least 1"),
+        (["rendered", "--sequences", "attic"], "--sequences attic: not in"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["compare", *words]) == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_impossible_options_are_refused():
