@@ -1,4 +1,4 @@
-# make demo    sets everything up in .venv, runs SLAM on a rendered sequence and says where the picture is
+# make demo    sets everything up in .venv, runs, maps, asks and compares on a rendered sequence, offline and live
 # make test    sets up and runs the tests
 # make check   lint, format, types and tests (with the layer rule)
 # make bench   measures and writes docs/benchmarks.md; BENCH="..." passes arguments
@@ -21,6 +21,9 @@ demo: $(DEMO)
 	@$(BIN)/bmask-slam run $(DEMO) --out runs/demo --overwrite
 	@$(BIN)/bmask-slam map runs/demo --mesh --plan
 	@$(BIN)/bmask-slam query runs/demo
+	@$(BIN)/bmask-slam live $(DEMO) --out runs/demo-live --overwrite
+	@$(BIN)/bmask-slam compare rendered --out runs/demo-comparison --sequences office \
+	  --configurations "default,without registration" --seeds 0
 
 $(DEMO): | $(READY)
 	@$(BIN)/bmask-slam render office --frames 200 --out $@
