@@ -86,6 +86,10 @@ REPORTS = {
             "dynamic.py --sequences {sequences} --segmenter light --seed 0 "  # tuned on: change it
             "--out {sequences}/dynamic",
         ),
+        "harm": (
+            "What the semantics cost where nothing moves",
+            "no_harm.py {sequences}/office-300 {sequences}/living_room ../shared/data/redkitchen",
+        ),
         "pairs": ("A real man who walks, by geometry alone", "dynamic_pairs.py"),
         "composited": (
             "A real man put into a real recording",
