@@ -132,7 +132,7 @@ def section(report: Report, name: str, sequences: Path) -> str:
     when = f"{processor()}; commit {commit}; code {code}; {now()}; {wall_s:.0f} s."
     captions = report.pictures.get(name, {})
     pictures = "".join(f"\n![{text}](images/{file})\n{text}.\n" for file, text in captions.items())
-    printed = f"```\n{done.stdout.strip()}\n```"
+    printed = f"```\n{done.stdout.rstrip()}\n```"
     return f"## {title}\n\n`python {command}`\n\n{printed}\n\n{when}\n{pictures}"
 
 
