@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 
 import cv2
@@ -13,7 +12,6 @@ from graph.camera import Camera
 from graph.geometry import Array
 from slam.frame import Frame
 
-DESCRIBERS = 2  # threads
 FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
 
 
@@ -82,42 +80,23 @@ class Features:
 
 
 class BriskExtractor:
-    """Detects, buckets and describes; holds OpenCV's detectors, so one per thread."""
+    """Detects, buckets and describes; holds OpenCV's detector, so one per thread."""
 
     def __init__(self, camera: Camera, config: FeatureConfig):
         self.camera = camera
         self.config = config
-        threshold, octaves = config.thresholds[0], config.octaves
-        self._describers = [cv2.BRISK_create(threshold, octaves) for _ in range(DESCRIBERS)]
+        self._describer = cv2.BRISK_create(config.thresholds[0], config.octaves)
         self._fast = {t: cv2.FastFeatureDetector_create(t) for t in config.thresholds}
-        self._helpers = ThreadPoolExecutor(DESCRIBERS)
 
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         kept = self._strongest_spread(self._detect(gray), gray.shape)
-        return self._assemble(frame, gray, *self._describe(gray, kept))
-
-    def _describe(
-        self, gray: NDArray[np.uint8], keypoints: list
-    ) -> tuple[Array, NDArray[np.uint8]]:
-        """Columns (N, 4) u, v, size, angle in degrees and descriptors (N, 64) uint8.
-
-        BRISK works through its keypoints one by one, most of a frame's time; so in parts, which
-        OpenCV can do at once.
-        """
-        cuts = np.linspace(0, len(keypoints), DESCRIBERS + 1).astype(int)
-        jobs = [
-            self._helpers.submit(describer.compute, gray, keypoints[a:b])
-            for describer, a, b in zip(self._describers, cuts[:-1], cuts[1:], strict=True)
-            if b > a
-        ]
-        parts = [part for part in (job.result() for job in jobs) if part[1] is not None]
-        if not parts:
-            return np.zeros((0, 4)), np.zeros((0, 64), np.uint8)
-        described = [k for keypoints, _ in parts for k in keypoints]
-        table = np.array([(*k.pt, k.size, k.angle) for k in described], dtype=float)
-        return table, np.concatenate([descriptors for _, descriptors in parts])
+        keypoints, descriptors = self._describer.compute(gray, kept)
+        if descriptors is None:
+            return self._assemble(frame, gray, np.zeros((0, 4)), np.zeros((0, 64), np.uint8))
+        table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=float)
+        return self._assemble(frame, gray, table.reshape(-1, 4), np.ascontiguousarray(descriptors))
 
     def _detect(self, gray: NDArray[np.uint8]) -> list:
         """Keypoints at the highest threshold that gives enough of them.

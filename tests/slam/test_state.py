@@ -32,7 +32,7 @@ from slam.system_config import SystemConfig
 
 FILE = Path("run/checkpoint")
 SCRATCH = {"elapsed_s"}  # means nothing between two frames
-OPAQUE = ("cv2", "gtsam", "faiss", "concurrent")  # made anew from configuration or state
+OPAQUE = ("cv2", "gtsam", "faiss")  # made anew from configuration or state
 SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),
     *("mapping.redundant_share=0.3", "mapping.redundant_views=2"),
