@@ -9,13 +9,13 @@ such as weights and masks are read where the segmenter runs.
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graph.errors import InputError
 from semantics.instances import Instance
 from semantics.labels import LabelSet
+from semantics.ray_connection import connect
 from semantics.segmenter import Image, check_image
 
 if TYPE_CHECKING:
@@ -27,33 +27,6 @@ START_S = 60.0
 """How long a segmenter may take to start there."""
 PATIENCE_S = 15.0
 """How long an image may take, with its way there and back."""
-
-
-def connect(address: str) -> Any:
-    """The ``ray`` module, connected; "local" starts a Ray of this machine's own.
-
-    Raises:
-        InputError: it is not installed, or no cluster answers.
-    """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray  # noqa: PLC0415  # optional, and slow to import
-    except ImportError as error:
-        raise InputError("--ray needs Ray: pip install 'bmask-slam[ray]'") from error
-    if ray.is_initialized():
-        return ray
-    dashboard = False if address == "local" else None
-    try:
-        ray.init(
-            address,
-            include_dashboard=dashboard,
-            log_to_driver=False,
-            logging_level=logging.ERROR,
-        )
-    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise InputError(f"--ray {address}: no Ray cluster answers ({reason})") from error
-    return ray
 
 
 class RaySegmenter:

@@ -10,6 +10,8 @@ from slam.rendering.sequence import RenderConfig
 
 VERDICT_METRICS = ("ate_rmse", "rpe_trans_rmse_second", "rpe_rot_rmse_second")
 """Not times: cells that run side by side disturb each other's."""
+OPTIONS = ("segmenter", "weights", "max_frames", "stride", "dense")
+"""What a configuration can say beside its parameters."""
 
 
 @dataclass(frozen=True)

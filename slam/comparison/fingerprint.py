@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from graph.data_files import data_path
-from slam.comparison.experiment import Configuration
+from slam.comparison.experiment import OPTIONS, Configuration
 from slam.configuration import dump, find_config, resolve
 from slam.rendering.sequence import RenderConfig
 from slam.system_config import SystemConfig
@@ -67,8 +67,7 @@ def configuration_print(configuration: Configuration, settings: tuple[str, ...])
     """Of the resolved parameters and the other options of a run."""
     file = find_config(configuration.config) if configuration.config else None
     resolved = dump(resolve(SystemConfig, file, (*configuration.set, *settings)))
-    names = ("segmenter", "weights", "max_frames", "stride", "dense")
-    return _digest([resolved, *(str(getattr(configuration, name)) for name in names)])
+    return _digest([resolved, *(str(getattr(configuration, name)) for name in OPTIONS)])
 
 
 def _contents(files: Iterable[Path], root: Path) -> Iterator[str]:

@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from slam import __version__
-from slam.comparison.experiment import Configuration, Experiment
+from slam.comparison.experiment import OPTIONS, Configuration, Experiment
 from slam.comparison.fingerprint import code_print
 from slam.comparison.pool import available_cores
 from slam.configuration import differences, find_config, resolve
 from slam.system_config import SystemConfig
 
 PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "open3d", "scipy", "torch", "faiss-cpu")
-OPTIONS = ("segmenter", "weights", "max_frames", "stride", "dense")
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import logging
-import socket
 from collections.abc import Generator, Sequence
 from types import TracebackType
 from typing import Any
 
-from graph.errors import InputError
+from semantics.ray_connection import connect
 from slam.comparison.job import Job, Outcome, run_job
 from slam.comparison.pool import Done
-
-LOCAL = "local"
-TIMEOUT_S = 5.0
 
 
 class RayPool:
@@ -27,21 +22,8 @@ class RayPool:
     """
 
     def __init__(self, address: str) -> None:
-        try:
-            import ray  # noqa: PLC0415 - optional, and slow to load
-        except ImportError as error:
-            raise InputError("--ray: needs Ray: pip install 'bmask-slam[ray]'") from error
-        self._ray: Any = ray
-        _check_address(address)
-        where = {"num_cpus": 1} if address == LOCAL else {"address": address}
-        try:
-            ray.init(
-                **where, include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING
-            )
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise InputError(f"--ray {address}: no cluster answers there ({reason})") from error
-        self._remote = ray.remote(num_cpus=1, max_retries=0)(_run)
+        self._ray: Any = connect(address, local_cpus=1)
+        self._remote = self._ray.remote(num_cpus=1, max_retries=0)(_run)
 
     def __enter__(self) -> RayPool:
         return self
@@ -70,20 +52,6 @@ class RayPool:
         finally:
             for reference in waiting:
                 self._ray.cancel(reference, force=True)
-
-
-def _check_address(address: str) -> None:
-    """Refuse HOST:PORT where nothing listens: Ray itself would try for minutes."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not (colon and port.isdigit()):
-        return
-    try:
-        socket.create_connection((host, int(port)), TIMEOUT_S).close()
-    except OSError as error:
-        raise InputError(
-            f"--ray {address}: nothing answers there ({error}); start it by ray start --head, or "
-            "leave --ray away"
-        ) from error
 
 
 def _run(job: Job) -> Outcome:
