@@ -1,19 +1,22 @@
-"""How old the figures in README.md and docs/ are: whether what measured them has changed since.
+"""How old the figures in README.md and docs/ are: whether what makes them has changed since.
 
-    python benchmarks/freshness.py        # every section, and what has changed in the system since
+    python benchmarks/freshness.py        # every section, and what has changed since
 
-Each section ends in a line with the date, the commit and a fingerprint of the benchmark: of its
-script and what it imports or calls of this folder, without comments, docstrings and layout. A
-section whose fingerprint is another today is stale, and tests/test_docs_fresh.py fails.
+Each section ends in a line with the date, the commit and a fingerprint of the code: of the
+benchmark's script, of what it imports or calls of this folder, and of its subject in the system
+(subjects.py), without comments, docstrings and layout. A section whose fingerprint is another today
+is stale, and tests/test_docs_fresh.py fails.
 """
 
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import io
 import re
 import subprocess
+import sys
 import tokenize
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,9 +24,12 @@ from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parent
+sys.path.insert(0, str(ROOT))
+
+from benchmarks.subjects import SUBJECTS  # noqa: E402
+
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-PACKAGES = ("graph", "semantics", "mapping", "slam")
-LAYOUT = ("report", "section_report", "machine", "freshness")
+LAYOUT = ("report", "section_report", "machine", "freshness", "subjects")
 """Modules that measure nothing: they write pages, or say what they were measured on."""
 DIGITS = 12
 LAST_LINE = re.compile(
@@ -43,7 +49,7 @@ class Section:
         title: the heading above it.
         script: of the benchmark, in this folder.
         commit, date: when it was measured, UTC.
-        code: the fingerprint of the benchmark then, "" where none was noted.
+        code: the fingerprint of the code then, "" where none was noted.
     """
 
     page: Path
@@ -55,7 +61,7 @@ class Section:
 
     @property
     def stale(self) -> bool:
-        """Whether the benchmark is another today."""
+        """Whether the benchmark or its subject is another today."""
         return self.code != code_print(FOLDER / self.script)
 
 
@@ -73,23 +79,31 @@ def sections(page: Path) -> list[Section]:
 
 
 def code_print(script: Path) -> str:
-    """The fingerprint of a benchmark; comments, docstrings and layout do not change it."""
+    """The fingerprint of a benchmark and its subject; comments and layout do not change it."""
     digest = hashlib.sha256()
-    for path in sorted(_modules(script)):
-        digest.update(f"{path.name}\n{_bare(path.read_text(encoding='utf-8'))}\n".encode())
+    for path in sorted(_modules(script)) + subject(script):
+        text = _bare(path.read_text(encoding="utf-8")).encode() if path.suffix == ".py" else None
+        digest.update(b"%s\n%s\n" % (path.name.encode(), text or path.read_bytes()))
     return digest.hexdigest()[:DIGITS]
 
 
-def commits_since(date: str) -> int | None:
-    """Commits to the system since a date (UTC); None without its history."""
-    command = ["git", "rev-list", "--count", f"--since={date} +0000", "HEAD", "--", *PACKAGES]
-    shallow = ["git", "rev-parse", "--is-shallow-repository"]
+def subject(script: Path) -> list[Path]:
+    """The files of the system that make a benchmark's figures."""
+    return sorted(
+        {path for pattern in SUBJECTS.get(script.name, ()) for path in ROOT.glob(pattern)}
+    )
+
+
+def changed_since(section: Section) -> list[str] | None:
+    """Files of a section's code that differ from its commit's; None without git and its history."""
+    script = FOLDER / section.script
+    files = [str(path.relative_to(ROOT)) for path in sorted(_modules(script)) + subject(script)]
+    command = ["git", "diff", "--name-only", section.commit, "--", *files]
     try:
-        if _output(shallow) != "false":
-            return None
-        return int(_output(command))
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     except (FileNotFoundError, subprocess.CalledProcessError):
         return None
+    return done.stdout.split()
 
 
 def _modules(script: Path) -> set[Path]:
@@ -119,6 +133,7 @@ def _names(path: Path) -> Iterator[str]:
             yield from re.findall(r"benchmarks/(\w+)\.py", node.value)
 
 
+@functools.cache
 def _bare(source: str) -> str:
     """The source without docstrings, comments, white space and trailing commas.
 
@@ -140,20 +155,16 @@ def _bare(source: str) -> str:
     return re.sub(r",(?=[)\]}])", "", re.sub(r"\s+", "", "".join(lines)))
 
 
-def _output(command: list[str]) -> str:
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
-
-
 def main() -> None:
     """Print all sections."""
     for page in PAGES:
         for section in sections(page):
-            since = commits_since(section.date)
             state = "STALE" if section.stale else "current"
-            age = "history unknown" if since is None else f"{since} commits to the system since"
             name = f"{page.relative_to(ROOT)}: {section.title}"
-            print(f"{state:<8}{name:<64}{section.script:<22}{section.date}  {age}")
+            print(f"{state:<8}{name:<72}{section.script:<20}{section.date}")
+            if section.stale:
+                changed = changed_since(section)
+                print("       ", "history unknown" if changed is None else " ".join(changed))
 
 
 if __name__ == "__main__":
