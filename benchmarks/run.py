@@ -117,7 +117,7 @@ def measure_all(arguments: argparse.Namespace) -> dict[str, Any]:
         noise = json.loads(call(command))
     return {
         "machine": describe_machine(),
-        "commit": describe_commit(ROOT, WRITTEN),
+        "commit": describe_commit(WRITTEN),
         "code": code_print(Path(__file__)),
         "date": now(),
         "command": command_line(arguments),

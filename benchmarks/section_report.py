@@ -20,7 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.freshness import code_print  # noqa: E402
-from benchmarks.machine import describe_commit, now, processor  # noqa: E402
+from benchmarks.machine import describe_commit, now  # noqa: E402
+from slam.machine import processor  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def section(report: Report, name: str, sequences: Path) -> str:
     if done.returncode:
         raise SystemExit(f"{command} failed:\n{done.stderr[-2000:]}")
     wall_s = time.perf_counter() - begin_s
-    commit = describe_commit(ROOT, (str(report.path.relative_to(ROOT)),))
+    commit = describe_commit((str(report.path.relative_to(ROOT)),))
     code = code_print(ROOT / command.split()[0])
     when = f"{processor()}; commit {commit}; code {code}; {now()}; {wall_s:.0f} s."
     captions = report.pictures.get(name, {})

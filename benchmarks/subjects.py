@@ -89,7 +89,8 @@ UNMEASURED = (
     "*/*/*/__init__.py",
     *_of(
         "graph",
-        "data_files.py errors.py g2o_landmarks*.py ply.py trajectory_formats.py update_report.py",
+        "data_files.py errors.py g2o_landmarks*.py ply.py trajectory_formats.py update_report.py "
+        "whole_file.py",
     ),
     *_of(
         "semantics",
@@ -102,6 +103,7 @@ UNMEASURED = (
         "__main__.py adjustment_report.py before_after.py calibration_report.py cli.py "
         "commands/*.py comparison/*.py comparison/report/*.py configuration.py covariances.py "
         "datasets/*.py evaluation/plot.py export.py landmark_cloud.py live/sources/*.py "
+        "machine.py "
         "map_file.py map_localisation.py memory.py object_picture.py optimise.py "
         "optimised_map.py progress.py query.py run_folder.py run_results.py runner.py "
         "segmentation.py semantic_files.py sequences/*.py stage_clock.py stop.py "

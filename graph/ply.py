@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph.errors import InputError
+from graph.whole_file import whole_file
 
 _TYPES = {
     "float": "<f4",
@@ -46,9 +46,8 @@ def write_ply(path: Path, columns: Mapping[str, NDArray[Any]], comment: str = ""
         vertices[name] = array
         header.append(f"property {_NAMES[array.dtype]} {name}")
     header.append("end_header\n")
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes("\n".join(header).encode("ascii") + vertices.tobytes())
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        temporary.write_bytes("\n".join(header).encode("ascii") + vertices.tobytes())
 
 
 def read_ply(path: Path) -> dict[str, NDArray[Any]]:

@@ -5,7 +5,6 @@ TUM's format is in ``graph.trajectory``.
 
 from __future__ import annotations
 
-import os
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
@@ -15,6 +14,7 @@ import numpy as np
 from graph.errors import InputError, finite_number
 from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
 from graph.trajectory import Trajectory, read_tum
+from graph.whole_file import whole_file
 
 EUROC_HEADER = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
@@ -178,8 +178,5 @@ def _numbers(words: list[str], where: str, counts: tuple[int, ...]) -> list[floa
 
 
 def _write(path: Path, lines: list[str]) -> None:
-    """The file appears whole or not at all."""
-    path = Path(path)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
-    os.replace(temporary, path)
+    with whole_file(Path(path)) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
+from graph.whole_file import whole_file
 from mapping.cloud import Cloud
 
 _PLY_NAMES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
@@ -65,15 +65,13 @@ class CloudWriter:
             self._temporary.unlink(missing_ok=True)
 
     def _finish(self, suffix: str, header: str) -> None:
-        path = self.stem.with_suffix(suffix)
-        temporary = path.with_name(f".{path.name}.part")
-        try:
-            with temporary.open("wb") as out, self._temporary.open("rb") as body:
-                out.write(header.encode("ascii"))
-                shutil.copyfileobj(body, out)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with (
+            whole_file(self.stem.with_suffix(suffix)) as temporary,
+            temporary.open("wb") as out,
+            self._temporary.open("rb") as body,
+        ):
+            out.write(header.encode("ascii"))
+            shutil.copyfileobj(body, out)
 
 
 # PCD's rgb is a number of 32 bits: its bytes are PLY's blue, green, red and alpha.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from graph.camera import Camera
 from graph.errors import InputError
 from graph.geometry import Array, inverse
+from graph.whole_file import whole_file
 from mapping.open3d_loader import load_open3d
 
 View = tuple[NDArray[np.float32], NDArray[np.uint8], Array]
@@ -76,8 +77,6 @@ def sampled(mesh: Any, count: int = 1_000_000) -> tuple[Array, Array]:
 
 def write_mesh(path: Path, mesh: Any) -> None:
     """Write a mesh as PLY. Raises InputError where Open3D cannot."""
-    temporary = path.with_name(f".part-{path.name}")
-    if not load_open3d().io.write_triangle_mesh(str(temporary), mesh):
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{path}: the mesh cannot be written; free some space")
-    temporary.replace(path)
+    with whole_file(path) as temporary:
+        if not load_open3d().io.write_triangle_mesh(str(temporary), mesh):
+            raise InputError(f"{path}: the mesh cannot be written; free some space")

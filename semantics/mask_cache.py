@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import cv2
 
 from graph.errors import InputError
+from graph.whole_file import whole_file
 from semantics.image_files import read_colour
 from semantics.instances import as_annotation
 from semantics.labels import LabelSet
@@ -141,6 +141,5 @@ def _as_coco(entries: Sequence[dict[str, Any]], labels: LabelSet) -> dict[str, A
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(content, separators=(",", ":")) + "\n")
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(content, separators=(",", ":")) + "\n")

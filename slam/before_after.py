@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-u
 from graph.errors import InputError
 from graph.geometry import Array
 from graph.trajectory import Indices
+from graph.whole_file import whole_file
 
 PICTURE_TYPES = (".png", ".pdf", ".svg")
 
@@ -59,9 +59,8 @@ def draw_before_after(path: Path, before: View, after: View) -> None:
         axes = figure.add_subplot(1, 2, k, projection=projection)
         axes.set_title(view.title)
         _draw(axes, view)
-    temporary = path.with_name(path.name + ".tmp")
-    figure.savefig(temporary, dpi=150, format=path.suffix[1:].lower())
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=150, format=path.suffix[1:].lower())
 
 
 def _draw(axes: Any, view: View) -> None:

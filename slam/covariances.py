@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from graph.errors import InputError, finite_number
 from graph.geometry import Array
 from graph.smoother import Smoother
 from graph.solver import SolverError
+from graph.whole_file import whole_file
 from slam.landmarks import Ints
 
 logger = logging.getLogger(__name__)
@@ -63,9 +63,8 @@ def write_covariances(path: Path, found: KeyframeCovariances) -> None:
     lines = [
         f"{i} {stamp:.6f} " + " ".join(f"{value:.9e}" for value in row) for i, stamp, row in rows
     ]
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(HEADER + "\n".join(lines) + "\n", encoding="ascii", newline="\n")
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        temporary.write_text(HEADER + "\n".join(lines) + "\n", encoding="ascii", newline="\n")
 
 
 def read_covariances(path: Path) -> KeyframeCovariances:

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ import numpy as np
 
 from graph.array_file import FileKind, read_arrays, write_arrays
 from graph.errors import InputError
+from graph.whole_file import whole_file
 from mapping.depth_files import read_fused, write_fused
 from mapping.inverse_depth import InverseDepthMap
 from mapping.labels import InstanceEvidence
@@ -119,9 +119,8 @@ class DenseFolder:
 
     def write_text(self, name: str, text: str) -> None:
         """Replace a text file."""
-        temporary = self.path / f".{name}.part"
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, self.path / name)
+        with whole_file(self.path / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
     def _file(self, kind: str, keyframe_id: int) -> Path:
         return self.path / kind / f"{keyframe_id:06d}"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from graph.camera import Camera
 from graph.errors import InputError
 from graph.geometry import Array, make_pose
+from graph.whole_file import whole_file
 from mapping.cloud import Cloud, merged, spill
 from mapping.cloud_files import CloudWriter
 from mapping.floor_plan import FloorPlan, plan_frame
@@ -236,8 +237,7 @@ def _views(run: MappedRun, keyframes: list[Keyframe], folder: DenseFolder) -> It
 
 def _write(folder: DenseFolder, name: str, image: NDArray[np.uint8]) -> Path:
     path = folder.path / name
-    temporary = folder.path / f".part-{name}"
-    if not cv2.imwrite(str(temporary), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-        raise InputError(f"{path}: cannot be written; free some space")
-    temporary.replace(path)
+    with whole_file(path) as temporary:
+        if not cv2.imwrite(str(temporary), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
+            raise InputError(f"{path}: cannot be written; free some space")
     return path

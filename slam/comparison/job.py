@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from graph.whole_file import whole_file
 from slam.comparison.result import CellStatus
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -132,10 +133,9 @@ def read_record(path: Path) -> Outcome | None:
 
 def write_record(path: Path, outcome: Outcome) -> None:
     """Write an outcome, whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
     plain = asdict(outcome) | {"status": outcome.status.value}
-    temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
 
 
 def _outcome(job: Job, code: int, wall_s: float) -> Outcome:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import threading
 from collections.abc import Generator, Sequence
@@ -12,6 +11,7 @@ from types import TracebackType
 from typing import Protocol
 
 from slam.comparison.job import Job, Outcome, run_job
+from slam.machine import available_cores
 
 Done = tuple[Job, Outcome]
 
@@ -25,13 +25,6 @@ class Pool(Protocol):
     def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
         """Yield each job with its outcome as it ends; when closed early, the others are ended."""
         ...
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 class LocalPool:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graph.errors import InputError
+from graph.whole_file import whole_file
 
 if TYPE_CHECKING:
     import pandas
@@ -136,12 +137,11 @@ class Comparison:
 
 
 def write_results(path: Path, comparison: Comparison) -> None:
-    """Write a comparison as JSON, under a temporary name first; NaN becomes null."""
+    """Write a comparison as JSON, whole or not at all; NaN becomes null."""
     plain = {"format": FORMAT_VERSION} | asdict(comparison)
     text = json.dumps(_finite(plain), indent=1, default=lambda value: value.value)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text + "\n", encoding="utf-8")
-    temporary.replace(path)
+    with whole_file(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def read_results(path: Path) -> Comparison:

@@ -10,6 +10,7 @@ from pathlib import Path
 import yaml
 
 from graph.errors import InputError
+from graph.whole_file import whole_file
 from semantics.http_file import WebFile, download
 from slam.datasets.catalogue import Recording
 from slam.datasets.icl_nuim import to_tum_layout
@@ -73,9 +74,8 @@ def read_sums(path: Path) -> dict[str, str]:
 def write_sums(path: Path, sums: dict[str, str]) -> None:
     """Write such lines, sorted by name."""
     text = "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items()))
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _completed(unpacked: Path, recording: Recording) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from graph.errors import InputError
 from graph.geometry import Array
 from graph.metrics import AbsoluteError, absolute_error
 from graph.trajectory import Trajectory, associate
+from graph.whole_file import whole_file
 
 ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#9a9a96", "#d6302a"
 GAP_STEPS = 5
@@ -54,9 +54,8 @@ def plot_trajectory(
         rmse_cm = 100 * error.translation_m.rmse
         title = f"{title}: ATE RMSE {rmse_cm:.2f} cm over {len(matched)} poses"
     figure.suptitle(title, fontsize=11)
-    temporary = path.with_name(path.name + ".tmp")
-    figure.savefig(temporary, format=form)
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format=form)
 
 
 def draw_top_view(

@@ -11,6 +11,7 @@ import yaml
 
 from graph.camera import Camera
 from graph.errors import InputError
+from graph.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -122,12 +123,10 @@ def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
     values |= {key: getattr(camera, name) for key, name in OPTIONAL.items()}
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines.append(yaml.safe_dump(values, sort_keys=False, default_flow_style=None).rstrip())
-    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        temporary.replace(path)
+        with whole_file(path) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
+from graph.whole_file import whole_file
 from slam.comparison.report.html import html_text
 from slam.comparison.report.pdf import pdf_bytes
 from slam.comparison.report.section import Section, slug
@@ -56,8 +56,6 @@ def _write_figures(folder: Path, sections: list[Section]) -> list[Path]:
 
 
 def _write(path: Path, data: bytes) -> Path:
-    """Write a file that appears whole or not at all."""
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(data)
     return path

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from feeding import feed
 from synthetic_view import CAMERA, render_plane
 
 from graph.errors import InputError
@@ -18,7 +19,6 @@ from graph.geometry import Array, inverse, se3_exp
 from graph.trajectory import read_tum
 from semantics.segmenter_table import SegmenterOptions
 from slam.configuration import resolve
-from slam.frame import Frame
 from slam.landmark_cloud import LandmarkCloud
 from slam.live.live_slam import LiveOptions, LiveSlam
 from slam.live.messages import NewKeyframe
@@ -32,18 +32,6 @@ SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
 TRUTH = [se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a, 0, 0])) for a in np.arange(30) * 0.02]
 FRAMES = [render_plane(pose, index) for index, pose in enumerate(TRUTH)]
-
-
-def feed(slam: LiveSlam, frames: list[Frame]) -> list[TrackingStatus]:
-    """Frames at a rate that a map on a busy machine can follow."""
-    statuses = []
-    for frame in frames:
-        statuses.append(slam.track(frame.timestamp_s, frame.rgb, frame.depth_m).status)
-        deadline_s = time.monotonic() + 2
-        while slam.health().keyframes_waiting > 1 and time.monotonic() < deadline_s:
-            time.sleep(0.01)
-            slam.catch_up()
-    return statuses
 
 
 def error_m(poses: Array) -> float:
