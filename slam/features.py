@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from graph.camera import Camera
 from graph.geometry import Array
+from slam.description import FixedSizeBrisk
 from slam.frame import Frame
 
 FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
@@ -85,30 +86,32 @@ class BriskExtractor:
     def __init__(self, camera: Camera, config: FeatureConfig):
         self.camera = camera
         self.config = config
-        self._describer = cv2.BRISK_create(config.thresholds[0], config.octaves)
+        self._describer = FixedSizeBrisk(FINEST_SIZE_PX)
+        self._border_px = max(config.border_px, self._describer.reach_px)
         self._fast = {t: cv2.FastFeatureDetector_create(t) for t in config.thresholds}
 
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        kept = self._strongest_spread(self._detect(gray), gray.shape)
-        keypoints, descriptors = self._describer.compute(gray, kept)
-        if descriptors is None:
-            return self._assemble(frame, gray, np.zeros((0, 4)), np.zeros((0, 64), np.uint8))
-        table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=float)
-        return self._assemble(frame, gray, table.reshape(-1, 4), np.ascontiguousarray(descriptors))
+        pixels, response, threshold = self._corners(gray)
+        if self.config.octaves > 0:
+            return self._with_scales(frame, gray, threshold)
+        pixels = pixels[self._strongest_spread(pixels, response, gray.shape[1])]
+        descriptors, angles_rad = self._describer.describe(gray, pixels)
+        raw, scales = pixels.astype(float), np.ones(len(pixels))
+        return self._assemble(frame, gray, (raw, scales, angles_rad), descriptors)
 
-    def _detect(self, gray: NDArray[np.uint8]) -> list:
-        """Keypoints at the highest threshold that gives enough of them.
+    def _corners(
+        self, gray: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], int]:
+        """Pixels (N, 2) and responses (N,) at the highest threshold that gives enough, and it.
 
         A corner's response is the highest threshold at which it is still found, so that one
         detection serves all thresholds above its own. Without octaves BRISK's detector is FAST
         with non-maximum suppression, and its sub-pixel step is not needed, since matches are
         registered to patches later.
         """
-        border, (height, width) = self.config.border_px, gray.shape
-        inside = np.zeros_like(gray)
-        inside[border : height - border, border : width - border] = 255
+        inside = self._inside(gray)
         thresholds, enough = self.config.thresholds, self.config.max_keypoints
         for lowest in (thresholds[len(thresholds) // 2], thresholds[-1]):
             found = self._fast[lowest].detect(gray, inside)
@@ -117,28 +120,53 @@ class BriskExtractor:
         response = np.array([keypoint.response for keypoint in found])
         usable = (t for t in thresholds if t > lowest and (response >= t).sum() >= enough)
         threshold = next(usable, lowest)
-        if self.config.octaves > 0:
-            return list(cv2.BRISK_create(threshold, self.config.octaves).detect(gray, inside))
-        return [found[i] for i in np.flatnonzero(response >= threshold)]
+        strong = response >= threshold
+        pixels = np.reshape(cv2.KeyPoint_convert(found), (-1, 2)).astype(np.float32, copy=False)
+        return pixels[strong], response[strong], threshold
 
-    def _strongest_spread(self, keypoints: list, shape: tuple[int, int]) -> list:
+    def _inside(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """255 where a descriptor can be had."""
+        border, (height, width) = self._border_px, gray.shape
+        inside = np.zeros_like(gray)
+        inside[border : height - border, border : width - border] = 255
+        return inside
+
+    def _with_scales(self, frame: Frame, gray: NDArray[np.uint8], threshold: int) -> Features:
+        """Features of several sizes, by OpenCV's BRISK."""
+        brisk = cv2.BRISK_create(threshold, self.config.octaves)
+        found = brisk.detect(gray, self._inside(gray))
+        pixels = np.reshape(cv2.KeyPoint_convert(found), (-1, 2))
+        response = np.array([keypoint.response for keypoint in found])
+        kept = self._strongest_spread(pixels, response, gray.shape[1])
+        keypoints, descriptors = brisk.compute(gray, [found[i] for i in kept])
+        table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], float).reshape(-1, 4)
+        bits = np.zeros((0, 64), np.uint8) if descriptors is None else descriptors
+        columns = table[:, :2], np.maximum(table[:, 2] / FINEST_SIZE_PX, 1.0)
+        return self._assemble(
+            frame,
+            gray,
+            (*columns, np.deg2rad(table[:, 3])),
+            np.ascontiguousarray(bits).view(np.uint64),
+        )
+
+    def _strongest_spread(
+        self, pixels: NDArray[np.float32], response: Array, width: int
+    ) -> NDArray[np.int64]:
         """At most ``max_keypoints``: every bucket's strongest first, then the second, and so on."""
-        if not keypoints:
-            return []
         size = self.config.bucket_px
-        columns = -(-shape[1] // size)
-        pixels = cv2.KeyPoint_convert(keypoints)
-        response = np.array([k.response for k in keypoints])
-        bucket = (pixels[:, 1] // size).astype(int) * columns + (pixels[:, 0] // size).astype(int)
-        keep = np.sort(spread_order(bucket, response)[: self.config.max_keypoints])
-        if self.config.octaves > 0:
-            return [keypoints[i] for i in keep]
-        return list(cv2.KeyPoint_convert(pixels[keep], FINEST_SIZE_PX))
+        column, row = (pixels // size).astype(np.int64).T
+        order = spread_order(row * -(-width // size) + column, response)
+        return np.sort(order[: self.config.max_keypoints])
 
     def _assemble(
-        self, frame: Frame, gray: NDArray[np.uint8], table: Array, descriptors: NDArray[np.uint8]
+        self,
+        frame: Frame,
+        gray: NDArray[np.uint8],
+        keypoints: tuple[Array, Array, Array],
+        descriptors: NDArray[np.uint64],
     ) -> Features:
-        raw, scales = table[:, :2], np.maximum(table[:, 2] / FINEST_SIZE_PX, 1.0)
+        """With depth and noise, from pixels (N, 2), scales (N,) and angles (N,) in radians."""
+        raw, scales, angles_rad = keypoints
         depth_m, spread_m = sample_depth(frame.depth_m, raw, self.config)
         disparity = self.camera.stereo_bf_px_m / depth_m
         sigmas = np.empty((len(raw), 3))
@@ -149,9 +177,9 @@ class BriskExtractor:
         return Features(
             pixels=undistort(self.camera, raw),
             image_pixels=raw,
-            descriptors=descriptors.view(np.uint64).reshape(-1, 8),
+            descriptors=descriptors,
             scales=scales,
-            angles_rad=np.deg2rad(table[:, 3]),
+            angles_rad=angles_rad,
             depth_m=depth_m,
             disparity_px=disparity,
             sigmas_px=sigmas,

@@ -18,6 +18,7 @@ from slam.features import (
     undistort,
 )
 from slam.frame import Frame
+from slam.matching import hamming
 
 RNG = np.random.default_rng(4)
 CONFIG = FeatureConfig()
@@ -84,9 +85,10 @@ def test_corners_are_those_of_the_highest_threshold_with_enough(contrast: float)
     assert expected <= pixels <= {k.pt for k in found if k.response >= weakest}
 
 
-def test_descriptors_are_those_of_opencv_at_these_keypoints() -> None:
+@pytest.mark.parametrize("octaves", [0, 2])
+def test_descriptors_are_those_of_opencv_at_these_keypoints(octaves: int) -> None:
     """Rows belong together: each descriptor is that of its own pixel, size and angle."""
-    features = extract(FRONTAL)
+    features = extract(FRONTAL, dataclasses.replace(CONFIG, octaves=octaves))
     keypoints = [
         cv2.KeyPoint(float(u), float(v), float(12.0 * s), float(np.rad2deg(a)))
         for (u, v), s, a in zip(
@@ -94,8 +96,10 @@ def test_descriptors_are_those_of_opencv_at_these_keypoints() -> None:
         )
     ]
     kept, expected = cv2.BRISK_create().compute(features.gray, keypoints)
-    assert len(kept) == len(features)
-    np.testing.assert_array_equal(features.descriptors.view(np.uint8), expected)
+    assert len(kept) == len(features) > 300
+    distance = hamming(features.descriptors, expected.view(np.uint64))
+    assert np.median(distance) <= (0 if octaves else 8)
+    assert np.percentile(distance, 99) < 60
 
 
 @pytest.mark.parametrize("cap", [50, 200])
