@@ -20,7 +20,8 @@ from semantics.segmenter import Image
 
 STRIDES = (8, 16, 32)
 SIZES_PX = (416, 640)
-"""Input sizes of the published networks: Nano and Tiny, and the larger ones."""
+"""Input sizes of the published networks: Nano and Tiny, and the larger ones. A file whose shapes
+are not fixed takes both, and is run at both: the larger one finds small objects."""
 PAD_VALUE = 114
 GEOMETRY = 5
 """x, y, width, height and objectness come before the class probabilities."""
@@ -37,6 +38,8 @@ class YoloxConfig:
             the one that stays.
         max_count: at most so many boxes stay.
         mirror: the mirror image is looked at as well, for twice the time.
+        sizes_px: sides of the square input; those that the file takes are used, one after the
+            other, and all their boxes count.
     """
 
     min_score: float = 0.001
@@ -44,6 +47,7 @@ class YoloxConfig:
     vote_iou: float = 0.8
     max_count: int = 100
     mirror: bool = True
+    sizes_px: tuple[int, ...] = SIZES_PX
 
 
 class YoloxDetector:
@@ -63,23 +67,26 @@ class YoloxDetector:
         self._path = path
         self._config = config or YoloxConfig()
         self._classes = read_label_set("coco")
-        self._side_px = self._find_side()
+        self._sides_px = self._find_sides()
 
     def detect(self, image: Image, labels: LabelSet) -> ClassifiedBoxes:
         """Boxes in an image (H, W, 3), red first, of the classes that ``labels`` knows."""
-        boxes, probabilities = self._look(image)
+        looks = [self._look(image, side) for side in self._sides_px]
         if self._config.mirror:
-            mirrored, more = self._look(np.ascontiguousarray(image[:, ::-1]))
-            mirrored[:, [2, 0]] = image.shape[1] - mirrored[:, [0, 2]]
-            boxes, probabilities = np.r_[boxes, mirrored], np.r_[probabilities, more]
+            other = np.ascontiguousarray(image[:, ::-1])
+            mirrored = [self._look(other, side) for side in self._sides_px]
+            for boxes, _ in mirrored:
+                boxes[:, [2, 0]] = image.shape[1] - boxes[:, [0, 2]]
+            looks += mirrored
+        every, probabilities = (np.concatenate(part) for part in zip(*looks, strict=True))
         numbers = np.array([labels.number(name) for name in self._classes.names[1:]])
-        return self._select(boxes, probabilities, numbers, len(labels))
+        return self._select(every, probabilities, numbers, len(labels))
 
-    def _look(self, image: Image) -> tuple[NDArray, NDArray]:
+    def _look(self, image: Image, side_px: int) -> tuple[NDArray, NDArray]:
         """Boxes (P, 4) in the image's pixels and class probabilities (P, 80), as they come."""
-        blob, factor = letterbox(image, self._side_px)
+        blob, factor = letterbox(image, side_px)
         self._network.setInput(blob)
-        boxes, probabilities = decode(self._network.forward()[0], self._side_px)
+        boxes, probabilities = decode(self._network.forward()[0], side_px)
         height, width = image.shape[:2]
         return np.clip(boxes / factor, 0, [width, height, width, height]), probabilities
 
@@ -108,21 +115,25 @@ class YoloxDetector:
             torch.from_numpy(distribution)[keep],
         )  # fmt: skip
 
-    def _find_side(self) -> int:
-        """The input size, by trying: the file's shapes are not shown by OpenCV."""
-        for side in SIZES_PX:
-            self._network.setInput(np.zeros((1, 3, side, side), np.float32))
-            try:
-                output = self._network.forward()
-            except cv2.error:
-                continue
-            cells = sum((side // stride) ** 2 for stride in STRIDES)
-            if output.shape == (1, cells, GEOMETRY + len(self._classes) - 1):
-                return side
-        raise InputError(
-            f"{self._path}: not a YOLOX network for COCO's 80 classes at one of {SIZES_PX} pixels; "
-            "give such a one"
-        )
+    def _find_sides(self) -> tuple[int, ...]:
+        """The input sizes, by trying: the file's shapes are not shown by OpenCV."""
+        sides = tuple(side for side in self._config.sizes_px if self._takes(side))
+        if not sides:
+            raise InputError(
+                f"{self._path}: not a YOLOX network for COCO's 80 classes at one of "
+                f"{self._config.sizes_px} pixels; give such a one"
+            )
+        return sides
+
+    def _takes(self, side_px: int) -> bool:
+        """Whether an input of this size gives what a YOLOX network gives."""
+        self._network.setInput(np.zeros((1, 3, side_px, side_px), np.float32))
+        try:
+            output = self._network.forward()
+        except cv2.error:
+            return False
+        cells = sum((side_px // stride) ** 2 for stride in STRIDES)
+        return bool(output.shape == (1, cells, GEOMETRY + len(self._classes) - 1))
 
 
 def voted(boxes: Tensor, scores: Tensor, labels: Tensor, keep: Tensor, min_iou: float) -> Tensor:

@@ -54,6 +54,12 @@ def clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.minimum(boxes.clamp(min=0), upper)
 
 
+def mirrored(boxes: Tensor, width: float) -> Tensor:
+    """Boxes (..., 4) in the mirror image, left and right exchanged."""
+    x1, y1, x2, y2 = boxes.unbind(-1)
+    return torch.stack([width - x2, y1, width - x1, y2], dim=-1)
+
+
 def enlarged(boxes: Tensor, factor: float) -> Tensor:
     """Boxes (N, 4) grown by a factor about their centres, also beyond the image."""
     if factor == 1.0:

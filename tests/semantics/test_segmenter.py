@@ -18,7 +18,7 @@ from semantics.mask_cache import ANNOTATIONS, CacheOptions, cache_masks
 from semantics.network.box_head import ClassifiedBoxes
 from semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
 from semantics.network.model import Detections, MaskRCNN
-from semantics.network_segmenter import NetworkSegmenter, as_instances
+from semantics.network_segmenter import NetworkSegmenter, as_instances, segment_both_ways
 from semantics.overlay import draw
 from semantics.segmenter import (
     CocoSegmenter,
@@ -207,6 +207,23 @@ def test_a_mask_of_an_enlarged_box_reaches_beyond_the_box() -> None:
     rows, columns = np.nonzero(as_instances(found, (60, 80), 0.0)[0].mask)
     assert (columns.min(), rows.min()) == pytest.approx((25, 15), abs=1)
     assert (columns.max(), rows.max()) == pytest.approx((55, 45), abs=1)
+
+
+def test_masks_of_a_mirrored_scene_are_the_mirrored_masks() -> None:
+    torch.manual_seed(0)
+    model = MaskRCNN(replace(TINY, class_agnostic=True)).eval()
+    image = torch.rand(3, 64, 96)
+    box = torch.tensor([[10.0, 8.0, 50.0, 60.0]])
+    given = ClassifiedBoxes(box, torch.tensor([2]), torch.tensor([0.9]), torch.full((1, 3), 1 / 3))
+    other = replace(given, boxes=torch.tensor([[46.0, 8.0, 86.0, 60.0]]))
+    with torch.inference_mode():
+        alone = model.segment([image], [given])[0]
+        found = segment_both_ways(model, image, given)
+        turned = segment_both_ways(model, image.flip(2), other)
+    torch.testing.assert_close(found.found.boxes, box)
+    torch.testing.assert_close(turned.masks, found.masks.flip(2))
+    torch.testing.assert_close(turned.mask_ious, found.mask_ious)
+    assert not torch.allclose(alone.masks, found.masks)
 
 
 def test_mask_scores_reorder_detections_and_empty_masks_go() -> None:

@@ -45,7 +45,7 @@ def test_the_letterbox_keeps_proportions() -> None:
 
 def test_the_real_network_finds_large_objects_in_real_photographs() -> None:
     content = read_coco(SHARED / "coco_excerpt" / "instances.json")
-    detector = YoloxDetector(ONNX)
+    detector = YoloxDetector(ONNX, YoloxConfig(mirror=False))
     hits = total = 0
     for image in content.images[:12]:
         pixels = read_colour(SHARED / "coco_excerpt" / "images" / image.file_name)
@@ -88,6 +88,24 @@ def test_with_the_mirror_image_a_mirrored_scene_has_the_mirrored_boxes() -> None
     torch.testing.assert_close(other.scores, one.scores, atol=1e-4, rtol=1e-4)
 
 
+def test_a_second_input_size_finds_more_small_objects() -> None:
+    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    one, both = (
+        YoloxDetector(ONNX, YoloxConfig(0.2, mirror=False, sizes_px=sizes))
+        for sizes in ((416,), (416, 640))
+    )
+    hits = {one: 0, both: 0}
+    for image in content.images[:8]:
+        pixels = read_colour(SHARED / "coco_excerpt" / "images" / image.file_name)
+        small = [o for o in image.objects if not o.crowd and o.mask().sum() < 48**2]
+        for detector in hits:
+            found = detector.detect(pixels, content.labels)
+            for o in small:
+                overlap = iou(torch.tensor([o.box]), found.boxes[found.labels == o.label])
+                hits[detector] += bool((overlap > 0.5).any())
+    assert hits[both] > hits[one]
+
+
 def test_only_classes_of_the_label_set_are_found() -> None:
     detector = YoloxDetector(ONNX)
     image = read_colour(sorted((SHARED / "coco_excerpt" / "images").iterdir())[0])
@@ -104,3 +122,5 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         YoloxDetector(bad)
     with pytest.raises(InputError, match="no such file"):
         YoloxDetector(tmp_path / "none.onnx")
+    with pytest.raises(InputError, match="not a YOLOX network"):
+        YoloxDetector(ONNX, YoloxConfig(sizes_px=(100,)))
