@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from graph.geometry import Array
 
@@ -54,25 +55,34 @@ def upright_axes(up_world: Array) -> Array:
     return np.stack([first, np.cross(up_world, first), up_world], axis=1)
 
 
-def box_around(points_world: Array, up_world: Array, trim: float = 0.0) -> OrientedBox:
-    """The upright box of least ground area around points (N, 3), N >= 1.
+def supported(points: Array, neighbours: int, reach_m: float) -> NDArray[np.bool_]:
+    """Which of the points (N, 3) of one thing have so many others near them.
 
-    Of the points in each direction the share ``trim`` is left out at either end: some are wrong.
+    Near is within ``reach_m`` and, where points are sparse, three times the median distance of the
+    farthest of a point's ``neighbours``. All, where nobody has. A lone point is an error of depth
+    or of a mask; a quantile would also take away faces that are seen at a glancing angle.
     """
+    if neighbours < 1 or len(points) <= neighbours:
+        return np.ones(len(points), bool)
+    farthest_m = KDTree(points).query(points, neighbours + 1)[0][:, -1]
+    near = np.asarray(farthest_m <= max(reach_m, 3 * float(np.median(farthest_m))))
+    return near if near.any() else np.ones(len(points), bool)
+
+
+def box_around(points_world: Array, up_world: Array) -> OrientedBox:
+    """The upright box of least ground area around points (N, 3), N >= 1."""
     R_world_upright = upright_axes(up_world)
     points = points_world @ R_world_upright
-    low, high = np.quantile(points, [trim, 1 - trim], axis=0)
-    inside = ((points >= low) & (points <= high)).all(axis=1)
-    ground = points[inside, :2] if inside.any() else points[:, :2]
-    angle_deg = cv2.minAreaRect(ground.astype(np.float32))[2]
+    low, high = points[:, 2].min(), points[:, 2].max()
+    angle_deg = cv2.minAreaRect(points[:, :2].astype(np.float32))[2]
     angle = np.deg2rad(angle_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    flat = ground @ turn
+    flat = points[:, :2] @ turn
     middle = turn @ (0.5 * (flat.min(axis=0) + flat.max(axis=0)))
-    size_m = np.array([*np.ptp(flat, axis=0), high[2] - low[2]])
+    size_m = np.array([*np.ptp(flat, axis=0), high - low])
     T = np.eye(4)
     T[:3, :3] = R_world_upright @ np.block([[turn, np.zeros((2, 1))], [0, 0, 1]])
-    T[:3, 3] = R_world_upright @ [*middle, 0.5 * (low[2] + high[2])]
+    T[:3, 3] = R_world_upright @ [*middle, 0.5 * (low + high)]
     return OrientedBox(T, np.maximum(size_m, MIN_SIZE_M))
 
 

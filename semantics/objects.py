@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
-from semantics.boxes3d import OrientedBox, box_around
+from semantics.boxes3d import OrientedBox, box_around, supported
 from semantics.detections import DetectionConfig, Detections, detect
 from semantics.label_store import LabelStore, LabelStoreConfig
 from semantics.object_association import (
@@ -32,14 +32,15 @@ from semantics.votes import NOBODY, Claims, Ints
 class ObjectConfig:
     """How objects are made of detections.
 
-    An object of fewer than ``min_keyframes`` is not told of; one keeps ``max_points`` points; of
-    its points in each direction the share ``trim`` at either end is not in its box.
+    An object of fewer than ``min_keyframes`` is not told of; one keeps ``max_points`` points. In
+    its box are those that have ``neighbours`` others within ``support_m``.
     """
 
     enabled: bool = True
     min_keyframes: int = 2
     max_points: int = 2000
-    trim: float = 0.01
+    neighbours: int = 2
+    support_m: float = 0.03
     detections: DetectionConfig = field(default_factory=DetectionConfig)
     association: AssociationConfig = field(default_factory=AssociationConfig)
     revision: RevisionConfig = field(default_factory=RevisionConfig)
@@ -93,7 +94,7 @@ class MapObject:
     Attributes:
         id: its number, never used twice.
         label: its likeliest class; distribution: (C,) over all.
-        centroid_world: (3,) m, mean of its points. box: around them.
+        centroid_world: (3,) m, mean of its points but lone ones. box: around them.
         keyframe_ids: that saw it. landmark_ids: on it.
         first_seen_s, last_seen_s: stamps.
     """
@@ -156,7 +157,8 @@ class ObjectMap:
                 continue
             distribution = self.labels.probabilities(np.array([i]))[0]
             mine = points[owners == i]
-            box = box_around(mine, up_world, self.config.trim)
+            mine = mine[supported(mine, self.config.neighbours, self.config.support_m)]
+            box = box_around(mine, up_world)
             label, landmarks = int(distribution.argmax()), self.points.landmarks_of(i)
             seen_s = float(stamps_s.min()), float(stamps_s.max())
             shape, by_whom = (mine.mean(axis=0), box), (keyframe_ids, landmarks)

@@ -7,7 +7,7 @@ import pytest
 
 from graph.camera import Camera
 from graph.geometry import Array, se3_exp, transform
-from semantics.boxes3d import EDGES, OrientedBox, box_around, box_iou, upright_axes
+from semantics.boxes3d import EDGES, OrientedBox, box_around, box_iou, supported, upright_axes
 from semantics.objects import pixel_rays
 from semantics.upright import Upright, sample_normals, up_direction
 
@@ -36,11 +36,32 @@ def test_a_box_around_a_turned_cuboid_is_that_cuboid(yaw_deg: float) -> None:
     assert box_iou(box, OrientedBox(T, size_m)) > 0.95
 
 
-def test_trimming_takes_strays_out() -> None:
+def test_lone_points_are_not_supported() -> None:
     rng = np.random.default_rng(2)
-    points = np.concatenate([cuboid(rng, np.ones(3)), rng.uniform(-3, 3, (20, 3))])
-    assert box_around(points, UP).size_m.max() > 3
-    assert np.allclose(box_around(points, UP, 0.02).size_m, 1.0, atol=0.05)
+    size_m = np.ones(3)
+    points = np.concatenate([cuboid(rng, size_m), rng.uniform(2, 6, (5, 3))])
+    kept = supported(points, 2, 0.03)
+    assert kept.tolist() == [True] * 3000 + [False] * 5
+    assert np.allclose(box_around(points[kept], UP).size_m, 1.0, atol=0.01)
+
+
+def test_a_face_of_few_points_stays_in_the_box() -> None:
+    """A book's back has 2000 points, its cover, seen at a glancing angle, eight."""
+    rng = np.random.default_rng(3)
+    back = rng.uniform(0, 1, (2000, 3)) * [0.03, 0.0, 0.3]
+    cover = np.array([[0.0, y, z] for y in (0.08, 0.1, 0.12, 0.14) for z in (0.1, 0.12)])
+    points = np.concatenate([back, cover])
+    assert supported(points, 2, 0.03).all()
+    assert not supported(points, 2, 0.01)[2000:].any()
+
+
+def test_support_is_what_counting_neighbours_says() -> None:
+    points = np.random.default_rng(4).normal(size=(80, 3))
+    apart = np.sort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)[:, 3]
+    assert (supported(points, 3, 0.1) == (apart <= 3 * np.median(apart))).all()
+    assert (supported(points, 3, 1e3)).all()
+    assert supported(points[:3], 3, 0.0).all()
+    assert supported(points, 0, 0.0).all()
 
 
 def test_one_point_and_a_flat_thing_have_boxes() -> None:
