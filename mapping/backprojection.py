@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from graph.camera import Camera
 from mapping.inverse_depth import InverseDepthMap
+from mapping.pixelwise import gate, windowed
 from mapping.warping import image_grid
 
 NORMAL_WINDOW_PX = 5
@@ -37,12 +37,15 @@ def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
     rho = given.rho
     inner = rho[1:-1, 1:-1]
     across, down = rho[1:-1, 2:] - rho[1:-1, :-2], rho[2:, 1:-1] - rho[:-2, 1:-1]
-    smooth = (across.abs() < MAX_STEP * inner) & (down.abs() < MAX_STEP * inner)
-    share = smooth.to(torch.float32)
-    stack = torch.stack([torch.where(smooth, across, 0.0), torch.where(smooth, down, 0.0), share])
-    a, b, weight = _window_mean(stack)
-    weight = torch.where(smooth, 2 * weight, torch.nan)
-    a, b = a / weight, b / weight
+    steep = torch.maximum(across.abs(), down.abs())
+    share = (MAX_STEP * inner).sub_(steep).sign_().nan_to_num_().relu_()
+    a, b, weight = (
+        windowed(torch.add, plane, NORMAL_WINDOW_PX // 2)
+        for plane in (across.nan_to_num_() * share, down.nan_to_num_() * share, share)
+    )
+    weight = (0.5 / weight).add_(gate(share - 1))
+    a *= weight
+    b *= weight
     u, v = image_grid(rho)
     u, v = u[:, 1:-1] - camera.cx, v[1:-1] - camera.cy
     planes = camera.fx * a, camera.fy * b, inner - a * u - b * v
@@ -51,9 +54,3 @@ def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
     for k, plane in enumerate(planes):
         normals[1:-1, 1:-1, k] = plane * scale
     return normals
-
-
-def _window_mean(planes: Tensor) -> Tensor:
-    """Means of (C, H, W) over a square window; zero beyond the image."""
-    size, rim = NORMAL_WINDOW_PX, NORMAL_WINDOW_PX // 2
-    return avg_pool2d(avg_pool2d(planes, (size, 1), 1, (rim, 0)), (1, size), 1, (0, rim))

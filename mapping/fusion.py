@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from itertools import combinations
 
 import numpy as np
@@ -13,9 +13,10 @@ from torch import Tensor
 
 from graph.camera import Camera
 from graph.geometry import inverse
-from mapping.inverse_depth import COMPATIBLE, InverseDepthMap, squared_gradient
-from mapping.regularisation import set_order
-from mapping.warping import View, hypothesis, moved, project
+from mapping.inverse_depth import InverseDepthMap, agreement, squared_gradient
+from mapping.pixelwise import gate, windowed
+from mapping.regularisation import FAR, set_order
+from mapping.warping import View, hypothesis, project
 
 MAX_NEIGHBOURS = 6
 MAX_COLOUR_STEP = 15.0
@@ -63,32 +64,33 @@ def fuse(
     sees through it; a surface that only one neighbour shows is not taken, nor, where there are
     images (3, H, W), one that has another colour there.
     """
-    views = neighbours[:MAX_NEIGHBOURS]
+    views, known = neighbours[:MAX_NEIGHBOURS], own.known
     seeds = seeded(own, views, camera)
-    empty = ~own.known
-    hypotheses = [hypothesis(torch.where(empty, seeds, own.rho), v, camera, empty) for v in views]
-    factor = variance_factor(own, hypotheses)
-    rho, weight = [own.rho], [_weight(own.variance)]
-    through = torch.zeros_like(empty)
-    for view, (mean, variance) in zip(views, hypotheses, strict=True):
-        if image is not None and view.image is not None:
-            drop_other_colours(seeds, variance, (image, view), camera)
-        weight.append(_weight(variance))
-        rho.append(torch.where(weight[-1] > 0, mean, torch.nan))
-        through |= rho[-1] < own.rho
+    empty = torch.isnan(own.rho).to(torch.float32)
+    said = [hypothesis(torch.where(known, own.rho, seeds), v, camera, empty) for v in views]
+    factor = variance_factor(own, said)
+    if image is not None:
+        drop_other_colours(seeds, [v for _, v in said], (image, views), camera)
+    rho = [_definite(r + 0 * v, FAR * k) for k, (r, v) in enumerate(said, 2)]
+    rho.insert(0, _definite(own.rho, FAR))
+    weight = [_definite(1 / v, 1.0) for v in (own.variance, *(v for _, v in said))]
     members = compatible_members(rho, weight)
-    alone = (members == 0) & ~empty & ~through
-    members += alone
-    total, norm = torch.zeros_like(seeds), torch.zeros_like(seeds)
-    count = torch.zeros_like(members)
+    least = reduce(torch.minimum, rho)
+    members += (members == 0) & known & ~(least < own.rho)
+    total, norm, count = (torch.zeros_like(seeds) for _ in range(3))
     for k, (rho_k, weight_k) in enumerate(zip(rho, weight, strict=True)):
-        used = (members >> k) & 1
+        used = (members >> k).bitwise_and_(1).to(torch.float32)
         count += used
-        share = weight_k * used
+        share = used.mul_(weight_k)
         norm += share
-        total.addcmul_(share, torch.nan_to_num(rho_k))
-    norm = torch.where(members > 0, norm, torch.nan)
-    return Fused(InverseDepthMap(total / norm, 1 / norm), count, factor)
+        total.addcmul_(share, rho_k)
+    total /= norm
+    fused = InverseDepthMap(total, norm.reciprocal_().add_(0 * total))
+    return Fused(fused, count.to(torch.uint8), factor)
+
+
+def _definite(values: Tensor, missing: float) -> Tensor:
+    return torch.nan_to_num(values, nan=missing, posinf=0.0)
 
 
 def variance_factor(own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Tensor]]) -> float:
@@ -139,76 +141,67 @@ def rim_steps(given: InverseDepthMap) -> tuple[Tensor, Tensor, Tensor]:
 
     The third is the greatest |rho_j - rho| (N,) of the 5x5 pixels around.
     """
-    known = given.known
-    share = torch.nn.functional.avg_pool2d(
-        known[None].to(torch.float32), 3, 1, 1, count_include_pad=False
-    )[0]
-    rows, columns = torch.nonzero(known & (share < 0.99)).unbind(-1)
-    padded = torch.nn.functional.pad(given.rho, (2, 2, 2, 2), value=torch.nan)
-    around = torch.arange(5, device=padded.device)
-    window = padded[rows[:, None, None] + around[:, None], columns[:, None, None] + around]
-    steps = torch.nan_to_num(window - given.rho[rows, columns][:, None, None]).abs()
-    return rows, columns, steps.amax((1, 2))
+    around = windowed(torch.add, given.rho, 1)  # NaN beside a hole
+    rows, columns = torch.nonzero(given.known & torch.isnan(around)).unbind(-1)
+    own = given.rho[rows, columns]
+    most = windowed(torch.maximum, torch.nan_to_num(given.rho, nan=-torch.inf), 2, -torch.inf)
+    least = windowed(torch.minimum, torch.nan_to_num(given.rho, nan=torch.inf), 2, torch.inf)
+    steps = torch.maximum(most[rows, columns] - own, own - least[rows, columns])
+    return rows, columns, steps
 
 
 def drop_other_colours(
-    seeds: Tensor, variance: Tensor, images: tuple[Tensor, View], camera: Camera
+    seeds: Tensor, variances: Sequence[Tensor], images: tuple[Tensor, Sequence[View]], camera: Camera
 ) -> None:
-    """Make the hypotheses NaN in place whose surface has another colour in the neighbour."""
-    own, view = images
-    assert view.image is not None
-    rows, columns = torch.nonzero(torch.isfinite(seeds) & torch.isfinite(variance)).unbind(-1)
-    pixels = (columns.to(torch.float32), rows.to(torch.float32))
-    u, v, _ = project(seeds[rows, columns], inverse(view.T_own_neighbour), camera, pixels)
+    """Make the views' variances (H, W) NaN in place where a seed has another colour in the view."""
+    own, views = images
+    rows, columns = torch.nonzero(torch.isfinite(seeds)).unbind(-1)
+    pixels, seed = (columns.to(torch.float32), rows.to(torch.float32)), seeds[rows, columns]
     height, width = seeds.shape
-    u, v = u.round().clamp(0, width - 1).long(), v.round().clamp(0, height - 1).long()
-    apart = (own[:, rows, columns] - view.image[:, v, u]).abs().amax(0)
-    other = apart > MAX_COLOUR_STEP
-    variance[rows[other], columns[other]] = torch.nan
-
-
-def _weight(variance: Tensor) -> Tensor:
-    """1 / sigma^2, 0 where nothing is known."""
-    return torch.nan_to_num(1 / variance, nan=0.0, posinf=0.0)
+    colours = own[:, rows, columns]
+    for view, variance in zip(views, variances, strict=True):
+        if view.image is None:
+            continue
+        u, v, _ = project(seed, inverse(view.T_own_neighbour), camera, pixels)
+        u, v = u.round().clamp(0, width - 1).long(), v.round().clamp(0, height - 1).long()
+        apart = (colours - view.image[:, v, u]).abs().amax(0)
+        variance[rows, columns] += gate(MAX_COLOUR_STEP - apart)
 
 
 def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tensor:
     """Inverse depth (H, W) of the nearest surface that neighbours see where ``own`` has none."""
-    height, width = own.rho.shape
-    seeds = torch.zeros(height * width, dtype=torch.float32, device=own.rho.device)
-    empty = ~own.known.reshape(-1)
+    (height, width), outside = own.rho.shape, own.rho.numel()
+    empty = torch.nn.functional.pad(torch.isnan(own.rho).reshape(-1), (0, 1))
     if not empty.any():
         return torch.full_like(own.rho, torch.nan)
+    seeds = torch.zeros(outside, device=own.rho.device)
     for view in views:
-        u, v, ahead = project(view.map.rho, view.T_own_neighbour, camera)
+        u, v, w = project(view.map.rho, view.T_own_neighbour, camera)
         column, row = u.round_(), v.round_()
-        inside = ahead & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        target = torch.where(inside, row * width + column, 0.0).to(torch.int32).reshape(-1)
-        landing = empty.index_select(0, target) & inside.reshape(-1)
-        chosen = torch.nonzero(landing)[:, 0]
-        pixels = ((chosen % width).to(torch.float32), (chosen // width).to(torch.float32))
-        rho, _ = moved(view.map.rho.reshape(-1)[chosen], view.T_own_neighbour, camera, pixels)
+        margin = torch.minimum(torch.minimum(column, width - 1 - column), w)
+        margin = torch.minimum(margin, torch.minimum(row, height - 1 - row))
+        place = column.add_(row, alpha=width).add_(gate(margin))
+        target = place.nan_to_num_(outside).to(torch.int32).reshape(-1)
+        chosen = torch.nonzero(empty.index_select(0, target))[:, 0]
+        rho = view.map.rho.reshape(-1)[chosen] / w.reshape(-1)[chosen]
         seeds.scatter_reduce_(0, target[chosen].to(torch.int64), rho, "amax")
     seeds = seeds.reshape(height, width)
-    around = torch.nn.functional.max_pool2d(
-        torch.maximum(torch.nan_to_num(own.rho), seeds)[None], 5, 1, 2
-    )[0]
+    around = windowed(torch.maximum, torch.maximum(torch.nan_to_num(own.rho), seeds), RIM_PX)
     return torch.where((seeds > 0) & (around < RIM_STEP * seeds), seeds, torch.nan)
 
 
 def compatible_members(rho: Sequence[Tensor], weight: Sequence[Tensor]) -> Tensor:
     """Bit masks (H, W) uint8 of the largest mutually compatible sets of two or more estimates.
 
-    ``rho`` and ``weight`` hold one (H, W) for each of up to seven keyframes, rho NaN where it says
-    nothing. 0 where no two are compatible; of equal sets the one with early members.
+    ``rho`` and ``weight`` hold one (H, W) for each of up to seven keyframes; where it says nothing
+    its rho is far from all others. 0 where no two are compatible; of equal sets the one with early
+    members.
     """
-    pairs = list(combinations(range(len(rho)), 2))
-    code = torch.zeros(rho[0].shape, dtype=torch.int32, device=rho[0].device)
-    for k, (i, j) in enumerate(pairs):
-        distance = (rho[i] - rho[j]).square_().mul_(weight[i] + weight[j])
-        code.add_(distance < COMPATIBLE, alpha=1 << k)
+    code = torch.zeros_like(rho[0])  # holds 21 bits without loss
+    for k, (i, j) in enumerate(combinations(range(len(rho)), 2)):
+        code += agreement(rho[i] - rho[j], weight[i] + weight[j], 1 << k)
     table = _largest_sets(len(rho)).to(code.device)
-    return table.index_select(0, code.reshape(-1)).reshape(code.shape)
+    return table.index_select(0, code.to(torch.int32).reshape(-1)).reshape(code.shape)
 
 
 @cache

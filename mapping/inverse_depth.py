@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from graph.camera import Camera
+from mapping.pixelwise import gate
 
 COMPATIBLE = 5.99
 """Chi-square with 2 degrees of freedom at 95 %."""
@@ -30,7 +31,7 @@ class InverseDepthMap:
     @property
     def known(self) -> Tensor:
         """(H, W) bool."""
-        return torch.isfinite(self.rho)
+        return self.rho.abs() < torch.inf
 
     def where(self, keep: Tensor) -> InverseDepthMap:
         """The same, with everything outside ``keep`` (H, W) unknown."""
@@ -74,10 +75,10 @@ def from_sensor(
     corrected), to which the lateral error adds (sigma_lateral |grad rho|)^2.
     """
     z = torch.as_tensor(depth_m, dtype=torch.float32, device=device)
-    usable = (z > noise.min_depth_m) & (z < noise.max_depth_m)
-    rho = torch.where(usable, 1 / z, torch.full_like(z, torch.nan))
+    usable = torch.minimum(z - noise.min_depth_m, noise.max_depth_m - z)
+    rho = z.reciprocal().add_(gate(usable))
     disparity = (noise.disparity_sigma_px / camera.stereo_bf_px_m) ** 2
-    variance = disparity + noise.lateral_sigma_px**2 * squared_gradient(rho)
+    variance = squared_gradient(rho).mul_(noise.lateral_sigma_px**2).add_(disparity)
     return InverseDepthMap(rho, variance)
 
 
@@ -86,7 +87,17 @@ def squared_gradient(rho: Tensor) -> Tensor:
 
     Central differences; where a neighbour is missing that direction counts as flat.
     """
-    dx, dy = torch.zeros_like(rho), torch.zeros_like(rho)
-    dx[:, 1:-1] = (rho[:, 2:] - rho[:, :-2]) / 2
-    dy[1:-1] = (rho[2:] - rho[:-2]) / 2
-    return torch.nan_to_num(dx) ** 2 + torch.nan_to_num(dy) ** 2 + 0 * rho
+    squared = rho * 0
+    squared[:, 1:-1] += (rho[:, 2:] - rho[:, :-2]).div_(2).nan_to_num_().square_()
+    squared[1:-1] += (rho[2:] - rho[:-2]).div_(2).nan_to_num_().square_()
+    return squared
+
+
+def agreement(difference: Tensor, weight: Tensor, worth: float = 1.0) -> Tensor:
+    """``worth`` where difference^2 weight < 5.99, else 0; the difference is overwritten.
+
+    ``weight`` is 1 / sigma_x^2 + 1 / sigma_y^2.
+    """
+    distance = difference.square_().mul_(weight)
+    steep = 2.0**100
+    return torch.rsub(distance, COMPATIBLE * steep, alpha=steep).clamp_(0, worth)

@@ -77,8 +77,8 @@ def _level(
     plane = torch.full(guide.shape[-2:], rho, device=guide.device)
     costs = []
     for other, T_other_own in others:
-        u, v, ahead = project(plane, T_other_own, camera)
-        seen = ahead & (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
+        u, v, w = project(plane, T_other_own, camera)
+        seen = (w > 0) & (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
         grid = torch.stack(
             [u * (2 / (camera.width - 1)) - 1, v * (2 / (camera.height - 1)) - 1], dim=-1
         )[None]

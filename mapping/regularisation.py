@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mapping.inverse_depth import COMPATIBLE, InverseDepthMap
+from mapping.inverse_depth import COMPATIBLE, InverseDepthMap, agreement
+from mapping.pixelwise import gate, windowed
 
 OFFSETS = tuple((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0))
 MIN_SUPPORT = 2
@@ -25,20 +26,27 @@ def regularise(given: InverseDepthMap, fill_support: int = FILL_SUPPORT) -> Inve
     from the largest set of mutually compatible neighbours, if that has ``fill_support``.
     """
     rho = torch.nan_to_num(given.rho, nan=FAR)
-    weight = _weight(given)
+    weight = torch.nan_to_num(1 / given.variance)
     rhos, weights = _padded(rho, FAR), _padded(weight)
-    count = torch.zeros_like(rho)
-    total, norm, best = rho * weight, weight.clone(), weight.clone()
-    for offset in OFFSETS:
-        rho_j, weight_j = _shifted(rhos, offset), _shifted(weights, offset)
-        agreeing = (rho - rho_j).square_().mul_(weight + weight_j) < COMPATIBLE
-        count += agreeing
-        share = agreeing * weight_j
-        norm += share
-        total.addcmul_(share, rho_j)
+    count, total = torch.zeros_like(rho), rho * weight
+    norm, best = weight.clone(), weight.clone()
+
+    def take(agreeing: Tensor, offset: tuple[int, int]) -> None:
+        """Add the neighbours at an offset that agree (H, W)."""
+        share = agreeing * _shifted(weights, offset)
+        count.add_(agreeing)
+        norm.add_(share)
+        total.addcmul_(share, _shifted(rhos, offset))
         torch.maximum(best, share, out=best)
-    cleaned = InverseDepthMap(total / norm, 1 / best).where(given.known & (count >= MIN_SUPPORT))
-    return _filled(given, cleaned, fill_support)
+
+    for dy, dx in OFFSETS[:4]:  # what agrees does so in both directions
+        both = weight + _shifted(weights, (dy, dx))
+        agreeing = agreement(rho - _shifted(rhos, (dy, dx)), both)
+        take(agreeing, (dy, dx))
+        take(_shifted(_padded(agreeing), (-dy, -dx)), (-dy, -dx))
+    rho = total.div_(norm).add_(gate(count.sub_(MIN_SUPPORT)))
+    cleaned = InverseDepthMap(rho, best.reciprocal_().add_(0 * rho))
+    return _filled(cleaned, rhos, weights, fill_support)
 
 
 def _padded(values: Tensor, rim: float = 0.0) -> Tensor:
@@ -53,30 +61,27 @@ def _shifted(padded: Tensor, offset: tuple[int, int]) -> Tensor:
     return padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
 
 
-def _filled(given: InverseDepthMap, cleaned: InverseDepthMap, support: int) -> InverseDepthMap:
-    """``cleaned``, with what was empty in ``given`` filled from its neighbours there."""
-    known = given.known
-    around = torch.nn.functional.avg_pool2d(
-        known[None].to(torch.float32), 3, 1, 1, divisor_override=1
-    )[0]
-    rows, columns = torch.nonzero(~known & (around >= support)).unbind(-1)
+def _filled(
+    cleaned: InverseDepthMap, rhos: Tensor, weights: Tensor, support: int
+) -> InverseDepthMap:
+    """``cleaned``, with what was empty before filled from its neighbours there.
+
+    ``rhos`` and ``weights`` are what was given, with a rim.
+    """
+    known = weights[1:-1, 1:-1].sign()
+    around = windowed(torch.add, known, 1).sub_(known, alpha=len(OFFSETS) + 1)
+    rows, columns = torch.nonzero(around >= support).unbind(-1)
     rho_j, weight_j = (
         torch.stack([_shifted(padded, offset)[rows, columns] for offset in OFFSETS], dim=-1)
-        for padded in (_padded(torch.nan_to_num(given.rho)), _padded(_weight(given)))
+        for padded in (rhos, weights)
     )
     members = largest_compatible_set(rho_j, weight_j)
     weight_j = weight_j * members
     enough = members.sum(-1) >= support
     rows, columns, weight_j, rho_j = (a[enough] for a in (rows, columns, weight_j, rho_j))
-    rho, variance = cleaned.rho.clone(), cleaned.variance.clone()
-    rho[rows, columns] = (weight_j * rho_j).sum(-1) / weight_j.sum(-1)
-    variance[rows, columns] = 1 / weight_j.amax(-1)
-    return InverseDepthMap(rho, variance)
-
-
-def _weight(given: InverseDepthMap) -> Tensor:
-    """1 / sigma^2, 0 where nothing is known."""
-    return torch.nan_to_num(1 / given.variance)
+    cleaned.rho[rows, columns] = (weight_j * rho_j).sum(-1) / weight_j.sum(-1)
+    cleaned.variance[rows, columns] = 1 / weight_j.amax(-1)
+    return cleaned
 
 
 def largest_compatible_set(rho: Tensor, weight: Tensor) -> Tensor:
@@ -85,14 +90,23 @@ def largest_compatible_set(rho: Tensor, weight: Tensor) -> Tensor:
     ``rho`` (N, 8) with weights 1 / sigma^2 (N, 8), 0 where there is none. Of equally large sets
     the first in the order of `set_order` is taken; one alone is no set.
     """
-    n = rho.shape[-1]
     distance = (rho[:, :, None] - rho[:, None]) ** 2 * (weight[:, :, None] + weight[:, None])
     there = weight > 0
-    pairs = (distance < COMPATIBLE) & there[:, :, None] & there[:, None]
-    bits = 1 << torch.arange(n, device=rho.device)
-    clashing = (~pairs * bits).sum(-1) & ~bits  # (N, n): who cannot be with member i
-    clean = [torch.ones(len(rho), dtype=torch.bool, device=rho.device)]
-    chosen = torch.zeros(len(rho), dtype=torch.int64, device=rho.device)
+    apart = there[:, :, None] & there[:, None] & ~(distance < COMPATIBLE)
+    members = there & (there.sum(-1, keepdim=True) > 1)
+    torn = torch.nonzero(apart.any((1, 2)))[:, 0]
+    members[torn] = _largest_by_trying(apart[torn], there[torn])
+    return members
+
+
+def _largest_by_trying(apart: Tensor, there: Tensor) -> Tensor:
+    """The same for rows of which some are ``apart`` (N, 8, 8) among those ``there`` (N, 8)."""
+    n = there.shape[-1]
+    bits = 1 << torch.arange(n, device=there.device)
+    clashing = ((apart | ~there[:, None]) * bits).sum(-1)  # (N, n): who cannot be with member i
+    clashing |= ~there * ((1 << n) - 1)
+    clean = [torch.ones(len(there), dtype=torch.bool, device=there.device)]
+    chosen = torch.zeros(len(there), dtype=torch.int64, device=there.device)
     for subset in range(1, 1 << n):
         lowest = (subset & -subset).bit_length() - 1
         clean.append(clean[subset & (subset - 1)] & ((clashing[:, lowest] & subset) == 0))

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse
 from mapping.inverse_depth import InverseDepthMap
+from mapping.pixelwise import gate
 
 MAX_APART_PX = 1.0
 """A neighbour's point farther from the pixel's ray is another point."""
@@ -41,22 +41,30 @@ def hypothesis(
 
     Each point is projected into the neighbour, whose rho and sigma there are mapped back as
     {rho + sigma, rho, rho - sigma} to p1, p2, p3: the mean p2 (H, W) and the variance
-    max(|p1 - p2|, |p3 - p2|)^2 (H, W), NaN where it says nothing. At pixels of ``inner`` (H, W)
-    only the inside of a surface counts: its last pixels reach up to half a pixel beyond its rim.
+    max(|p1 - p2|, |p3 - p2|)^2 (H, W), NaN where it says nothing. Where ``inner`` (H, W) is 1, not
+    0, only the inside of a surface counts: its last pixels reach up to half a pixel beyond its rim.
+
+    With w the ratio of seed and its inverse depth in the neighbour, (t_x, t_y, t_z) the
+    neighbour's place, e = w rho - seed and d = 1 + t_z e, mapping back gives p2 = w rho / d,
+    |p3 - p2| = w sigma |1 - t_z seed| / (d |d - |t_z| w sigma|), which is the greater for t_z > 0
+    as |p1 - p2| is for t_z < 0, and the pixel is missed by e / d (K t - t_z pixel).
     """
     columns, rows = image_grid(seeds)
-    u, v, ahead = project(seeds, inverse(view.T_own_neighbour), camera, (columns, rows))
-    rho, variance = _sampled(view.map, u, v, inner)
-    sigma = variance.sqrt_()
-    forward, t_z = _depth_row(view.T_own_neighbour, camera)
-    ray = forward[0] * u + forward[1] * v + forward[2]
-    p1, p2, p3 = (r / (ray + t_z * r) for r in (rho + sigma, rho, rho - sigma))
-    back_u, back_v, behind = project(rho, view.T_own_neighbour, camera, (u, v))
-    apart = (back_u - columns).square_() + (back_v - rows).square_()
-    usable = ahead & behind & (apart < MAX_APART_PX**2) & (rho > sigma)
-    spread = torch.maximum((p1 - p2).abs_(), (p3 - p2).abs_()).square_()
-    missing = torch.full_like(p2, torch.nan)
-    return torch.where(usable, p2, missing), torch.where(usable, spread, missing)
+    u, v, w = project(seeds, inverse(view.T_own_neighbour), camera, (columns, rows))
+    rho, sigma, margin = _sampled(view.map, u, v, inner)
+    rho.mul_(w)
+    sigma.mul_(w)
+    b_x, b_y, t_z = (camera.K @ view.T_own_neighbour[:3, 3]).tolist()
+    e = rho - seeds
+    d = (t_z * e).add_(1)
+    lever = (b_x - t_z * columns) ** 2 + (b_y - t_z * rows) ** 2
+    margin = torch.minimum(margin, torch.minimum(w, d))
+    margin = torch.minimum(margin, rho - sigma)
+    missed = e.square_().mul_(lever)
+    usable = gate(torch.minimum(margin, d.square().mul_(MAX_APART_PX**2).sub_(missed)))
+    least = torch.sub(d, sigma, alpha=abs(t_z)).mul_(d)
+    spread = (1 - t_z * seeds).mul_(sigma).div_(least).square_()
+    return rho.div_(d).add_(usable), spread.add_(usable)
 
 
 def project(
@@ -65,25 +73,18 @@ def project(
     """Where points at inverse depth ``rho`` appear in another keyframe.
 
     ``pixels`` are their columns and rows, those of a whole image if not given. Returns columns and
-    rows there, and whether they are in front of that camera.
+    rows there, and rho over the inverse depth there: positive in front of that camera.
     """
     if pixels is None:
         pixels = image_grid(rho)
     K = camera.K
     A = (K @ T_other_own[:3, :3] @ np.linalg.inv(K)).tolist()
     b = (K @ T_other_own[:3, 3]).tolist()
-    x, y, w = ((pixels[0] * A[i][0] + A[i][2]) + pixels[1] * A[i][1] + rho * b[i] for i in range(3))
-    return x.div_(w), y.div_(w), w > 0
-
-
-def moved(
-    rho: Tensor, T_other_own: Array, camera: Camera, pixels: tuple[Tensor, Tensor]
-) -> tuple[Tensor, Tensor]:
-    """The same points' inverse depth in the other keyframe, and d rho' / d rho."""
-    forward, t_z = _depth_row(T_other_own, camera)
-    ray = forward[0] * pixels[0] + forward[1] * pixels[1] + forward[2]
-    depth = ray + t_z * rho
-    return rho / depth, ray / depth**2
+    x, y, w = (
+        (pixels[0] * A[i][0] + (pixels[1] * A[i][1] + A[i][2])).add_(rho, alpha=b[i])
+        for i in range(3)
+    )
+    return x.div_(w), y.div_(w), w
 
 
 def image_grid(like: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,30 +95,34 @@ def image_grid(like: Tensor) -> tuple[Tensor, Tensor]:
     return columns[None], rows[:, None]
 
 
-def _depth_row(T_own_other: Array, camera: Camera) -> tuple[list[float], float]:
-    """(a, t): a point at pixel p and inverse depth rho of the other has 1 / rho' = (a p + t rho)
-    / rho in the own camera.
-    """
-    row = T_own_other[2, :3] @ np.linalg.inv(camera.K)
-    return row.tolist(), float(T_own_other[2, 3])
-
-
 def _sampled(
     view: InverseDepthMap, u: Tensor, v: Tensor, inner: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """rho and variance of a map at pixels (H, W), NaN outside.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """rho and sigma of a map at pixels (H, W), and a margin (H, W), negative or NaN where unusable.
 
     Inverse depth is linear in the image of a plane, so it is interpolated; where the pixels
-    around are not one surface the nearest is taken, or none at pixels of ``inner`` (H, W).
+    around are not one surface the nearest is taken, or none where ``inner`` (H, W) is 1.
     """
     height, width = view.rho.shape
-    outside = (u < 0) | (v < 0) | (u > width - 1) | (v > height - 1)
-    grid = torch.stack([u * (2 / (width - 1)) - 1, v * (2 / (height - 1)) - 1], dim=-1)[None]
-    stack = torch.stack([view.rho, view.variance])[None]
-    near, variance = grid_sample(stack, grid, "nearest", "border", align_corners=True)[0]
-    between = grid_sample(stack[:, :1], grid, "bilinear", "border", align_corners=True)[0, 0]
-    one_surface = (between - near).square() < JUMP_SIGMAS**2 * variance
-    rho = torch.where(one_surface, between, near)
+    margin = torch.minimum(torch.minimum(u, width - 1 - u), torch.minimum(v, height - 1 - v))
+    u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
+    left, top = u.floor().clamp_(max=width - 2), v.floor().clamp_(max=height - 2)
+    a, b = u.sub_(left), v.sub_(top)
+    corner = left.add_(top, alpha=width)
+    nearest = torch.add(corner, a.round()).add_(b.round(), alpha=width)
+    at, at_nearest = (index.nan_to_num_().to(torch.int32).reshape(-1) for index in (corner, nearest))
+    flat = view.rho.reshape(-1)
+
+    def read(values: Tensor, index: Tensor) -> Tensor:
+        return values.index_select(0, index).reshape(u.shape)
+
+    upper = torch.lerp(read(flat, at), read(flat[1:], at), a)
+    lower = torch.lerp(read(flat[width:], at), read(flat[width + 1 :], at), a)
+    near = read(flat, at_nearest)
+    sigma = read(view.variance.reshape(-1), at_nearest).sqrt_()
+    jump = torch.lerp(upper, lower, b).sub_(near)
+    one_surface = (JUMP_SIGMAS * sigma).sub_(jump.abs()).sign_().nan_to_num_().relu_()
+    rho = near.addcmul_(jump.nan_to_num_(), one_surface)
     if inner is not None:
-        outside |= inner & ~one_surface
-    return rho.masked_fill_(outside, torch.nan), variance.masked_fill_(outside, torch.nan)
+        margin = torch.minimum(margin, one_surface.sub_(inner))
+    return rho, sigma, margin
