@@ -66,18 +66,25 @@ def fuse(
     """
     views, known = neighbours[:MAX_NEIGHBOURS], own.known
     seeds = seeded(own, views, camera)
-    empty = torch.isnan(own.rho).to(torch.float32)
-    said = [hypothesis(torch.where(known, own.rho, seeds), v, camera, empty) for v in views]
+    asked, empty = torch.where(known, own.rho, seeds), torch.isnan(own.rho).to(torch.float32)
+    said = [hypothesis(asked, view, camera, empty) for view in views]
     factor = variance_factor(own, said)
     if image is not None:
         drop_other_colours(seeds, [v for _, v in said], (image, views), camera)
-    rho = [_definite(r + 0 * v, FAR * k) for k, (r, v) in enumerate(said, 2)]
-    rho.insert(0, _definite(own.rho, FAR))
+    rho = [_definite(own.rho, FAR)]
+    rho += [_definite(r + 0 * v, FAR * k) for k, (r, v) in enumerate(said, 2)]
     weight = [_definite(1 / v, 1.0) for v in (own.variance, *(v for _, v in said))]
     members = compatible_members(rho, weight)
-    least = reduce(torch.minimum, rho)
-    members += (members == 0) & known & ~(least < own.rho)
-    total, norm, count = (torch.zeros_like(seeds) for _ in range(3))
+    seen_through = reduce(torch.minimum, rho) < own.rho
+    members += (members == 0) & known & ~seen_through
+    return Fused(*_fused(rho, weight, members), factor)
+
+
+def _fused(
+    rho: Sequence[Tensor], weight: Sequence[Tensor], members: Tensor
+) -> tuple[InverseDepthMap, Tensor]:
+    """The members (H, W), as bit masks, of the estimates fused, and how many they are."""
+    total, norm, count = (torch.zeros_like(rho[0]) for _ in range(3))
     for k, (rho_k, weight_k) in enumerate(zip(rho, weight, strict=True)):
         used = (members >> k).bitwise_and_(1).to(torch.float32)
         count += used
@@ -86,7 +93,7 @@ def fuse(
         total.addcmul_(share, rho_k)
     total /= norm
     fused = InverseDepthMap(total, norm.reciprocal_().add_(0 * total))
-    return Fused(fused, count.to(torch.uint8), factor)
+    return fused, count.to(torch.uint8)
 
 
 def _definite(values: Tensor, missing: float) -> Tensor:
@@ -151,11 +158,14 @@ def rim_steps(given: InverseDepthMap) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def drop_other_colours(
-    seeds: Tensor, variances: Sequence[Tensor], images: tuple[Tensor, Sequence[View]], camera: Camera
+    seeds: Tensor,
+    variances: Sequence[Tensor],
+    images: tuple[Tensor, Sequence[View]],
+    camera: Camera,
 ) -> None:
     """Make the views' variances (H, W) NaN in place where a seed has another colour in the view."""
     own, views = images
-    rows, columns = torch.nonzero(torch.isfinite(seeds)).unbind(-1)
+    rows, columns = torch.nonzero(seeds > 0).unbind(-1)
     pixels, seed = (columns.to(torch.float32), rows.to(torch.float32)), seeds[rows, columns]
     height, width = seeds.shape
     colours = own[:, rows, columns]
@@ -163,8 +173,10 @@ def drop_other_colours(
         if view.image is None:
             continue
         u, v, _ = project(seed, inverse(view.T_own_neighbour), camera, pixels)
-        u, v = u.round().clamp(0, width - 1).long(), v.round().clamp(0, height - 1).long()
-        apart = (colours - view.image[:, v, u]).abs().amax(0)
+        u, v = u.round_().clamp_(0, width - 1), v.round_().clamp_(0, height - 1)
+        place = u.add_(v, alpha=width).to(torch.int32)
+        there = view.image.reshape(3, -1).index_select(1, place)
+        apart = (colours - there).abs_().amax(0)
         variance[rows, columns] += gate(MAX_COLOUR_STEP - apart)
 
 

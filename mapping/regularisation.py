@@ -102,17 +102,13 @@ def largest_compatible_set(rho: Tensor, weight: Tensor) -> Tensor:
 def _largest_by_trying(apart: Tensor, there: Tensor) -> Tensor:
     """The same for rows of which some are ``apart`` (N, 8, 8) among those ``there`` (N, 8)."""
     n = there.shape[-1]
-    bits = 1 << torch.arange(n, device=there.device)
-    clashing = ((apart | ~there[:, None]) * bits).sum(-1)  # (N, n): who cannot be with member i
-    clashing |= ~there * ((1 << n) - 1)
-    clean = [torch.ones(len(there), dtype=torch.bool, device=there.device)]
-    chosen = torch.zeros(len(there), dtype=torch.int64, device=there.device)
-    for subset in range(1, 1 << n):
-        lowest = (subset & -subset).bit_length() - 1
-        clean.append(clean[subset & (subset - 1)] & ((clashing[:, lowest] & subset) == 0))
-    for subset in set_order(n):
-        chosen = torch.where((chosen == 0) & clean[subset], subset, chosen)
-    return (chosen[:, None] & bits) != 0
+    sets = [[s >> i & 1 for i in range(n)] for s in set_order(n)]
+    tried = torch.tensor(sets, dtype=torch.float32, device=there.device)
+    pairs = (tried[:, :, None] * tried[:, None]).reshape(-1, n * n)
+    clashes = apart.reshape(-1, n * n).to(torch.float32) @ pairs.T
+    clashes += (~there).to(torch.float32) @ tried.T
+    free, first = (clashes == 0).to(torch.uint8).max(-1)
+    return (tried[first] * free[:, None]) > 0
 
 
 def set_order(n: int) -> list[int]:

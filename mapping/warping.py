@@ -110,7 +110,9 @@ def _sampled(
     a, b = u.sub_(left), v.sub_(top)
     corner = left.add_(top, alpha=width)
     nearest = torch.add(corner, a.round()).add_(b.round(), alpha=width)
-    at, at_nearest = (index.nan_to_num_().to(torch.int32).reshape(-1) for index in (corner, nearest))
+    at, at_nearest = (
+        index.nan_to_num_().to(torch.int32).reshape(-1) for index in (corner, nearest)
+    )
     flat = view.rho.reshape(-1)
 
     def read(values: Tensor, index: Tensor) -> Tensor:

@@ -104,7 +104,7 @@ def test_it_follows_the_formulas(count: int) -> None:
     result = fuse(own, views, CAMERA)
     rho, variance, used = reference(own, views, seeded(own, views, CAMERA).numpy())
     np.testing.assert_allclose(result.map.rho.numpy(), rho, rtol=1e-5)
-    np.testing.assert_allclose(result.map.variance.numpy(), variance, rtol=2e-4)
+    np.testing.assert_allclose(result.map.variance.numpy(), variance, rtol=1e-5)
     np.testing.assert_array_equal(result.views.numpy(), np.nan_to_num(used))
     if count == 7:
         assert (used >= 5).sum() > 100

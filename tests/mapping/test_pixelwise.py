@@ -1,0 +1,47 @@
+"""Arithmetic on images against loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from surface_scene import CAMERA
+
+from mapping.inverse_depth import COMPATIBLE, DepthNoise, agreement, from_sensor
+from mapping.pixelwise import gate, windowed
+
+
+def test_a_gate_lets_through_what_is_not_negative() -> None:
+    margin = torch.tensor([2.0, 0.0, -0.0, -1e-6, torch.nan, -torch.inf])
+    np.testing.assert_array_equal(gate(margin).numpy(), [0, 0, 0, *[np.nan] * 3])
+
+
+@pytest.mark.parametrize("radius", [1, 2])
+@pytest.mark.parametrize(("combine", "slow", "beyond"), [
+    (torch.add, np.sum, 0.0), (torch.maximum, np.max, -np.inf), (torch.minimum, np.min, 3.0),
+])  # fmt: skip
+def test_windows(radius: int, combine, slow, beyond: float) -> None:
+    values = np.random.default_rng(0).normal(0, 1, (2, 7, 9)).astype(np.float32)
+    padded = np.pad(values, ((0, 0), (radius,) * 2, (radius,) * 2), constant_values=beyond)
+    size = 2 * radius + 1
+    expected = [
+        [[slow(p[r : r + size, c : c + size]) for c in range(9)] for r in range(7)] for p in padded
+    ]
+    found = windowed(combine, torch.from_numpy(values), radius, beyond)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_two_estimates_agree_below_the_bound() -> None:
+    bound = np.float32(COMPATIBLE)
+    squared = torch.tensor([0.0, np.nextafter(bound, np.float32(0)), bound, 1e12, np.inf])
+    found = agreement(torch.ones(5), squared, 8.0)
+    np.testing.assert_array_equal(found.numpy(), [8, 8, 0, 0, 0])
+
+
+def test_the_sensor_counts_within_its_range() -> None:
+    depth_m = np.full((5, 5), 2.0, np.float32)
+    depth_m[0] = 0.0, 0.29, 8.01, np.nan, np.inf
+    given = from_sensor(depth_m, CAMERA, DepthNoise())
+    np.testing.assert_array_equal(given.known.numpy(), depth_m == 2)
+    np.testing.assert_array_equal(np.isnan(given.variance.numpy()), depth_m != 2)
+    np.testing.assert_allclose(given.rho.numpy()[1:], 0.5)
