@@ -21,6 +21,8 @@ logger = logging.getLogger(__name__)
 
 AHEAD = 2
 """Frames whose features are computed ahead of tracking where the source waits."""
+KEPT = 3
+"""Frames that wait for tracking at most where it does not; one more drives out the others."""
 
 _Pairs: TypeAlias = Iterator[tuple[Frame, Prepared]]
 
@@ -71,7 +73,7 @@ def _with_features(slam: LiveSlam, source: Source) -> _Pairs:
 
 def _newest(slam: LiveSlam, pairs: _Pairs, options: PlayOptions, stop: StopRequest) -> _Pairs:
     """What comes, dropping what there is no time for."""
-    newest = Newest(pairs, keep=1)
+    newest = Newest(pairs, KEPT)
     heard_s, silent = time.monotonic(), False
     try:
         while not newest.ended and stop.signal is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from pathlib import Path
 
@@ -54,6 +55,7 @@ class LiveSystem(SlamSystem):
         super().__init__(camera, config)
         self.remote.wait_until_ready(START_S)
         self.semantics = _AskedMasks(self)
+        gc.freeze()  # to look through all modules would stop tracking for 0.1 s
 
     def _make_mapper(self, tracker: Tracker) -> Mapper:
         return self.remote  # type: ignore[return-value]  # it has what the step asks for
@@ -109,6 +111,7 @@ class LiveSystem(SlamSystem):
 
     def close(self) -> None:
         """End the other processes; what they knew and did not send is lost."""
+        gc.unfreeze()
         self.remote.close()
         if self.segmenter is not None:
             self.segmenter.close()

@@ -6,6 +6,7 @@ and nothing is inherited by accident. It ends when its owner does, however that 
 
 from __future__ import annotations
 
+import gc
 import importlib
 import itertools
 import logging
@@ -120,5 +121,6 @@ def serve(connection: int, theirs: int, ours: int) -> None:
     for target, arguments in itertools.islice(channel.messages(), 1):
         module, _, function = target.partition(":")
         run: Callable[..., None] = getattr(importlib.import_module(module), function)
+        gc.freeze()  # modules are not worth looking through again and again
         run(channel, *arguments)
     channel.finish()

@@ -96,7 +96,9 @@ def paced(frames: Iterator[Frame]) -> Iterator[Frame]:
 
 
 class Newest(Generic[T]):
-    """Takes items from an iterator in a thread and keeps a few; a new one drives out the oldest.
+    """Takes items from an iterator in a thread and keeps a few; one too many drives out the others.
+
+    So a short stall costs no item, and a lasting one no more delay than a short one.
 
     Attributes:
         dropped: items that nobody took in time.
@@ -143,8 +145,8 @@ class Newest(Generic[T]):
             with self._changed:
                 self._kept.append(item)
                 if len(self._kept) > self._keep:
-                    self._kept.pop(0)
-                    self.dropped += 1
+                    self.dropped += len(self._kept) - 1
+                    del self._kept[:-1]
                 self._changed.notify()
 
     def _notify(self) -> None:

@@ -67,6 +67,19 @@ def test_a_slow_taker_gets_the_newest_and_the_rest_is_counted() -> None:
     assert newest.dropped == 8
 
 
+def test_one_too_many_leaves_only_the_newest() -> None:
+    all_there = threading.Event()
+
+    def at_once() -> Iterator[int]:
+        yield from range(6)
+        all_there.set()
+
+    newest = Newest(at_once(), keep=3)
+    assert all_there.wait(5)
+    assert taken(newest) == [3, 4, 5]  # 3 drove out the others
+    assert newest.dropped == 3
+
+
 def test_an_error_of_the_source_comes_after_what_it_gave() -> None:
     def broken() -> Iterator[int]:
         yield 1
