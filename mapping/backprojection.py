@@ -23,7 +23,7 @@ def back_project(given: InverseDepthMap, camera: Camera) -> Tensor:
     z = 1 / given.rho
     u, v = image_grid(z)
     x, y = (u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z
-    return torch.stack([x, y, z], dim=-1)
+    return _interleaved(x, y, z)
 
 
 def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
@@ -51,6 +51,13 @@ def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
     planes = camera.fx * a, camera.fy * b, inner - a * u - b * v
     scale = (planes[0].square() + planes[1].square() + planes[2].square()).rsqrt_().neg_()
     normals = torch.full((*rho.shape, 3), torch.nan, device=rho.device)
-    for k, plane in enumerate(planes):
-        normals[1:-1, 1:-1, k] = plane * scale
+    normals[1:-1, 1:-1] = _interleaved(*(plane.mul_(scale) for plane in planes))
     return normals
+
+
+def _interleaved(*planes: Tensor) -> Tensor:
+    """Planes (H, W) as one (H, W, C), faster than `torch.stack`."""
+    together = torch.empty((*planes[0].shape, len(planes)), device=planes[0].device)
+    for k, plane in enumerate(planes):
+        together[..., k] = plane
+    return together

@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from graph.camera import Camera
 from graph.geometry import inverse
@@ -108,11 +109,11 @@ def variance_factor(own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Ten
     of the relative pose makes it too small. The median of all neighbours' factors.
     """
     factors, step = [], (slice(None, None, SAMPLE_STEP),) * 2
+    own_rho, own_variance = own.rho[step], own.variance[step]
     for mean, variance in hypotheses:
-        ratio = (own.rho[step] - mean[step]) ** 2 / (own.variance[step] + variance[step])
-        ratio = ratio[torch.isfinite(ratio)]
-        if len(ratio) >= MIN_SAMPLE:
-            factors.append(float(ratio.median()) / MEDIAN_CHI2)
+        ratio = (mean[step] - own_rho).square_().div_(variance[step] + own_variance)
+        if int((ratio == ratio).sum()) >= MIN_SAMPLE:
+            factors.append(float(ratio.nanmedian()) / MEDIAN_CHI2)
     return float(np.clip(np.median(factors), *FACTOR_RANGE)) if factors else 1.0
 
 
@@ -165,39 +166,36 @@ def drop_other_colours(
 ) -> None:
     """Make the views' variances (H, W) NaN in place where a seed has another colour in the view."""
     own, views = images
-    rows, columns = torch.nonzero(seeds > 0).unbind(-1)
-    pixels, seed = (columns.to(torch.float32), rows.to(torch.float32)), seeds[rows, columns]
     height, width = seeds.shape
-    colours = own[:, rows, columns]
+    chosen = torch.nonzero(seeds.reshape(-1) > 0)[:, 0]
+    pixels = (chosen % width).to(torch.float32), (chosen // width).to(torch.float32)
+    seed = seeds.reshape(-1).index_select(0, chosen)
+    colours = own.reshape(3, -1).index_select(1, chosen)
     for view, variance in zip(views, variances, strict=True):
         if view.image is None:
             continue
         u, v, _ = project(seed, inverse(view.T_own_neighbour), camera, pixels)
         u, v = u.round_().clamp_(0, width - 1), v.round_().clamp_(0, height - 1)
-        place = u.add_(v, alpha=width).to(torch.int32)
+        place = u.add_(v, alpha=width).nan_to_num_().to(torch.int32)
         there = view.image.reshape(3, -1).index_select(1, place)
         apart = (colours - there).abs_().amax(0)
-        variance[rows, columns] += gate(MAX_COLOUR_STEP - apart)
+        variance.view(-1).index_add_(0, chosen, gate(MAX_COLOUR_STEP - apart))
 
 
 def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tensor:
     """Inverse depth (H, W) of the nearest surface that neighbours see where ``own`` has none."""
-    (height, width), outside = own.rho.shape, own.rho.numel()
-    empty = torch.nn.functional.pad(torch.isnan(own.rho).reshape(-1), (0, 1))
-    if not empty.any():
-        return torch.full_like(own.rho, torch.nan)
-    seeds = torch.zeros(outside, device=own.rho.device)
+    height, width = own.rho.shape
+    empty = pad(torch.isnan(own.rho), (1, 1, 1, 1)).reshape(-1)
+    seeds = torch.zeros((height + 2) * (width + 2), device=own.rho.device)
     for view in views:
         u, v, w = project(view.map.rho, view.T_own_neighbour, camera)
-        column, row = u.round_(), v.round_()
-        margin = torch.minimum(torch.minimum(column, width - 1 - column), w)
-        margin = torch.minimum(margin, torch.minimum(row, height - 1 - row))
-        place = column.add_(row, alpha=width).add_(gate(margin))
-        target = place.nan_to_num_(outside).to(torch.int32).reshape(-1)
+        column, row = u.round_().clamp_(-1, width), v.round_().clamp_(-1, height)
+        place = row.add_(1).mul_(width + 2).add_(column).add_(1).nan_to_num_()
+        target = place.to(torch.int32).reshape(-1)
         chosen = torch.nonzero(empty.index_select(0, target))[:, 0]
         rho = view.map.rho.reshape(-1)[chosen] / w.reshape(-1)[chosen]
         seeds.scatter_reduce_(0, target[chosen].to(torch.int64), rho, "amax")
-    seeds = seeds.reshape(height, width)
+    seeds = seeds.reshape(height + 2, width + 2)[1:-1, 1:-1]
     around = windowed(torch.maximum, torch.maximum(torch.nan_to_num(own.rho), seeds), RIM_PX)
     return torch.where((seeds > 0) & (around < RIM_STEP * seeds), seeds, torch.nan)
 

@@ -77,8 +77,8 @@ def _level(
     plane = torch.full(guide.shape[-2:], rho, device=guide.device)
     costs = []
     for other, T_other_own in others:
-        u, v, w = project(plane, T_other_own, camera)
-        seen = (w > 0) & (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
+        u, v, _ = project(plane, T_other_own, camera)
+        seen = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
         grid = torch.stack(
             [u * (2 / (camera.width - 1)) - 1, v * (2 / (camera.height - 1)) - 1], dim=-1
         )[None]
@@ -92,7 +92,7 @@ def _motion(rho: Tensor, T_other_own: Array, camera: Camera) -> Tensor:
     step = 1e-3
     u, v, _ = project(rho, T_other_own, camera)
     u2, v2, _ = project(rho + step, T_other_own, camera)
-    return torch.nan_to_num(torch.hypot(u2 - u, v2 - v) / step)
+    return torch.nan_to_num(torch.hypot(u2 - u, v2 - v) / step, posinf=0.0)
 
 
 def shrunk_camera(camera: Camera, by: int) -> Camera:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse
@@ -58,8 +59,7 @@ def hypothesis(
     e = rho - seeds
     d = (t_z * e).add_(1)
     lever = (b_x - t_z * columns) ** 2 + (b_y - t_z * rows) ** 2
-    margin = torch.minimum(margin, torch.minimum(w, d))
-    margin = torch.minimum(margin, rho - sigma)
+    margin = torch.minimum(margin, torch.minimum(d, rho - sigma))
     missed = e.square_().mul_(lever)
     usable = gate(torch.minimum(margin, d.square().mul_(MAX_APART_PX**2).sub_(missed)))
     least = torch.sub(d, sigma, alpha=abs(t_z)).mul_(d)
@@ -73,7 +73,7 @@ def project(
     """Where points at inverse depth ``rho`` appear in another keyframe.
 
     ``pixels`` are their columns and rows, those of a whole image if not given. Returns columns and
-    rows there, and rho over the inverse depth there: positive in front of that camera.
+    rows there, infinite or NaN behind that camera, and rho over the inverse depth there, at least 0.
     """
     if pixels is None:
         pixels = image_grid(rho)
@@ -84,6 +84,7 @@ def project(
         (pixels[0] * A[i][0] + (pixels[1] * A[i][1] + A[i][2])).add_(rho, alpha=b[i])
         for i in range(3)
     )
+    w.relu_()
     return x.div_(w), y.div_(w), w
 
 
@@ -105,24 +106,18 @@ def _sampled(
     """
     height, width = view.rho.shape
     margin = torch.minimum(torch.minimum(u, width - 1 - u), torch.minimum(v, height - 1 - v))
-    u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
-    left, top = u.floor().clamp_(max=width - 2), v.floor().clamp_(max=height - 2)
-    a, b = u.sub_(left), v.sub_(top)
-    corner = left.add_(top, alpha=width)
-    nearest = torch.add(corner, a.round()).add_(b.round(), alpha=width)
-    at, at_nearest = (
-        index.nan_to_num_().to(torch.int32).reshape(-1) for index in (corner, nearest)
+    nearest = u.round().add_(v.round(), alpha=width).clamp_(0, height * width - 1)
+    place = nearest.nan_to_num_().to(torch.int32).reshape(-1)
+    near, sigma = (
+        values.reshape(-1).index_select(0, place).reshape(u.shape)
+        for values in (view.rho, view.variance)
     )
-    flat = view.rho.reshape(-1)
-
-    def read(values: Tensor, index: Tensor) -> Tensor:
-        return values.index_select(0, index).reshape(u.shape)
-
-    upper = torch.lerp(read(flat, at), read(flat[1:], at), a)
-    lower = torch.lerp(read(flat[width:], at), read(flat[width + 1 :], at), a)
-    near = read(flat, at_nearest)
-    sigma = read(view.variance.reshape(-1), at_nearest).sqrt_()
-    jump = torch.lerp(upper, lower, b).sub_(near)
+    sigma.sqrt_()
+    grid = torch.empty((1, *u.shape, 2), device=u.device)
+    grid[0, ..., 0] = u.mul_(2 / (width - 1)).sub_(1)
+    grid[0, ..., 1] = v.mul_(2 / (height - 1)).sub_(1)
+    between = grid_sample(view.rho[None, None], grid, "bilinear", "border", align_corners=True)
+    jump = between[0, 0].sub_(near)
     one_surface = (JUMP_SIGMAS * sigma).sub_(jump.abs()).sign_().nan_to_num_().relu_()
     rho = near.addcmul_(jump.nan_to_num_(), one_surface)
     if inner is not None:
