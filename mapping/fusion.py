@@ -112,7 +112,7 @@ def variance_factor(own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Ten
     own_rho, own_variance = own.rho[step], own.variance[step]
     for mean, variance in hypotheses:
         ratio = (mean[step] - own_rho).square_().div_(variance[step] + own_variance)
-        if int((ratio == ratio).sum()) >= MIN_SAMPLE:
+        if int(torch.isfinite(ratio).sum()) >= MIN_SAMPLE:
             factors.append(float(ratio.nanmedian()) / MEDIAN_CHI2)
     return float(np.clip(np.median(factors), *FACTOR_RANGE)) if factors else 1.0
 

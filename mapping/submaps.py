@@ -81,12 +81,17 @@ def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) ->
 def nearest_a_voxel(
     points: NDArray[np.float32], variances: NDArray[np.float32], voxel_m: float
 ) -> NDArray[np.int64]:
-    """Indices, rising, of the surest point (N, 3) in each voxel."""
-    order = np.lexsort((variances, voxel_keys(points, voxel_m)))
-    keys = voxel_keys(points, voxel_m)[order]
-    first = np.ones(len(keys), bool)
-    first[1:] = keys[1:] != keys[:-1]
-    return np.sort(order[first])
+    """Indices, rising, of the surest point (N, 3) in each voxel, of equals the first."""
+    if len(points) == 0:
+        return np.zeros(0, np.int64)
+    keys = voxel_keys(points, voxel_m)
+    order = np.argsort(keys)
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    counts = np.diff(starts, append=len(keys))
+    sorted_variances = variances[order]
+    least = np.repeat(np.minimum.reduceat(sorted_variances, starts), counts)
+    surest = np.where(sorted_variances == least, order, len(keys))
+    return np.sort(np.minimum.reduceat(surest, starts))
 
 
 def voxel_keys(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:

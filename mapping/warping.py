@@ -73,7 +73,7 @@ def project(
     """Where points at inverse depth ``rho`` appear in another keyframe.
 
     ``pixels`` are their columns and rows, those of a whole image if not given. Returns columns and
-    rows there, infinite or NaN behind that camera, and rho over the inverse depth there, at least 0.
+    rows there, infinite or NaN behind that camera, and rho over the inverse depth there, 0 behind.
     """
     if pixels is None:
         pixels = image_grid(rho)

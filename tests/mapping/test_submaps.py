@@ -105,6 +105,18 @@ def test_one_point_a_voxel_the_surest() -> None:
     np.testing.assert_array_equal(kept, [1, 2])
 
 
+def test_one_point_a_voxel_of_many() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-1, 1, (4000, 3)).astype(np.float32)
+    variances = rng.integers(1, 4, 4000).astype(np.float32)
+    best: dict[tuple[int, ...], int] = {}
+    for k, cell in enumerate(map(tuple, np.floor(points / 0.25).astype(int).tolist())):
+        if cell not in best or variances[k] < variances[best[cell]]:
+            best[cell] = k
+    kept = nearest_a_voxel(points, variances, 0.25)
+    np.testing.assert_array_equal(kept, sorted(best.values()))
+
+
 def test_it_reads_back_as_it_was(tmp_path: Path) -> None:
     submap = make_submap(fused_plane(), CAMERA, 0.05)
     write_submap(tmp_path / "7", submap)
