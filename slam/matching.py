@@ -63,6 +63,7 @@ class WindowIndex:
         key = strip * self.STRIDE + pixels[:, 0]
         self._order = np.argsort(key, kind="stable")
         self._keys = key[self._order]
+        self._u, self._v = np.ascontiguousarray(pixels[self._order].T)
 
     def pairs(self, centres: Array, radius_px: Array) -> tuple[Ints, Ints]:
         """All pairs (centre index, keypoint index) closer than each centre's radius."""
@@ -73,10 +74,10 @@ class WindowIndex:
         start = np.searchsorted(self._keys, middle - radius_px[owner], side="left")
         stop = np.searchsorted(self._keys, middle + radius_px[owner], side="right")
         interval, position = expand_ranges(start, stop)
-        query, train = owner[interval], self._order[position]
-        offset = self.pixels[train] - centres[query]
-        near = np.einsum("ij,ij->i", offset, offset) <= radius_px[query] ** 2
-        return query[near], train[near]
+        query = owner[interval]
+        du, dv = self._u[position] - centres[query, 0], self._v[position] - centres[query, 1]
+        near = np.flatnonzero(du * du + dv * dv <= (radius_px * radius_px)[query])
+        return query[near], self._order[position[near]]
 
 
 def expand_ranges(start: Ints, stop: Ints) -> tuple[Ints, Ints]:
@@ -117,9 +118,9 @@ def match_pairs(
     return unique_train(matches) if config.mutual else matches
 
 
-def _sorted_rows(query: Ints, distance: Ints, train: Ints) -> tuple[Ints, Ints, Ints]:
-    """The columns sorted by query, distance, train: as one number, which sorts ten times faster."""
-    key = (((query << _DISTANCE_BITS) | distance) << _INDEX_BITS) | train
+def _sorted_rows(first: Ints, distance: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
+    """The columns sorted by first, distance, last: as one number, which sorts ten times faster."""
+    key = (((first << _DISTANCE_BITS) | distance) << _INDEX_BITS) | last
     key.sort()
     rest = key >> _INDEX_BITS
     distances = rest & ((1 << _DISTANCE_BITS) - 1)
@@ -128,10 +129,10 @@ def _sorted_rows(query: Ints, distance: Ints, train: Ints) -> tuple[Ints, Ints, 
 
 def unique_train(matches: Matches) -> Matches:
     """Only the closest query of every train index, in the order of the queries."""
-    order = np.lexsort((matches.query, matches.distance, matches.train))
-    train = matches.train[order]
-    first = order[np.flatnonzero(np.r_[True, train[1:] != train[:-1]])] if len(order) else order
-    return matches[np.sort(first)]
+    train, distance, query = _sorted_rows(matches.train, matches.distance, matches.query)
+    first = np.flatnonzero(np.diff(train, prepend=-1))
+    order = np.argsort(query[first])
+    return Matches(query[first][order], train[first][order], distance[first][order])
 
 
 def match_brute_force(query: Bits, train: Bits, config: MatchConfig) -> Matches:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse, orthonormalised, transform
@@ -13,6 +14,7 @@ from slam.reprojection import Reprojection, moved
 
 CHI2_3DOF = 7.815  # 95 %
 CHI2_2DOF = 5.991
+_DAMPING = 1e-9 * np.eye(6)
 
 
 @dataclass(frozen=True)
@@ -149,11 +151,17 @@ def _descend(
     """
     for _ in range(iterations):
         H, g = matches.normal_equations(T, kernel)
-        step = np.asarray(-np.linalg.solve(H + 1e-9 * np.eye(6), g), dtype=np.float64)
+        step = _solution(H + _DAMPING, -g)
         T = moved(T, step)
         if np.abs(step).max() < tolerance:
             break
     return T, H
+
+
+def _solution(H: Array, b: Array) -> Array:
+    """x (6,) of H x = b for a symmetric H (6, 6), by Cholesky's way where it is positive."""
+    _, x, failure = dposv(H, b)  # a third of numpy's time, which here is not the arithmetic's
+    return np.asarray(x if failure == 0 else np.linalg.solve(H, b), dtype=np.float64)
 
 
 def _inliers(T: Array, matches: Reprojection, gate: Array) -> NDArray[np.bool_]:

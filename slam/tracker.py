@@ -163,23 +163,8 @@ class Tracker:
         ``max_view_angle_deg`` of the direction it was last seen from. The window grows with the
         keypoint's scale; a keypoint of another scale than predicted is no candidate.
         """
-        camera = self.camera
-        points_camera = transform(inverse(T_world_camera), landmarks.points_world[ids])
-        front = points_camera[:, 2] > 0.1
-        ids, points_camera = ids[front], points_camera[front]
-        pixels = camera.project(points_camera)
-        towards = T_world_camera[:3, 3] - landmarks.points_world[ids]
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        cosine = np.einsum("ij,ij->i", towards, landmarks.directions[ids])
-        inside = (
-            (pixels[:, 0] > 0)
-            & (pixels[:, 0] < camera.width - 1)
-            & (pixels[:, 1] > 0)
-            & (pixels[:, 1] < camera.height - 1)
-            & (cosine > np.cos(np.deg2rad(self.config.max_view_angle_deg)))
-        )
-        ids, pixels = ids[inside], pixels[inside]
-        scale = np.maximum(landmarks.extent[ids] / points_camera[inside, 2], 1.0)
+        ids, pixels, z = self._in_view(T_world_camera, ids, landmarks)
+        scale = np.maximum(landmarks.extent[ids] / z, 1.0)
         query, train = index.pairs(pixels, radius_px * np.minimum(np.sqrt(scale), 3.0))
         ratio = features.scales[train] / scale[query]
         limit = self.config.match.max_scale_ratio
@@ -192,6 +177,25 @@ class Tracker:
             return ids, matches
         turn = features.angles_rad[matches.train] - landmarks.angles_rad[ids[matches.query]]
         return ids, consistent_rotation(matches, turn, tolerance)
+
+    def _in_view(
+        self, T_world_camera: Array, ids: Ints, landmarks: LandmarkTable
+    ) -> tuple[Ints, Array, Array]:
+        """Those of the landmarks that are in view, their pixels (N, 2) and z-depths (N,) in m."""
+        camera, points_world = self.camera, landmarks.points_world[ids]
+        points_camera = transform(inverse(T_world_camera), points_world)
+        front = np.flatnonzero(points_camera[:, 2] > 0.1)
+        points_camera = points_camera[front]
+        pixels = camera.project(points_camera)
+        u, v = pixels.T
+        inside = (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)
+        rows = front[inside]
+        towards = T_world_camera[:3, 3] - points_world[rows]
+        distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+        along = np.einsum("ij,ij->i", towards, landmarks.directions[ids[rows]])
+        seen = along > np.cos(np.deg2rad(self.config.max_view_angle_deg)) * distance
+        chosen = np.flatnonzero(inside)[seen]
+        return ids[rows[seen]], pixels[chosen], points_camera[chosen, 2]
 
     def _first_estimate(
         self,
