@@ -75,6 +75,10 @@ REPORTS = {
         ),
         "rooms": ("Masks of rendered rooms", "segmentation.py rooms --rooms {sequences}/rooms"),
         "cost": ("Time and memory of the networks", "segmentation.py cost"),
+        "beside": (
+            "Beside torchvision's network",
+            "beside_torchvision.py --environment {sequences}/torchvision",
+        ),
         "labels-truth": (
             "Labels and objects from true masks", "labels.py {sequences}/office-300"
         ),

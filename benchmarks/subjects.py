@@ -61,6 +61,7 @@ RENDERING = _of("slam", "rendering/*.py")
 SEMANTICS = LABELS + MOVING + NETWORK + WEIGHTS
 
 SUBJECTS = {
+    "beside_torchvision.py": NETWORK,
     "calibration.py": CALIBRATION,
     "composited.py": ODOMETRY + MOVING + NETWORK + WEIGHTS + METRICS,
     "covariances.py": SMOOTHER,
