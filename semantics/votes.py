@@ -24,8 +24,10 @@ _MAD_TO_SIGMA = 1.4826
 class VoteConfig:
     """Which pixels of a mask are believed.
 
-    Nearer than ``border_px`` to another mask or to the mask's edge nothing is said: segmentation
-    errs there. A depth belongs to the mask's surface if it is within ``depth_sigmas`` robust
+    Nearer than ``border_px`` to another mask or to the mask's edge a pixel says nothing, since
+    segmentation errs there, unless depth tells the sides apart: where all surface within
+    ``edge_px`` that is as far as the landmark, to the share ``edge_depth``, is of instances of one
+    class. A depth belongs to the mask's surface if it is within ``depth_sigmas`` robust
     standard deviations, and ``depth_margin_m`` at 1 m that grows with the square of the depth,
     of the median in the mask. What is farther than ``background_border_px`` from any mask is
     "unknown" with a weight of ``background_weight``: a network misses things, and masks are too
@@ -35,16 +37,18 @@ class VoteConfig:
     border_px: int = 1
     depth_sigmas: float = 3.5
     depth_margin_m: float = 0.03
+    edge_px: int = 4
+    edge_depth: float = 0.03
     background_border_px: int = 8
     background_weight: float = 0.5
 
     def __post_init__(self) -> None:
         if (
-            min(self.border_px, self.background_border_px) < 0
+            min(self.border_px, self.edge_px, self.background_border_px) < 0
             or self.depth_sigmas <= 0
-            or self.depth_margin_m < 0
+            or min(self.depth_margin_m, self.edge_depth) < 0
         ):
-            raise ValueError("borders, depth_sigmas and depth_margin_m must not be negative")
+            raise ValueError("borders and what depths may differ by must not be negative")
         if not 0 <= self.background_weight < 1:
             raise ValueError("background_weight must be in [0, 1)")
 
@@ -57,6 +61,7 @@ class Claims:
         instances: in the order of their mask scores, the best first.
         owner: (H, W) int16, the instance that a pixel belongs to, -1 for none.
         inner: (H, W) bool, not near the border between two owners, or that of a mask and none.
+        depth_m: (h, w) every s-th pixel of the depth image both ways, NaN where missing.
         depth_range_m: (K, 2) nearest and farthest depth of each instance's surface; NaN for one
             without depth.
     """
@@ -64,6 +69,7 @@ class Claims:
     instances: tuple[Instance, ...]
     owner: NDArray[np.int16]
     inner: Mask
+    depth_m: NDArray[np.float32]
     depth_range_m: Array
 
     def on_surface(self, owners: Ints, z_m: Array) -> Mask:
@@ -139,32 +145,69 @@ def claim_pixels(
         covered = (owner != NOBODY).astype(np.uint8)
         near = cv2.dilate(covered, _disc(config.background_border_px)) > covered
         inner &= ~near
-    return Claims(ranked, owner, inner, _surfaces(owner, inner, depth_m, len(ranked), config))
+    surfaces = _surfaces(owner, inner, depth_m, len(ranked), config)
+    return Claims(ranked, owner, inner, depth_m, surfaces)
 
 
 def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteConfig) -> Votes:
     """The votes of a keyframe about the landmarks that it observes (paper, Algorithm 3).
 
     For each landmark, at ``pixels`` (N, 2) in the image and with z-depth ``z_m`` (N,) in the
-    camera, NaN if unknown: the instance that owns its pixel, unless the pixel is near a border or
-    the landmark is not on the instance's surface, votes with its class distribution, weighted by
-    its mask score. Where there is no instance, the background votes.
+    camera, NaN if unknown: the instance that owns its pixel, unless the landmark is not on the
+    instance's surface, votes with its class distribution, weighted by its mask score. Near a
+    border it is the instance that alone has surface at the landmark's depth. Where there is no
+    instance, the background votes.
     """
     height, width = claims.owner.shape
     columns, rows = np.rint(pixels).astype(np.int64).reshape(-1, 2).T
     columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
     owners = claims.owner[rows, columns].astype(np.int64)
-    votes = claims.inner[rows, columns]
+    inner = claims.inner[rows, columns]
+    alone = inner.copy()
+    if claims.instances and config.edge_px and not inner.all():
+        edge = np.flatnonzero(~inner)
+        owners[edge], alone[edge] = _at_edges(
+            claims, (rows[edge], columns[edge]), z_m[edge], config
+        )
     covered = owners != NOBODY
+    votes = inner | covered
     votes[covered] &= claims.on_surface(owners[covered], z_m[covered])
-    chosen = np.flatnonzero(votes)
     if not config.background_weight:
-        chosen = chosen[covered[chosen]]
+        votes &= covered
+    chosen = np.flatnonzero(votes)
     background = np.eye(1, classes, dtype=np.float32)[0]
     table = np.array([*(i.distribution for i in claims.instances), background], np.float32)
     scores = [*(i.mask_score for i in claims.instances), config.background_weight]
-    owners = owners[chosen]  # NOBODY, -1, is the last row of both
-    return Votes(chosen, owners, table[owners], np.array(scores, np.float32)[owners])
+    speakers = owners[chosen]  # NOBODY, -1, is the last row of both
+    instances = np.where(alone[chosen], speakers, NOBODY)
+    return Votes(chosen, instances, table[speakers], np.array(scores, np.float32)[speakers])
+
+
+def _at_edges(
+    claims: Claims, places: tuple[Ints, Ints], z_m: Array, config: VoteConfig
+) -> tuple[Ints, Mask]:
+    """Whose surface landmarks (N,) at rows and columns (N,) near a border are on, by their depth.
+
+    The instance (N,) with the worst score of those of one class that have surface there, NOBODY
+    where classes differ or some of the surface is nobody's; whether it is the only one (N,).
+    """
+    step = max(claims.owner.shape[0] // max(claims.depth_m.shape[0], 1), 1)
+    limits = np.minimum(claims.depth_m.shape, np.array(claims.owner.shape) // step) - 1
+    reach = np.arange(-(config.edge_px // step), config.edge_px // step + 1)
+    shifts = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
+    around = np.stack(places, axis=1)[:, None] // step + shifts
+    rows, columns = np.moveaxis(np.clip(around, 0, limits), -1, 0)
+    apart_m = np.abs(claims.depth_m[rows, columns] - z_m[:, None])
+    there = apart_m < config.edge_depth * z_m[:, None]
+    owners = claims.owner[rows * step, columns * step].astype(np.int64)
+    first = np.where(there, owners, len(claims.instances)).min(
+        axis=1, initial=len(claims.instances)
+    )
+    last = np.where(there, owners, NOBODY).max(axis=1, initial=NOBODY)
+    classes = np.array([i.label for i in claims.instances])
+    of_class = np.where(owners == NOBODY, 0, classes[owners])
+    one = (~there | (of_class == classes[last][:, None])).all(axis=1) & there.any(axis=1)
+    return np.where(one, last, NOBODY), first == last
 
 
 def _disc(radius_px: int) -> NDArray[np.uint8]:
