@@ -164,11 +164,10 @@ def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteCo
     owners = claims.owner[rows, columns].astype(np.int64)
     inner = claims.inner[rows, columns]
     alone = inner.copy()
-    if claims.instances and config.edge_px and not inner.all():
-        edge = np.flatnonzero(~inner)
-        owners[edge], alone[edge] = _at_edges(
-            claims, (rows[edge], columns[edge]), z_m[edge], config
-        )
+    edge = np.flatnonzero(~inner)
+    owners[edge] = NOBODY
+    if claims.instances and config.edge_px and len(edge):
+        owners[edge], alone[edge] = _at_edges(claims, rows[edge], columns[edge], z_m[edge], config)
     covered = owners != NOBODY
     votes = inner | covered
     votes[covered] &= claims.on_surface(owners[covered], z_m[covered])
@@ -184,7 +183,7 @@ def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteCo
 
 
 def _at_edges(
-    claims: Claims, places: tuple[Ints, Ints], z_m: Array, config: VoteConfig
+    claims: Claims, rows: Ints, columns: Ints, z_m: Array, config: VoteConfig
 ) -> tuple[Ints, Mask]:
     """Whose surface landmarks (N,) at rows and columns (N,) near a border are on, by their depth.
 
@@ -195,14 +194,13 @@ def _at_edges(
     limits = np.minimum(claims.depth_m.shape, np.array(claims.owner.shape) // step) - 1
     reach = np.arange(-(config.edge_px // step), config.edge_px // step + 1)
     shifts = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
-    around = np.stack(places, axis=1)[:, None] // step + shifts
+    around = np.stack([rows, columns], axis=1)[:, None] // step + shifts
     rows, columns = np.moveaxis(np.clip(around, 0, limits), -1, 0)
     apart_m = np.abs(claims.depth_m[rows, columns] - z_m[:, None])
     there = apart_m < config.edge_depth * z_m[:, None]
     owners = claims.owner[rows * step, columns * step].astype(np.int64)
-    first = np.where(there, owners, len(claims.instances)).min(
-        axis=1, initial=len(claims.instances)
-    )
+    count = len(claims.instances)
+    first = np.where(there, owners, count).min(axis=1, initial=count)
     last = np.where(there, owners, NOBODY).max(axis=1, initial=NOBODY)
     classes = np.array([i.label for i in claims.instances])
     of_class = np.where(owners == NOBODY, 0, classes[owners])

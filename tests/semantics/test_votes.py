@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,38 @@ def test_a_slanted_surface_votes_as_a_whole() -> None:
     pixels = np.stack([np.full(len(rows), 60), rows], axis=1).astype(float)
     z_m = np.interp(rows, np.arange(0, SIZE[0], 2), depth_m[:, 0])
     assert len(vote(claims, pixels, z_m, 4, CONFIG).rows) == len(rows)
+
+
+def stepped() -> np.ndarray:
+    """The chair at 2 m before a wall at 4 m, at every second pixel."""
+    depth_m = flat(4.0)
+    depth_m[10:40, 15:45] = 2.0
+    return depth_m
+
+
+def test_near_a_border_the_depth_says_which_side_it_is() -> None:
+    claims = claim_pixels([CHAIR], stepped(), SIZE, CONFIG)
+    columns = np.array([28, 31, 33, 31, 28, 31])  # the mask begins at column 30
+    z_m = np.array([2.0, 2.02, 1.99, 4.0, 4.0, np.nan])
+    pixels = np.stack([columns, np.full(6, 50)], axis=1).astype(float)
+    found = vote(claims, pixels, z_m, 4, CONFIG)
+    assert found.rows.tolist() == [0, 1, 2]  # the wall's landmarks stay silent: it may be missed
+    assert found.instances.tolist() == [0, 0, 0]
+    assert np.allclose(found.distributions, CHAIR.distribution)
+    without = replace(CONFIG, edge_px=0)
+    assert vote(claims, pixels[[0, 1]], z_m[[0, 1]], 4, without).rows.tolist() == []
+
+
+def test_on_the_border_of_two_things_of_one_class_the_class_is_known_and_the_thing_is_not() -> None:
+    for label, rows in ((1, [0]), (2, [])):
+        right = instance(slice(20, 80), slice(90, 140), label, 0.7)
+        depth_m = flat(4.0)
+        depth_m[10:40, 15:70] = 2.0
+        claims = claim_pixels([CHAIR, right], depth_m, SIZE, CONFIG)
+        found = vote(claims, np.array([[90.0, 50.0]]), np.array([2.0]), 4, CONFIG)
+        assert found.rows.tolist() == rows
+        assert found.instances.tolist() == [-1] * len(rows)
+        assert np.allclose(found.weights, 0.7)
 
 
 def test_without_depth_and_without_instances() -> None:
