@@ -1,9 +1,12 @@
 """Run benchmarks one after the other and keep what they print in a report under docs/.
 
     python benchmarks/section_report.py graph [--only loops,session] [--sequences runs/bench]
+    python benchmarks/section_report.py --stale [graph]
 
 What a benchmark prints stands in the report as it is, below the command. With ``--only`` the other
-sections stay as they were.
+sections stay as they were; with ``--stale`` those that are not there, or older than the code that
+makes them, are made anew, in one report or in all. README.md and docs/benchmarks.md are written by
+``make bench``.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.freshness import code_print  # noqa: E402
+from benchmarks.freshness import PAGES, code_print, sections  # noqa: E402
 from benchmarks.machine import describe_commit, now  # noqa: E402
 from slam.machine import processor  # noqa: E402
 
@@ -120,11 +123,13 @@ REPORTS = {
 }  # fmt: skip
 
 
-def section(report: Report, name: str, sequences: Path) -> str:
+def make_section(report: Report, name: str, sequences: Path) -> str:
     """Run a benchmark; its section."""
     title, command = report.sections[name]
     command = f"benchmarks/{command.format(sequences=sequences)}"
     print(f"{title}: python {command}", flush=True)
+    commit = describe_commit(tuple(str(page.relative_to(ROOT)) for page in PAGES))
+    code = code_print(ROOT / command.split()[0])
     begin_s = time.perf_counter()
     done = subprocess.run(
         [sys.executable, *command.split()], cwd=ROOT, capture_output=True, text=True, check=False
@@ -132,8 +137,6 @@ def section(report: Report, name: str, sequences: Path) -> str:
     if done.returncode:
         raise SystemExit(f"{command} failed:\n{done.stderr[-2000:]}")
     wall_s = time.perf_counter() - begin_s
-    commit = describe_commit((str(report.path.relative_to(ROOT)),))
-    code = code_print(ROOT / command.split()[0])
     when = f"{processor()}; commit {commit}; code {code}; {now()}; {wall_s:.0f} s."
     captions = report.pictures.get(name, {})
     pictures = "".join(f"\n![{text}](images/{file})\n{text}.\n" for file, text in captions.items())
@@ -141,26 +144,40 @@ def section(report: Report, name: str, sequences: Path) -> str:
     return f"## {title}\n\n`python {command}`\n\n{printed}\n\n{when}\n{pictures}"
 
 
+def replace_section(report: Report, new: str) -> None:
+    """Put a section into its page, in the place of the old one."""
+    old = report.path.read_text() if report.path.exists() else report.head
+    parts = {
+        part.split("\n", 1)[0]: part.rstrip() + "\n\n"
+        for part in re.split(r"(?m)^(?=## )", old)[1:]
+    }
+    parts[new.split("\n", 1)[0]] = new.rstrip() + "\n\n"
+    titles = [f"## {title}" for title, _ in report.sections.values()]
+    body = "".join(parts[title] for title in titles if title in parts)
+    report.path.write_text(f"{report.head}\n{body.rstrip()}\n")
+
+
+def stale(report: Report) -> list[str]:
+    """Names of the sections that are missing or older than the code that makes them."""
+    written = sections(report.path) if report.path.exists() else []
+    fresh = {section.title for section in written if not section.stale}
+    return [name for name, (title, _) in report.sections.items() if title not in fresh]
+
+
 def main() -> None:
     """Write a report, or renew some of its sections."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("report", choices=REPORTS)
+    parser.add_argument("report", choices=REPORTS, nargs="?")
     parser.add_argument("--only", help="some of its sections, such as loops,session")
+    parser.add_argument("--stale", action="store_true", help="those that need it, of all reports")
     parser.add_argument("--sequences", type=Path, default=Path("runs/bench"))
     arguments = parser.parse_args()
-    report = REPORTS[arguments.report]
-    chosen = arguments.only.split(",") if arguments.only else list(report.sections)
-    for name in chosen:
-        new = section(report, name, arguments.sequences)
-        old = report.path.read_text() if report.path.exists() else report.head
-        parts = {
-            part.split("\n", 1)[0]: part.rstrip() + "\n\n"
-            for part in re.split(r"(?m)^(?=## )", old)[1:]
-        }
-        parts[new.split("\n", 1)[0]] = new.rstrip() + "\n\n"
-        titles = [f"## {title}" for title, _ in report.sections.values()]
-        body = "".join(parts[title] for title in titles if title in parts)
-        report.path.write_text(f"{report.head}\n{body.rstrip()}\n")
+    if not arguments.report and not arguments.stale:
+        parser.error("which report? Or --stale")
+    for report in [REPORTS[arguments.report]] if arguments.report else REPORTS.values():
+        names = stale(report) if arguments.stale else list(report.sections)
+        for name in arguments.only.split(",") if arguments.only else names:
+            replace_section(report, make_section(report, name, arguments.sequences))
 
 
 if __name__ == "__main__":
