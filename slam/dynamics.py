@@ -156,7 +156,9 @@ class Dynamics:
             return ids[self.movability.moving(ids)]
         points = world.landmarks.points_world[ids]
         gone = self._check.judge(points, view, tracked.T_world_camera) == Verdict.MOVING
-        found = np.isin(ids, tracked.landmark_ids)
+        tracked_now = np.zeros(len(world.landmarks), bool)
+        tracked_now[tracked.landmark_ids] = True
+        found = tracked_now[ids]
         gone &= ~found
         told = found | gone
         self.movability.update(ids[told], gone[told], self.config.movability.frame_power)

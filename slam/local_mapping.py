@@ -44,8 +44,10 @@ def local_landmarks(world: WorldMap, seen_ids: Ints, config: MappingConfig) -> I
     strong = world.covisible(seen_ids, config.local_min_shared)[: config.local_keyframes]
     if not strong:
         return np.unique(seen_ids)
-    ids = np.concatenate([keyframe.landmark_ids for _, keyframe in strong] + [seen_ids])
-    return world.landmarks.living(np.unique(ids))
+    chosen = np.zeros(len(world.landmarks) + 1, bool)  # the last entry answers for id -1
+    for ids in (*(keyframe.landmark_ids for _, keyframe in strong), seen_ids):
+        chosen[ids] = True
+    return np.flatnonzero(chosen[:-1] & world.landmarks.alive)
 
 
 def create_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> Ints:

@@ -20,6 +20,8 @@ logger = logging.getLogger(__name__)
 
 HEALTH_S = 1.0
 SNAPSHOT_S = 5.0
+SNAPSHOT_SHARE = 0.005
+"""Of the time at most goes into trajectory.txt, which takes longer as it grows."""
 SAY_S = 60.0
 """A disk that stays full is said again after so long."""
 
@@ -35,7 +37,8 @@ class Recorder:
         self.folder = folder
         self.unwritten = 0
         self._said_s = -np.inf
-        self._health_s = self._snapshot_s = time.monotonic()
+        self._health_s = time.monotonic()
+        self._snapshot_due_s = self._health_s + SNAPSHOT_S
 
     def frame(
         self,
@@ -66,9 +69,11 @@ class Recorder:
     ) -> None:
         self.folder.write_frame(result)
         now_s = time.monotonic()
-        if now_s - self._snapshot_s >= SNAPSHOT_S:
-            self._snapshot_s = now_s
+        if now_s >= self._snapshot_due_s:
+            self._snapshot_due_s = now_s + SNAPSHOT_S
             self.folder.write_trajectory(trajectory())
+            took_s = time.monotonic() - now_s
+            self._snapshot_due_s = now_s + max(SNAPSHOT_S, took_s / SNAPSHOT_SHARE)
         if now_s - self._health_s >= HEALTH_S:
             self._health_s = now_s
             self.folder.write_text(HEALTH, health().as_json())

@@ -1,0 +1,58 @@
+"""When the live loop writes its trajectory: often, but never for long."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from graph.trajectory import Trajectory
+from slam.live import recorder
+from slam.live.health import Health
+from slam.live.recorder import SNAPSHOT_S, SNAPSHOT_SHARE, Recorder
+
+NOTHING = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    clock = SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    return clock
+
+
+def written(clock: SimpleNamespace, cost_s: float, error: OSError | None = None) -> list[float]:
+    """When a trajectory that takes so long is written, of 300 s with ten frames a second."""
+    times: list[float] = []
+
+    def write(_: Trajectory) -> None:
+        times.append(clock.now_s)
+        clock.now_s += cost_s
+        if error is not None:
+            raise error
+
+    folder = SimpleNamespace(
+        write_frame=lambda _: None, write_trajectory=write, write_text=lambda *_: None, path="run"
+    )
+    keeper = Recorder(folder)
+    end_s = clock.now_s + 300
+    while clock.now_s < end_s:
+        keeper.frame(None, Health, lambda: NOTHING)
+        clock.now_s += 0.1
+    return times
+
+
+def test_a_short_trajectory_is_written_every_few_seconds(clock: SimpleNamespace) -> None:
+    assert np.diff(written(clock, 0.0)) == pytest.approx(SNAPSHOT_S, abs=0.11)
+
+
+def test_a_long_one_takes_no_more_than_its_share_of_the_time(clock: SimpleNamespace) -> None:
+    times = written(clock, 0.3)
+    assert len(times) > 3
+    assert np.diff(times) == pytest.approx(0.3 / SNAPSHOT_SHARE, abs=0.11)
+
+
+def test_a_full_disk_is_tried_again_no_sooner(clock: SimpleNamespace) -> None:
+    times = written(clock, 0.0, OSError(28, "No space left on device"))
+    assert np.diff(times) == pytest.approx(SNAPSHOT_S, abs=0.11)
