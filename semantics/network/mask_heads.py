@@ -74,3 +74,16 @@ def of_class(values: Tensor, labels: Tensor) -> Tensor:
     if values.shape[1] == 1:
         return values[:, 0]
     return values[torch.arange(len(labels), device=values.device), labels]
+
+
+def expected_iou(masks: Tensor) -> Tensor:
+    """IoU (R,) of masks, binarised at 0.5, to expect if the probabilities (R, M, M) are right.
+
+    That is the expected intersection with the object over the expected union, where each cell is
+    the object's with its probability (Nowozin 2014, "Optimal decisions from probabilistic models:
+    the intersection-over-union case"); 0 for an empty mask.
+    """
+    inside = masks > 0.5
+    intersection = (masks * inside).sum(dim=(1, 2))
+    union = inside.sum(dim=(1, 2)) + (masks * ~inside).sum(dim=(1, 2))
+    return intersection / union.clamp(min=1e-6)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from semantics.network.config import NetworkConfig
-from semantics.network.mask_heads import MaskIoUHead
+from semantics.network.mask_heads import MaskIoUHead, expected_iou
 from semantics.network.model import RoIHeads
 from semantics.network.roi_align import feature_table
 
@@ -52,3 +52,16 @@ def test_without_the_head_every_mask_counts_in_full() -> None:
     masks, ious = heads.masks(table, [torch.tensor([[0.0, 0.0, 50.0, 50.0]])], torch.tensor([1]))
     assert masks.shape == (1, 28, 28)
     assert ious.tolist() == [1.0]
+
+
+def test_the_expected_iou_is_that_of_objects_drawn_from_the_probabilities() -> None:
+    generator = torch.Generator().manual_seed(0)
+    masks = (
+        torch.rand(3, 28, 28, generator=generator) ** torch.tensor([0.3, 1.0, 2.0])[:, None, None]
+    )
+    drawn = torch.rand(400, 3, 28, 28, generator=generator) < masks
+    found = masks > 0.5
+    union = (drawn | found).sum(dim=(2, 3))
+    mean = ((drawn & found).sum(dim=(2, 3)) / union).mean(dim=0)
+    torch.testing.assert_close(expected_iou(masks), mean, atol=0.005, rtol=0)
+    assert expected_iou(torch.zeros(1, 28, 28)).tolist() == [0.0]

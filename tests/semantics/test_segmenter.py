@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -224,6 +225,24 @@ def test_masks_of_a_mirrored_scene_are_the_mirrored_masks() -> None:
     torch.testing.assert_close(turned.masks, found.masks.flip(2))
     torch.testing.assert_close(turned.mask_ious, found.mask_ious)
     assert not torch.allclose(alone.masks, found.masks)
+
+
+@pytest.mark.parametrize("channels", [0, 4])
+def test_the_iou_of_masks_from_both_ways_is_judged_and_expected(channels: int) -> None:
+    torch.manual_seed(0)
+    config = replace(TINY, class_agnostic=True, maskiou_channels=channels)
+    model = MaskRCNN(config).eval()
+    with torch.no_grad():
+        model.roi_heads.mask_predictor.mask_fcn_logits.weight.zero_()
+        model.roi_heads.mask_predictor.mask_fcn_logits.bias.fill_(math.log(4.0))  # 0.8 everywhere
+        if model.roi_heads.maskiou_head is not None:
+            model.roi_heads.maskiou_head.maskiou.weight.zero_()
+            model.roi_heads.maskiou_head.maskiou.bias.fill_(0.3)
+    box = torch.tensor([[10.0, 8.0, 50.0, 60.0]])
+    given = ClassifiedBoxes(box, torch.tensor([2]), torch.tensor([0.9]), torch.full((1, 3), 1 / 3))
+    with torch.inference_mode():
+        found = segment_both_ways(model, torch.rand(3, 64, 96), given)
+    assert float(found.mask_ious) == pytest.approx(0.55 if channels else 1.0)
 
 
 def test_mask_scores_reorder_detections_and_empty_masks_go() -> None:
