@@ -56,25 +56,26 @@ def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) ->
     Points without a normal, and those seen at less
     than 6 degrees, are left out: they are rims.
     """
-    grid = back_project(result.map, camera)
-    normal_grid = surface_normals(result.map, camera)
-    rays = grid / torch.linalg.norm(grid, dim=-1, keepdim=True)
-    facing = -(normal_grid * rays).sum(-1) > MAX_GRAZING_COSINE
-    rows, columns = (a.cpu().numpy() for a in torch.nonzero(facing).unbind(-1))
-    points, normals = (g[facing].cpu().numpy() for g in (grid, normal_grid))
-    variances = (result.map.variance / result.map.rho**4)[facing].cpu().numpy()
+    grid = back_project(result.map, camera).reshape(-1, 3)
+    normals = surface_normals(result.map, camera).reshape(-1, 3)
+    facing = -(normals * grid).sum(-1) > MAX_GRAZING_COSINE * torch.linalg.norm(grid, dim=-1)
+    pixels = torch.nonzero(facing)[:, 0]
+    points = grid.index_select(0, pixels).cpu().numpy()
+    squared_depth = result.map.rho.square().reciprocal_()
+    depth_variance = (result.map.variance * squared_depth.square_()).reshape(-1)
+    variances = depth_variance.index_select(0, pixels).cpu().numpy()
+    keep = nearest_a_voxel(points, variances, voxel_m)
+    kept = pixels.cpu().numpy()[keep]
     instances = result.keyframe.instances
     if instances is None:
         instances = np.zeros(result.keyframe.depth_m.shape, np.uint16)
-    keep = nearest_a_voxel(points, variances, voxel_m)
-    rows, columns = rows[keep], columns[keep]
     return Submap(
         result.keyframe.id,
         points[keep],
-        normals[keep],
-        result.keyframe.rgb[rows, columns],
+        normals.cpu().numpy()[kept],
+        result.keyframe.rgb.reshape(-1, 3)[kept],
         variances[keep],
-        instances[rows, columns],
+        instances.reshape(-1)[kept],
     )
 
 
