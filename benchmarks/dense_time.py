@@ -23,14 +23,17 @@ from mapping.warping import View
 from slam.dense_input import MappedRun
 
 ROUNDS = 6
+MAX_LOAD = 1.7
+"""Of the machine, this process included: above it the clock says nothing."""
 
 
 def step_times_ms(steps: Steps, run: MappedRun, config: DenseConfig) -> dict[str, Any]:
     """Least times of a keyframe in the middle: Steps one by one and together, and Open3D's TSDF.
 
-    "processor" is processor time on one thread, "wall" what the clock says on two. They take
-    turns, ROUNDS times, since a busy machine is now slower, now faster.
+    "processor" is processor time on one thread, "wall" what the clock says on two, empty if others
+    load the machine. They take turns, ROUNDS times, since a machine is now slower, now faster.
     """
+    load = os.getloadavg()[0]
     single = _Single(steps, run, config)
     works = single.works()
     together: dict[str, Callable[[], Any]] = {
@@ -38,18 +41,19 @@ def step_times_ms(steps: Steps, run: MappedRun, config: DenseConfig) -> dict[str
         "TSDF": lambda: open3d_points(run, steps.keyframes),
     }
     processor = dict.fromkeys([*works, *together], np.inf)
-    wall, threads = dict.fromkeys(together, np.inf), torch.get_num_threads()
+    wall = dict.fromkeys(together if load < MAX_LOAD else (), np.inf)
+    threads = torch.get_num_threads()
     for _ in range(ROUNDS):
         for name, work in {**works, **together}.items():
             torch.set_num_threads(1)
             processor[name] = min(processor[name], _took_ms(work, time.process_time))
-            torch.set_num_threads(2)
-            if name in together:
+            if name in wall:
+                torch.set_num_threads(2)
                 wall[name] = min(wall[name], _took_ms(work, time.perf_counter))
     torch.set_num_threads(threads)
-    for times in (processor, wall):
+    for times in filter(None, (processor, wall)):
         times["TSDF"] /= len(steps.keyframes)
-    return {"processor": processor, "wall": wall, "load": os.getloadavg()[0]}
+    return {"processor": processor, "wall": wall, "load": load}
 
 
 def _took_ms(work: Callable[[], Any], clock: Callable[[], float]) -> float:
