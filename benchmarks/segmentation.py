@@ -5,13 +5,13 @@
     python benchmarks/segmentation.py cost
 
 Photographs: the part of ../shared/data/coco_excerpt that no training saw (`--held-out 0.28
---seed 0`), boxes from YOLOX-Nano; by the project's own weights, and by three networks that went on
-from them on the excerpt's photographs alone ({} in ``--weights`` stands for the seed). Rooms: seeds
-that no training saw, the network's own boxes. Cost: a 640x480 image in a process of its own, two
-threads, random weights that take every proposal for an object, so that there are as many
-instances as the network gives at most. "IoU corr." is of predicted and true IoU of the masks in
-boxes that overlap an object of their class by half; "where good" of those masks alone that overlap
-it by half themselves.
+--seed 0`), boxes from YOLOX-Nano at 416 and at 640 pixels; by the project's own weights, and by
+three networks that went on from them on the excerpt's photographs alone ({} in ``--weights`` stands
+for the seed). Rooms: seeds that no training saw, the network's own boxes. Cost: a 640x480 image in
+a process of its own, two threads, random weights that take every proposal for an object, so that
+there are as many instances as the network gives at most. "IoU corr." is of predicted and true IoU
+of the masks in boxes that overlap an object of their class by half; "where good" of those masks
+alone that overlap it by half themselves.
 """
 
 from __future__ import annotations
