@@ -58,12 +58,14 @@ class Sighting:
         half_size: (3,) m, along the image's columns, its rows and the depth.
         distribution: (C,) over classes.
         log_odds: that it moves, by its class's prior and this keyframe's geometry.
+        still: it stood still for so long that its class does not count.
     """
 
     centroid_world: Array
     half_size: Array
     distribution: NDArray[np.float32]
     log_odds: float
+    still: bool = False
 
 
 @dataclass(frozen=True, eq=False)

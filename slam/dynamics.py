@@ -20,6 +20,7 @@ from slam.keyframe_masks import KeyframeMasks, surface_points
 from slam.landmarks import Ints, Mask
 from slam.localiser import Localiser
 from slam.mapper import Mapper
+from slam.stance import Stance, stance
 from slam.static_check import (
     DepthView,
     StaticCheck,
@@ -181,7 +182,8 @@ class Dynamics:
         if keyframe is not None:
             self.tracks.see(keyframe.timestamp_s, movable)
         odds = np.array([-np.inf if s is None else s.log_odds for s in sightings])
-        self._believe(masks, odds > 0)
+        still = np.array([s is not None and s.still for s in sightings], bool)
+        self._believe(masks, odds > 0, still)
         if not (odds > 0).any():
             return
         covered = np.isin(masks.claims.owner, np.flatnonzero(odds > 0))
@@ -258,36 +260,36 @@ class Dynamics:
         low, centroid, high = np.percentile(points, (4, 50, 96), axis=0)
         half_size = np.maximum(high - centroid, centroid - low)
         distribution = masks.claims.instances[k].distribution
+        found = self._stance(transform(masks.T_world_camera, points), masks, mapper)
+        still = found is Stance.STILL
         prior = float(distribution @ self.priors.of(masks.names))
+        prior = min(prior, self.priors.unknown) if still else prior
         odds = float(log_odds(np.clip(prior, 0.01, 0.99)))
-        odds += self._evidence(transform(masks.T_world_camera, points), masks, mapper)
+        odds += self.config.movability.step * (int(found is Stance.MOVING) - int(found.is_static))
         centre_world = transform(masks.T_world_camera, centroid[None])[0]
-        return Sighting(centre_world, half_size, distribution, odds)
+        return Sighting(centre_world, half_size, distribution, odds, still)
 
-    def _evidence(self, points_world: Array, masks: KeyframeMasks, mapper: Mapper) -> float:
-        """Log odds that an instance at these points moves, by what other keyframes saw there."""
+    def _stance(self, points_world: Array, masks: KeyframeMasks, mapper: Mapper) -> Stance:
+        """What other keyframes saw where an instance is."""
         keyframe = mapper.world.keyframes.get(masks.keyframe_id)
         if keyframe is None or not self.config.geometry:
-            return 0.0
+            return Stance.UNKNOWN
         here = self.memory.posed(keyframe.segment, mapper)
         views = [v for v in here if v.keyframe_id != masks.keyframe_id]
-        if not views:
-            return 0.0
-        told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
-        verdicts = self._check.agree(told)
-        known = np.count_nonzero(verdicts)
-        if known < self.config.min_judged:
-            return 0.0
-        step = self.config.movability.step
-        return step if np.count_nonzero(verdicts < 0) > known / 2 else -step
+        least, now_s = self.config.min_judged, keyframe.timestamp_s
+        return stance(points_world, now_s, views, self._check, least)
 
-    def _believe(self, masks: KeyframeMasks, moving: Mask) -> None:
-        """Landmarks on instances have their classes' priors, and move if their instance does."""
+    def _believe(self, masks: KeyframeMasks, moving: Mask, still: Mask) -> None:
+        """Landmarks on instances have their classes' priors, and move if their instance does; of
+        what stood still for long the class says nothing.
+        """
         ids, first = np.unique(masks.landmark_ids, return_index=True)
         priors = masks.label_distributions[first] @ self.priors.of(masks.names)
-        self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
         instances = masks.instances[first]
         on_one = instances >= 0
+        parked = np.append(still, False)[instances]
+        priors[parked] = np.minimum(priors[parked], self.priors.unknown)
+        self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
         self.movability.update(ids[on_one], moving[instances[on_one]])
 
     def _remove(self, ids: Ints, mapper: Mapper) -> None:

@@ -44,7 +44,8 @@ class StaticCheckConfig:
     ``max_depth_m``.
     ``views`` keyframes are remembered, at least ``interval_s`` apart. ``neighbours`` within
     ``neighbour_px`` decide about a keypoint that cannot be judged by itself, if their depths
-    differ by less than ``same_depth`` of it.
+    differ by less than ``same_depth`` of it. A thing stood still if each of two or more views that
+    are at least ``still_s`` away in time found ``still_share`` of it where it is.
     """
 
     margin_m: float = 0.1
@@ -56,6 +57,8 @@ class StaticCheckConfig:
     neighbours: int = 5
     neighbour_px: float = 30.0
     same_depth: float = 0.05
+    still_s: float = 1.0
+    still_share: float = 0.9
 
     def __post_init__(self) -> None:
         if self.margin_m <= 0 or self.depth_sigmas < 0 or self.window_px < 0:
@@ -135,6 +138,17 @@ class StaticCheck:
     def agree(self, verdicts: Verdicts) -> Verdicts:
         """What several views (K, N) say together (N,): the majority of those that say anything."""
         return np.asarray(np.sign(verdicts.sum(axis=0, dtype=np.int8)))
+
+    def stood_still(self, verdicts: Verdicts, apart_s: Array, at_least: int) -> bool:
+        """Whether views (K, N) of a thing's points, taken ``apart_s`` (K,) from it, show it there.
+
+        A view that speaks of fewer than ``at_least`` points does not count.
+        """
+        known = np.count_nonzero(verdicts, axis=1)
+        asked = (np.abs(apart_s) >= self.config.still_s) & (known >= at_least)
+        there = np.count_nonzero(verdicts == Verdict.STATIC, axis=1)
+        good = there[asked] >= self.config.still_share * known[asked]
+        return bool(len(good) >= 2 and good.all())
 
     def spread(self, pixels: Array, depth_m: Array, verdicts: Verdicts) -> Verdicts:
         """Verdicts (N,) with those of keypoints that have none taken from their neighbours.

@@ -16,18 +16,21 @@ from slam.static_check import DepthView, StaticCheckConfig
 
 @dataclass(frozen=True, eq=False)
 class RememberedView:
-    """The depth that a keyframe saw, and when."""
+    """The depth that a keyframe saw, and when; ``view`` is without what moved, ``seen`` with it."""
 
     keyframe_id: int
     timestamp_s: float
     view: DepthView
+    seen: DepthView
 
 
 class PosedView(NamedTuple):
     """A remembered view, ``T_world_camera`` (4, 4)."""
 
     keyframe_id: int
+    timestamp_s: float
     view: DepthView
+    seen: DepthView
     T_world_camera: Array
 
 
@@ -46,7 +49,8 @@ class ViewMemory:
         """Remember what a keyframe saw, unless the last is too recent."""
         if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.config.interval_s:
             return
-        self.views.append(RememberedView(keyframe_id, timestamp_s, view.thinned(THINNED)))
+        views = view.thinned(THINNED), view.thinned(THINNED)
+        self.views.append(RememberedView(keyframe_id, timestamp_s, *views))
         del self.views[: -self.config.views]
 
     def posed(self, segment: int, mapper: Mapper) -> list[PosedView]:
@@ -57,7 +61,8 @@ class ViewMemory:
             heir = mapper.world.keyframes.get(heir_id)
             if heir is not None and heir.segment == segment:
                 pose = heir.T_world_camera @ T_heir_keyframe
-                found.append(PosedView(kept.keyframe_id, kept.view, pose))
+                when = kept.keyframe_id, kept.timestamp_s
+                found.append(PosedView(*when, kept.view, kept.seen, pose))
         return found
 
     def forget_space(self, keyframe_id: int, covered: Mask) -> None:
@@ -75,13 +80,14 @@ class ViewMemory:
 
     def state(self) -> Arrays:
         """All views as named arrays."""
-        near = [v.view.nearest_m for v in self.views]
-        far = [v.view.farthest_m for v in self.views]
+        views = [(v.view, v.seen) for v in self.views]
+        near = [[v.nearest_m, s.nearest_m] for v, s in views]
+        far = [[v.farthest_m, s.farthest_m] for v, s in views]
         return {
             "keyframe_ids": np.array([v.keyframe_id for v in self.views], np.int64),
             "timestamps_s": np.array([v.timestamp_s for v in self.views], float),
             "step": np.array([v.view.step for v in self.views], np.int64),
-            "shape": np.array([v.shape for v in near[:1]], np.int64).ravel(),
+            "shape": np.array([n[0].shape for n in near[:1]], np.int64).ravel(),
             "nearest_m": np.array(near, np.float32).ravel(),
             "farthest_m": np.array(far, np.float32).ravel(),
         }
@@ -89,9 +95,9 @@ class ViewMemory:
     def restore(self, state: Arrays) -> None:
         """Become the memory of a state."""
         ids, shape = state["keyframe_ids"].tolist(), state["shape"].tolist() or [0, 0]
-        near, far = (state[name].reshape(len(ids), *shape) for name in ("nearest_m", "farthest_m"))
+        depths = (state[k].reshape(len(ids), 2, *shape) for k in ("nearest_m", "farthest_m"))
         stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
         self.views = [
-            RememberedView(i, t, DepthView(n.copy(), f.copy(), s))
-            for i, t, n, f, s in zip(ids, stamps_s, near, far, steps, strict=True)
+            RememberedView(i, t, *(DepthView(n[k].copy(), f[k].copy(), s) for k in (0, 1)))
+            for i, t, n, f, s in zip(ids, stamps_s, *depths, steps, strict=True)
         ]

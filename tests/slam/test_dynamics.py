@@ -141,6 +141,20 @@ def test_a_person_is_left_out_before_moving_and_between_keyframes(frames: list[F
     np.testing.assert_allclose(track.half_size[:2], 120 * CARD_Z_M / CAMERA.fx, rtol=0.1)
 
 
+def standing(frames: int) -> list[Frame]:
+    """The card never moves, the camera hardly."""
+    still = [view(0)] * frames
+    return [replace(f, index=k, timestamp_s=k / 30, name="0") for k, f in enumerate(still)]
+
+
+def test_what_is_called_a_person_and_stands_for_long_is_structure_again() -> None:
+    system = run(standing(60), label=1, settings=["dynamics.check.views=12"])
+    counts = np.array(system.counts)
+    assert counts[1:10, 1].sum() > 0.9 * counts[1:10, 0].sum()
+    assert counts[-5:, 1].sum() == 0
+    assert landmarks_on_card(system) > 50
+
+
 def test_what_is_seen_to_stand_still_is_used_in_a_walkers_box_too(frames: list[Frame]) -> None:
     system = run(frames[:8])
     wall = np.array([0.5, 0.0, 2.0])

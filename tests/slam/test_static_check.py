@@ -99,12 +99,34 @@ def test_neighbours_speak_for_the_silent_of_the_same_depth() -> None:
     assert CHECK.spread(pixels, depth_m, static).tolist() == static.tolist()
 
 
+@pytest.mark.parametrize(
+    "shares, apart_s, still",
+    [
+        ((1.0, 1.0), (1.5, -1.2), True),
+        ((1.0, 1.0), (1.5, 0.5), False),  # one of the views is too near in time
+        ((1.0, 0.8), (1.5, 1.2), False),
+        ((0.0, 0.8), (0.2, 1.2), False),
+        ((1.0, 0.95, 0.0), (1.5, 1.2, 0.3), True),
+    ],
+)
+def test_a_thing_that_views_show_there_for_long_stood_still(
+    shares: tuple[float, ...], apart_s: tuple[float, ...], still: bool
+) -> None:
+    verdicts = np.array([np.where(np.arange(100) < 100 * s, 1, -1) for s in shares], np.int8)
+    assert CHECK.stood_still(verdicts, np.array(apart_s), 20) is still
+    hidden = np.concatenate([verdicts, np.zeros_like(verdicts)], axis=1)
+    assert CHECK.stood_still(hidden, np.array(apart_s), 20) is still
+    assert not CHECK.stood_still(hidden, np.array(apart_s), 120)
+    assert not CHECK.stood_still(np.zeros((2, 5), np.int8), np.array([2.0, 3.0]), 1)
+
+
 def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
     config = StaticCheckConfig(views=3, interval_s=0.25)
     memory, other = ViewMemory(config), ViewMemory(config)
     for k in range(12):
         memory.add(k, 0.1 * k, depth_view(box_before_wall() + k, 5))
     assert [v.keyframe_id for v in memory.views] == [3, 6, 9]
+    memory.forget_space(6, np.ones(box_before_wall().shape, bool))
     other.restore(memory.state())
     for a, b in zip(memory.views, other.views, strict=True):
         assert (a.keyframe_id, a.timestamp_s, a.view.step) == (
@@ -112,8 +134,11 @@ def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
             b.timestamp_s,
             b.view.step,
         )
-        np.testing.assert_array_equal(a.view.nearest_m, b.view.nearest_m)
-        np.testing.assert_array_equal(a.view.farthest_m, b.view.farthest_m)
+        for one, two in ((a.view, b.view), (a.seen, b.seen)):
+            np.testing.assert_array_equal(one.nearest_m, two.nearest_m)
+            np.testing.assert_array_equal(one.farthest_m, two.farthest_m)
+    assert [bool(v.view.nearest_m.any()) for v in memory.views] == [True, False, True]
+    assert all(v.seen.nearest_m.any() for v in memory.views)
 
 
 @pytest.mark.parametrize("bad", [{"margin_m": 0.0}, {"views": 0}, {"window_px": -1}])
