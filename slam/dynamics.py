@@ -52,6 +52,7 @@ class DynamicsConfig:
     geometry: bool = True
     priors: str = "movability"
     doubt_share: float = 0.5
+    settled_share: float = 0.2
     min_static: int = 60
     mask_border_px: int = 5
     min_judged: int = 20
@@ -76,12 +77,14 @@ class Sifted:
         moving: (N,) of the frame's own features, those on moving things.
         mostly_moving: too few would have been left.
         view: what the frame's depth says about space; None if geometry is switched off.
+        standing: how many features lie where views saw a surface.
     """
 
     features: Features
     moving: Mask
     mostly_moving: bool
     view: DepthView | None
+    standing: int = 0
 
     @property
     def ignored(self) -> int:
@@ -120,7 +123,8 @@ class Dynamics:
         predicted = localiser.prediction() if localiser is not None else None
         sifted = self.sift(frame, features, predicted, views)
         doubted = sifted.moving.sum() > self.config.doubt_share * len(features)
-        if localiser is None or not doubted:
+        settled = max(self.config.min_static, self.config.settled_share * len(features))
+        if localiser is None or not doubted or sifted.standing >= settled:
             return sifted
         found = localiser.preview(features, mapper.world)
         if found is None:
@@ -148,7 +152,9 @@ class Dynamics:
         if np.count_nonzero(~moving) < self.config.min_static:
             logger.info("frame %d: nearly everything moves; all is used", frame.index)
             return Sifted(features, moving, True, view)
-        return Sifted(select(features, np.flatnonzero(~moving)), moving, False, view)
+        standing = int(np.count_nonzero((verdicts == Verdict.STATIC) & ~moving))
+        left = select(features, np.flatnonzero(~moving))
+        return Sifted(left, moving, False, view, standing)
 
     def watch(self, tracked: Tracked, view: DepthView | None, world: WorldMap) -> Ints:
         """Evidence of a tracked frame about landmarks; returns those in view believed moving."""

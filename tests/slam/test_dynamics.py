@@ -215,6 +215,22 @@ def test_when_nearly_everything_moves_all_is_used_and_said(frames: list[Frame]) 
     assert not results[3].mostly_moving
 
 
+@pytest.mark.parametrize("settled_share", [0.2, 1.0])
+def test_much_that_is_seen_to_stand_settles_the_doubt(
+    frames: list[Frame], settled_share: float
+) -> None:
+    settings = ["dynamics.doubt_share=0.0", f"dynamics.settled_share={settled_share}"]
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, [*SETTINGS, *settings]))
+    for frame in frames[:22]:
+        system.process(frame)
+    asked = []
+    system.localiser.preview = lambda *a: asked.append(1)  # type: ignore
+    features = system.prepare(frames[22])
+    sifted = SlamSystem._sift(system, frames[22], features)
+    assert sifted.moving.sum() > 20
+    assert bool(asked) is (settled_share == 1.0)
+
+
 def test_where_the_prediction_is_far_off_the_room_does_not_move() -> None:
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS))
     for k in range(4):
