@@ -12,6 +12,7 @@ time 8 m farther on, through fusion into the folder of a dense map, and the clou
 from __future__ import annotations
 
 import argparse
+import ctypes
 import sys
 import tempfile
 import time
@@ -140,7 +141,7 @@ def session(sequence: Sequence, count: int) -> Iterator[str]:
     with tempfile.TemporaryDirectory() as temporary:
         folder = DenseFolder(Path(temporary), {})
         mapper = DenseMapper(sequence.camera)
-        yield f"keyframes  memory MB  ms a keyframe  (memory before: {rss_mb():.0f} MB)"
+        yield f"keyframes  memory MB  in use MB  ms a keyframe  (memory before: {rss_mb():.0f} MB)"
         fused_s = 0.0
         for number in range(count):
             lap, step = divmod(number, len(true))
@@ -154,7 +155,8 @@ def session(sequence: Sequence, count: int) -> Iterator[str]:
             _save(finished, folder, sequence.camera)
             fused_s += time.perf_counter() - started_s
             if (number + 1) % (count // 6) == 0:
-                yield f"{number + 1:9} {rss_mb():10.0f} {1e3 * fused_s / (count // 6):14.0f}"
+                took_ms = 1e3 * fused_s / (count // 6)
+                yield f"{number + 1:9} {rss_mb():10.0f} {in_use_mb():10.0f} {took_ms:14.0f}"
                 fused_s = 0.0
         _save(mapper.flush(), folder, sequence.camera)
         started_s = time.perf_counter()
@@ -185,6 +187,26 @@ def rss_mb() -> float:
     """Memory that the process holds."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096 / 1e6
+
+
+class _HeapState(ctypes.Structure):
+    """glibc's struct mallinfo2."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd",
+            "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
+        )
+    )  # fmt: skip
+
+
+def in_use_mb() -> float:
+    """What was allocated and not freed: the C library keeps some of the rest for later."""
+    mallinfo2 = ctypes.CDLL("libc.so.6").mallinfo2
+    mallinfo2.restype = _HeapState
+    state = mallinfo2()
+    return float(state.uordblks + state.hblkhd) / 1e6
 
 
 def main() -> None:

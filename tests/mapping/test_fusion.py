@@ -29,7 +29,7 @@ from mapping.fusion import (
 )
 from mapping.inverse_depth import InverseDepthMap, squared_gradient
 from mapping.regularisation import regularise
-from mapping.warping import JUMP_SIGMAS, MAX_APART_PX, View, hypothesis
+from mapping.warping import JUMP_SIGMAS, MAX_APART_PX, View, hypothesis, project
 
 
 def read(given: InverseDepthMap, u: float, v: float, inner: bool):
@@ -120,6 +120,16 @@ def test_a_neighbour_sees_the_same_plane() -> None:
     assert seen.mean() > 0.6
     np.testing.assert_allclose(mean.numpy()[seen], truth[seen], rtol=2e-5)
     assert (variance.numpy()[seen] > 0).all()
+
+
+def test_what_is_behind_the_other_camera_is_nowhere_in_its_image() -> None:
+    away = make_pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+    u, v, ratio = project(torch.full((30, 40), 0.5), away, CAMERA)
+    assert not (torch.isfinite(u) | torch.isfinite(v)).any()
+    assert (ratio == 0).all()
+    truth = np.full((30, 40), 0.5)
+    view = View(as_map(truth, 0.01), away)
+    assert torch.isnan(hypothesis(torch.tensor(truth).float(), view, CAMERA)[0]).all()
 
 
 def test_moving_the_world_changes_nothing() -> None:
