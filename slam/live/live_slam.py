@@ -35,8 +35,8 @@ from slam.viewer.scene import Scene, ViewOptions
 
 logger = logging.getLogger(__name__)
 
-IMAGE_EVERY = 3
-"""Frames from one image in the viewer to the next."""
+IMAGE_EVERY, MAP_S = 3, 1.0
+"""Frames from one image in the viewer to the next; the longest wait for the map in one go."""
 
 
 @dataclass(frozen=True)
@@ -188,9 +188,9 @@ class LiveSlam:
         """The landmarks of the largest map segment as they are."""
         return self._system.landmarks()
 
-    def catch_up(self) -> None:
-        """Take in what the other processes have found; ``track`` does so too."""
-        self._system.catch_up()
+    def catch_up(self, waiting: float = np.inf) -> None:
+        """Take in what the others have found, until only so many keyframes wait for the map."""
+        self._system.wait_for_map(waiting, MAP_S)
 
     def processes(self) -> dict[str, int]:
         """Process ids by name."""

@@ -23,6 +23,8 @@ AHEAD = 2
 """Frames whose features are computed ahead of tracking where the source waits."""
 KEPT = 3
 """Frames that wait for tracking at most where it does not; one more drives out the others."""
+WAITING = 1
+"""Keyframes that wait for the map at most where the source waits: left far behind, it is lost."""
 
 _Pairs: TypeAlias = Iterator[tuple[Frame, Prepared]]
 
@@ -52,6 +54,7 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
         for frame, ahead in chosen:
             prepared = ahead
             if not options.realtime:  # it waited in a queue, which no camera would make it do
+                slam.catch_up(WAITING)
                 prepared = replace(ahead, arrived_s=time.monotonic())
             try:
                 slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, prepared, frame.name)

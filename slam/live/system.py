@@ -89,6 +89,16 @@ class LiveSystem(SlamSystem):
         self.localiser.new_local_map(self.remote.world, heir)
         self._reference, self._segment = heir, heir.segment
 
+    def wait_for_map(self, waiting: float, timeout_s: float) -> None:
+        """Catch up until no more than so many keyframes wait for the map, or for so long."""
+        deadline_s = time.monotonic() + timeout_s
+        self.catch_up()
+        while self.remote.pending > waiting and not self.remote.given_up:
+            if time.monotonic() > deadline_s:
+                return
+            time.sleep(0.001)
+            self.catch_up()
+
     def insert(self, frame: Frame, tracked: Tracked, local_ids: Ints) -> tuple[Tracked, Keyframe]:
         """Make a frame a keyframe; segments are joined by the map's process."""
         self.remote.reference = self._reference

@@ -13,10 +13,13 @@ from synthetic_view import CAMERA, render_plane
 
 from graph.errors import InputError
 from graph.geometry import se3_exp
+from slam.configuration import resolve
 from slam.frame import Frame
 from slam.live.live_slam import LiveSlam
-from slam.live.play import PlayOptions, play
+from slam.live.play import WAITING, PlayOptions, play
 from slam.live.sources import Newest
+from slam.results import FrameResult
+from slam.system_config import SystemConfig
 
 POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(10)]
 FRAMES = [render_plane(pose, index) for index, pose in enumerate(POSES)]
@@ -113,6 +116,22 @@ def test_a_source_that_waits_is_tracked_whole_and_refused_frames_are_passed_over
     assert play(slam, Given(frames), PlayOptions(realtime=False, quiet=True)) is None
     health = slam.health()
     assert (health.frames, health.frames_refused, health.frames_dropped) == (5, 2, 0)
+
+
+def test_a_source_that_waits_does_not_run_away_from_the_map(monkeypatch) -> None:
+    settings = ["keyframes.min_interval_frames=1", "keyframes.max_shared=1.1"]
+    with LiveSlam(CAMERA, resolve(SystemConfig, None, settings)) as slam:
+        waiting, track = [], slam.track
+
+        def watched(*arguments: object) -> FrameResult:
+            waiting.append(slam.health().keyframes_waiting)
+            return track(*arguments)
+
+        monkeypatch.setattr(slam, "track", watched)
+        play(slam, Given(FRAMES), PlayOptions(realtime=False, quiet=True))
+        assert slam.health().keyframes > 3
+    assert len(waiting) == len(FRAMES)
+    assert max(waiting) <= WAITING
 
 
 def test_silence_is_reported_once_and_frames_after_it_are_tracked(slam, caplog) -> None:
