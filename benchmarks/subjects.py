@@ -23,8 +23,8 @@ SMOOTHER = _of(
 LOOPS = _of("graph", "loop_*.py") + _of("slam", "loop_*.py place_recognition.py")
 ODOMETRY = _of(
     "slam",
-    "depth_regions.py features.py frame.py graph_feed.py history.py keyframes.py landmarks.py "
-    "local_mapping.py localiser.py map_pruning.py mapper.py matching.py pose_optimisation.py "
+    "depth_regions.py description.py features.py frame.py graph_feed.py history.py keyframes.py "
+    "landmarks.py local_mapping.py localiser.py map_pruning.py mapper.py matching.py pose_optimisation.py "
     "relocalisation.py reprojection.py results.py segments.py subpixel.py system.py "
     "system_config.py tracker.py triangulation.py world_map.py",
 )
@@ -48,13 +48,13 @@ LABELS = (
     "data/labels/*.yaml",
 )
 MOVING = _of("semantics", "instance_tracks.py movability.py") + _of(
-    "slam", "dynamics.py keyframe_masks.py static_check.py view_memory.py"
+    "slam", "dynamics.py keyframe_masks.py stance.py static_check.py view_memory.py"
 )
 DENSE = _of(
     "mapping",
     "backprojection.py cloud.py dense.py floor_plan.py fusion.py inverse_depth.py labels.py "
-    "matching_cost.py mesh.py object_clouds.py plane_sweep.py regularisation.py search_range.py "
-    "stereo.py submaps.py warping.py",
+    "matching_cost.py mesh.py object_clouds.py pixelwise.py plane_sweep.py regularisation.py "
+    "search_range.py stereo.py submaps.py warping.py",
 ) + _of("slam", "dense_*.py")
 LIVE = _of("slam", "live/*.py")
 RENDERING = _of("slam", "rendering/*.py")
