@@ -91,7 +91,7 @@ REPORTS = {
         ),
         "dynamic": (
             "People who walk, a carried box and a pulled chair",
-            "dynamic.py --sequences {sequences} --segmenter light --seed 0 "  # tuned on: change it
+            "dynamic.py --sequences {sequences} --segmenter light --seed 1 "
             "--out {sequences}/dynamic",
         ),
         "harm": (
