@@ -6,6 +6,8 @@ import gc
 import time
 from pathlib import Path
 
+import faiss
+
 from graph.array_file import nested, read_arrays
 from graph.camera import Camera
 from semantics.segmenter import NoSegmenter
@@ -56,6 +58,7 @@ class LiveSystem(SlamSystem):
         self.remote.wait_until_ready(START_S)
         self.semantics = _AskedMasks(self)
         gc.freeze()  # to look through all modules would stop tracking for 0.1 s
+        faiss.omp_set_num_threads(1)  # a second one would wait for a core, and tracking for it
 
     def _make_mapper(self, tracker: Tracker) -> Mapper:
         return self.remote  # type: ignore[return-value]  # it has what the step asks for

@@ -1,7 +1,8 @@
 """A process that works on messages, and how it looks to its owner when it dies.
 
 It is a fresh interpreter with a socket: a caller's script needs no ``if __name__ == "__main__"``,
-and nothing is inherited by accident. It ends when its owner does, however that came.
+and nothing is inherited by accident. It ends when its owner does, however that came. It stays in
+its owner's session, since Linux weighs priorities within a session only (autogroups).
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Worker:
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 env=os.environ | ONE_THREAD | {"PYTHONPATH": path},
-                start_new_session=True,  # Ctrl-C in a terminal is for the owner to act on
+                process_group=0,  # Ctrl-C in a terminal is for the owner to act on
             )
             self._channel = Channel(Connection(ours.detach()), (Ring(files[0]), Ring(files[1])))
         finally:

@@ -55,6 +55,16 @@ def answers(worker: Worker, count: int) -> list:
     return found
 
 
+def test_it_shares_its_owners_session_but_not_its_interrupts() -> None:
+    """Priorities count within a session; Ctrl-C goes to a process group."""
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    try:
+        assert os.getsid(worker.pid) == os.getsid(0)
+        assert os.getpgid(worker.pid) == worker.pid
+    finally:
+        worker.kill()
+
+
 def test_messages_of_any_size_come_back_in_order(caplog) -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
     sizes = [10, 100_000, 5_000_000, 400_000, 0, *[300_000] * 12]  # more than the memory holds
