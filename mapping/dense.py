@@ -19,9 +19,10 @@ from mapping.inverse_depth import DepthNoise, InverseDepthMap, from_sensor
 from mapping.plane_sweep import completed, sweep
 from mapping.regularisation import regularise
 from mapping.search_range import search_range
+from mapping.stereo import match_stereo
 from mapping.warping import View
 
-DepthSource = Literal["sensor", "both", "motion"]
+DepthSource = Literal["sensor", "both", "stereo", "motion"]
 MIN_BASELINE_M, SWEEP_VIEWS = 0.03, 2
 WINDOW = 6
 """Keyframes on either side among which neighbours are chosen."""
@@ -39,6 +40,9 @@ class DenseKeyframe:
         landmark_ids: (L,) landmarks that it observes.
         landmark_depths_m: (L,) their z in its camera.
         instances: (H, W) uint16, number of the instance that each pixel shows, 0 for none; or None.
+        right: (H, W, 3) uint8, the right image of a rectified pair whose left one is ``rgb``, with
+            the camera's bf: u_right = u_left - bf / z; or None.
+        unmatched: (H, W) bool, pixels to which matching images must give no depth; or None.
     """
 
     id: int
@@ -48,6 +52,8 @@ class DenseKeyframe:
     landmark_ids: NDArray[np.int64]
     landmark_depths_m: Array
     instances: NDArray[np.uint16] | None = None
+    right: NDArray[np.uint8] | None = None
+    unmatched: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +78,8 @@ class DenseConfig:
     Attributes:
         noise: of the depth sensor.
         neighbours: at most so many are fused with a keyframe.
-        source: "sensor"; "both", with a plane sweep where the sensor has nothing; or "motion", the
-            sweep alone.
+        source: "sensor"; "stereo", keyframes' right images; "motion", a plane sweep between
+            keyframes; or "both", where the sensor has nothing the right image, or else the sweep.
         device: torch's name of where it is computed.
     """
 
@@ -119,21 +125,26 @@ class DenseMapper:
         """Steps 1 to 3 of a keyframe, with those that came before it."""
         config, measured = self.config, None
         image = as_image(keyframe.rgb, config.device)
-        if config.source != "motion":
+        if config.source in ("sensor", "both"):
             measured = from_sensor(keyframe.depth_m, self.camera, config.noise, config.device)
         if config.source != "sensor":
-            swept = self._sweep(keyframe, image)
-            measured = swept if measured is None else completed(measured, swept)
+            matched = self._matched(keyframe, image)
+            if keyframe.unmatched is not None:
+                matched = matched.where(~torch.from_numpy(keyframe.unmatched).to(image.device))
+            measured = matched if measured is None else completed(measured, matched)
         assert measured is not None
         return _Prepared(keyframe, regularise(measured), image)
 
-    def _sweep(self, keyframe: DenseKeyframe, image: Tensor) -> InverseDepthMap:
-        """Steps 1 and 2 against the last keyframes that stood elsewhere."""
+    def _matched(self, keyframe: DenseKeyframe, image: Tensor) -> InverseDepthMap:
+        """Steps 1 and 2 with the right image, or else the last keyframes that stood elsewhere."""
+        window = search_range(keyframe.landmark_depths_m)
+        if window is not None and keyframe.right is not None:
+            right = as_image(keyframe.right, self.config.device)
+            return match_stereo(image, right, self.camera, window)
         T_own_world = inverse(keyframe.T_world_camera)
         others = [(p.image, T_own_world @ p.keyframe.T_world_camera) for p in self._held[-WINDOW:]]
         apart = [o for o in others if np.linalg.norm(o[1][:3, 3]) > MIN_BASELINE_M]
-        window = search_range(keyframe.landmark_depths_m)
-        if window is None or not apart:
+        if window is None or not apart or self.config.source == "stereo":
             empty = torch.full(image.shape[-2:], torch.nan, device=image.device)
             return InverseDepthMap(empty, empty)
         return sweep(image, apart[-SWEEP_VIEWS:], self.camera, window)

@@ -32,18 +32,19 @@ def match_stereo(
     """Inverse depth of the left image of a rectified pair (3, H, W), u_right = u_left - d.
 
     Costs are summed by a guided filter, or with ``exact`` by adaptive support weights; the winner
-    takes all within ``search_range`` (1/m); what the right image's winner does not confirm within
-    a pixel is dropped. sigma_rho = sigma_d / (f b) with sigma_d = 1 px.
+    takes all within ``search_range`` (1/m) and a pixel around it; what wins at the rim of that is
+    no minimum and is dropped, as is what the right image's winner does not confirm within a pixel.
+    sigma_rho = sigma_d / (f b) with sigma_d = 1 px.
     """
     bf, config = camera.stereo_bf_px_m, config or MatchingConfig()
-    first = max(math.floor(search_range[0] * bf), 0)
-    last = max(math.ceil(search_range[1] * bf), first + 1)
+    first = max(math.floor(search_range[0] * bf) - 1, 0)
+    last = math.ceil(search_range[1] * bf) + 1
     costs = _summed(left, right, range(first, last + 1), (config, exact))
     mirrored = _summed(right.flip(-1), left.flip(-1), range(first, last + 1), (config, exact))
     disparity = winner(costs)[0] + first
     other = (winner(mirrored)[0] + first).flip(-1)
-    agreed = checked(disparity, other)
-    known = agreed & (disparity > 0.5)
+    inner = (disparity > max(first, 0.5)) & (disparity < last)
+    known = inner & checked(disparity, other)
     rho = torch.where(known, disparity / bf, torch.nan)
     return InverseDepthMap(rho, torch.where(known, bf**-2, torch.nan))
 

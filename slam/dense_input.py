@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from graph.array_file import Arrays, part
 from graph.camera import Camera
 from graph.errors import InputError
 from graph.geometry import Array, inverse, transform
-from mapping.dense import DenseKeyframe
+from mapping.dense import DenseKeyframe, DepthSource
 from semantics.label_store import LabelStore
 from semantics.labels import LabelSet, label_set
 from slam.configuration import resolve
@@ -22,9 +23,12 @@ from slam.frame import Frame
 from slam.landmarks import Ints, Mask
 from slam.map_file import read_map
 from slam.map_state import world_of
+from slam.right_images import RightImages
 from slam.semantic_mapping import SemanticsConfig
 from slam.sequences import Sequence, open_sequence
 from slam.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
 
 MAX_STAMP_ERROR_S = 1e-4
 MIN_DEPTH_SHARE = 0.01
@@ -42,6 +46,7 @@ class MappedRun:
         camera: whose distortion is taken out of what ``load`` returns.
         sequence: the images.
         labels: what it knows of its landmarks' classes; None if it had no segmenter.
+        right: the right images, if depth comes from stereo pairs.
     """
 
     path: Path
@@ -50,6 +55,7 @@ class MappedRun:
     camera: Camera
     sequence: Sequence
     labels: RunLabels | None = None
+    right: RightImages | None = None
 
     def poses(self) -> dict[int, Array]:
         """T_world_camera of every keyframe by its id, as it is at this moment."""
@@ -119,13 +125,14 @@ def _recorded_sequence(config: Path) -> Path:
 
 
 def load(
-    run: MappedRun, keyframe: Keyframe, needs_depth: bool = True
+    run: MappedRun, keyframe: Keyframe, source: DepthSource = "sensor"
 ) -> tuple[DenseKeyframe, NDArray[np.uint8]]:
     """A keyframe with its images, undistorted, and its colour image as it was taken.
 
     Raises:
         InputError: a pose that is not finite, no landmarks, an image that cannot be read or is
-            not the keyframe's, or no depth: this keyframe cannot be mapped.
+            not the keyframe's, or none of what the source of depth needs: this keyframe cannot be
+            mapped.
     """
     name = f"keyframe {keyframe.id}"
     if not np.isfinite(keyframe.T_world_camera).all():
@@ -141,13 +148,27 @@ def load(
             f"{name}: frame {keyframe.frame_index} of {run.sequence.folder} is of "
             f"{frame.timestamp_s:.6f} s, not {keyframe.timestamp_s:.6f} s; give its own --sequence"
         )
-    if needs_depth and np.isfinite(frame.depth_m).mean() < MIN_DEPTH_SHARE:
+    if source in ("sensor", "both") and np.isfinite(frame.depth_m).mean() < MIN_DEPTH_SHARE:
         raise InputError(f"{name}: frame {keyframe.frame_index} has no valid depth")
     rgb, depth_m = undistorted(frame, run.camera)
     points = run.world.landmarks.points_world[landmark_ids]
     depths_m = transform(inverse(keyframe.T_world_camera), points)[:, 2]
     T = keyframe.T_world_camera
-    return DenseKeyframe(keyframe.id, T, rgb, depth_m, landmark_ids, depths_m), frame.rgb
+    dense = DenseKeyframe(keyframe.id, T, rgb, depth_m, landmark_ids, depths_m)
+    return replace(dense, right=_right(run, keyframe, source)), frame.rgb
+
+
+def _right(run: MappedRun, keyframe: Keyframe, source: DepthSource) -> NDArray[np.uint8] | None:
+    """The keyframe's right image; only where it is the one source of depth it cannot be missed."""
+    if run.right is None or source == "motion":
+        return None
+    try:
+        return run.right.load(keyframe.frame_index)
+    except InputError as error:
+        if source == "stereo":
+            raise InputError(f"keyframe {keyframe.id}: {error}") from error
+        logger.warning("keyframe %d: %s; it is swept instead", keyframe.id, error)
+        return None
 
 
 def image_name(run: MappedRun, keyframe: Keyframe) -> str:

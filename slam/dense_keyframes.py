@@ -107,10 +107,12 @@ class KeyframeWork:
             folder.write_moving(
                 make_submap(self._unfused(dense, moving), self._mapper.camera, options.voxel_m)
             )
-        still = np.where(widened(moving), np.float32(np.nan), dense.depth_m)
+        moves = widened(moving)
+        still_m = np.where(moves, np.float32(np.nan), dense.depth_m)
+        still = dataclasses.replace(dense, depth_m=still_m, unmatched=moves)
         self._mapper.move(self._opened.run.poses())
         started_s = time.perf_counter()
-        finished = self._mapper.push(dataclasses.replace(dense, depth_m=still), wanted)
+        finished = self._mapper.push(still, wanted)
         self._save(finished, started_s)
 
     def finish(self) -> None:
@@ -121,7 +123,7 @@ class KeyframeWork:
     def _labelled(self, keyframe: Keyframe) -> tuple[DenseKeyframe, NDArray[np.bool_]]:
         """The keyframe with its instances, and where moving ones are (H, W)."""
         run, segmenter = self._opened.run, self._opened.segmenter
-        dense, rgb = load(run, keyframe, self._opened.options.source != "motion")
+        dense, rgb = load(run, keyframe, self._opened.options.source)
         instances = segmenter.segment(rgb, image_name(run, keyframe))
         labels = keyframe_labels(instances, rgb.shape[:2], len(segmenter.labels))
         self._evidence[keyframe.id] = _evidence(run, keyframe, labels)

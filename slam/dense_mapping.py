@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph.errors import InputError
-from mapping.dense import WINDOW
+from mapping.dense import WINDOW, DepthSource
 from semantics.movability import read_priors
 from semantics.segmenter import Segmenter
 from semantics.segmenter_table import make_segmenter
@@ -24,6 +24,7 @@ from slam.dense_keyframes import (
     run_began,
 )
 from slam.dense_options import MapOptions
+from slam.right_images import RIGHT_LIST, read_right_images
 from slam.world_map import Keyframe
 
 Progress = Callable[[int, int], None]
@@ -57,8 +58,20 @@ def assembled(run: MappedRun, segmenter: Segmenter, options: MapOptions) -> Open
         if segmenter.labels.number(name) == 0:
             known = ", ".join(segmenter.labels.names[1:]) or "none, give --segmenter or --masks"
             raise InputError(f"--without {name!r}: no such class; there are: {known}")
-    options = dataclasses.replace(options, without=without)
-    return OpenMap(run, segmenter, DenseFolder(run.path, _settings(options, segmenter)), options)
+    options, run = dataclasses.replace(options, without=without), _with_pairs(run, options.source)
+    settings = _settings(options, segmenter)
+    if options.source != "sensor":
+        settings["stereo_bf"] = None if run.right is None else run.camera.stereo_bf_px_m
+    return OpenMap(run, segmenter, DenseFolder(run.path, settings), options)
+
+
+def _with_pairs(run: MappedRun, source: DepthSource) -> MappedRun:
+    """The run with its right images and the bf of the pairs, if the source of depth uses them."""
+    there = source == "both" and (run.sequence.folder / RIGHT_LIST).is_file()
+    if source != "stereo" and not there:
+        return run
+    right = read_right_images(run.sequence, run.camera)
+    return dataclasses.replace(run, camera=right.camera, right=right)
 
 
 def _settings(options: MapOptions, segmenter: Segmenter) -> dict[str, Any]:

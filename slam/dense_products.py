@@ -231,7 +231,7 @@ def write_dense_mesh(run: MappedRun, folder: DenseFolder, voxel_m: float) -> lis
 
 def _views(run: MappedRun, keyframes: list[Keyframe], folder: DenseFolder) -> Iterator[View]:
     for keyframe in keyframes:
-        dense, _ = load(run, keyframe)
+        dense, _ = load(run, keyframe, "motion")  # its colours only
         yield folder.fused(keyframe.id).depth_m(), dense.rgb, keyframe.T_world_camera
 
 

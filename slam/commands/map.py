@@ -40,10 +40,11 @@ def add_map(commands: _Commands) -> None:
     )
     parser.add_argument(
         "--depth-source",
-        choices=("sensor", "both", "motion"),
+        choices=("sensor", "both", "stereo", "motion"),
         default="sensor",
-        help="both: with a plane sweep between keyframes where the sensor has nothing; motion: "
-        "the sweep alone",
+        help="stereo: rectified pairs, with the right images of right.txt; motion: a plane sweep "
+        "between keyframes; both: the sensor, and where it has nothing the pair or else the sweep "
+        "(default: sensor)",
     )
     parser.add_argument("--device", default="cpu", help="where depth is fused (default: cpu)")
     parser.add_argument("--quiet", action="store_true", help="print only the folder's path")

@@ -115,6 +115,22 @@ def test_stereo_finds_the_disparity_with_the_right_sign(exact: bool) -> None:
     np.testing.assert_allclose(found.variance.numpy()[known], (1 / 9.0) ** 2, rtol=1e-5)
 
 
+def test_a_disparity_outside_the_range_is_not_taken_for_its_rim() -> None:
+    wide = texture(40, 90)
+    left, right = tensor(wide[:, :, :70]), tensor(wide[:, :, 12:82])  # u_right = u_left - 12
+    camera = dataclasses.replace(CAMERA, width=70, height=40)
+    config = MatchingConfig(guided_radius=3)
+    found = []
+    for low, high in ((9, 15), (12, 15), (2, 9)):
+        window = (low / 9.0, high / 9.0)
+        found.append(match_stereo(left, right, camera, window, config=config).rho[:, 16:] * 9.0)
+    for disparity in found[:2]:
+        assert (disparity - 12).abs().nan_to_num(9.0).lt(0.5).float().mean() > 0.9
+    beyond = found[2][found[2].isfinite()]
+    assert len(beyond) < 0.5 * found[2].numel()
+    assert beyond.min() > 1.01 and beyond.max() < 9.99
+
+
 def test_what_the_other_side_does_not_confirm_is_dropped() -> None:
     left, right = tensor(np.full((1, 8), 2.0)), tensor(np.full((1, 8), 2.0))
     right[0, 3] = 5.0
