@@ -109,7 +109,7 @@ REPORTS = {
         "loop": ("Submaps follow a loop closure", "dense_session.py loop {sequences}/dense/office"),
         "session": (
             "Memory over a long session",
-            "dense_session.py session {sequences}/dense/office --keyframes 360",
+            "dense_session.py session {sequences}/dense/office --keyframes 900",
         ),
         "pictures": ("What it looks like", "dense_pictures.py {sequences}/dense docs/images"),
     }, {

@@ -55,7 +55,7 @@ DENSE = _of(
     "backprojection.py cloud.py dense.py floor_plan.py fusion.py inverse_depth.py labels.py "
     "matching_cost.py mesh.py object_clouds.py pixelwise.py plane_sweep.py regularisation.py "
     "search_range.py stereo.py submaps.py warping.py",
-) + _of("slam", "dense_*.py")
+) + _of("slam", "dense_*.py right_images.py")
 LIVE = _of("slam", "live/*.py")
 RENDERING = _of("slam", "rendering/*.py")
 SEMANTICS = LABELS + MOVING + NETWORK + WEIGHTS
