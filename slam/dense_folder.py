@@ -33,6 +33,7 @@ from mapping.depth_files import read_fused, write_fused
 from mapping.inverse_depth import InverseDepthMap
 from mapping.labels import InstanceEvidence
 from mapping.submaps import Submap, read_submap, write_submap
+from slam.memory import give_back_memory
 
 logger = logging.getLogger(__name__)
 
@@ -90,6 +91,7 @@ class DenseFolder:
         write_fused(self._file("depth", submap.anchor), fused)
         write_arrays(self._file("labels", submap.anchor), LABEL_FILE, {}, vars(evidence))
         write_submap(self._file("submaps", submap.anchor), submap)
+        give_back_memory()
 
     def write_moving(self, submap: Submap) -> None:
         """Save what moves in a keyframe. Raises InputError if it cannot."""

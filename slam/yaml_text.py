@@ -49,6 +49,10 @@ class _Dumper(yaml.SafeDumper):
     ) -> yaml.SequenceNode:
         return super().represent_sequence(tag, sequence, flow_style=True)
 
+    def represent_scalar(self, tag: str, value: str, style: str | None = None) -> yaml.ScalarNode:
+        escaped = any(c in value for c in "\x85\u2028\u2029")  # line breaks, unless escaped
+        return super().represent_scalar(tag, value, '"' if escaped else style)
+
 
 def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
     return int(loader.construct_scalar(node))

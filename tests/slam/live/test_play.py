@@ -129,7 +129,7 @@ def test_a_source_that_waits_does_not_run_away_from_the_map(monkeypatch) -> None
 
         monkeypatch.setattr(slam, "track", watched)
         play(slam, Given(FRAMES), PlayOptions(realtime=False, quiet=True))
-        assert slam.health().keyframes > 3
+        assert slam.health().keyframes > WAITING + 1
     assert len(waiting) == len(FRAMES)
     assert max(waiting) <= WAITING
 
