@@ -6,7 +6,8 @@ torchvision does not go with the project's torch for CPUs, so both networks run 
 their own, made where it is missing (a download of 5.4 GB). A 640x480 image, enlarged by both as
 torchvision does, two threads; random weights that take every proposal for an object, so that both
 find as many instances as they give at most. Calls alternate; memory is that of processes of their
-own, where both networks are made and one runs. "apart" is the largest difference of boxes (px), scores and masks.
+own, where both networks are made and one runs. "apart" is the largest difference of boxes (px),
+scores and masks.
 """
 
 from __future__ import annotations
