@@ -3,7 +3,8 @@
     python benchmarks/dense_pictures.py ROOT docs/images
 
 ROOT/kitchen-run is a run of the red kitchen and ROOT/office-run one of the rendered office, both
-mapped by ``bmask-slam map --mesh --plan``, the kitchen with the light network's masks.
+mapped by ``bmask-slam map --mesh --plan``, the kitchen with the light network's masks in the boxes
+of YOLOX-Nano (``--proposals``).
 """
 
 from __future__ import annotations
