@@ -114,7 +114,7 @@ REPORTS = {
         "pictures": ("What it looks like", "dense_pictures.py {sequences}/dense docs/images"),
     }, {
         "pictures": {
-            "dense_kitchen.jpg": "The red kitchen: cloud, and labels: light masks in YOLOX-Nano's boxes",
+            "dense_kitchen.jpg": "The red kitchen; labels by light masks in YOLOX-Nano's boxes",
             "dense_kitchen_mesh.jpg": "Its mesh, lit from the camera, and the cloud",
             "dense_kitchen_plan.png": "Its floor plan: floor, what stands on it, the camera's path",
             "dense_office.jpg": "A rendered office: cloud and labels",
