@@ -46,6 +46,19 @@ def taken(newest: Newest[int]) -> list[int]:
     return found
 
 
+def filled(count: int, keep: int) -> Newest:
+    """After a source that gave so many items at once, before any is taken."""
+    all_there = threading.Event()
+
+    def at_once() -> Iterator[int]:
+        yield from range(count)
+        all_there.set()
+
+    newest = Newest(at_once(), keep)
+    assert all_there.wait(5)
+    return newest
+
+
 def test_items_that_are_taken_in_time_all_come_in_order() -> None:
     def slowly() -> Iterator[int]:
         for k in range(5):
@@ -58,27 +71,13 @@ def test_items_that_are_taken_in_time_all_come_in_order() -> None:
 
 
 def test_a_slow_taker_gets_the_newest_and_the_rest_is_counted() -> None:
-    all_there = threading.Event()
-
-    def at_once() -> Iterator[int]:
-        yield from range(10)
-        all_there.set()
-
-    newest = Newest(at_once(), keep=2)
-    assert all_there.wait(5)
+    newest = filled(10, keep=2)
     assert taken(newest) == [8, 9]
     assert newest.dropped == 8
 
 
 def test_one_too_many_leaves_only_the_newest() -> None:
-    all_there = threading.Event()
-
-    def at_once() -> Iterator[int]:
-        yield from range(6)
-        all_there.set()
-
-    newest = Newest(at_once(), keep=3)
-    assert all_there.wait(5)
+    newest = filled(6, keep=3)
     assert taken(newest) == [3, 4, 5]  # 3 drove out the others
     assert newest.dropped == 3
 
@@ -120,17 +119,21 @@ def test_a_source_that_waits_is_tracked_whole_and_refused_frames_are_passed_over
 
 def test_a_source_that_waits_does_not_run_away_from_the_map(monkeypatch) -> None:
     settings = ["keyframes.min_interval_frames=1", "keyframes.max_shared=1.1"]
+    to_and_fro = [*POSES, *POSES[::-1]] * 2  # keyframes are made when the map has time for them
+    frames = [render_plane(pose, index) for index, pose in enumerate(to_and_fro)]
     with LiveSlam(CAMERA, resolve(SystemConfig, None, settings)) as slam:
-        waiting, track = [], slam.track
+        waiting, made, track = [], [], slam.track
 
         def watched(*arguments: object) -> FrameResult:
             waiting.append(slam.health().keyframes_waiting)
-            return track(*arguments)
+            result = track(*arguments)
+            made.append(result.keyframe_id is not None)
+            return result
 
         monkeypatch.setattr(slam, "track", watched)
-        play(slam, Given(FRAMES), PlayOptions(realtime=False, quiet=True))
-        assert slam.health().keyframes > WAITING + 1
-    assert len(waiting) == len(FRAMES)
+        play(slam, Given(frames), PlayOptions(realtime=False, quiet=True))
+    assert sum(made) > 3  # the map itself may have culled some by now
+    assert len(waiting) == len(frames)
     assert max(waiting) <= WAITING
 
 
