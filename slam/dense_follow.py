@@ -1,4 +1,4 @@
-"""``run --dense``: keyframes are fused as they come; ``map_run`` completes that at the end."""
+"""``run --map``: keyframes are fused as they come; ``map_run`` completes that at the end."""
 
 from __future__ import annotations
 

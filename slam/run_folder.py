@@ -8,11 +8,11 @@ keyframes.txt         the keyframes, as trajectory.txt
 frames.csv            one line a frame: status, matches, inliers, milliseconds a stage, keyframe
 landmarks.ply         x y z (world, metres), red green blue, observations, id
 graph                 the saved factor graph and values, one file that loads again
-map                   keyframes, landmarks and graph, for ``run --map`` and ``run --localise``
+map                   keyframes, landmarks and graph, for ``run --continue`` and ``run --localise``
 labels.csv            with a segmenter: label, probability, entropy, views of every landmark
 objects.json, .ply    with a segmenter: objects with label, box, keyframes; the boxes as lines
 objects.png           with a segmenter: landmarks by label and objects, from above
-dense/                with ``--dense``, or by ``bmask-slam map``: see `slam.dense_folder`
+dense/                with ``--map``, or by ``bmask-slam map``: see `slam.dense_folder`
 covariances.txt       with ``--covariances``: of every keyframe's pose, see `slam.covariances`
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference

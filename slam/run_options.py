@@ -12,6 +12,8 @@ from slam.system_config import SystemConfig
 
 _PATHS = ("sequence", "camera", "reference", "map")
 _RECORDED = (*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense")
+_FLAGS = {"map": "--continue", "dense": "--map"}
+"""Of options that are not called as their field is."""
 
 
 @dataclass(frozen=True)
@@ -99,4 +101,4 @@ class RunOptions:
 
 
 def _flag(option: str) -> str:
-    return "--" + option.replace("_", "-")
+    return _FLAGS.get(option, "--" + option.replace("_", "-"))

@@ -21,7 +21,7 @@ EPILOG = """\
 long runs and known places:
   bmask-slam run hall --out h --checkpoint-every 300   one that may be killed
   bmask-slam run --resume h                            goes on from its last checkpoint
-  bmask-slam run hall2 --map h                         another recording of the place: one map
+  bmask-slam run hall2 --continue h                    another recording of the place: one map
   bmask-slam run hall3 --localise h                    only where the camera was in that map
 """
 OPTIONS = (
@@ -65,13 +65,14 @@ def add_run(commands: _Commands) -> None:
         help="write a checkpoint every N frames; 300 is a good number",
     )
     parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with a killed run")
-    parser.add_argument("--map", type=Path, metavar="MAP", help="run or map file to continue")
+    parser.add_argument(
+        "--continue", dest="map", type=Path, metavar="MAP", help="run or map file to go on with"
+    )
     parser.add_argument(
         "--localise", type=Path, metavar="MAP", help="only find the frames in a map, unchanged"
     )
-    parser.add_argument(
-        "--dense", action="store_true", default=None, help="also a dense map, as by bmask-slam map"
-    )
+    text = "also a dense map, as by bmask-slam map"
+    parser.add_argument("--map", dest="dense", action="store_true", default=None, help=text)
     parser.add_argument(
         "--covariances",
         dest="set",

@@ -62,7 +62,7 @@ class Configuration:
         given = {name: value for name in named if (value := getattr(self, name))}
         words = [w for name, v in given.items() for w in (f"--{name.replace('_', '-')}", str(v))]
         words += [word for setting in self.set for word in ("--set", setting)]
-        return words + ["--dense"] * self.dense
+        return words + ["--map"] * self.dense
 
 
 @dataclass(frozen=True)

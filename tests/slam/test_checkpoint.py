@@ -213,7 +213,7 @@ def test_another_sequence_is_refused(begun: Path, sequence: Path, refused) -> No
 def test_other_options_are_refused(begun: Path, refused) -> None:
     refused(r"--stride: the run was begun with 1; leave it away", {"stride": 3})
     refused(r"--out: the run was begun with .*out; leave", {"out": begun.parent})
-    refused(r"--map: the run was begun with None", {"map": begun.parent})
+    refused(r"--continue: the run was begun with None", {"map": begun.parent})
     other = SystemConfig(tracking=TrackingConfig(min_inliers=41))
     refused(r"--config: the run was begun with another configuration", {"config": other})
     (begun / "config.yaml").write_text("{tracking: {min_inliers: 41}}")

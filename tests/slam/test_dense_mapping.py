@@ -218,7 +218,7 @@ def test_a_run_can_fuse_its_keyframes_on_the_way(
 ) -> None:
     run = tmp_path / "run"
     often = "keyframes={max_shared: 1.1, min_interval_frames: 2, min_tracked: 5}"
-    arguments = ["run", str(room), "--dense", "--segmenter", "truth", "--set", often]
+    arguments = ["run", str(room), "--map", "--segmenter", "truth", "--set", often]
     assert main([*arguments, "--out", str(run), "--quiet"]) == 0
     counts = json.loads((run / "dense" / "dense.json").read_text())
     total = counts["keyframes_fused"] + counts["keyframes_reused"]

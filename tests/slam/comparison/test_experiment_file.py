@@ -47,7 +47,7 @@ def test_every_key_is_read(tmp_path):
     assert kitchen.camera == tmp_path / "camera.yaml"
     assert found.configurations["default"] == Configuration()
     assert found.configurations["other"].arguments() == [
-        *("--segmenter", "none", "--stride", "2", "--set", "loops.enabled=false", "--dense"),
+        *("--segmenter", "none", "--stride", "2", "--set", "loops.enabled=false", "--map"),
     ]
     assert found.systems["ORB"].trajectories == {"xyz": "orb.txt", "office@3": "orb-3.txt"}
     assert found.systems["ORB"].with_scale
