@@ -43,6 +43,7 @@ from slam.live.messages import (
 )
 from slam.live.replica import DeltaMaker
 from slam.mapper import Mapper
+from slam.memory import give_back_memory
 from slam.semantic_mapping import SemanticMapper
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
@@ -132,6 +133,7 @@ class MapKeeper:
                     logger.warning("%s: cannot be written (%s)", message.path, error.strerror)
                 else:
                     self._send(StateSaved(number, message.path))
+                give_back_memory()  # of the state, and of what the graph has changed since
             case Finish():
                 self.system.mapper.history.extend(message.history)
                 self.system.finish()

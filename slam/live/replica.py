@@ -69,8 +69,9 @@ class WorldDelta:
 
 @dataclass
 class _Sent:
-    """What the other side has."""
+    """What the other side has: of landmarks those that live, by ``ids``."""
 
+    ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     landmarks: dict[str, NDArray] = field(default_factory=dict)
     fused: int = 0
     observations: dict[int, Ints] = field(default_factory=dict)
@@ -96,6 +97,8 @@ class DeltaMaker:
         fused = int(np.count_nonzero(table.replaced_by >= 0))
         replaced_by = table.replaced_by.copy() if fused != self._sent.fused else None
         self._sent.fused = fused
+        for culled in self._sent.observations.keys() - world.keyframes.keys():
+            del self._sent.observations[culled], self._sent.masked[culled]
         return WorldDelta(
             size=len(table),
             alive=np.packbits(table.alive),
@@ -113,17 +116,17 @@ class DeltaMaker:
 
     def _changed_landmarks(self, world: WorldMap) -> Ints:
         """Living landmarks whose looks or observations are not as sent; they count as sent now."""
-        table, sent = world.landmarks, self._sent.landmarks
-        changed = table.alive.copy()
-        old = len(sent["host"]) if sent else 0
-        same = np.ones(old, bool)
-        for name in COMPARED if old else ():
-            here, there = getattr(table, name)[:old], sent[name]
-            bytes_here, bytes_there = (a.reshape(old, -1).view(np.uint8) for a in (here, there))
-            same &= (bytes_here == bytes_there).all(axis=1)  # NaN is equal to itself
-        changed[:old] &= ~same
-        self._sent.landmarks = {name: getattr(table, name).copy() for name in COMPARED}
-        return np.flatnonzero(changed)
+        table, sent = world.landmarks, self._sent
+        ids = np.flatnonzero(table.alive)
+        looks = {name: getattr(table, name)[ids] for name in COMPARED}
+        _, here, there = np.intersect1d(ids, sent.ids, assume_unique=True, return_indices=True)
+        same = np.ones(len(here), bool)
+        for name in COMPARED if len(here) else ():
+            a, b = looks[name][here], sent.landmarks[name][there]
+            bytes_a, bytes_b = (rows.reshape(len(here), -1).view(np.uint8) for rows in (a, b))
+            same &= (bytes_a == bytes_b).all(axis=1)  # NaN is equal to itself
+        sent.ids, sent.landmarks = ids, looks
+        return np.delete(ids, here[same])
 
     def _has_changed(self, keyframe: Keyframe) -> bool:
         sent = self._sent

@@ -2,13 +2,16 @@
 
 import dataclasses
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.stats import chi2
 from synthetic_room import CAMERA, Room, make_room
 
 from graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from graph.keys import keyframe_keys, landmark_keys
 from graph.smoother import Smoother, SmootherConfig
+from graph.solver import poses_last
 from graph.updates import (
     GraphEstimate,
     GraphUpdate,
@@ -192,3 +195,17 @@ def test_observation_errors_find_a_planted_outlier() -> None:
     assert np.mean(errors.chi2 < 7.815) > 0.93
     assert errors.is_stereo.all()
     assert (errors.depth_m > 0.5).all()
+
+
+def test_only_poses_are_eliminated_last() -> None:
+    x1, x2 = keyframe_keys(np.array([1, 2]))
+    graph = gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Unit.Create(6)
+    graph.add(gtsam.BetweenFactorPose3(x1, x2, gtsam.Pose3(), noise))
+    calibration = gtsam.Cal3_S2(500.0, 500.0, 0.0, 320.0, 240.0)
+    pixel_noise = gtsam.noiseModel.Unit.Create(2)
+    (landmark,) = landmark_keys(np.array([7]))
+    graph.add(gtsam.GenericProjectionFactorCal3_S2([1, 1], pixel_noise, x2, landmark, calibration))
+    groups = poses_last(graph)
+    assert groups.size() == 2
+    assert groups.at(x1) == groups.at(x2) == 1
