@@ -25,7 +25,7 @@ from graph.geometry import Array, inverse, se3_exp, se3_log, transform
 from semantics.boxes3d import OrientedBox, box_around, box_iou
 from semantics.label_store import LabelStore
 from semantics.objects import MapObject, pixel_rays
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
+from semantics.segmenter_table import make_segmenter
 from slam.configuration import resolve
 from slam.rendering.true_boxes import OBJECTS_TRUTH
 from slam.sequences import Sequence, open_sequence
@@ -108,11 +108,11 @@ def main() -> None:
 
 
 def run_system(sequence: Sequence, arguments: argparse.Namespace) -> SlamSystem:
-    options = SegmenterOptions(arguments.segmenter, weights=arguments.weights)
-    segmenter = make_segmenter(options, sequence.folder)
+    config = resolve(SystemConfig, None, arguments.set)
+    given = {"name": arguments.segmenter, "weights": arguments.weights}
+    segmenter = make_segmenter(replace(config.semantics.segmenter, **given), sequence.folder)
     if arguments.imperfect:
         segmenter = ImperfectSegmenter(segmenter, Errors(), arguments.seed)
-    config = resolve(SystemConfig, None, arguments.set)
     system = SlamSystem(sequence.camera, config, segmenter)
     classes = len(segmenter.labels)
     system.semantics.labels = RecordingStore(classes, config.semantics.labels)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import betaln
 
 from graph.array_file import Arrays
 from graph.geometry import Array
@@ -24,9 +25,16 @@ class LabelStoreConfig:
     share the rest. Views of one thing by one network err together; to count each for less, take
     its likelihood to the ``power`` of less than 1. No class becomes less likely than the
     likeliest one by more than ``max_log_odds``, so that a wrong belief can be overcome.
+
+    A view in which no mask lies on a thing speaks for "unknown", the less the more there are: what
+    a network missed in one view it misses in the next. The share of views in which it finds a
+    thing is a Beta variable of the thing, with ``recall_found`` and ``recall_missed`` as its
+    parameters, so m misses of a thing with a class have the probability B(a, b + m) / B(a, b).
     """
 
     prior_unknown: float = 0.5
+    recall_found: float = 2.0
+    recall_missed: float = 0.4
     power: float = 1.0
     max_log_odds: float = 9.0
 
@@ -35,6 +43,8 @@ class LabelStoreConfig:
             raise ValueError("power must be in (0, 1], max_log_odds at least 1")
         if not 0 < self.prior_unknown < 1:
             raise ValueError("prior_unknown must be between 0 and 1")
+        if min(self.recall_found, self.recall_missed) <= 0:
+            raise ValueError("recall_found and recall_missed must be positive")
 
     def prior(self, classes: int) -> Array:
         """(C,) what a thing is before the first view."""
@@ -88,21 +98,29 @@ class LabelStore:
         gained = np.float32(self.config.power) * np.log(np.maximum(likelihood, floor))
         self._add(ids, gained, weighted, np.ones(len(ids), np.int32))
 
+    def miss(self, ids: Ints, weights: Floats) -> None:
+        """Views of things ids (N,) on which no mask lies, with weights (N,). An id may repeat."""
+        if len(ids):
+            self._reserve(int(ids.max()) + 1)
+            np.add.at(self._misses, ids, weights)
+            np.add.at(self._views, ids, 1)
+
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
         """What is known of from_ids (N,) is known of to_ids (N,) as well; both are one thing."""
         if not len(from_ids):
             return
         self._reserve(int(max(from_ids.max(), to_ids.max())) + 1)
         gained, counts = self._log_p[from_ids], self._counts[from_ids]
-        views = self._views[from_ids]
+        views, misses = self._views[from_ids], self._misses[from_ids]
         self.drop(from_ids)
         self._add(to_ids, gained, counts, views)
+        np.add.at(self._misses, to_ids, misses)
 
     def drop(self, ids: Ints) -> None:
         """Forget things (N,)."""
         ids = ids[ids < len(self._views)]
         self._log_p[ids] = self._counts[ids] = 0.0
-        self._views[ids] = 0
+        self._views[ids] = self._misses[ids] = 0
         self._resize(len(self))
 
     def known(self) -> Ints:
@@ -114,6 +132,7 @@ class LabelStore:
         inside = ids < len(self._views)
         log_p = np.tile(np.log(self._prior), (len(ids), 1))
         log_p[inside] += self._log_p[ids[inside]]
+        log_p[inside, 1:] += self._log_missed(self._misses[ids[inside]])[:, None]
         p = np.exp(log_p - log_p.max(axis=1, keepdims=True, initial=-np.inf))
         return p / p.sum(axis=1, keepdims=True)
 
@@ -122,6 +141,7 @@ class LabelStore:
         inside = ids < len(self._views)
         alpha = np.tile(self._prior, (len(ids), 1))
         alpha[inside] += self._counts[ids[inside]]
+        alpha[inside, 0] += self._misses[ids[inside]]
         return alpha
 
     def estimates(self, ids: Ints) -> LabelEstimates:
@@ -142,6 +162,7 @@ class LabelStore:
             "log_p": self._log_p[ids].ravel(),
             "counts": self._counts[ids].ravel(),
             "views": self._views[ids],
+            "misses": self._misses[ids],
         }
 
     def restore(self, state: Arrays) -> None:
@@ -152,7 +173,13 @@ class LabelStore:
         self._log_p[ids] = state["log_p"].reshape(len(ids), self.classes)
         self._counts[ids] = state["counts"].reshape(len(ids), self.classes)
         self._views[ids] = state["views"]
+        self._misses[ids] = state["misses"]
         self._resize(len(self))
+
+    def _log_missed(self, misses: Floats) -> Array:
+        """log P(m misses (N,) | a thing with a class), m not whole where a view was half sure."""
+        a, b = self.config.recall_found, self.config.recall_missed
+        return np.asarray(betaln(a, b + misses.astype(float)) - betaln(a, b))
 
     def _add(self, ids: Ints, gained: Floats, counts: Floats, views: NDArray[np.int32]) -> None:
         if len(np.unique(ids)) == len(ids):
@@ -171,6 +198,7 @@ class LabelStore:
         self._log_p: Floats = np.zeros((_FIRST_CAPACITY, self.classes), np.float32)
         self._counts: Floats = np.zeros((_FIRST_CAPACITY, self.classes), np.float32)
         self._views: NDArray[np.int32] = np.zeros(_FIRST_CAPACITY, np.int32)
+        self._misses: Floats = np.zeros(_FIRST_CAPACITY, np.float32)
 
     def _reserve(self, size: int) -> None:
         if size > len(self._views):
@@ -183,6 +211,7 @@ class LabelStore:
             self._log_p = _resized(self._log_p, capacity)
             self._counts = _resized(self._counts, capacity)
             self._views = _resized(self._views, capacity)
+            self._misses = _resized(self._misses, capacity)
 
 
 def _resized(table: NDArray[Any], rows: int) -> NDArray[Any]:

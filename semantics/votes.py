@@ -18,6 +18,8 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 NOBODY = -1
 _MAD_TO_SIGMA = 1.4826
+_COARSE = 4
+"""Every so many pixels each way of masks are compared."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,11 @@ class VoteConfig:
     class. A depth belongs to the mask's surface if it is within ``depth_sigmas`` robust
     standard deviations, and ``depth_margin_m`` at 1 m that grows with the square of the depth,
     of the median in the mask. What is farther than ``background_border_px`` from any mask is
-    "unknown" with a weight of ``background_weight``: a network misses things, and masks are too
-    small as often as too large, so this is less than a mask's word.
+    missed by all. Where neither distance nor depth decides, a pixel speaks for its owner, or as
+    missed, with ``border_weight`` of the usual weight.
+
+    A mask that lies in another of at least twice its area, to the share ``nested``, is in front
+    of it whatever their scores, if it is of another class: a book in a bookcase.
     """
 
     border_px: int = 1
@@ -40,7 +45,8 @@ class VoteConfig:
     edge_px: int = 4
     edge_depth: float = 0.03
     background_border_px: int = 8
-    background_weight: float = 0.5
+    border_weight: float = 0.6
+    nested: float = 0.8
 
     def __post_init__(self) -> None:
         if (
@@ -49,8 +55,8 @@ class VoteConfig:
             or min(self.depth_margin_m, self.edge_depth) < 0
         ):
             raise ValueError("borders and what depths may differ by must not be negative")
-        if not 0 <= self.background_weight < 1:
-            raise ValueError("background_weight must be in [0, 1)")
+        if not 0 <= self.border_weight <= 1 or self.nested <= 0:
+            raise ValueError("border_weight must be in [0, 1], nested above 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +66,7 @@ class Claims:
     Attributes:
         instances: in the order of their mask scores, the best first.
         owner: (H, W) int16, the instance that a pixel belongs to, -1 for none.
+        under: (H, W) int16, the one that it would belong to without its owner, -1 for none.
         inner: (H, W) bool, not near the border between two owners, or that of a mask and none.
         depth_m: (h, w) every s-th pixel of the depth image both ways, NaN where missing.
         depth_range_m: (K, 2) nearest and farthest depth of each instance's surface; NaN for one
@@ -68,6 +75,7 @@ class Claims:
 
     instances: tuple[Instance, ...]
     owner: NDArray[np.int16]
+    under: NDArray[np.int16]
     inner: Mask
     depth_m: NDArray[np.float32]
     depth_range_m: Array
@@ -84,13 +92,17 @@ class Votes:
 
     Attributes:
         rows: (M,) which of the landmarks.
-        instances: (M,) the instance that each is on, -1 for none.
-        distributions: (M, C).
-        weights: (M,) how likely the distribution is meant for this landmark.
+        instances: (M,) the instance that each is on for sure, -1 for none.
+        missed: (M,) no instance is there.
+        sure: (M,) distance or depth tells whose surface it is.
+        distributions: (M, C); zeros where missed.
+        weights: (M,) how likely the distribution, or the miss, is meant for this landmark.
     """
 
     rows: Ints
     instances: Ints
+    missed: Mask
+    sure: Mask
     distributions: NDArray[np.float32]
     weights: NDArray[np.float32]
 
@@ -128,16 +140,18 @@ def claim_pixels(
     size: tuple[int, int],
     config: VoteConfig,
 ) -> Claims:
-    """Give each pixel to the instance with the best mask score that covers it.
+    """Give each pixel to the instance with the best mask score that covers it, or is in front.
 
     ``size`` is the image's (H, W); ``depth_m`` (H / s, W / s) may be every s-th pixel of the
     depth image in both directions.
     """
     ranked = tuple(sorted(instances, key=lambda i: -i.mask_score))
-    owner = np.full(size, NOBODY, np.int16)
-    for k in reversed(range(len(ranked))):  # the best is painted last
+    owner, under = np.full((2, *size), NOBODY, np.int16)
+    for k in _painting_order(ranked, config.nested).tolist():
         x1, y1, x2, y2 = _window(ranked[k])
-        owner[y1:y2, x1:x2][ranked[k].mask[y1:y2, x1:x2]] = k
+        here = ranked[k].mask[y1:y2, x1:x2]
+        under[y1:y2, x1:x2][here] = owner[y1:y2, x1:x2][here]
+        owner[y1:y2, x1:x2][here] = k
     inner = np.ones(size, bool)
     if ranked:
         disc = _disc(config.border_px)
@@ -146,40 +160,69 @@ def claim_pixels(
         near = cv2.dilate(covered, _disc(config.background_border_px)) > covered
         inner &= ~near
     surfaces = _surfaces(owner, inner, depth_m, len(ranked), config)
-    return Claims(ranked, owner, inner, depth_m, surfaces)
+    return Claims(ranked, owner, under, inner, depth_m, surfaces)
+
+
+def _painting_order(ranked: Sequence[Instance], nested: float) -> Ints:
+    """Numbers of instances, those at the back first: by how many each lies in, then by score."""
+    if not ranked:
+        return np.zeros(0, np.int64)
+    some = np.array([i.mask[::_COARSE, ::_COARSE].ravel() for i in ranked], np.float32)
+    labels = np.array([i.label for i in ranked])
+    both, areas = some @ some.T, some.sum(axis=1)
+    inside = (both >= nested * areas[:, None]) & (areas[:, None] > 0)
+    inside &= (areas[None] >= 2 * areas[:, None]) & (labels[None] != labels[:, None])
+    return np.lexsort((-np.arange(len(ranked)), inside.sum(axis=1)))
 
 
 def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteConfig) -> Votes:
-    """The votes of a keyframe about the landmarks that it observes (paper, Algorithm 3).
+    """The votes of a keyframe about the landmarks that it sees (paper, Algorithm 3).
 
     For each landmark, at ``pixels`` (N, 2) in the image and with z-depth ``z_m`` (N,) in the
     camera, NaN if unknown: the instance that owns its pixel, unless the landmark is not on the
-    instance's surface, votes with its class distribution, weighted by its mask score. Near a
-    border it is the instance that alone has surface at the landmark's depth. Where there is no
-    instance, the background votes.
+    instance's surface, votes with its class distribution, weighted by its mask score; with what
+    that leaves, the one under it. Near a border it is the instance that alone has surface at the
+    landmark's depth. Where there is no instance, it is missed.
     """
     height, width = claims.owner.shape
     columns, rows = np.rint(pixels).astype(np.int64).reshape(-1, 2).T
     columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
     owners = claims.owner[rows, columns].astype(np.int64)
     inner = claims.inner[rows, columns]
-    alone = inner.copy()
+    sure, alone = inner.copy(), inner.copy()
     edge = np.flatnonzero(~inner)
-    owners[edge] = NOBODY
     if claims.instances and config.edge_px and len(edge):
-        owners[edge], alone[edge] = _at_edges(claims, rows[edge], columns[edge], z_m[edge], config)
+        found, one = _at_edges(claims, rows[edge], columns[edge], z_m[edge], config)
+        told = found != NOBODY
+        owners[edge[told]], alone[edge], sure[edge] = found[told], one & told, told
     covered = owners != NOBODY
-    votes = inner | covered
-    votes[covered] &= claims.on_surface(owners[covered], z_m[covered])
-    if not config.background_weight:
-        votes &= covered
+    votes = np.ones(len(owners), bool)
+    votes[covered] = claims.on_surface(owners[covered], z_m[covered])
+    votes &= sure | (config.border_weight > 0)
     chosen = np.flatnonzero(votes)
-    background = np.eye(1, classes, dtype=np.float32)[0]
-    table = np.array([*(i.distribution for i in claims.instances), background], np.float32)
-    scores = [*(i.mask_score for i in claims.instances), config.background_weight]
-    speakers = owners[chosen]  # NOBODY, -1, is the last row of both
+    speakers = owners[chosen]
+    same = speakers == claims.owner[rows[chosen], columns[chosen]]
+    behind = np.where(same, claims.under[rows[chosen], columns[chosen]], NOBODY)
+    distributions, weights = _mixed(claims.instances, speakers, behind, classes)
+    missed = speakers == NOBODY
+    weights[missed] = 1.0
+    sure = sure[chosen]
+    weights[~sure] *= np.float32(config.border_weight)
     instances = np.where(alone[chosen], speakers, NOBODY)
-    return Votes(chosen, instances, table[speakers], np.array(scores, np.float32)[speakers])
+    return Votes(chosen, instances, missed, sure, distributions, weights)
+
+
+def _mixed(
+    instances: Sequence[Instance], first: Ints, second: Ints, classes: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What instances (M,) with others (M,) behind them, or NOBODY, say: distributions, weights."""
+    nothing = np.zeros(classes, np.float32)
+    table = np.array([*(i.distribution for i in instances), nothing], np.float32)
+    scores = np.array([*(i.mask_score for i in instances), 0.0], np.float32)
+    front, back = scores[first], (1 - scores[first]) * scores[second]
+    weights = front + back
+    sums = front[:, None] * table[first] + back[:, None] * table[second]
+    return sums / np.maximum(weights, np.float32(1e-12))[:, None], weights
 
 
 def _at_edges(

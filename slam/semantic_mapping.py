@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
 from graph.errors import InputError
-from graph.geometry import Array, inverse, transform
+from graph.geometry import Array
 from semantics.instances import Instance
 from semantics.label_store import LabelEstimates, LabelStore, LabelStoreConfig
 from semantics.labels import LabelSet
@@ -21,12 +21,13 @@ from semantics.objects import KeyframeView, MapObject, ObjectConfig, ObjectMap, 
 from semantics.segmenter import NoSegmenter, Segmenter
 from semantics.segmenter_table import SegmenterOptions
 from semantics.upright import Upright
-from semantics.votes import Claims, VoteConfig, check_instances, claim_pixels, vote
+from semantics.votes import Claims, VoteConfig, Votes, check_instances, claim_pixels, vote
 from slam.dynamics import Dynamics
 from slam.frame import Frame
 from slam.keyframe_masks import KeyframeMasks
 from slam.landmarks import Ints
 from slam.mapper import Mapper
+from slam.observed_landmarks import Located, Observed, observed_by
 from slam.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
@@ -35,13 +36,21 @@ DEFAULT_SEGMENTER = "light"
 DEPTH_STEP = 2
 """Of a keyframe's depth image every second pixel each way waits for its masks."""
 MAX_WAITING = 100
+VOTE_SCORE = 0.1
 
 
 @dataclass(frozen=True)
 class SemanticsConfig:
-    """Where masks come from, and what is believed of them."""
+    """Where masks come from, and what is believed of them.
 
-    segmenter: SegmenterOptions = field(default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER))
+    Of instances with a class score below ``object_score`` the votes count, but nothing else: they
+    make no objects and nothing moves for them.
+    """
+
+    segmenter: SegmenterOptions = field(
+        default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER, min_score=VOTE_SCORE)
+    )
+    object_score: float = 0.5
     votes: VoteConfig = field(default_factory=VoteConfig)
     labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)
     objects: ObjectConfig = field(default_factory=ObjectConfig)
@@ -87,23 +96,6 @@ class _Waiting:
 
     timestamp_s: float
     depth_m: NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class _Observed:
-    """Pixels (N, 2), as detected, and landmark ids (N,) of a keyframe, which may be culled.
-
-    It stands in the frame of a keyframe of the map, ``anchor``: itself or its heir.
-    """
-
-    pixels: Array
-    landmark_ids: Ints
-    anchor: Keyframe
-    T_anchor_camera: Array
-
-    @property
-    def T_world_camera(self) -> Array:
-        return self.anchor.T_world_camera @ self.T_anchor_camera
 
 
 class SemanticMapper:
@@ -170,7 +162,7 @@ class SemanticMapper:
         """
         size = (self.camera.height, self.camera.width)
         check_instances(instances, size, self.names, f"keyframe {keyframe_id}")
-        observed = _observed(keyframe_id, mapper)
+        observed = observed_by(keyframe_id, mapper)
         refused = "" if observed is not None else "it is not in the map"
         if keyframe_id in self._done:
             refused = "it has its masks already"
@@ -180,22 +172,22 @@ class SemanticMapper:
         self._done.add(keyframe_id)
         nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
         waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
-        claims = claim_pixels(instances, waiting.depth_m, size, self.config.votes)
-        points = mapper.world.landmarks.points_world[observed.landmark_ids]
-        z_m = transform(inverse(observed.T_world_camera), points)[:, 2]
-        votes = vote(claims, observed.pixels, z_m, len(self.names), self.config.votes)
-        ids = observed.landmark_ids[votes.rows]
-        self.labels.update(ids, votes.distributions, votes.weights)
+        strong = [i for i in instances if i.class_score >= self.config.object_score]
+        claims = claim_pixels(strong, waiting.depth_m, size, self.config.votes)
+        seen = observed.located(mapper)
+        votes = self._votes(claims, seen)
+        ids = observed.landmark_ids[votes.rows[votes.sure]]
+        on = votes.instances[votes.sure]
+        spoken = self._label((claims, instances), seen, waiting, mapper)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
-            objects = self._add_objects((keyframe_id, waiting), claims, observed, mapper)
-            on = objects[votes.instances] >= 0
-            self.objects.place_landmarks(ids[on], objects[votes.instances[on]])
+            objects = self._add_objects((keyframe_id, waiting), claims, observed, mapper)[on]
+            self.objects.place_landmarks(ids[objects >= 0], objects[objects >= 0])
         if self._dynamics is not None:
-            about = (ids, votes.instances, self.labels.probabilities(ids))
-            seen = (claims, waiting.depth_m, observed.T_world_camera)
-            masks = KeyframeMasks(keyframe_id, self.names, *seen, *about)
+            about = (ids, on, self.labels.probabilities(ids))
+            view = (claims, waiting.depth_m, observed.T_world_camera)
+            masks = KeyframeMasks(keyframe_id, self.names, *view, *about)
             self._dynamics.see(masks, mapper)
-        return Attachment(keyframe_id, len(instances), ids)
+        return Attachment(keyframe_id, len(instances), spoken)
 
     def follow(self, mapper: Mapper) -> None:
         """Keep up with the map.
@@ -281,8 +273,30 @@ class SemanticMapper:
         self._done = set()
         self._waiting = {}
 
+    def _votes(self, claims: Claims, seen: Located) -> Votes:
+        return vote(claims, seen.pixels, seen.z_m, len(self.names), self.config.votes)
+
+    def _label(
+        self,
+        masks: tuple[Claims, Sequence[Instance]],
+        observed: Located,
+        waiting: _Waiting,
+        mapper: Mapper,
+    ) -> Ints:
+        """All instances vote on all landmarks in sight; returns the ids (N,) of those."""
+        claims, instances = masks
+        if len(claims.instances) < len(instances):
+            size = claims.owner.shape
+            claims = claim_pixels(instances, waiting.depth_m, size, self.config.votes)
+        seen = observed.with_visible(waiting.depth_m, self.camera, mapper)
+        votes = self._votes(claims, seen)
+        ids, hit = seen.landmark_ids[votes.rows], ~votes.missed
+        self.labels.update(ids[hit], votes.distributions[hit], votes.weights[hit])
+        self.labels.miss(ids[~hit], votes.weights[~hit])
+        return ids
+
     def _add_objects(
-        self, waited: tuple[int, _Waiting], claims: Claims, observed: _Observed, mapper: Mapper
+        self, waited: tuple[int, _Waiting], claims: Claims, observed: Observed, mapper: Mapper
     ) -> Ints:
         """The object of each of the claims' instances (K,) and -1 for the last, "none"."""
         keyframe_id, waiting = waited
@@ -307,21 +321,3 @@ class SemanticMapper:
 def kept_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     """Every DEPTH_STEP-th pixel each way of a z-depth image (H, W) in m."""
     return depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()
-
-
-def _observed(keyframe_id: int, mapper: Mapper) -> _Observed | None:
-    """What a keyframe of the map, or a culled one, sees of the landmarks that live."""
-    world = mapper.world
-    keyframe = world.keyframes.get(keyframe_id)
-    if keyframe is not None:
-        rows, ids = world.observed(keyframe)
-        return _Observed(keyframe.features.image_pixels[rows], ids, keyframe, np.eye(4))
-    culled = world.culled.get(keyframe_id)
-    heir_id, T_heir_keyframe = mapper.history.heir(keyframe_id)
-    heir = world.keyframes.get(heir_id)
-    if culled is None or heir is None:
-        return None
-    rows = np.flatnonzero(culled.landmark_ids >= 0)
-    ids = world.landmarks.current(culled.landmark_ids[rows])
-    alive = world.landmarks.alive[ids]
-    return _Observed(culled.image_pixels[rows[alive]], ids[alive], heir, T_heir_keyframe)

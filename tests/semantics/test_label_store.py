@@ -76,17 +76,44 @@ def test_the_order_of_views_and_repeated_ids_do_not_matter() -> None:
     assert np.allclose(a.dirichlet(five), c.dirichlet(five))
 
 
+def missed_by_integral(prior: np.ndarray, misses: float, a: float, b: float) -> np.ndarray:
+    """A belief after views that missed the thing: its recall integrated out numerically."""
+    recall = (np.arange(200_000) + 0.5) / 200_000
+    density = recall ** (a - 1) * (1 - recall) ** (b - 1)
+    chance = (density * (1 - recall) ** misses).sum() / density.sum()
+    belief = prior * np.array([1.0, *4 * [chance]])
+    return belief / belief.sum()
+
+
+def test_misses_are_views_of_one_recall_that_is_not_known() -> None:
+    config = LabelStoreConfig(recall_found=2.0, recall_missed=1.5, max_log_odds=60.0)
+    store, three = LabelStore(C, config), np.array([3])
+    p, weights = views(1, np.random.default_rng(6))
+    store.miss(np.array([3, 3]), np.array([1.0, 0.5], np.float32))
+    store.update(three, p, weights)
+    store.miss(np.array([9]), np.array([1.0], np.float32))
+    expected = missed_by_integral(posterior(p, weights), 1.5, 2.0, 1.5)
+    assert np.allclose(store.probabilities(three)[0], expected, atol=1e-4)
+    assert store.estimates(np.array([3, 9])).views.tolist() == [3, 1]
+    first, then = (np.log(missed_by_integral(PRIOR, m, 2.0, 1.5)[1]) for m in (1, 2))
+    nine = store.probabilities(np.array([9]))[0]
+    assert np.log(nine[1]) == pytest.approx(first, abs=1e-4)
+    assert then - first > first - np.log(PRIOR[1])  # the second adds less than the first
+
+
 def test_a_fused_thing_keeps_both_histories() -> None:
     p, weights = views(4, np.random.default_rng(3))
     store, whole = LabelStore(C, NO_LIMIT), LabelStore(C, NO_LIMIT)
     store.update(np.array([1, 1]), p[:2], weights[:2])
     store.update(np.array([2, 2]), p[2:], weights[2:])
+    store.miss(np.array([1, 2]), np.array([0.5, 1.0], np.float32))
     store.move(np.array([1]), np.array([2]))
     whole.update(np.array([2, 2, 2, 2]), p, weights)
+    whole.miss(np.array([2, 2]), np.array([0.5, 1.0], np.float32))
     ids = np.array([1, 2])
     assert np.allclose(store.probabilities(ids), whole.probabilities(ids), atol=1e-6)
     assert np.allclose(store.dirichlet(ids), whole.dirichlet(ids))
-    assert store.estimates(ids).views.tolist() == [0, 4]
+    assert store.estimates(ids).views.tolist() == [0, 6]
     store.drop(ids)
     assert store.known().tolist() == []
 
@@ -106,6 +133,7 @@ def test_a_store_becomes_the_same_from_its_state() -> None:
     p, weights = views(3, np.random.default_rng(4))
     store = LabelStore(C)
     store.update(np.array([2, 5000, 7]), p, weights)
+    store.miss(np.array([2, 7, 9]), np.array([1.0, 1.0, 0.6], np.float32))
     store.drop(np.array([7]))
     twin = LabelStore(C)
     twin.restore(store.state())
@@ -124,5 +152,6 @@ def test_a_keyframe_takes_at_most_two_milliseconds() -> None:
         for _ in range(9):
             start_s = time.perf_counter()
             store.update(ids, p, weights)
+            store.miss(ids, weights)
             took_s.append(time.perf_counter() - start_s)
         assert min(took_s) < 2e-3, classes

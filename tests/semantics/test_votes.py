@@ -14,7 +14,7 @@ from semantics.votes import VoteConfig, check_instances, claim_pixels, grouped_m
 
 SIZE = (120, 160)
 LABELS = label_set(("chair", "desk", "cup"))
-CONFIG = VoteConfig(border_px=3, background_border_px=5, background_weight=0.25)
+CONFIG = VoteConfig(border_px=3, background_border_px=5, border_weight=0.0)
 
 
 def instance(rows: slice, columns: slice, label: int, score: float = 0.9) -> Instance:
@@ -36,8 +36,9 @@ def test_a_landmark_on_an_instance_gets_its_distribution_and_score() -> None:
     found = vote(claims, pixels, np.array([2.0, 3.0]), 4, CONFIG)
     assert found.rows.tolist() == [0, 1]
     assert found.instances.tolist() == [0, -1]
-    assert np.allclose(found.distributions, [CHAIR.distribution, [1, 0, 0, 0]])
-    assert found.weights == pytest.approx([0.9, 0.25])
+    assert found.missed.tolist() == [False, True]
+    assert np.allclose(found.distributions, [CHAIR.distribution, [0, 0, 0, 0]])
+    assert found.weights == pytest.approx([0.9, 1.0])
 
 
 def test_columns_are_not_taken_for_rows() -> None:
@@ -53,6 +54,15 @@ def test_near_a_border_nobody_votes_on_either_side() -> None:
     found = vote(claims, pixels, np.full(len(columns), 2.0), 4, CONFIG)
     silent = np.setdiff1d(columns, columns[found.rows])
     assert silent.tolist() == [*range(25, 33), *range(87, 95)]
+    half = replace(CONFIG, border_weight=0.5)
+    found = vote(claims, pixels, np.full(len(columns), 2.0), 4, half)
+    assert len(found.rows) == len(columns)
+    assert np.array_equal(columns[~found.sure], silent)
+    assert (found.instances[~found.sure] == -1).all()
+    on_mask = (columns >= 30) & (columns < 90)
+    assert np.array_equal(found.missed, ~on_mask)
+    weights = np.where(on_mask, 0.9, 1.0) * np.where(found.sure, 1.0, 0.5)
+    assert found.weights == pytest.approx(weights)
 
 
 def test_the_edge_of_the_image_is_no_border() -> None:
@@ -69,10 +79,30 @@ def test_where_masks_overlap_the_better_one_owns_the_pixel() -> None:
         found = vote(claims, np.array([[65.0, 55.0], [40.0, 30.0]]), np.full(2, 2.0), 4, CONFIG)
         labels = [claims.instances[k].label for k in found.instances]
         assert labels == [3, 1]
-    worse = instance(slice(40, 70), slice(50, 80), 3, 0.5)
+    worse = instance(slice(40, 110), slice(50, 140), 3, 0.5)
     claims = claim_pixels([worse, CHAIR], flat(), SIZE, CONFIG)
     found = vote(claims, np.array([[65.0, 55.0]]), np.array([2.0]), 4, CONFIG)
     assert claims.instances[found.instances[0]].label == 1
+
+
+def test_what_lies_in_a_larger_thing_of_another_class_is_in_front_of_it() -> None:
+    inside, part = (instance(slice(40, 60), slice(40, 60), label, 0.3) for label in (3, 1))
+    large = instance(slice(40, 80), slice(34, 90), 3, 0.3)
+    for other, label in ((inside, 3), (part, 1), (large, 1)):
+        claims = claim_pixels([CHAIR, other], flat(), SIZE, CONFIG)
+        found = vote(claims, np.array([[50.0, 50.0]]), np.array([2.0]), 4, CONFIG)
+        front = claims.instances[found.instances[0]]
+        assert front.label == label
+        assert (front.mask_score == 0.3) == (other is inside)
+
+
+def test_what_the_mask_in_front_leaves_open_the_one_behind_says() -> None:
+    cup = instance(slice(40, 60), slice(40, 60), 3, 0.3)
+    claims = claim_pixels([CHAIR, cup], flat(), SIZE, CONFIG)
+    found = vote(claims, np.array([[50.0, 50.0], [80.0, 70.0]]), np.full(2, 2.0), 4, CONFIG)
+    assert found.weights == pytest.approx([0.3 + 0.7 * 0.9, 0.9])
+    expected = (0.3 * cup.distribution + 0.7 * 0.9 * CHAIR.distribution) / (0.3 + 0.7 * 0.9)
+    assert np.allclose(found.distributions, [expected, CHAIR.distribution])
 
 
 def test_a_landmark_that_is_not_on_the_surface_does_not_vote() -> None:
@@ -132,8 +162,7 @@ def test_without_depth_and_without_instances() -> None:
     assert vote(claims, pixels, z_m, 4, CONFIG).instances.tolist() == [0]
     nothing = claim_pixels([], flat(), SIZE, CONFIG)
     assert vote(nothing, pixels, z_m, 4, CONFIG).instances.tolist() == [-1]
-    silent = VoteConfig(background_weight=0.0)
-    assert len(vote(nothing, pixels, z_m, 4, silent).rows) == 0
+    assert vote(nothing, pixels, z_m, 4, CONFIG).missed.tolist() == [True]
     assert len(vote(nothing, np.zeros((0, 2)), np.zeros(0), 4, CONFIG).rows) == 0
 
 

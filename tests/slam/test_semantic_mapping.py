@@ -178,6 +178,21 @@ def test_the_estimate_is_the_same_with_and_without_masks(at_once: SlamSystem) ->
     assert without.semantics.state()["labels.ids"].size == 0
 
 
+class Unsure(Sides):
+    """Hardly sees what is on the right."""
+
+    def instances(self, number: int) -> list[Instance]:
+        left, right = super().instances(number)
+        return [left, Instance(right.mask, right.box, 2, certain(2, 3, 0.45), 0.45, 0.45)]
+
+
+def test_a_weak_detection_votes_but_makes_no_object() -> None:
+    system = run(Unsure(FRAMES))
+    on_right = system.landmarks().points_world[:, 0] > EDGE_M + 0.05
+    assert (estimates(system).labels[on_right] == 2).mean() > 0.9
+    assert {o.label for o in system.objects().objects} == {1}
+
+
 def test_the_first_keyframe_must_have_masks_the_others_may_lack_them() -> None:
     class Sometimes(Sides):
         def segment(self, image: Image, name: str) -> list[Instance]:
