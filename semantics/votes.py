@@ -216,13 +216,15 @@ def _mixed(
     instances: Sequence[Instance], first: Ints, second: Ints, classes: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """What instances (M,) with others (M,) behind them, or NOBODY, say: distributions, weights."""
-    nothing = np.zeros(classes, np.float32)
-    table = np.array([*(i.distribution for i in instances), nothing], np.float32)
-    scores = np.array([*(i.mask_score for i in instances), 0.0], np.float32)
+    nothing = np.zeros(classes)
+    table: NDArray[np.float32] = np.array(
+        [*(i.distribution for i in instances), nothing], np.float32
+    )
+    scores: NDArray[np.float32] = np.array([*(i.mask_score for i in instances), 0.0], np.float32)
     front, back = scores[first], (1 - scores[first]) * scores[second]
     weights = front + back
     sums = front[:, None] * table[first] + back[:, None] * table[second]
-    return sums / np.maximum(weights, np.float32(1e-12))[:, None], weights
+    return (sums / np.maximum(weights, 1e-12)[:, None]).astype(np.float32), weights
 
 
 def _at_edges(

@@ -187,7 +187,7 @@ class Unsure(Sides):
 
 
 def test_a_weak_detection_votes_but_makes_no_object() -> None:
-    system = run(Unsure(FRAMES))
+    system = run(Unsure(FRAMES), MANY_KEYFRAMES)
     on_right = system.landmarks().points_world[:, 0] > EDGE_M + 0.05
     assert (estimates(system).labels[on_right] == 2).mean() > 0.9
     assert {o.label for o in system.objects().objects} == {1}
