@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from numpy.typing import NDArray
 
 from graph.array_file import Arrays
 from graph.geometry import Array, inverse
 from graph.trajectory import Trajectory
 from slam.world_map import WorldMap
 
-
-@dataclass(frozen=True)
-class HistoryEntry:
-    """A frame's stamp and its pose as seen from its reference keyframe."""
-
-    timestamp_s: float
-    keyframe_id: int
-    T_keyframe_camera: Array
+ENTRY = np.dtype(
+    [("timestamp_s", float), ("keyframe_id", np.int64), ("T_keyframe_camera", float, (4, 4))]
+)
+"""A frame's stamp and its pose as seen from its reference keyframe."""
+Entries = NDArray[np.void]
 
 
 class FrameHistory:
     """One entry a tracked frame; a keyframe that is culled hands its frames to another."""
 
     def __init__(self) -> None:
-        self._entries: list[HistoryEntry] = []
+        self._store: Entries = np.zeros(1024, ENTRY)
+        self._size = 0
         self._parent: dict[int, tuple[int, Array]] = {}
 
     @property
@@ -38,15 +35,21 @@ class FrameHistory:
     ) -> None:
         """Remember a frame's pose as seen from a keyframe whose current pose is given."""
         T_keyframe_camera = inverse(T_world_keyframe) @ T_world_camera
-        self._entries.append(HistoryEntry(timestamp_s, keyframe_id, T_keyframe_camera))
+        self.extend(np.array([(timestamp_s, keyframe_id, T_keyframe_camera)], ENTRY))
 
-    def since(self, count: int) -> list[HistoryEntry]:
+    def since(self, count: int) -> Entries:
         """What was appended after the first ``count`` frames."""
-        return self._entries[count:]
+        return self._store[count : self._size].copy()
 
-    def extend(self, entries: list[HistoryEntry]) -> None:
+    def extend(self, entries: Entries) -> None:
         """Append what another history holds of the frames that follow."""
-        self._entries += entries
+        size = self._size + len(entries)
+        if size > len(self._store):
+            bigger = np.zeros(max(2 * len(self._store), size), ENTRY)
+            bigger[: self._size] = self._store[: self._size]
+            self._store = bigger
+        self._store[self._size : size] = entries
+        self._size = size
 
     def hand_over(self, keyframe_id: int, parent_id: int, T_parent_keyframe: Array) -> None:
         """A keyframe leaves the map: its frames follow the parent from now on."""
@@ -54,16 +57,20 @@ class FrameHistory:
 
     def trajectories(self, world: WorldMap) -> dict[int, Trajectory]:
         """Every tracked frame, by map segment, from the keyframes' current poses."""
-        stamps: dict[int, list[float]] = {}
-        poses: dict[int, list[Array]] = {}
-        for entry in self._entries:
-            keyframe_id, T = self._resolve(entry.keyframe_id, entry.T_keyframe_camera)
-            keyframe = world.keyframes[keyframe_id]
-            stamps.setdefault(keyframe.segment, []).append(entry.timestamp_s)
-            poses.setdefault(keyframe.segment, []).append(keyframe.T_world_camera @ T)
+        entries = self._store[: self._size]
+        ids, which = np.unique(entries["keyframe_id"], return_inverse=True)
+        order = np.argsort(which, kind="stable")
+        groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(ids)))[:-1])
+        poses, segments = np.empty((len(entries), 4, 4)), np.empty(len(entries), np.int64)
+        for keyframe_id, rows in zip(ids.tolist(), groups, strict=False):
+            owner, T = self._resolve(keyframe_id, entries["T_keyframe_camera"][rows])
+            keyframe = world.keyframes[owner]
+            poses[rows], segments[rows] = keyframe.T_world_camera @ T, keyframe.segment
         return {
-            segment: Trajectory(np.array(stamps[segment]), np.array(poses[segment]))
-            for segment in sorted(stamps)
+            segment: Trajectory(
+                entries["timestamp_s"][segments == segment], poses[segments == segment]
+            )
+            for segment in np.unique(segments).tolist()
         }
 
     def heir(self, keyframe_id: int) -> tuple[int, Array]:
@@ -72,11 +79,11 @@ class FrameHistory:
 
     def state(self) -> Arrays:
         """All entries, and who inherited whose frames, as arrays."""
-        entries, heirs = self._entries, list(self._parent.values())
+        entries, heirs = self._store[: self._size], list(self._parent.values())
         return {
-            "timestamps_s": np.array([entry.timestamp_s for entry in entries], float),
-            "keyframe_ids": np.array([entry.keyframe_id for entry in entries], np.int64),
-            "T_keyframe_camera": _stacked([entry.T_keyframe_camera for entry in entries]),
+            "timestamps_s": entries["timestamp_s"].copy(),
+            "keyframe_ids": entries["keyframe_id"].copy(),
+            "T_keyframe_camera": entries["T_keyframe_camera"].copy(),
             "culled_ids": np.array(list(self._parent), np.int64),
             "heir_ids": np.array([heir for heir, _ in heirs], np.int64),
             "T_heir_culled": _stacked([T for _, T in heirs]),
@@ -84,13 +91,16 @@ class FrameHistory:
 
     def restore(self, state: Arrays) -> None:
         """Become the history of a state."""
-        columns = [state[name] for name in ("timestamps_s", "keyframe_ids", "T_keyframe_camera")]
-        rows = zip(columns[0].tolist(), columns[1].tolist(), columns[2], strict=True)
-        self._entries = [HistoryEntry(stamp_s, keyframe_id, T) for stamp_s, keyframe_id, T in rows]
+        self._size = len(state["timestamps_s"])
+        self._store = np.zeros(max(self._size, 1024), ENTRY)
+        columns = ("timestamps_s", "keyframe_ids", "T_keyframe_camera")
+        for name, column in zip(ENTRY.names or (), columns, strict=True):
+            self._store[name][: self._size] = state[column]
         heirs = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
         self._parent = dict(zip(state["culled_ids"].tolist(), heirs, strict=True))
 
     def _resolve(self, keyframe_id: int, T: Array) -> tuple[int, Array]:
+        """The keyframe that stands for one, and poses T (..., 4, 4) as seen from it."""
         while keyframe_id in self._parent:
             keyframe_id, T_parent_keyframe = self._parent[keyframe_id]
             T = T_parent_keyframe @ T

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,17 +14,22 @@ from slam.subpixel import PATCH_PX
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_COLUMNS: dict[str, tuple[tuple[int, ...], type, float]] = {
-    "points_world": ((3,), np.float64, np.nan),
+_Columns = dict[str, tuple[tuple[int, ...], type, float]]
+
+_LOOKS: _Columns = {
     "descriptors": ((8,), np.uint64, 0),
     "directions": ((3,), np.float64, 0.0),
     "extent": ((), np.float64, 0.0),
     "angles_rad": ((), np.float64, 0.0),
     "colours": ((3,), np.uint8, 0),
-    "host": ((), np.int64, -1),
-    "last_keyframe": ((), np.int64, -1),
     "patches": ((PATCH_PX, PATCH_PX), np.uint8, 0),
     "patch_views": ((3,), np.float64, np.nan),
+}
+"""What only the living have: most landmarks die young, and a session has no end."""
+_OF_ALL: _Columns = {
+    "points_world": ((3,), np.float64, np.nan),
+    "host": ((), np.int64, -1),
+    "last_keyframe": ((), np.int64, -1),
     "observations": ((), np.int64, 0),
     "visible": ((), np.int64, 0),
     "found": ((), np.int64, 0),
@@ -30,6 +37,32 @@ _COLUMNS: dict[str, tuple[tuple[int, ...], type, float]] = {
     "alive": ((), np.bool_, False),
     "in_graph": ((), np.bool_, False),
 }
+_COLUMNS = _OF_ALL | _LOOKS
+_PLACE: _Columns = {"place": ((), np.int64, 0)}
+
+
+class Looks:
+    """A column over landmark ids that has rows for the living alone, at their places.
+
+    Place 0 is that of all the dead, who look like nothing: what is written about them is lost.
+    """
+
+    def __init__(self, rows: NDArray, place: Ints) -> None:
+        self._rows, self._place = rows, place
+
+    def __len__(self) -> int:
+        return len(self._place)
+
+    def __getitem__(self, ids: Any) -> NDArray:
+        return self._rows[self._place[ids]]
+
+    def __setitem__(self, ids: Any, values: Any) -> None:
+        nothing = self._rows[0].copy()
+        self._rows[self._place[ids]] = values
+        self._rows[0] = nothing
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
+        return np.array(self._rows[self._place], dtype)
 
 
 class LandmarkTable:
@@ -50,31 +83,35 @@ class LandmarkTable:
         visible, found: (N,) frames in which it should have been, and was, matched.
         replaced_by: (N,) the landmark that this one was fused into, -1 for none.
         alive, in_graph: (N,) bool.
+        place: (N,) where a living one's looks are kept, 0 for the dead.
+
+    Descriptors, directions, extent, angles, colours and patches are those of the living: a dead
+    landmark looks like nothing, and its place serves another.
     """
 
     points_world: Array
-    descriptors: NDArray[np.uint64]
-    directions: Array
-    extent: Array
-    angles_rad: Array
-    colours: NDArray[np.uint8]
+    descriptors: Looks
+    directions: Looks
+    extent: Looks
+    angles_rad: Looks
+    colours: Looks
     host: Ints
     last_keyframe: Ints
-    patches: NDArray[np.uint8]
-    patch_views: Array
+    patches: Looks
+    patch_views: Looks
     observations: Ints
     visible: Ints
     found: Ints
     replaced_by: Ints
     alive: Mask
     in_graph: Mask
+    place: Ints
 
     def __init__(self) -> None:
         self._size = 0
-        self._store: dict[str, NDArray] = {
-            name: np.full((1024, *shape), fill, dtype)
-            for name, (shape, dtype, fill) in _COLUMNS.items()
-        }
+        self._store = {name: _filled(1024, column) for name, column in (_OF_ALL | _PLACE).items()}
+        self._looks = {name: _filled(1, column) for name, column in _LOOKS.items()}
+        self._free: list[int] = []
         self._make_views()
 
     def __len__(self) -> int:
@@ -82,13 +119,10 @@ class LandmarkTable:
 
     def add(self, columns: dict[str, NDArray]) -> Ints:
         """New landmarks from columns by name; returns their ids (N,)."""
-        count = len(columns["points_world"])
-        ids = np.arange(self._size, self._size + count)
-        self._size += count
-        capacity = len(self._store["alive"])
-        if self._size > capacity:
-            self._grow(max(2 * capacity, self._size))
-        self._make_views()
+        first = self._size
+        self.extend_to(first + len(columns["points_world"]))
+        ids = np.arange(first, self._size)
+        self._settle(ids)
         for name, values in columns.items():
             getattr(self, name)[ids] = values
         self.alive[ids] = True
@@ -97,10 +131,22 @@ class LandmarkTable:
 
     def extend_to(self, size: int) -> None:
         """Rows up to a size, those that are new not alive: to be filled from another table."""
+        self._vacate(np.arange(size, self._size))
+        capacity, old = len(self._store["alive"]), self._size
+        for name, (shape, dtype, fill) in (_OF_ALL | _PLACE).items():
+            if size > capacity:
+                bigger: NDArray = np.empty((max(2 * capacity, size), *shape), dtype)
+                bigger[:old] = self._store[name][:old]
+                self._store[name] = bigger
+            self._store[name][old:size] = fill
         self._size = size
-        if size > len(self._store["alive"]):
-            self._grow(max(2 * len(self._store["alive"]), size))
         self._make_views()
+
+    def set_alive(self, alive: Mask) -> None:
+        """Exactly these of all (N,) are alive; those that are new look like nothing yet."""
+        self._vacate(np.flatnonzero((self.place > 0) & ~alive))
+        self._settle(np.flatnonzero((self.place == 0) & alive))
+        self.alive[:] = alive
 
     def living(self, ids: Ints) -> Ints:
         """Those of the ids that are still in the map."""
@@ -122,6 +168,7 @@ class LandmarkTable:
         """Take landmarks out of the map; keyframes drop them when they next look."""
         self.alive[ids] = False
         self.in_graph[ids] = False
+        self._vacate(np.unique(ids))
 
     def move_with_hosts(self, ids: Ints, keyframe_ids: Ints, T_old: Array, T_new: Array) -> None:
         """Carry landmarks along with their host keyframes from poses T_old to T_new (K, 4, 4)."""
@@ -140,19 +187,41 @@ class LandmarkTable:
 
     def restore(self, state: Arrays) -> None:
         """Become the table of a state; this one must be new."""
-        self._size = int(state["size"])
-        self._grow(max(len(self._store["alive"]), self._size))
-        self._make_views()
+        self.extend_to(int(state["size"]))
+        self._settle(state["ids"])
         for name in _COLUMNS:
             getattr(self, name)[state["ids"]] = True if name == "alive" else state[name]
 
-    def _grow(self, capacity: int) -> None:
-        for name, (shape, dtype, fill) in _COLUMNS.items():
-            bigger: NDArray = np.full((capacity, *shape), fill, dtype)
-            old = self._store[name]
-            bigger[: len(old)] = old
-            self._store[name] = bigger
+    def _settle(self, ids: Ints) -> None:
+        """Places for landmarks (N,) that have none."""
+        missing = len(ids) - len(self._free)
+        if missing > 0:
+            capacity = len(self._looks["extent"])
+            more = max(missing, capacity)
+            for name, column in _LOOKS.items():
+                self._looks[name] = np.concatenate([self._looks[name], _filled(more, column)])
+            self._free += range(capacity + more - 1, capacity - 1, -1)
+            self._make_views()
+        if len(ids):
+            self.place[ids] = self._free[-len(ids) :][::-1]
+            del self._free[-len(ids) :]
+
+    def _vacate(self, ids: Ints) -> None:
+        """Landmarks (N,), each once, give up their places, which look like nothing again."""
+        places = self.place[ids]
+        places = places[places > 0]
+        for name, (_, _, fill) in _LOOKS.items():
+            self._looks[name][places] = fill
+        self.place[ids] = 0
+        self._free += places[::-1].tolist()
 
     def _make_views(self) -> None:
         for name, array in self._store.items():
             setattr(self, name, array[: self._size])
+        for name, rows in self._looks.items():
+            setattr(self, name, Looks(rows, self.place))
+
+
+def _filled(count: int, column: tuple[tuple[int, ...], type, float]) -> NDArray:
+    shape, dtype, fill = column
+    return np.full((count, *shape), fill, dtype)

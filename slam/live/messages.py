@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graph.geometry import Array
 from semantics.instances import Instance
-from slam.history import HistoryEntry
+from slam.history import Entries
 from slam.landmarks import Ints
 from slam.live.replica import WorldDelta
 from slam.tracker import Tracked
@@ -53,7 +53,7 @@ class NewKeyframe:
     reference: tuple[int, Array] | None
     local_ids: Ints
     sightings: Sightings
-    history: list[HistoryEntry]
+    history: Entries
     depth_m: Depth
 
 
@@ -69,7 +69,7 @@ class LostKeyframe:
     id: int
     heir_id: int
     T_heir_lost: Array
-    history: list[HistoryEntry]
+    history: Entries
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Finish:
     """To the map: no more keyframes; optimise once more and write all that is known."""
 
     path: Path
-    history: list[HistoryEntry]
+    history: Entries
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from graph.camera import Camera
 from graph.errors import InputError
 from graph.geometry import inverse
 from slam.frame import Frame
-from slam.history import FrameHistory
+from slam.history import Entries, FrameHistory
 from slam.landmarks import Ints, Mask
 from slam.live.messages import (
     Began,
@@ -297,7 +297,7 @@ class RemoteMapper:
         landmarks.visible[:] = landmarks.found[:] = 0
         return found
 
-    def _untold_history(self) -> list[Any]:
+    def _untold_history(self) -> Entries:
         entries = self.history.since(self._told_frames)
         self._told_frames += len(entries)
         return entries

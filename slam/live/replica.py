@@ -179,7 +179,7 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
 def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
     table = world.landmarks
     table.extend_to(delta.size)
-    table.alive[:] = np.unpackbits(delta.alive, count=delta.size)
+    table.set_alive(np.unpackbits(delta.alive, count=delta.size).view(bool))
     table.points_world[table.alive] = delta.points_world
     for name, rows in delta.columns.items():
         getattr(table, name)[delta.ids] = rows

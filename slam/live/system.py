@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 import time
 from pathlib import Path
 
@@ -31,6 +32,8 @@ MAX_PENDING = 3
 FIRST_MAP_S = 5.0
 """How long the frame that begins a map may wait for its landmarks."""
 START_S = 60.0
+SWITCH_S = 0.0005
+"""How long another thread may keep Python's lock, which tracking asks for many times a frame."""
 MASKS_S = 10.0
 """How long the masks of the last keyframes are waited for at the end."""
 FINISH_S = 600.0
@@ -58,6 +61,8 @@ class LiveSystem(SlamSystem):
         self.remote.wait_until_ready(START_S)
         self.semantics = _AskedMasks(self)
         gc.freeze()  # to look through all modules would stop tracking for 0.1 s
+        self._switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
         faiss.omp_set_num_threads(1)  # a second one would wait for a core, and tracking for it
 
     def _make_mapper(self, tracker: Tracker) -> Mapper:
@@ -125,6 +130,7 @@ class LiveSystem(SlamSystem):
     def close(self) -> None:
         """End the other processes; what they knew and did not send is lost."""
         gc.unfreeze()
+        sys.setswitchinterval(self._switch_s)
         self.remote.close()
         if self.segmenter is not None:
             self.segmenter.close()

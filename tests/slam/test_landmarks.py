@@ -89,3 +89,39 @@ def test_landmarks_move_rigidly_with_their_own_host() -> None:
 def test_an_unknown_column_is_a_bug_that_shows() -> None:
     with pytest.raises(AttributeError):
         LandmarkTable().add({**columns(2), "colour_of_the_sky": np.zeros(2)})
+
+
+def test_the_looks_of_the_dead_make_room_for_others() -> None:
+    table = LandmarkTable()
+    first = table.add(columns(500))
+    table.descriptors[first] = RNG.integers(0, 1 << 60, (500, 8), dtype=np.uint64)
+    kept = table.descriptors[first[::2]]
+    rows = len(table._looks["descriptors"])
+    for _ in range(20):
+        dead = table.add(columns(200))
+        table.descriptors[dead] = 5
+        table.patch_views[dead] = 1.0
+        table.remove(dead)
+        table.descriptors[dead] = 7  # lost
+        assert (table.descriptors[dead] == 0).all()
+        assert np.isnan(table.patch_views[dead]).all()
+    table.remove(first[1::2])
+    newest = table.add(columns(300))
+    assert (table.descriptors[newest] == 0).all()
+    np.testing.assert_array_equal(table.descriptors[first[::2]], kept)
+    assert len(table) == 4800
+    assert len(table._looks["descriptors"]) <= 2 * rows
+
+
+def test_a_copy_is_told_who_lives() -> None:
+    table = LandmarkTable()
+    table.add(columns(6))
+    table.extent[np.arange(6)] = np.arange(6.0)
+    table.alive[[1, 2]] = False  # for a moment
+    table.set_alive(np.array([1, 1, 0, 1, 1, 0], bool))
+    assert table.extent[np.arange(6)].tolist() == [0, 1, 0, 3, 4, 0]
+    table.extend_to(4)  # an owner that began anew
+    table.extend_to(8)
+    table.set_alive(np.ones(8, bool))
+    assert table.extent[np.arange(8)].tolist() == [0, 1, 0, 3, 0, 0, 0, 0]
+    assert len(np.unique(table.place)) == 8

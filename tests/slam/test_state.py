@@ -195,5 +195,6 @@ def test_what_is_compared_by_contents_has_no_other_attributes(system: SlamSystem
     }
     rows = {"of_keyframe", "of_landmark", "_free", "_columns", "_slots", "_used"}
     assert vars(shadow.observations).keys() == rows
-    assert vars(table).keys() == {"_size", "_store", *table._store}
-    assert table._store.keys() - {"alive"} == table.state().keys() - {"size", "ids"}
+    columns = table._store.keys() | table._looks.keys()
+    assert vars(table).keys() == {"_size", "_store", "_looks", "_free", *columns}
+    assert columns - {"alive", "place"} == table.state().keys() - {"size", "ids"}

@@ -17,6 +17,8 @@ from slam.sequences import Sequence
 
 T = TypeVar("T")
 
+MAX_AHEAD_S = 0.1
+"""Of a longer pause in a recording no more is slept through before the next frame is read."""
 MAX_WAIT_S = 10.0
 """A longer pause in a recording is not played."""
 
@@ -85,14 +87,30 @@ class Limited:
 
 
 def paced(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """Each frame, not before its time by the stamps; the first at once."""
-    begin_s = None
-    for frame in frames:
+    """Each frame, not before its time by the stamps; the first at once.
+
+    It is read in the second half of the time until then, as a camera would deliver it, and not
+    while the frame before is tracked.
+    """
+    begin_s, last_s, interval_s = None, 0.0, 0.0
+    while True:
+        if begin_s is not None:
+            _sleep_until(begin_s + last_s + min(interval_s, MAX_AHEAD_S) / 2)
+        frame = next(frames, None)
+        if frame is None:
+            return
         now_s = time.monotonic()
         if begin_s is None or begin_s + frame.timestamp_s - now_s > MAX_WAIT_S:
             begin_s = now_s - frame.timestamp_s
-        time.sleep(max(begin_s + frame.timestamp_s - now_s, 0.0))
+        else:
+            interval_s = frame.timestamp_s - last_s
+        last_s = frame.timestamp_s
+        _sleep_until(begin_s + last_s)
         yield frame
+
+
+def _sleep_until(time_s: float) -> None:
+    time.sleep(max(time_s - time.monotonic(), 0.0))
 
 
 class Newest(Generic[T]):

@@ -6,6 +6,7 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from slam.frame import Frame
 from slam.live.live_slam import LiveSlam
 from slam.live.play import WAITING, PlayOptions, play
 from slam.live.sources import Newest
+from slam.live.sources.source import paced
 from slam.results import FrameResult
 from slam.system_config import SystemConfig
 
@@ -148,3 +150,19 @@ def test_silence_is_reported_once_and_frames_after_it_are_tracked(slam, caplog) 
     play(slam, Silent([]), PlayOptions(silence_s=0.2, quiet=True))
     assert slam.health().frames == before + 2
     assert caplog.text.count("no frame for") == 1
+
+
+def test_a_recording_is_read_late_and_given_in_time() -> None:
+    frames = [replace(FRAMES[k], timestamp_s=5.0 + 0.1 * k) for k in range(5)]
+    read_s, given_s = [], []
+
+    def reading() -> Iterator[Frame]:
+        for frame in frames:
+            read_s.append(time.monotonic())
+            yield frame
+
+    for _ in paced(reading()):
+        given_s.append(time.monotonic())
+    due_s = given_s[0] + 0.1 * np.arange(5)
+    assert (np.array(given_s) > due_s - 1e-3).all()
+    assert (np.array(read_s)[2:] > due_s[2:] - 0.051).all()  # from the third on it knows when
