@@ -37,8 +37,8 @@ from benchmarks.dense_surface import (
 from benchmarks.dense_time import ROUNDS, step_times_ms
 from graph.ply import read_ply
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
+from slam.dense_fusion import dense_config
 from slam.dense_input import MappedRun, open_run
-from slam.dense_keyframes import dense_config
 from slam.dense_options import MapOptions
 from slam.dense_run import map_run
 from slam.rendering.sequence import RenderConfig, render_sequence

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import bisect
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -24,6 +25,7 @@ from mapping.warping import View
 
 DepthSource = Literal["sensor", "both", "stereo", "motion"]
 MIN_BASELINE_M, SWEEP_VIEWS = 0.03, 2
+Mask = NDArray[np.bool_]
 WINDOW = 6
 """Keyframes on either side among which neighbours are chosen."""
 
@@ -53,7 +55,7 @@ class DenseKeyframe:
     landmark_depths_m: Array
     instances: NDArray[np.uint16] | None = None
     right: NDArray[np.uint8] | None = None
-    unmatched: NDArray[np.bool_] | None = None
+    unmatched: Mask | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,26 +101,26 @@ class _Prepared:
 
 
 class DenseMapper:
-    """Takes keyframes one after the other and gives each back, fused, once six more came.
+    """Takes keyframes one after the other and gives each back, fused, once six later ones came.
 
-    Memory is bounded: thirteen keyframes are held.
+    Memory is bounded: thirteen keyframes are held, in the order of their ids. One that comes after
+    a later one still finds its place; those that are fused by then did without it.
     """
 
     def __init__(self, camera: Camera, config: DenseConfig | None = None) -> None:
         self.camera = camera
         self.config = config or DenseConfig()
         self._held: list[_Prepared] = []
-        self._unwanted: set[int] = set()
-        self._done = 0  # of those held, counted from the oldest
+        self._wanted: set[int] = set()
 
     def push(self, keyframe: DenseKeyframe, wanted: bool = True) -> list[FusedKeyframe]:
         """Take a keyframe in; the one for which all neighbours exist by that comes back.
 
         One that is not ``wanted`` serves its neighbours only.
         """
-        self._held.append(self._prepare(keyframe))
-        if not wanted:
-            self._unwanted.add(keyframe.id)
+        bisect.insort(self._held, self._prepare(keyframe), key=lambda p: p.keyframe.id)
+        if wanted:
+            self._wanted.add(keyframe.id)
         return self._finished(len(self._held) - WINDOW)
 
     def _prepare(self, keyframe: DenseKeyframe) -> _Prepared:
@@ -156,22 +158,34 @@ class DenseMapper:
             if T is not None and T is not held.keyframe.T_world_camera:
                 self._held[k] = replace(held, keyframe=replace(held.keyframe, T_world_camera=T))
 
+    def relabel(self, keyframe_id: int, instances: NDArray[np.uint16], moves: Mask) -> None:
+        """Take over the instances (H, W) of a keyframe, and what moves in it (H, W).
+
+        For those that wait for neighbours; any other keyframe is passed over.
+        """
+        for k, held in enumerate(self._held):
+            if held.keyframe.id == keyframe_id and keyframe_id in self._wanted:
+                depth_m = np.where(moves, np.float32(np.nan), held.keyframe.depth_m)
+                told = replace(held.keyframe, instances=instances, depth_m=depth_m, unmatched=moves)
+                self._held[k] = self._prepare(told)
+
+    def forget(self, keyframe_ids: Collection[int]) -> None:
+        """Do without keyframes from here on."""
+        self._held = [p for p in self._held if p.keyframe.id not in keyframe_ids]
+        self._wanted -= set(keyframe_ids)
+
     def flush(self) -> list[FusedKeyframe]:
         """What still waits for neighbours that will not come; what follows begins anew."""
         results = self._finished(len(self._held))
-        self._held, self._done = [], 0
+        self._held = []
         return results
 
     def _finished(self, end: int) -> list[FusedKeyframe]:
         """Fuse those held up to ``end`` and let go of what nobody needs any more."""
-        wanted = [
-            k for k in range(self._done, end) if self._held[k].keyframe.id not in self._unwanted
-        ]
-        results = [self._fuse(k) for k in wanted]
-        self._done = max(self._done, end)
-        stale = max(self._done - WINDOW, 0)
-        del self._held[:stale]
-        self._done -= stale
+        ids = [p.keyframe.id for p in self._held[: max(end, 0)]]
+        results = [self._fuse(k) for k, number in enumerate(ids) if number in self._wanted]
+        self._wanted -= set(ids)
+        del self._held[: max(end - WINDOW, 0)]
         return results
 
     def _fuse(self, k: int) -> FusedKeyframe:

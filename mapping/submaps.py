@@ -79,6 +79,19 @@ def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) ->
     )
 
 
+def relabelled(
+    submap: Submap, camera: Camera, instances: NDArray[np.uint16], moves: NDArray[np.bool_]
+) -> Submap:
+    """A submap with the instances (H, W) of its keyframe, without points on what ``moves`` (H, W).
+
+    Points were made of pixels' centres, which are found again by projection.
+    """
+    columns, rows = np.rint(camera.project(submap.points.astype(float))).astype(np.int64).T
+    keep = ~moves[rows, columns]
+    arrays = {name: values[keep] for name, values in _arrays(submap).items()}
+    return Submap(submap.anchor, **arrays | {"instances": instances[rows, columns][keep]})
+
+
 def nearest_a_voxel(
     points: NDArray[np.float32], variances: NDArray[np.float32], voxel_m: float
 ) -> NDArray[np.int64]:

@@ -25,20 +25,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from graph.array_file import FileKind, read_arrays, write_arrays
+from graph.camera import Camera
 from graph.errors import InputError
 from graph.whole_file import whole_file
 from mapping.depth_files import read_fused, write_fused
 from mapping.inverse_depth import InverseDepthMap
 from mapping.labels import InstanceEvidence
-from mapping.submaps import Submap, read_submap, write_submap
+from mapping.submaps import Submap, read_submap, relabelled, write_submap
 from slam.memory import give_back_memory
 
 logger = logging.getLogger(__name__)
 
 LABEL_FILE = FileKind("keyframe labels", 2)
-PARTS = ("depth", "labels", "submaps", "moving")
+PARTS = ("depth", "labels", "moving", "submaps")
 
 
 class DenseFolder:
@@ -92,6 +95,31 @@ class DenseFolder:
         write_arrays(self._file("labels", submap.anchor), LABEL_FILE, {}, vars(evidence))
         write_submap(self._file("submaps", submap.anchor), submap)
         give_back_memory()
+
+    def relabel(
+        self,
+        keyframe_id: int,
+        camera: Camera,
+        shown: tuple[NDArray[np.uint16], NDArray[np.bool_]],
+        evidence: InstanceEvidence,
+    ) -> None:
+        """Give a finished keyframe its instances (H, W), without what moves in it (H, W).
+
+        Raises:
+            InputError: it cannot be written; what was there stays.
+        """
+        instances, moves = shown
+        told = relabelled(self.submap(keyframe_id), camera, instances, moves)
+        if moves.any():
+            still = self.fused(keyframe_id).where(torch.from_numpy(~moves))
+            write_fused(self._file("depth", keyframe_id), still)
+        write_arrays(self._file("labels", keyframe_id), LABEL_FILE, {}, vars(evidence))
+        write_submap(self._file("submaps", keyframe_id), told)
+
+    def remove(self, keyframe_id: int) -> None:
+        """Without a keyframe, whatever is there of it; its submap goes first."""
+        for kind in reversed(PARTS):
+            self._file(kind, keyframe_id).unlink(missing_ok=True)
 
     def write_moving(self, submap: Submap) -> None:
         """Save what moves in a keyframe. Raises InputError if it cannot."""

@@ -49,7 +49,7 @@ def dense_follower(system: System, sequence: Sequence, run: Path) -> Callable[[F
     segmenter = system.semantics.segmenter = LastSegmentation(system.semantics.segmenter)
     masks = system.config.semantics.segmenter
     world = system.mapper.world
-    mapped = MappedRun(run, world, [], sequence.camera, sequence)
+    mapped = MappedRun(run, world, [], sequence.camera, sequence=sequence)
     work = KeyframeWork(assembled(mapped, segmenter, MapOptions(run, masks=masks)))
 
     def follow(result: FrameResult) -> None:

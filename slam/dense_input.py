@@ -19,6 +19,7 @@ from mapping.dense import DenseKeyframe, DepthSource
 from semantics.label_store import LabelStore
 from semantics.labels import LabelSet, label_set
 from slam.configuration import resolve
+from slam.dense_view import SeenKeyframe, seen
 from slam.frame import Frame
 from slam.landmarks import Ints, Mask
 from slam.map_file import read_map
@@ -36,26 +37,22 @@ _ORIGIN = re.compile(r"^# .*?, sequence (?P<path>.+), stride \d+$")
 
 
 @dataclass(frozen=True, eq=False)
-class MappedRun:
-    """A run folder and its sequence.
+class SavedMap:
+    """The map of a run folder.
 
     Attributes:
         path: the run folder.
         world: its map.
         keyframes: those of its largest segment, oldest first.
         camera: whose distortion is taken out of what ``load`` returns.
-        sequence: the images.
         labels: what it knows of its landmarks' classes; None if it had no segmenter.
-        right: the right images, if depth comes from stereo pairs.
     """
 
     path: Path
     world: WorldMap
     keyframes: list[Keyframe]
     camera: Camera
-    sequence: Sequence
     labels: RunLabels | None = None
-    right: RightImages | None = None
 
     def poses(self) -> dict[int, Array]:
         """T_world_camera of every keyframe by its id, as it is at this moment."""
@@ -69,6 +66,19 @@ class MappedRun:
         heirs = self.world.landmarks.current(ids)
         store = self.labels.store
         return store.probabilities(heirs), store.estimates(heirs).views > 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MappedRun(SavedMap):
+    """A run folder and its sequence.
+
+    Attributes:
+        sequence: the images.
+        right: the right images, if depth comes from stereo pairs.
+    """
+
+    sequence: Sequence
+    right: RightImages | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +97,19 @@ def open_run(path: Path, sequence: Path | None = None) -> MappedRun:
     """
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; give the folder of a finished run")
+    saved = read_saved_map(path)
+    folder = sequence or _recorded_sequence(path / "config.yaml")
+    opened = open_sequence(folder, camera=saved.camera)
+    return MappedRun(**vars(saved), sequence=opened)
+
+
+def read_saved_map(path: Path) -> SavedMap:
+    """The map of a run folder, without its images. Raises InputError if there is none."""
     state, camera = read_map(path)
     world = world_of(part(state, "mapper.world"))
-    folder = sequence or _recorded_sequence(path / "config.yaml")
     keyframes = world.in_segment(world.largest_segment())
     labels = _labels(part(state, "semantics"), path / "config.yaml")
-    return MappedRun(path, world, keyframes, camera, open_sequence(folder, camera=camera), labels)
+    return SavedMap(path, world, keyframes, camera, labels)
 
 
 def run_semantics(config: Path) -> SemanticsConfig:
@@ -126,36 +143,53 @@ def _recorded_sequence(config: Path) -> Path:
 
 def load(
     run: MappedRun, keyframe: Keyframe, source: DepthSource = "sensor"
-) -> tuple[DenseKeyframe, NDArray[np.uint8]]:
-    """A keyframe with its images, undistorted, and its colour image as it was taken.
+) -> tuple[DenseKeyframe, SeenKeyframe]:
+    """A keyframe with its images, undistorted, and what it was made of.
 
     Raises:
         InputError: a pose that is not finite, no landmarks, an image that cannot be read or is
             not the keyframe's, or none of what the source of depth needs: this keyframe cannot be
             mapped.
     """
-    name = f"keyframe {keyframe.id}"
-    if not np.isfinite(keyframe.T_world_camera).all():
+    whole = seen(run.world, keyframe, run.sequence.load(frame_index(run, keyframe)))
+    dense = dense_keyframe(whole, run.camera, source)
+    return replace(dense, right=_right(run, keyframe, source)), whole
+
+
+def dense_keyframe(
+    whole: SeenKeyframe, camera: Camera, source: DepthSource = "sensor"
+) -> DenseKeyframe:
+    """A keyframe with undistorted images. Raises InputError if it cannot be mapped, as ``load``."""
+    name = f"keyframe {whole.id}"
+    if not np.isfinite(whole.T_world_camera).all():
         raise InputError(f"{name}: its pose is not finite; run the sequence again")
-    _, landmark_ids = run.world.observed(keyframe)
-    if len(landmark_ids) == 0:
+    if len(whole.landmark_ids) == 0:
         raise InputError(f"{name}: it observes no landmark, so its place is not known")
-    if not 0 <= keyframe.frame_index < len(run.sequence):
-        raise InputError(f"{name}: frame {keyframe.frame_index} is not in {run.sequence.folder}")
-    frame = run.sequence.load(keyframe.frame_index)
-    if abs(frame.timestamp_s - keyframe.timestamp_s) > MAX_STAMP_ERROR_S:
-        raise InputError(
-            f"{name}: frame {keyframe.frame_index} of {run.sequence.folder} is of "
-            f"{frame.timestamp_s:.6f} s, not {keyframe.timestamp_s:.6f} s; give its own --sequence"
-        )
-    if source in ("sensor", "both") and np.isfinite(frame.depth_m).mean() < MIN_DEPTH_SHARE:
-        raise InputError(f"{name}: frame {keyframe.frame_index} has no valid depth")
-    rgb, depth_m = undistorted(frame, run.camera)
-    points = run.world.landmarks.points_world[landmark_ids]
-    depths_m = transform(inverse(keyframe.T_world_camera), points)[:, 2]
-    T = keyframe.T_world_camera
-    dense = DenseKeyframe(keyframe.id, T, rgb, depth_m, landmark_ids, depths_m)
-    return replace(dense, right=_right(run, keyframe, source)), frame.rgb
+    if source in ("sensor", "both") and np.isfinite(whole.frame.depth_m).mean() < MIN_DEPTH_SHARE:
+        raise InputError(f"{name}: frame {whole.frame.index} has no valid depth")
+    rgb, depth_m = undistorted(whole.frame, camera)
+    depths_m = transform(inverse(whole.T_world_camera), whole.points_world)[:, 2]
+    return DenseKeyframe(whole.id, whole.T_world_camera, rgb, depth_m, whole.landmark_ids, depths_m)
+
+
+def frame_index(run: MappedRun, keyframe: Keyframe) -> int:
+    """Where in the sequence a keyframe's images are, by its stamp.
+
+    A live run counts the frames that it tracked, not those of the sequence.
+
+    Raises:
+        InputError: the sequence has no such frame.
+    """
+    stamps_s, index = run.sequence.timestamps_s, keyframe.frame_index
+    nearest = int(np.abs(stamps_s - keyframe.timestamp_s).argmin())
+    if abs(stamps_s[nearest] - keyframe.timestamp_s) <= MAX_STAMP_ERROR_S:
+        return nearest
+    if not 0 <= index < len(run.sequence):
+        raise InputError(f"keyframe {keyframe.id}: frame {index} is not in {run.sequence.folder}")
+    raise InputError(
+        f"keyframe {keyframe.id}: frame {index} of {run.sequence.folder} is of "
+        f"{stamps_s[index]:.6f} s, not {keyframe.timestamp_s:.6f} s; give its own --sequence"
+    )
 
 
 def _right(run: MappedRun, keyframe: Keyframe, source: DepthSource) -> NDArray[np.uint8] | None:
@@ -163,7 +197,7 @@ def _right(run: MappedRun, keyframe: Keyframe, source: DepthSource) -> NDArray[n
     if run.right is None or source == "motion":
         return None
     try:
-        return run.right.load(keyframe.frame_index)
+        return run.right.load(frame_index(run, keyframe))
     except InputError as error:
         if source == "stereo":
             raise InputError(f"keyframe {keyframe.id}: {error}") from error
@@ -173,7 +207,8 @@ def _right(run: MappedRun, keyframe: Keyframe, source: DepthSource) -> NDArray[n
 
 def image_name(run: MappedRun, keyframe: Keyframe) -> str:
     """The name of a keyframe's colour image relative to its sequence."""
-    file, folder = run.sequence.pairs.rgb_files[keyframe.frame_index], run.sequence.folder
+    folder = run.sequence.folder
+    file = run.sequence.pairs.rgb_files[frame_index(run, keyframe)]
     return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,18 +12,14 @@ from numpy.typing import NDArray
 
 from graph.errors import InputError
 from mapping.dense import WINDOW, DepthSource
+from semantics.labels import LabelSet
 from semantics.movability import read_priors
 from semantics.segmenter import Segmenter
 from semantics.segmenter_table import make_segmenter
 from slam.dense_folder import DenseFolder
+from slam.dense_fusion import FusionCounts, dense_config
 from slam.dense_input import MappedRun, open_run, run_semantics
-from slam.dense_keyframes import (
-    FusionCounts,
-    KeyframeWork,
-    OpenMap,
-    dense_config,
-    run_began,
-)
+from slam.dense_keyframes import KeyframeWork, OpenMap
 from slam.dense_options import MapOptions
 from slam.right_images import RIGHT_LIST, read_right_images
 from slam.world_map import Keyframe
@@ -47,22 +44,28 @@ def open_map(options: MapOptions) -> OpenMap:
 
 def assembled(run: MappedRun, segmenter: Segmenter, options: MapOptions) -> OpenMap:
     """The same for options in which ``masks`` are named already."""
+    options = settled(options, segmenter.labels)
+    run = _with_pairs(run, options.source)
+    settings = folder_settings(options, segmenter.labels)
+    if options.source != "sensor":
+        settings["stereo_bf"] = None if run.right is None else run.camera.stereo_bf_px_m
+    return OpenMap(run, segmenter, DenseFolder(run.path, settings), options)
+
+
+def settled(options: MapOptions, labels: LabelSet) -> MapOptions:
+    """The options with the classes that are left out, checked. Raises InputError."""
     if not 0.001 <= options.voxel_m <= 1:
         raise InputError(f"voxel {options.voxel_m} m: must be between 0.001 and 1")
     without = options.without
     if without is None:
-        priors = read_priors("movability").of(segmenter.labels)
+        priors = read_priors("movability").of(labels)
         moving = np.flatnonzero(priors > LIKELY_MOVING).tolist()
-        without = tuple(segmenter.labels.names[k] for k in moving)
+        without = tuple(labels.names[k] for k in moving)
     for name in without:
-        if segmenter.labels.number(name) == 0:
-            known = ", ".join(segmenter.labels.names[1:]) or "none, give --segmenter or --masks"
+        if labels.number(name) == 0:
+            known = ", ".join(labels.names[1:]) or "none, give --segmenter or --masks"
             raise InputError(f"--without {name!r}: no such class; there are: {known}")
-    options, run = dataclasses.replace(options, without=without), _with_pairs(run, options.source)
-    settings = _settings(options, segmenter)
-    if options.source != "sensor":
-        settings["stereo_bf"] = None if run.right is None else run.camera.stereo_bf_px_m
-    return OpenMap(run, segmenter, DenseFolder(run.path, settings), options)
+    return dataclasses.replace(options, without=without)
 
 
 def _with_pairs(run: MappedRun, source: DepthSource) -> MappedRun:
@@ -74,18 +77,28 @@ def _with_pairs(run: MappedRun, source: DepthSource) -> MappedRun:
     return dataclasses.replace(run, camera=right.camera, right=right)
 
 
-def _settings(options: MapOptions, segmenter: Segmenter) -> dict[str, Any]:
+def folder_settings(options: MapOptions, labels: LabelSet) -> dict[str, Any]:
+    """What a dense map is made with, as its folder keeps it; of ``settled`` options."""
     return {
         "method": METHOD,
-        "run": run_began(options.run),
+        "run": _run_began(options.run),
         "voxel_m": options.voxel_m,
         "masks": None if options.masks is None else options.masks.described(),
         "source": options.source,
         "without": list(options.without or ()),
         "moving": options.moving,
-        "labels": list(segmenter.labels.names),
+        "labels": list(labels.names),
         "noise": dataclasses.asdict(dense_config(options).noise),
     }
+
+
+def _run_began(run: Path) -> str:
+    """When a run was begun, by its log: what an overwritten run left is of no use."""
+    path = run / "log.txt"
+    if not path.is_file():
+        return ""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return file.readline().strip()
 
 
 def fuse_run(opened: OpenMap, progress: Progress = lambda done, total: None) -> FusionCounts:

@@ -22,9 +22,11 @@ from mapping.floor_plan import FloorPlan, plan_frame
 from mapping.mesh import View, sampled, truncation_voxels, tsdf_mesh, write_mesh
 from mapping.object_clouds import ObjectClouds, ObjectRegion
 from mapping.pictures import Picture, palette, with_legend
+from semantics.labels import LabelSet
 from slam.dense_folder import DenseFolder
-from slam.dense_input import MappedRun, load
+from slam.dense_input import MappedRun, SavedMap, load
 from slam.dense_keyframes import OpenMap
+from slam.dense_options import MapOptions
 from slam.semantic_files import OBJECTS, read_objects
 from slam.world_map import Keyframe
 
@@ -48,15 +50,34 @@ class Products:
     label_shares: dict[str, float]
 
 
-def finished(run: MappedRun, folder: DenseFolder) -> list[Keyframe]:
+@dataclass(frozen=True, eq=False)
+class FusedMap:
+    """A dense map whose keyframes are fused.
+
+    Attributes:
+        run: what of. labels: of its instances. folder: where it is. options: as made.
+    """
+
+    run: SavedMap
+    labels: LabelSet
+    folder: DenseFolder
+    options: MapOptions
+
+    @classmethod
+    def of(cls, opened: OpenMap) -> FusedMap:
+        """The same of a map that was being made."""
+        return cls(opened.run, opened.segmenter.labels, opened.folder, opened.options)
+
+
+def finished(run: SavedMap, folder: DenseFolder) -> list[Keyframe]:
     """The keyframes that have a submap."""
     return [k for k in run.keyframes if folder.is_done(k.id)]
 
 
-def write_clouds(opened: OpenMap) -> Products:
+def write_clouds(opened: FusedMap) -> Products:
     """Write the coloured and the semantic cloud and what is drawn of them, in one pass a cloud."""
     run, folder, voxel_m = opened.run, opened.folder, opened.options.voxel_m
-    names, keyframes = opened.segmenter.labels.names, finished(run, folder)
+    names, keyframes = opened.labels.names, finished(run, folder)
     with tempfile.TemporaryDirectory(dir=folder.path, prefix=".blocks-") as temporary:
         table, first = likelihood_table(opened, keyframes)
         rows = zip(keyframes, first.tolist(), strict=True)
@@ -80,7 +101,7 @@ def write_clouds(opened: OpenMap) -> Products:
 
 
 def _write_blocks(
-    opened: OpenMap, blocks: Iterable[Cloud], gallery: _Gallery, floor: FloorPlan | None
+    opened: FusedMap, blocks: Iterable[Cloud], gallery: _Gallery, floor: FloorPlan | None
 ) -> list[Path]:
     """Give each block to all that want it."""
     path = opened.folder.path
@@ -101,7 +122,7 @@ def _write_blocks(
 
 
 def _write_moving(
-    opened: OpenMap,
+    opened: FusedMap,
     keyframes: list[Keyframe],
     labels: tuple[NDArray[np.float32], NDArray[np.int64]],
     temporary: Path,
@@ -162,7 +183,7 @@ class _Gallery:
 
 
 def likelihood_table(
-    opened: OpenMap, keyframes: list[Keyframe]
+    opened: FusedMap, keyframes: list[Keyframe]
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """All instances' log likelihoods (I, C), and the first row (K,) of each keyframe in it.
 
@@ -172,17 +193,17 @@ def likelihood_table(
     rows = []
     for keyframe in keyframes:
         evidence = opened.folder.evidence(keyframe.id)
-        told = opened.run.believed(evidence.landmark_ids, opened.segmenter.labels)
+        told = opened.run.believed(evidence.landmark_ids, opened.labels)
         rows.append(evidence.with_landmarks(*told))
     first = np.cumsum([0, *(len(r) for r in rows)], dtype=np.int64)[:-1]
     return np.concatenate(rows), first
 
 
-def _regions(opened: OpenMap) -> list[ObjectRegion]:
+def _regions(opened: FusedMap) -> list[ObjectRegion]:
     """The objects that the run found, if it had a segmenter with the same labels."""
     if not (opened.run.path / OBJECTS).is_file():
         return []
-    number = opened.segmenter.labels.number
+    number = opened.labels.number
     return [
         ObjectRegion(f"{o.id:04d}-{o.label.replace(' ', '_')}", number(o.label), o.box)
         for o in read_objects(opened.run.path)[1]
@@ -199,7 +220,7 @@ def _floor_plan(blocks: Iterator[Cloud], keyframes: list[Keyframe], classes: int
     return FloorPlan(plan_frame(whole, guess, PLAN_CELL_M), classes)
 
 
-def _viewpoints(run: MappedRun, keyframes: list[Keyframe]) -> dict[str, tuple[Camera, Array]]:
+def _viewpoints(run: SavedMap, keyframes: list[Keyframe]) -> dict[str, tuple[Camera, Array]]:
     """Two keyframes' views, and one from behind and above the path."""
     camera = run.camera
     chosen = {

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.dense_keyframes import FusionCounts
+from slam.dense_folder import DenseFolder
+from slam.dense_fusion import FusionCounts
 from slam.dense_mapping import Progress, fuse_run, open_map
 from slam.dense_options import MapOptions
-from slam.dense_products import Products, write_clouds, write_dense_mesh
+from slam.dense_products import FusedMap, Products, write_clouds, write_dense_mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +42,17 @@ def map_run(options: MapOptions, progress: Progress = lambda done, total: None) 
     opened = open_map(options)
     counts = fuse_run(opened, progress)
     started_s = time.perf_counter()
-    products = write_clouds(opened)
+    products = write_clouds(FusedMap.of(opened))
     if options.mesh:
         products.files.extend(write_dense_mesh(opened.run, opened.folder, options.voxel_m))
-    folder = opened.folder
-    summary = MapSummary(folder.path, counts, products, time.perf_counter() - started_s)
-    folder.write_text("dense.json", json.dumps(_rows(summary), indent=1) + "\n")
+    summary = MapSummary(opened.folder.path, counts, products, time.perf_counter() - started_s)
+    write_summary(opened.folder, summary)
     return summary
+
+
+def write_summary(folder: DenseFolder, summary: MapSummary) -> None:
+    """Write dense.json."""
+    folder.write_text("dense.json", json.dumps(_rows(summary), indent=1) + "\n")
 
 
 def _rows(summary: MapSummary) -> dict[str, object]:

@@ -1,0 +1,185 @@
+"""Labelled keyframes through the fusion into the folder of a dense map."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.camera import Camera
+from graph.geometry import Array
+from mapping.dense import DenseConfig, DenseKeyframe, DenseMapper, FusedKeyframe, Mask
+from mapping.inverse_depth import DepthNoise, from_sensor
+from mapping.labels import InstanceEvidence, KeyframeLabels, keyframe_labels, widened
+from mapping.submaps import Submap, make_submap
+from semantics.instances import Instance
+from semantics.labels import LabelSet
+from slam.configuration import resolve
+from slam.dense_folder import DenseFolder
+from slam.dense_input import undistorted_labels
+from slam.dense_options import MapOptions
+from slam.dense_view import SeenKeyframe
+from slam.features import FeatureConfig
+
+
+@dataclass(eq=False)
+class FusionCounts:
+    """What became of the keyframes.
+
+    Attributes:
+        fused: in this call.
+        reused: finished before.
+        left_out: by id, why.
+        fuse_ms: of each that was fused, Steps 1 to 6 without reading and writing files.
+    """
+
+    fused: int = 0
+    reused: int = 0
+    left_out: dict[int, str] = field(default_factory=dict)
+    fuse_ms: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledKeyframe:
+    """A keyframe and what its masks say.
+
+    Attributes:
+        dense: with its instances.
+        segment: map segment.
+        moving: (H, W) pixels of instances that are left out of the map, since they move.
+        evidence: of the classes of its instances.
+    """
+
+    dense: DenseKeyframe
+    segment: int
+    moving: Mask
+    evidence: InstanceEvidence
+
+
+def dense_config(options: MapOptions) -> DenseConfig:
+    """The configuration of the fusion, with the run's own model of its depth sensor."""
+    features = resolve(FeatureConfig, options.run / "config.yaml", section="features")
+    noise = DepthNoise(
+        disparity_sigma_px=features.disparity_sigma_px, max_depth_m=features.max_depth_m
+    )
+    return DenseConfig(noise=noise, source=options.source, device=options.device)
+
+
+class KeyframeFusion:
+    """Takes keyframes in and saves each one's submap once its neighbours came.
+
+    Attributes:
+        counts: what became of them.
+    """
+
+    def __init__(
+        self, camera: Camera, labels: LabelSet, folder: DenseFolder, options: MapOptions
+    ) -> None:
+        """For options that name the classes that are left out."""
+        self.counts = FusionCounts()
+        self._camera, self._folder, self._options = camera, folder, options
+        self._classes = len(labels)
+        self._moving = [labels.number(name) for name in options.without or ()]
+        self._mapper = DenseMapper(camera, dense_config(options))
+        self._evidence: dict[int, InstanceEvidence] = {}
+        self._segment: int | None = None
+
+    def labelled(
+        self, dense: DenseKeyframe, whole: SeenKeyframe, instances: Sequence[Instance]
+    ) -> LabelledKeyframe:
+        """A keyframe with the instances of its image as it was taken."""
+        labels = keyframe_labels(instances, whole.frame.rgb.shape[:2], self._classes)
+        evidence = _evidence(whole, labels)
+        numbers = undistorted_labels(labels.numbers, self._camera)
+        moving = [k for k, found in enumerate(instances, 1) if found.label in self._moving]
+        dense = replace(dense, instances=numbers)
+        return LabelledKeyframe(dense, whole.segment, np.isin(numbers, moving), evidence)
+
+    def take(self, keyframe: LabelledKeyframe, poses: Mapping[int, Array]) -> list[Submap]:
+        """Take a keyframe in; what its arrival finishes, saved.
+
+        Keyframes of different map segments have no frame in common and are not fused.
+        ``poses`` are the T_world_camera (4, 4) of keyframes by id as they are at this moment.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        before = self.finish() if keyframe.segment != self._segment else []
+        self._segment = keyframe.segment
+        dense, moving, folder = keyframe.dense, keyframe.moving, self._folder
+        wanted = not folder.is_done(dense.id)
+        self.counts.reused += not wanted
+        self._evidence[dense.id] = keyframe.evidence
+        if wanted and self._options.moving and moving.any():
+            apart = self._unfused(dense, moving)
+            folder.write_moving(make_submap(apart, self._mapper.camera, self._options.voxel_m))
+        moves = widened(moving)
+        still_m = np.where(moves, np.float32(np.nan), dense.depth_m)
+        still = replace(dense, depth_m=still_m, unmatched=moves)
+        self._mapper.move(poses)
+        started_s = time.perf_counter()
+        return before + self._save(self._mapper.push(still, wanted), started_s)
+
+    def move(self, poses: Mapping[int, Array]) -> None:
+        """Take over the poses of keyframes that wait, as optimised since."""
+        self._mapper.move(poses)
+
+    def relabel(self, keyframe: LabelledKeyframe) -> None:
+        """Take over a keyframe's masks that come late, whether it waits or is saved.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        number, moves = keyframe.dense.id, widened(keyframe.moving)
+        numbers = keyframe.dense.instances
+        assert numbers is not None
+        if self._folder.is_done(number):
+            self._folder.relabel(number, self._mapper.camera, (numbers, moves), keyframe.evidence)
+        elif number in self._evidence:
+            self._evidence[number] = keyframe.evidence
+            self._mapper.relabel(number, numbers, moves)
+
+    def forget(self, keyframe_ids: Collection[int]) -> None:
+        """Keyframes left the map: so do their submaps."""
+        self._mapper.forget(keyframe_ids)
+        for number in keyframe_ids:
+            self._evidence.pop(number, None)
+            self._folder.remove(number)
+
+    def finish(self) -> list[Submap]:
+        """Save what still waits. Raises InputError if the disk is full."""
+        started_s = time.perf_counter()
+        return self._save(self._mapper.flush(), started_s)
+
+    def _unfused(self, dense: DenseKeyframe, where: Mask) -> FusedKeyframe:
+        """What the sensor alone says of some pixels."""
+        depth_m = np.where(where, dense.depth_m, np.float32(np.nan))
+        measured = from_sensor(depth_m, self._mapper.camera, self._mapper.config.noise)
+        return FusedKeyframe(dense, measured, where.astype(np.uint8))
+
+    def _save(self, finished: Sequence[FusedKeyframe], started_s: float) -> list[Submap]:
+        voxel_m, folder = self._options.voxel_m, self._folder
+        submaps = [make_submap(r, self._mapper.camera, voxel_m) for r in finished]
+        elapsed_ms = 1e3 * (time.perf_counter() - started_s)
+        for result, submap in zip(finished, submaps, strict=True):
+            folder.write(submap, result.map, self._evidence[submap.anchor])
+            self.counts.fused += 1
+            self.counts.fuse_ms.append(elapsed_ms / len(finished))
+        for keyframe_id in [i for i in self._evidence if folder.is_done(i)]:
+            del self._evidence[keyframe_id]
+        return submaps
+
+
+def _evidence(whole: SeenKeyframe, labels: KeyframeLabels) -> InstanceEvidence:
+    """What the masks say, and the landmarks on them."""
+    columns, lines = np.rint(whole.pixels).astype(np.int64).T
+    height, width = labels.numbers.shape
+    numbers: NDArray[np.uint16] = labels.numbers[
+        lines.clip(0, height - 1), columns.clip(0, width - 1)
+    ]
+    return InstanceEvidence(
+        labels.log_likelihoods, whole.landmark_ids[numbers > 0], numbers[numbers > 0]
+    )
