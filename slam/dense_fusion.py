@@ -1,4 +1,4 @@
-"""Labelled keyframes through the fusion into the folder of a dense map."""
+"""Keyframes and their masks through the fusion into the folder of a dense map."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graph.camera import Camera
 from graph.geometry import Array
 from mapping.dense import DenseConfig, DenseKeyframe, DenseMapper, FusedKeyframe, Mask
 from mapping.inverse_depth import DepthNoise, from_sensor
-from mapping.labels import InstanceEvidence, KeyframeLabels, keyframe_labels, widened
+from mapping.labels import InstanceEvidence, keyframe_labels, widened
 from mapping.submaps import Submap, make_submap
 from semantics.instances import Instance
 from semantics.labels import LabelSet
@@ -21,8 +21,8 @@ from slam.configuration import resolve
 from slam.dense_folder import DenseFolder
 from slam.dense_input import undistorted_labels
 from slam.dense_options import MapOptions
-from slam.dense_view import SeenKeyframe
 from slam.features import FeatureConfig
+from slam.landmarks import Ints
 
 
 @dataclass(eq=False)
@@ -43,18 +43,16 @@ class FusionCounts:
 
 
 @dataclass(frozen=True, eq=False)
-class LabelledKeyframe:
-    """A keyframe and what its masks say.
+class ShownInstances:
+    """What a keyframe's masks say.
 
     Attributes:
-        dense: with its instances.
-        segment: map segment.
+        numbers: (H, W) uint16, the instance of each undistorted pixel, from 1; 0 for none.
         moving: (H, W) pixels of instances that are left out of the map, since they move.
-        evidence: of the classes of its instances.
+        evidence: of the classes of the instances.
     """
 
-    dense: DenseKeyframe
-    segment: int
+    numbers: NDArray[np.uint16]
     moving: Mask
     evidence: InstanceEvidence
 
@@ -87,18 +85,25 @@ class KeyframeFusion:
         self._evidence: dict[int, InstanceEvidence] = {}
         self._segment: int | None = None
 
-    def labelled(
-        self, dense: DenseKeyframe, whole: SeenKeyframe, instances: Sequence[Instance]
-    ) -> LabelledKeyframe:
-        """A keyframe with the instances of its image as it was taken."""
-        labels = keyframe_labels(instances, whole.frame.rgb.shape[:2], self._classes)
-        evidence = _evidence(whole, labels)
+    def read(
+        self, instances: Sequence[Instance], landmark_ids: Ints, pixels: Array
+    ) -> ShownInstances:
+        """The instances of an image as it was taken, and which landmarks (L,) are on them.
+
+        ``pixels`` (L, 2) are where those were detected.
+        """
+        shape = self._camera.height, self._camera.width
+        labels = keyframe_labels(instances, shape, self._classes)
+        columns, lines = np.rint(pixels).astype(np.int64).T
+        on = labels.numbers[lines.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)]
+        evidence = InstanceEvidence(labels.log_likelihoods, landmark_ids[on > 0], on[on > 0])
         numbers = undistorted_labels(labels.numbers, self._camera)
         moving = [k for k, found in enumerate(instances, 1) if found.label in self._moving]
-        dense = replace(dense, instances=numbers)
-        return LabelledKeyframe(dense, whole.segment, np.isin(numbers, moving), evidence)
+        return ShownInstances(numbers, np.isin(numbers, moving), evidence)
 
-    def take(self, keyframe: LabelledKeyframe, poses: Mapping[int, Array]) -> list[Submap]:
+    def take(
+        self, dense: DenseKeyframe, segment: int, shown: ShownInstances, poses: Mapping[int, Array]
+    ) -> list[Submap]:
         """Take a keyframe in; what its arrival finishes, saved.
 
         Keyframes of different map segments have no frame in common and are not fused.
@@ -107,12 +112,14 @@ class KeyframeFusion:
         Raises:
             InputError: the disk is full.
         """
-        before = self.finish() if keyframe.segment != self._segment else []
-        self._segment = keyframe.segment
-        dense, moving, folder = keyframe.dense, keyframe.moving, self._folder
+        before = self.finish() if segment != self._segment else []
+        self._segment = segment
+        folder, moving = self._folder, shown.moving
         wanted = not folder.is_done(dense.id)
         self.counts.reused += not wanted
-        self._evidence[dense.id] = keyframe.evidence
+        if wanted:
+            self._evidence[dense.id] = shown.evidence
+        dense = replace(dense, instances=shown.numbers)
         if wanted and self._options.moving and moving.any():
             apart = self._unfused(dense, moving)
             folder.write_moving(make_submap(apart, self._mapper.camera, self._options.voxel_m))
@@ -127,20 +134,19 @@ class KeyframeFusion:
         """Take over the poses of keyframes that wait, as optimised since."""
         self._mapper.move(poses)
 
-    def relabel(self, keyframe: LabelledKeyframe) -> None:
+    def relabel(self, keyframe_id: int, shown: ShownInstances) -> None:
         """Take over a keyframe's masks that come late, whether it waits or is saved.
 
         Raises:
             InputError: the disk is full.
         """
-        number, moves = keyframe.dense.id, widened(keyframe.moving)
-        numbers = keyframe.dense.instances
-        assert numbers is not None
-        if self._folder.is_done(number):
-            self._folder.relabel(number, self._mapper.camera, (numbers, moves), keyframe.evidence)
-        elif number in self._evidence:
-            self._evidence[number] = keyframe.evidence
-            self._mapper.relabel(number, numbers, moves)
+        moves = widened(shown.moving)
+        if self._folder.is_done(keyframe_id):
+            about = (shown.numbers, moves)
+            self._folder.relabel(keyframe_id, self._mapper.camera, about, shown.evidence)
+        elif keyframe_id in self._evidence:
+            self._evidence[keyframe_id] = shown.evidence
+            self._mapper.relabel(keyframe_id, shown.numbers, moves)
 
     def forget(self, keyframe_ids: Collection[int]) -> None:
         """Keyframes left the map: so do their submaps."""
@@ -165,21 +171,7 @@ class KeyframeFusion:
         submaps = [make_submap(r, self._mapper.camera, voxel_m) for r in finished]
         elapsed_ms = 1e3 * (time.perf_counter() - started_s)
         for result, submap in zip(finished, submaps, strict=True):
-            folder.write(submap, result.map, self._evidence[submap.anchor])
+            folder.write(submap, result.map, self._evidence.pop(submap.anchor))
             self.counts.fused += 1
             self.counts.fuse_ms.append(elapsed_ms / len(finished))
-        for keyframe_id in [i for i in self._evidence if folder.is_done(i)]:
-            del self._evidence[keyframe_id]
         return submaps
-
-
-def _evidence(whole: SeenKeyframe, labels: KeyframeLabels) -> InstanceEvidence:
-    """What the masks say, and the landmarks on them."""
-    columns, lines = np.rint(whole.pixels).astype(np.int64).T
-    height, width = labels.numbers.shape
-    numbers: NDArray[np.uint16] = labels.numbers[
-        lines.clip(0, height - 1), columns.clip(0, width - 1)
-    ]
-    return InstanceEvidence(
-        labels.log_likelihoods, whole.landmark_ids[numbers > 0], numbers[numbers > 0]
-    )

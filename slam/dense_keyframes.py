@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from graph.errors import InputError
 from semantics.segmenter import Segmenter
 from slam.dense_folder import DenseFolder
-from slam.dense_fusion import FusionCounts, KeyframeFusion, LabelledKeyframe
+from slam.dense_fusion import FusionCounts, KeyframeFusion
 from slam.dense_input import MappedRun, image_name, load
 from slam.dense_options import MapOptions
 from slam.world_map import Keyframe
@@ -52,21 +52,17 @@ class KeyframeWork:
         Raises:
             InputError: the disk is full.
         """
+        run, segmenter = self._opened.run, self._opened.segmenter
         try:
-            labelled = self._labelled(keyframe)
+            dense, whole = load(run, keyframe, self._opened.options.source)
+            instances = segmenter.segment(whole.frame.rgb, image_name(run, keyframe))
         except InputError as error:
             logger.warning("%s; left out", error)
             self.counts.left_out[keyframe.id] = str(error)
             return
-        self._fusion.take(labelled, self._opened.run.poses())
+        shown = self._fusion.read(instances, whole.landmark_ids, whole.pixels)
+        self._fusion.take(dense, whole.segment, shown, run.poses())
 
     def finish(self) -> None:
         """Save what still waits. Raises InputError if the disk is full."""
         self._fusion.finish()
-
-    def _labelled(self, keyframe: Keyframe) -> LabelledKeyframe:
-        """The keyframe with its instances."""
-        run, segmenter = self._opened.run, self._opened.segmenter
-        dense, whole = load(run, keyframe, self._opened.options.source)
-        instances = segmenter.segment(whole.frame.rgb, image_name(run, keyframe))
-        return self._fusion.labelled(dense, whole, instances)

@@ -19,8 +19,8 @@ _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # 
 
 TEXT = "track a source of frames as they come"
 MORE = """\
-Tracking is here; the map, its graph and loops, and segmentation have processes of their own. The
-run folder is that of `run`, with health.json, which is rewritten every second."""
+Tracking is here; the map with its graph and loops, segmentation and the dense map have processes
+of their own. The run folder is that of `run`, with health.json, which is rewritten every second."""
 
 SOURCE_HELP = """\
 folder in TUM layout, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the RealSense that is
@@ -44,6 +44,7 @@ def add_live(commands: _Commands) -> None:
     parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
     parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
+    parser.add_argument("--map", action="store_true", help="also a dense map, as by bmask-slam map")
     add_segmenter_arguments(parser, "light")
     parser.add_argument("--view", action="store_true", help="show it in Rerun's window")
     add_view_arguments(parser)
@@ -89,6 +90,7 @@ def _live(arguments: argparse.Namespace) -> int:
     from slam.evaluation import format_table
     from slam.live.live_slam import LiveOptions, LiveSlam
     from slam.live.play import PlayOptions, play
+    from slam.live.sources.bags import is_bag
     from slam.live.sources.opening import open_source
     from slam.progress import console_log
     from slam.run_folder import free_run_path
@@ -104,10 +106,16 @@ def _live(arguments: argparse.Namespace) -> int:
     ):
         out = arguments.out or free_run_path(f"{source.name}-live")
         folder = Path(arguments.source)
-        images = folder if folder.is_dir() else Path()
+        images = folder if folder.is_dir() and not is_bag(folder) else Path()
         view = view_options(arguments, arguments.view)
         options = LiveOptions(
-            out, arguments.overwrite, source.groundtruth, view, images, source.name
+            out,
+            arguments.overwrite,
+            source.groundtruth,
+            view,
+            images,
+            source.name,
+            arguments.map,
         )
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
@@ -117,6 +125,8 @@ def _live(arguments: argparse.Namespace) -> int:
     else:
         left_out = source.counts.line()
         print(f"{format_table(slam.rows)}\n\nRun folder  {out}")
+        if slam.dense is not None:
+            print(f"Dense map   {out / 'dense'}, {slam.dense.points} points")
         if left_out:
             print(f"Source      {left_out}")
     return 128 + ended_by if ended_by else 0

@@ -24,13 +24,16 @@ class Health:
         frames: tracked so far. frames_per_second: of the last frames.
         latency_ms_median, latency_ms_p95: from handing a frame in until its result.
         keyframes, landmarks, loops_closed: in the map.
+        submaps: in the dense map.
         keyframes_waiting: for the map's process. masks_waiting: for the segmenter's.
+        submaps_waiting: for the dense map's.
         frames_dropped: by the source, since tracking was busy.
         frames_refused: that were broken, or not later than the one before.
         masks_dropped: keyframes that were passed over by the segmenter.
+        submaps_dropped: keyframes that were passed over by the dense map.
         unwritten: how often a full disk kept something from being written.
         lost_frames: without a pose. lost_episodes: how often tracking was lost.
-        map_deaths, segmenter_deaths: of their processes, which were started again.
+        map_deaths, segmenter_deaths, dense_deaths: of their processes, which were started again.
         source: what the source counted, by name.
     """
 
@@ -42,16 +45,20 @@ class Health:
     keyframes: int = 0
     landmarks: int = 0
     loops_closed: int = 0
+    submaps: int = 0
     keyframes_waiting: int = 0
     masks_waiting: int = 0
+    submaps_waiting: int = 0
     frames_dropped: int = 0
     frames_refused: int = 0
     masks_dropped: int = 0
+    submaps_dropped: int = 0
     unwritten: int = 0
     lost_frames: int = 0
     lost_episodes: int = 0
     map_deaths: int = 0
     segmenter_deaths: int = 0
+    dense_deaths: int = 0
     source: dict[str, int] = field(default_factory=dict)
 
     def as_json(self) -> str:
@@ -61,6 +68,10 @@ class Health:
     def line(self) -> str:
         """For a person."""
         waiting = f"{self.keyframes_waiting} keyframes and {self.masks_waiting} masks waiting"
+        if self.submaps or self.submaps_waiting:
+            waiting += f", {self.submaps} submaps, {self.submaps_waiting} waiting"
+        if self.submaps_dropped:
+            waiting += f" and {self.submaps_dropped} dropped"
         full = ", DISK FULL" if self.unwritten else ""
         return (
             f"{self.status}{full}, {self.frames_per_second:.0f} frames/s, "

@@ -16,17 +16,20 @@ from numpy.typing import NDArray
 from graph.camera import Camera
 from graph.errors import InputError
 from graph.trajectory import Trajectory
-from semantics.segmenter_table import SegmenterOptions
+from slam import __version__
 from slam.configuration import dump
 from slam.evaluation import Row
 from slam.features import Features
 from slam.frame import Frame
 from slam.landmark_cloud import LandmarkCloud
+from slam.live.dense_messages import MapWritten
+from slam.live.display import Display
 from slam.live.health import WINDOW, FrameMeter, Health
+from slam.live.incoming import checked
 from slam.live.recorder import Recorder, rescued
-from slam.live.segmentation import RemoteSegmenter
 from slam.live.sources.counts import SourceCounts
 from slam.live.system import LiveSystem
+from slam.live.workers import start_system
 from slam.results import FrameResult
 from slam.run_folder import DISK_ERRORS, HEALTH, RunFolder
 from slam.run_results import Tally, measure, row, save
@@ -35,8 +38,10 @@ from slam.viewer.scene import Scene, ViewOptions
 
 logger = logging.getLogger(__name__)
 
-IMAGE_EVERY, MAP_S = 3, 1.0
-"""Frames from one image in the viewer to the next; the longest wait for the map in one go."""
+MAP_S = 1.0
+"""The longest wait for the map in one go."""
+CLOUDS_S = 600.0
+"""How long the dense map may take to be finished at the end."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +53,10 @@ class LiveOptions:
         overwrite: replace the run that it holds.
         reference: trajectory to compare with at the end.
         view: where a viewer shows it, if anywhere.
-        images: folder that a segmenter looks masks up for.
+        images: folder that the frames are of, if any: a segmenter looks masks up for it, and
+            `bmask-slam map` reads it.
         title: of the picture.
+        dense: make a dense map as well; needs ``out``.
     """
 
     out: Path | None = None
@@ -58,6 +65,12 @@ class LiveOptions:
     view: ViewOptions = field(default_factory=ViewOptions)
     images: Path = Path()
     title: str = "live"
+    dense: bool = False
+
+    @property
+    def origin(self) -> str:
+        """What config.yaml says of where the frames are."""
+        return "live" if self.images == Path() else f"sequence {self.images}, stride 1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +88,14 @@ class Prepared:
 
 
 class LiveSlam:
-    """The live loop. The map, its graph and loops, and segmentation run in other processes.
+    """The live loop. Map with graph and loops, segmentation and dense map have processes.
 
     A context manager: leaving it ends them and saves everything, whatever the reason.
 
     Attributes:
         frames_dropped: by the source, which counts them here.
         source_counts: of the source, for ``health``.
-        rows: what metrics.json holds, once it is closed.
+        rows: what metrics.json holds, once it is closed. dense: how the dense map ended, then.
     """
 
     def __init__(
@@ -99,24 +112,28 @@ class LiveSlam:
         self.frames_dropped = 0
         self.source_counts = SourceCounts()
         self.rows: list[Row] = []
+        self.dense: MapWritten | None = None
         self._tally, self._meter = Tally(), FrameMeter()
         self._refused = 0
-        self._shown = 0
         self._closed = False
         self._last_s = -np.inf
         self._begin_s = time.monotonic()
         self._scene: Scene | None = None
+        self._display: Display | None = None
         self._scratch = Path(tempfile.mkdtemp(prefix="bmask-slam-"))
         self._recorder: Recorder | None = None
         try:
             if self.options.out is not None:
                 folder = RunFolder(self.options.out, self.options.overwrite).__enter__()
                 self._recorder = Recorder(folder)
-                folder.write_text("config.yaml", dump(self.config))
+                origin = f"bmask-slam {__version__}, {self.options.origin}"
+                folder.write_text("config.yaml", f"# {origin}\n{dump(self.config)}")
+                logger.info("%s: %s", origin, self.options.title)
             if self.options.view.anywhere:
                 self._scene = Scene(self.options.title, self.options.view)
                 self._scene.camera(camera)
-            self._system = self._start(self.config.semantics.segmenter)
+                self._display = Display(self._scene)
+            self._system = self._start()
         except BaseException:
             self._leave()
             raise
@@ -163,7 +180,8 @@ class LiveSlam:
         """
         arrived_s = time.monotonic() if prepared is None else prepared.arrived_s
         try:
-            frame = self._checked(timestamp_s, rgb, depth_m, name)
+            given = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name)
+            frame = checked(given, self.camera, self._last_s)
         except InputError:
             self._refused += 1
             raise
@@ -177,7 +195,8 @@ class LiveSlam:
         self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
         if self._recorder is not None:
             self._recorder.frame(result, self.health, self.trajectory)
-        self._show(result, rgb)
+        if self._display is not None and self._display.frame(result, rgb, self._system):
+            self._display.map(self._system, self.health())
         return result
 
     def trajectory(self) -> Trajectory:
@@ -197,13 +216,15 @@ class LiveSlam:
         found = {"map": self._system.remote.pid}
         if self._system.segmenter is not None:
             found["segmenter"] = self._system.segmenter.pid
+        if self._system.dense is not None:
+            found["dense"] = self._system.dense.pid
         return found
 
     def health(self) -> Health:
         """How the loop is doing."""
         system, meter = self._system, self._meter
         median, high = meter.percentiles_ms(WINDOW)
-        segmenter, remote = system.segmenter, system.remote
+        segmenter, remote, dense = system.segmenter, system.remote, system.dense
         return Health(
             status=meter.status,
             frames=meter.frames,
@@ -213,16 +234,20 @@ class LiveSlam:
             keyframes=len(remote.world.keyframes),
             landmarks=int(remote.world.landmarks.alive.sum()),
             loops_closed=remote.loops_closed,
+            submaps=len(dense.submaps) if dense else 0,
             keyframes_waiting=remote.pending,
             masks_waiting=segmenter.waiting if segmenter else 0,
+            submaps_waiting=dense.waiting if dense else 0,
             frames_dropped=self.frames_dropped,
             frames_refused=self._refused,
             masks_dropped=segmenter.dropped if segmenter else 0,
-            unwritten=self._recorder.unwritten if self._recorder else 0,
+            submaps_dropped=dense.dropped if dense else 0,
+            unwritten=self._unwritten(),
             lost_frames=meter.lost_frames,
             lost_episodes=meter.lost_episodes,
             map_deaths=remote.deaths,
             segmenter_deaths=segmenter.deaths if segmenter else 0,
+            dense_deaths=dense.deaths if dense else 0,
             source=asdict(self.source_counts),
         )
 
@@ -250,53 +275,18 @@ class LiveSlam:
             self._system.close()
             self._leave(failure)
 
-    def _start(self, segmenter: SegmenterOptions) -> LiveSystem:
-        remote = None
-        if segmenter.name != "none":
-            remote = RemoteSegmenter(segmenter, self.options.images)
-        try:
-            return LiveSystem(self.camera, self.config, self._scratch, remote)
-        except BaseException:
-            if remote is not None:
-                remote.close()
-            raise
+    def _start(self) -> LiveSystem:
+        options = self.options
+        if options.dense and options.out is None:
+            raise InputError("a dense map needs a run folder; give one, as out")
+        run, shown = options.out if options.dense else None, self._display is not None
+        return start_system(self.camera, self.config, self._scratch, options.images, run, shown)
 
-    def _checked(self, timestamp_s: float, rgb: NDArray, depth_m: NDArray, name: str) -> Frame:
-        height, width = self.camera.height, self.camera.width
-        if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
-            raise InputError(
-                f"frame at {timestamp_s}: colour is {rgb.dtype} {rgb.shape}, the camera gives "
-                f"uint8 ({height}, {width}, 3); resize it, or correct the camera"
-            )
-        if depth_m.shape != (height, width) or depth_m.dtype.kind != "f":
-            raise InputError(
-                f"frame at {timestamp_s}: depth is {depth_m.dtype} {depth_m.shape}; give metres as "
-                f"float ({height}, {width}), registered to the colour image"
-            )
-        if not timestamp_s > self._last_s:
-            raise InputError(
-                f"frame at {timestamp_s}: not later than the one before, at {self._last_s}; leave "
-                "it out, or begin anew if the clock was set back"
-            )
-        known = depth_m.astype(np.float32, copy=False)
-        if (missing := known <= 0).any():  # most sources say NaN, and a copy costs a millisecond
-            known = np.where(missing, np.float32(np.nan), known)
-        return Frame(self._meter.frames, timestamp_s, rgb, known, name)
-
-    def _show(self, result: FrameResult, rgb: NDArray[np.uint8]) -> None:
-        """The frame at once, the map when it was brought up to date."""
-        if self._scene is None:
-            return
-        self._scene.frame(result, rgb if self._meter.frames % IMAGE_EVERY == 1 else None)
-        if self._shown == self._system.remote.changes:
-            return
-        self._shown = self._system.remote.changes
-        cloud, path = self.map(), self._system.keyframe_trajectory().positions_world
-        self._scene.points("world/landmarks", cloud.points_world, cloud.colours, 0.008)
-        colours = np.full((len(path), 3), 200, np.uint8)
-        self._scene.points("world/keyframes", path, colours, 0.02)
-        numbers = {k: v for k, v in asdict(self.health()).items() if isinstance(v, int | float)}
-        self._scene.numbers("health", numbers)
+    def _unwritten(self) -> int:
+        """How often the disk was full."""
+        dense = self._system.dense
+        recorded = self._recorder.unwritten if self._recorder else 0
+        return recorded + (dense.unwritten if dense else 0)
 
     def _conclude(self, health: Health) -> None:
         """Save what an offline run saves; the trajectory at least, if the map cannot be had."""
@@ -320,6 +310,23 @@ class LiveSlam:
         self.rows = rows
         save(self._system, folder, rows, self.options.reference, self.options.title)
         folder.complete()
+        self._conclude_dense(folder, health)
+
+    def _conclude_dense(self, folder: RunFolder, health: Health) -> None:
+        """Let the dense map be finished, and say what is not in it."""
+        dense, world, run = self._system.dense, self._system.mapper.world, folder.path
+        if dense is None:
+            return
+        self.dense = dense.finish(world, CLOUDS_S)
+        if self._display is not None:
+            self._display.submaps(dense, world, True, len(world.keyframes))
+        if self.dense.failure:
+            logger.error("%s; bmask-slam map %s completes it", self.dense.failure, run)
+        elif self.dense.missing:
+            count = len(self.dense.missing)
+            logger.warning("bmask-slam map %s adds the %d keyframes left out", run, count)
+        ended = replace(health, submaps=len(dense.submaps), submaps_waiting=0)
+        folder.write_text(HEALTH, ended.as_json())
 
     def _leave(self, failure: InputError | None = None) -> None:
         if self._scene is not None:

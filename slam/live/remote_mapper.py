@@ -115,6 +115,10 @@ class RemoteMapper:
         """Keyframes that the process has not finished with."""
         return len(self._pending)
 
+    def awaits(self, keyframe_id: int) -> bool:
+        """Whether the process has not finished with a keyframe."""
+        return keyframe_id in self._pending
+
     @property
     def idle(self) -> bool:
         """Whether the process waits for work."""

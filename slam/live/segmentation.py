@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from graph.errors import InputError
@@ -13,25 +12,15 @@ from semantics.labels import LabelSet
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
 from slam.live.channel import Channel
 from slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready
-from slam.live.worker import Failure, Worker
+from slam.live.supervision import Patience, SupervisedWorker
 
 logger = logging.getLogger(__name__)
 
 NICENESS = 15
 
 
-@dataclass(frozen=True)
-class SegmentationConfig:
-    """At most ``waiting`` keyframes wait for masks, the oldest are passed over.
-
-    A process that has not answered for ``patience_s`` hangs and is started again, at most
-    ``restarts`` times; ``start_s`` is how long it may take to start.
-    """
-
-    waiting: int = 4
-    patience_s: float = 20.0
-    start_s: float = 60.0
-    restarts: int = 3
+WAITING = 4
+"""Keyframes that wait for masks at most; the oldest are passed over."""
 
 
 def serve_segmenter(
@@ -65,21 +54,18 @@ class RemoteSegmenter:
         labels: what its numbers mean.
         dropped: keyframes that were passed over.
         segmentation_ms: time of each keyframe that was not.
-        deaths: how often the process died or hung.
     """
 
     def __init__(
-        self, options: SegmenterOptions, sequence: Path, config: SegmentationConfig | None = None
+        self, options: SegmenterOptions, sequence: Path, rules: Patience | None = None
     ) -> None:
         """Start it, and wait until it knows its labels. Raises InputError if it cannot start."""
-        self.config = config or SegmentationConfig()
-        self.dropped = self.deaths = 0
+        self.dropped = 0
         self.segmentation_ms: list[float] = []
-        self._arguments = (options, sequence, self.config.waiting)
         self._asked: dict[int, ImageToSegment] = {}
-        self._heard_s = time.monotonic()
-        self._worker = self._start()
-        self.labels = LabelSet(self._first_words())
+        target, arguments = f"{__name__}:serve_segmenter", (options, sequence, WAITING)
+        self._worker = SupervisedWorker("segmenter", target, arguments, rules or Patience())
+        self.labels = LabelSet(self._worker.first_words().labels)
 
     @property
     def pid(self) -> int:
@@ -87,70 +73,44 @@ class RemoteSegmenter:
         return self._worker.pid
 
     @property
+    def deaths(self) -> int:
+        """How often the process died or hung."""
+        return self._worker.deaths
+
+    @property
     def waiting(self) -> int:
         """Keyframes whose masks have not come."""
         return len(self._asked)
 
+    def awaits(self, keyframe_id: int) -> bool:
+        """Whether the masks of a keyframe may still come."""
+        return keyframe_id in self._asked
+
     def ask(self, image: ImageToSegment) -> None:
         """Ask for the masks of a keyframe; returns at once."""
-        if not self._asked:
-            self._heard_s = time.monotonic()
+        begins = not self._asked
         self._asked[image.keyframe_id] = image
-        self._worker.send(image)
+        self._worker.send(image, begins)
 
     def answers(self) -> list[Masks]:
         """The masks that have come. A process that died or hangs is started again."""
         found = []
         for message in self._worker.receive():
-            self._heard_s = time.monotonic()
+            self._asked.pop(message.keyframe_id, None)
             match message:
                 case Masks():
-                    self._asked.pop(message.keyframe_id, None)
                     self.segmentation_ms.append(message.segmentation_ms)
                     found.append(message)
                 case NotSegmented():
-                    self._asked.pop(message.keyframe_id, None)
                     self.dropped += 1
                     logger.info("keyframe %d has no masks: %s", message.keyframe_id, message.reason)
-                case Failure():
-                    logger.error("the segmenter failed: %s", message.text)
-        silent_s = time.monotonic() - self._heard_s
-        if self.deaths > self.config.restarts:
+        if self._worker.was_restarted(busy=bool(self._asked)):
+            for image in self._asked.values():
+                self._worker.send(image)
+        if self._worker.given_up:
             self._asked.clear()
-        elif not self._worker.alive or (self._asked and silent_s > self.config.patience_s):
-            self._restart()
         return found
 
     def close(self) -> None:
         """End the process at once."""
-        self._worker.kill()
-
-    def _start(self) -> Worker:
-        return Worker("segmenter", "slam.live.segmentation:serve_segmenter", *self._arguments)
-
-    def _first_words(self) -> tuple[str, ...]:
-        deadline_s = time.monotonic() + self.config.start_s
-        while time.monotonic() < deadline_s:
-            for message in self._worker.receive(0.1):
-                match message:
-                    case Ready():
-                        return message.labels
-                    case Failure():
-                        self.close()
-                        raise InputError(message.text.strip().splitlines()[-1])
-            if not self._worker.alive:
-                break
-        self.close()
-        raise InputError("the segmenter's process did not start; see the lines above")
-
-    def _restart(self) -> None:
-        self.deaths += 1
-        self._heard_s = time.monotonic()
-        self._worker.kill()
-        if self.deaths > self.config.restarts:
-            logger.error("the segmenter died %d times; no masks from here on", self.deaths)
-            return
-        logger.warning("the segmenter died or hangs; started again, %d wait", len(self._asked))
-        self._worker = self._start()
-        for image in self._asked.values():
-            self._worker.send(image)
+        self._worker.close()

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import faiss
+import numpy as np
 
 from graph.array_file import nested, read_arrays
 from graph.camera import Camera
@@ -17,6 +18,7 @@ from slam.frame import Frame
 from slam.landmarks import Ints
 from slam.live.map_process import STATE_FILE, LabelledNothing
 from slam.live.messages import ImageToSegment
+from slam.live.remote_dense import RemoteDenseMapper
 from slam.live.remote_mapper import RemoteMapper
 from slam.live.segmentation import RemoteSegmenter
 from slam.mapper import Mapper
@@ -45,6 +47,7 @@ class LiveSystem(SlamSystem):
     Attributes:
         remote: the map's copy, and the process that keeps it.
         segmenter: the process that makes masks; None without.
+        dense: the process that makes submaps; None without.
     """
 
     def __init__(
@@ -53,13 +56,16 @@ class LiveSystem(SlamSystem):
         config: SystemConfig,
         folder: Path,
         segmenter: RemoteSegmenter | None = None,
+        dense: RemoteDenseMapper | None = None,
     ) -> None:
-        self.segmenter = segmenter
+        self.segmenter, self.dense = segmenter, dense
         self._names = (segmenter or NoSegmenter).labels.names
         self.remote = RemoteMapper(camera, config, self._names, folder)
         super().__init__(camera, config)
         self.remote.wait_until_ready(START_S)
-        self.semantics = _AskedMasks(self)
+        if dense is not None:
+            dense.wait_until_ready()
+        self.semantics = _Asked(self)
         gc.freeze()  # to look through all modules would stop tracking for 0.1 s
         self._switch_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
@@ -88,6 +94,10 @@ class LiveSystem(SlamSystem):
             self.dynamics.see(masks, self.mapper)
         for found in self.segmenter.answers() if self.segmenter else ():
             self.remote.tell(found)
+            if self.dense is not None:
+                self.dense.see(found, self.remote.world)
+        if self.dense is not None:
+            self._follow(self.dense, moved=self.remote.changes != changes)
         if reference is None or T_before is None or self.remote.changes == changes:
             return
         heir_id, T_heir_reference = self.remote.history.heir(reference.id)
@@ -97,15 +107,28 @@ class LiveSystem(SlamSystem):
         self.localiser.new_local_map(self.remote.world, heir)
         self._reference, self._segment = heir, heir.segment
 
+    def _follow(self, dense: RemoteDenseMapper, moved: bool) -> None:
+        """Let the dense map follow the map."""
+        remote, segmenter = self.remote, self.segmenter
+        if moved:
+            dense.forget_culled(remote.world, remote.awaits)
+        lacks = segmenter.awaits if segmenter is not None else (lambda number: False)
+        dense.follow(remote.world, remote.awaits, lacks)
+
     def wait_for_map(self, waiting: float, timeout_s: float) -> None:
-        """Catch up until no more than so many keyframes wait for the map, or for so long."""
+        """Catch up until no more than so many keyframes wait for the map, or for so long.
+
+        The dense map is waited for where it would drop a keyframe.
+        """
         deadline_s = time.monotonic() + timeout_s
         self.catch_up()
-        while self.remote.pending > waiting and not self.remote.given_up:
-            if time.monotonic() > deadline_s:
-                return
+        while self._is_behind(waiting) and time.monotonic() < deadline_s:
             time.sleep(0.001)
             self.catch_up()
+
+    def _is_behind(self, waiting: float) -> bool:
+        is_full = waiting < np.inf and self.dense is not None and self.dense.full
+        return is_full or (self.remote.pending > waiting and not self.remote.given_up)
 
     def insert(self, frame: Frame, tracked: Tracked, local_ids: Ints) -> tuple[Tracked, Keyframe]:
         """Make a frame a keyframe; segments are joined by the map's process."""
@@ -125,10 +148,16 @@ class LiveSystem(SlamSystem):
         whole.restore({**state, **own}, path)
         self.mapper, self.localiser = whole.mapper, whole.localiser
         self.semantics, self.dynamics = whole.semantics, whole.dynamics
-        self.close()
+        self._end()
 
     def close(self) -> None:
         """End the other processes; what they knew and did not send is lost."""
+        self._end()
+        if self.dense is not None:
+            self.dense.close()
+
+    def _end(self) -> None:
+        """End all that a finished map does without."""
         gc.unfreeze()
         sys.setswitchinterval(self._switch_s)
         self.remote.close()
@@ -141,8 +170,8 @@ class LiveSystem(SlamSystem):
         return "" if busy else super()._keyframe_reason(tracked)
 
 
-class _AskedMasks(SemanticMapper):
-    """On tracking's side: asks for a keyframe's masks; what they say is known elsewhere."""
+class _Asked(SemanticMapper):
+    """On tracking's side: asks for a keyframe's masks and submap, which others make."""
 
     def __init__(self, system: LiveSystem) -> None:
         super().__init__(system.camera, system.config.semantics)
@@ -152,6 +181,8 @@ class _AskedMasks(SemanticMapper):
         """Ask, and do not wait."""
         if self._system.segmenter is not None:
             self._system.segmenter.ask(ImageToSegment(keyframe.id, frame.rgb, frame.name))
+        if self._system.dense is not None:
+            self._system.dense.ask(keyframe.id, frame)
 
     def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
         """None: the map's process has them."""

@@ -6,7 +6,8 @@ world/trajectory      the path so far
 world/keyframes       their positions; ``world/loops`` lines between the ends of closed loops
 world/landmarks       points, coloured by their labels where they have one, else as they look
 world/objects         boxes with labels
-world/dense           the dense cloud
+world/dense           the dense cloud of a finished run
+world/submaps/ID      of a live run: some points of each submap, in the frame of its keyframe
 plots/...             status, inliers, milliseconds of each stage, queues
 ====================  ==============================================================================
 """
@@ -94,8 +95,7 @@ class Scene:
         self._stream.set_time(TIMELINE, duration=result.timestamp_s)
         T = result.T_world_camera
         if T is not None:
-            transform = rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
-            self._log("world/camera", transform)
+            self._log("world/camera", self._pose(T))
             self._path.append(T[:3, 3])
             if len(self._path) % 10 == 0:
                 self.line("world/trajectory", np.array(self._path), (80, 170, 255))
@@ -110,9 +110,23 @@ class Scene:
         self.numbers("features", counted)
         self.numbers("ms", result.stage_ms)
 
-    def points(self, path: str, points: Array, colours: NDArray[np.uint8], radius_m: float) -> None:
+    def points(
+        self, path: str, points: NDArray[np.floating], colours: NDArray[np.uint8], radius_m: float
+    ) -> None:
         """Points (N, 3) with colours (N, 3)."""
         self._log(path, self._rr.Points3D(points, colors=colours, radii=radius_m))
+
+    def submap(self, number: int, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+        """Points (N, 3) with colours (N, 3) in the frame of a keyframe, see ``move_submap``."""
+        self.points(f"world/submaps/{number}", points, colours, 0.006)
+
+    def move_submap(self, number: int, T_world_anchor: Array) -> None:
+        """Put a submap where its keyframe is, T (4, 4)."""
+        self._log(f"world/submaps/{number}", self._pose(T_world_anchor))
+
+    def remove_submap(self, number: int) -> None:
+        """Show it no more."""
+        self._log(f"world/submaps/{number}", self._rr.Clear(recursive=True))
 
     def line(self, path: str, points: Array, colour: Sequence[int]) -> None:
         """A line through points (N, 3)."""
@@ -150,6 +164,9 @@ class Scene:
         """Write what waits."""
         self._stream.flush()
         self._stream.disconnect()
+
+    def _pose(self, T: Array) -> Any:
+        return self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
 
     def _log(self, path: str, value: Any, static: bool = False) -> None:
         self._stream.log(path, value, static=static)

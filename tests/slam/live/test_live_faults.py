@@ -26,8 +26,9 @@ from slam.live.live_slam import LiveOptions, LiveSlam
 from slam.live.messages import ImageToSegment
 from slam.live.play import PlayOptions, play
 from slam.live.recorder import HEALTH_S
-from slam.live.segmentation import RemoteSegmenter, SegmentationConfig
+from slam.live.segmentation import RemoteSegmenter
 from slam.live.sources.counts import SourceCounts
+from slam.live.supervision import Patience
 from slam.results import TrackingStatus
 from slam.system_config import SystemConfig
 
@@ -166,8 +167,8 @@ def test_a_killed_segmenter_costs_masks_alone(tmp_path) -> None:
 
 
 def test_a_segmenter_that_hangs_is_started_again(tmp_path) -> None:
-    options = SegmentationConfig(patience_s=2.0)
-    segmenter = RemoteSegmenter(label_image(tmp_path), tmp_path, options)
+    rules = Patience(answer_s=2.0)
+    segmenter = RemoteSegmenter(label_image(tmp_path), tmp_path, rules)
     first = segmenter.pid
     try:
         os.kill(first, signal.SIGSTOP)

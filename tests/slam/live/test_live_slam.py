@@ -22,7 +22,7 @@ from slam.configuration import resolve
 from slam.landmark_cloud import LandmarkCloud
 from slam.live.live_slam import LiveOptions, LiveSlam
 from slam.live.messages import NewKeyframe
-from slam.live.segmentation import RemoteSegmenter, SegmentationConfig
+from slam.live.segmentation import RemoteSegmenter
 from slam.results import TrackingStatus
 from slam.run_folder import HEALTH
 from slam.system import SlamSystem
@@ -183,4 +183,4 @@ def test_a_run_folder_in_use_is_refused_and_nothing_starts(tmp_path) -> None:
 def test_a_segmenter_that_cannot_start_says_why(tmp_path) -> None:
     options = SegmenterOptions("precomputed", masks=tmp_path / "none.json")
     with pytest.raises(InputError, match=r"none\.json"):
-        RemoteSegmenter(options, tmp_path, SegmentationConfig())
+        RemoteSegmenter(options, tmp_path)

@@ -1,0 +1,93 @@
+"""What a viewer is told of the live loop, a little at each frame."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graph.geometry import Array
+from slam.live.health import Health
+from slam.live.remote_dense import RemoteDenseMapper
+from slam.live.system import LiveSystem
+from slam.results import FrameResult
+from slam.viewer.scene import Scene
+from slam.world_map import WorldMap
+
+IMAGE_EVERY = 3
+"""Frames from one image to the next."""
+MOVED_AT_ONCE = 10
+"""Submaps that are moved at a frame, at most: what waits is moved at the next ones."""
+MOVED_M, TURNED = 0.002, 0.001
+"""What is nearer to its place, in metres and by its rotation matrix, is left there."""
+
+
+class Display:
+    """Tells a scene what is found; closing it is up to who made it."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._frames = self._changes = 0
+        self._placed: dict[int, Array] = {}
+        self._away: list[int] = []
+
+    def frame(self, result: FrameResult, rgb: NDArray[np.uint8], system: LiveSystem) -> bool:
+        """Show a frame, and of the submaps what is due; whether the map has changed."""
+        self._frames += 1
+        self._scene.frame(result, rgb if self._frames % IMAGE_EVERY == 1 else None)
+        has_changed = self._changes != system.remote.changes
+        self._changes = system.remote.changes
+        if system.dense is not None:
+            self.submaps(system.dense, system.remote.world, has_changed, MOVED_AT_ONCE)
+        return has_changed
+
+    def map(self, system: LiveSystem, health: Health) -> None:
+        """Show landmarks, keyframes and queues."""
+        cloud, path = system.landmarks(), system.keyframe_trajectory().positions_world
+        self._scene.points("world/landmarks", cloud.points_world, cloud.colours, 0.008)
+        colours = np.full((len(path), 3), 200, np.uint8)
+        self._scene.points("world/keyframes", path, colours, 0.02)
+        numbers = {k: v for k, v in asdict(health).items() if isinstance(v, int | float)}
+        self._scene.numbers("health", numbers)
+
+    def submaps(
+        self, dense: RemoteDenseMapper, world: WorldMap, has_changed: bool, at_once: int
+    ) -> None:
+        """Show submaps that are finished, and move those whose keyframes have moved.
+
+        One whose keyframe is in another map segment than the largest waits until they are joined.
+        """
+        if has_changed:
+            for gone in self._placed.keys() - world.keyframes.keys():
+                del self._placed[gone]
+                self._scene.remove_submap(gone)
+            self._away = self._moved(world)
+        for number in self._away[:at_once]:
+            if number in self._placed and number in world.keyframes:
+                self._place(number, world)
+        del self._away[:at_once]
+        segment = world.largest_segment() if dense.previews else 0
+        due = [n for n in dense.previews if n in world.keyframes]
+        for number in [n for n in due if world.keyframes[n].segment == segment][:at_once]:
+            preview = dense.previews.pop(number)
+            self._scene.submap(number, preview.points, preview.colours)
+            self._place(number, world)
+
+    def _moved(self, world: WorldMap) -> list[int]:
+        """Submaps that are not where their keyframes are, the farthest first."""
+        ids = list(self._placed)
+        if not ids:
+            return []
+        there = np.array([self._placed[i] for i in ids])
+        here = np.array([world.keyframes[i].T_world_camera for i in ids])
+        off = np.abs(here - there)[:, :3]
+        moved = np.maximum(
+            off[..., 3].max(axis=1) / MOVED_M, off[..., :3].max(axis=(1, 2)) / TURNED
+        )
+        return [ids[k] for k in np.argsort(-moved, kind="stable") if moved[k] > 1]
+
+    def _place(self, number: int, world: WorldMap) -> None:
+        T = world.keyframes[number].T_world_camera
+        self._placed[number] = T.copy()
+        self._scene.move_submap(number, T)
