@@ -41,6 +41,7 @@ class SupervisedWorker:
         self.deaths = 0
         self._target, self._arguments, self._rules = target, arguments, rules
         self._heard_s = time.monotonic()
+        self._is_ready = False
         self._worker = self._start()
 
     @property
@@ -60,6 +61,7 @@ class SupervisedWorker:
             for message in self._worker.receive(0.1):
                 match message:
                     case Ready():
+                        self._is_ready = True
                         return message
                     case Failure():
                         self.close()
@@ -80,6 +82,7 @@ class SupervisedWorker:
         messages = self._worker.receive()
         if messages:
             self._heard_s = time.monotonic()
+            self._is_ready = True
         for message in messages:
             if isinstance(message, Failure):
                 logger.error("the %s failed: %s", self.name, message.text)
@@ -90,10 +93,11 @@ class SupervisedWorker:
         if self.given_up:
             return False
         silent_s = time.monotonic() - self._heard_s
-        if self._worker.alive and not (busy and silent_s > self._rules.answer_s):
+        limit_s = self._rules.answer_s if self._is_ready else self._rules.start_s
+        if self._worker.alive and not (busy and silent_s > limit_s):
             return False
         self.deaths += 1
-        self._heard_s = time.monotonic()
+        self._heard_s, self._is_ready = time.monotonic(), False
         self._worker.kill()
         if self.given_up:
             logger.error("the %s died %d times and is given up", self.name, self.deaths)

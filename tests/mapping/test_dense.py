@@ -78,3 +78,43 @@ def test_after_a_flush_it_begins_anew() -> None:
     assert [r.keyframe.id for r in first + again] == list(range(6))
     for mine, theirs in zip(again, alone, strict=True):
         np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
+
+
+def test_one_that_comes_late_finds_its_place() -> None:
+    given = keyframes(9)
+    expected = {r.keyframe.id: r for r in all_of(DenseMapper(CAMERA), given)}
+    found = all_of(DenseMapper(CAMERA), [given[k] for k in (0, 2, 4, 1, 3, 5, 6, 8, 7)])
+    assert sorted(r.keyframe.id for r in found) == list(range(9))
+    for result in found[2:]:  # the first were fused before all their neighbours had come
+        if result.keyframe.id > 2:
+            expected_rho = expected[result.keyframe.id].map.rho.numpy()
+            np.testing.assert_array_equal(result.map.rho.numpy(), expected_rho)
+
+
+def test_what_is_forgotten_is_as_if_it_had_not_come() -> None:
+    given = keyframes(8)
+    expected = all_of(DenseMapper(CAMERA), [k for k in given if k.id not in (2, 5)])
+    mapper = DenseMapper(CAMERA)
+    found = [r for k in given[:6] for r in mapper.push(k)]
+    mapper.forget([2, 5])
+    found += [r for k in given[6:] for r in mapper.push(k)] + mapper.flush()
+    for mine, theirs in zip(found, expected, strict=True):
+        assert mine.keyframe.id == theirs.keyframe.id
+        np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
+
+
+def test_labels_that_come_late_are_as_if_in_time() -> None:
+    given = keyframes(8)
+    moves, numbers = np.zeros((30, 40), bool), np.ones((30, 40), np.uint16)
+    moves[5:15, 8:20] = True
+    hidden = np.where(moves, np.float32(np.nan), given[3].depth_m)
+    told = replace(given[3], depth_m=hidden, instances=numbers, unmatched=moves)
+    expected = all_of(DenseMapper(CAMERA), [told if k.id == 3 else k for k in given])
+    mapper = DenseMapper(CAMERA)
+    found = [r for k in given[:6] for r in mapper.push(k)]
+    mapper.relabel(3, numbers, moves)
+    mapper.relabel(99, numbers, moves)
+    found += [r for k in given[6:] for r in mapper.push(k)] + mapper.flush()
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
+    assert found[3].keyframe.instances is numbers

@@ -14,7 +14,13 @@ from graph.errors import InputError
 from graph.geometry import make_pose, se3_exp, transform
 from mapping.backprojection import back_project, surface_normals
 from mapping.dense import DenseKeyframe, FusedKeyframe
-from mapping.submaps import make_submap, nearest_a_voxel, read_submap, write_submap
+from mapping.submaps import (
+    make_submap,
+    nearest_a_voxel,
+    read_submap,
+    relabelled,
+    write_submap,
+)
 
 T = poses(np.random.default_rng(2), 1, 0.2, 0.3)[0]
 NORMAL, OFFSET_M = np.array([0.2, -0.1, 1.0]), 2.0
@@ -136,3 +142,20 @@ def test_nothing_known_gives_no_points() -> None:
     result = fused_plane()
     nothing = result.map.where(torch.zeros(30, 40, dtype=torch.bool))
     assert len(make_submap(FusedKeyframe(result.keyframe, nothing, result.views), CAMERA)) == 0
+
+
+def test_new_instances_reach_the_pixels_that_points_were_made_of() -> None:
+    result = fused_plane()
+    submap = make_submap(result, CAMERA, 0.01)
+    numbers = np.arange(1200, dtype=np.uint16).reshape(30, 40)
+    moves = np.zeros((30, 40), bool)
+    moves[:, 25:] = True
+    told = relabelled(submap, CAMERA, numbers, moves)
+    expected = make_submap(
+        replace(result, keyframe=replace(result.keyframe, instances=numbers)), CAMERA, 0.01
+    )
+    keep = expected.instances % 40 < 25
+    assert 0 < keep.sum() < len(keep)
+    np.testing.assert_array_equal(told.instances, expected.instances[keep])
+    np.testing.assert_array_equal(told.points, expected.points[keep])
+    np.testing.assert_array_equal(told.colours, expected.colours[keep])

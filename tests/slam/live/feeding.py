@@ -11,14 +11,14 @@ from slam.results import TrackingStatus
 PATIENCE_S = 2
 
 
-def feed(slam: LiveSlam, frames: list[Frame]) -> list[TrackingStatus]:
-    """Track frames, each after the map has taken all keyframes but one; their statuses."""
+def feed(slam: LiveSlam, frames: list[Frame], waiting: int = 1) -> list[TrackingStatus]:
+    """Track frames, each after the map has taken all keyframes but so many; their statuses."""
     statuses = []
     for frame in frames:
         tracked = slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, name="a.png")
         statuses.append(tracked.status)
         deadline_s = time.monotonic() + PATIENCE_S
-        while slam.health().keyframes_waiting > 1 and time.monotonic() < deadline_s:
+        while slam.health().keyframes_waiting > waiting and time.monotonic() < deadline_s:
             time.sleep(0.01)
             slam.catch_up()
     return statuses

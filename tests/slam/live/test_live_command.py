@@ -10,8 +10,11 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
+from graph.ply import read_ply
 from graph.trajectory import read_tum
 from slam.cli import main
 from slam.live.worker import ROOT
@@ -53,10 +56,37 @@ def test_masks_from_another_process_label_the_map(recording, tmp_path) -> None:
     assert json.loads((out / "objects.json").read_text())["objects"]
 
 
+def test_a_live_dense_map_is_the_offline_one_and_can_be_taken_up(
+    recording, tmp_path, capsys
+) -> None:
+    """A frame that is dropped puts keyframes' numbers out of step with their images."""
+    out, offline = tmp_path / "live", tmp_path / "offline"
+    live = start(recording, out, "--realtime", "--map", "--segmenter", "none")
+    output, errors = live.communicate(timeout=120)
+    assert live.returncode == 0, errors
+    assert "Dense map" in output
+    common = [str(recording), "--segmenter", "none", "--out", str(offline), "--quiet"]
+    assert main(["run", *common]) == 0
+    assert main(["map", str(offline), "--quiet"]) == 0
+    clouds = [read_ply(path / "dense" / "cloud.ply") for path in (out, offline)]
+    mine, theirs = (np.stack([c[axis] for axis in "xyz"], axis=1)[::5] for c in clouds)
+    for found, other in ((mine, theirs), (theirs, mine)):
+        distances_m = cKDTree(other).query(found)[0]
+        assert (distances_m < 0.03).mean() > 0.9
+        assert distances_m[distances_m < 0.05].mean() < 0.01
+    submaps = sorted((out / "dense" / "submaps").iterdir())
+    submaps[0].unlink()
+    capsys.readouterr()
+    assert main(["map", str(out)]) == 0
+    summary = capsys.readouterr().out
+    assert f"1 fused, {len(submaps) - 1} were finished" in summary
+    assert "left out" not in summary
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_everything_saved(recording, tmp_path, number) -> None:
     out = tmp_path / "run"
-    live = start(recording, out, "--realtime", "--segmenter", "none")
+    live = start(recording, out, "--realtime", "--map", "--segmenter", "none")
     deadline_s = time.monotonic() + 60
     while frames_written(out) < 8 and time.monotonic() < deadline_s:
         time.sleep(0.05)
@@ -66,3 +96,4 @@ def test_a_signal_ends_it_with_everything_saved(recording, tmp_path, number) -> 
     tracked = len(read_tum(out / "trajectory.txt"))
     assert 8 <= tracked == frames_written(out) < FRAMES
     assert {"map", "metrics.json", "landmarks.ply"} <= {path.name for path in out.iterdir()}
+    assert read_ply(out / "dense" / "cloud.ply")["x"].size > 1000

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -48,18 +47,6 @@ def running(pids: list[int]) -> list[int]:
         if path.is_file():
             states[pid] = path.read_text().rsplit(")", 1)[1].split()[0]
     return [pid for pid, state in states.items() if state != "Z"]
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 300 kB, which a run folder's map does not fit into."""
-    path = tmp_path / "disk"
-    path.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=300k", "none", str(path)]
-    if shutil.which("mount") is None or subprocess.call(command, stderr=-3):
-        pytest.skip("a small file system cannot be mounted: not root, or not Linux")
-    yield path
-    subprocess.run(["umount", str(path)], check=True)
 
 
 def fill(disk: Path) -> Path:

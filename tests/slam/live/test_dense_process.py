@@ -1,0 +1,170 @@
+"""The dense map's process, called directly: surfaces in their place, masks early or late."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, PLANE_Z_M, render_plane
+
+from graph.geometry import Array, se3_exp
+from semantics.instances import Instance, certain, mask_box
+from semantics.segmenter_table import SegmenterOptions
+from slam.configuration import dump
+from slam.dense_folder import DenseFolder
+from slam.dense_view import SeenKeyframe
+from slam.live.dense_messages import DenseOrder, Forget, KeyframeToMap, LateMasks, Mapped, NotMapped
+from slam.live.dense_process import DenseKeeper
+from slam.system_config import SystemConfig
+
+LABELS = ("background", "person", "chair")
+POSES = {k: se3_exp(np.array([0, 0.01 * k, 0, 0.03 * k, 0, 0])) for k in range(8)}
+FRAMES = {k: render_plane(T, k) for k, T in POSES.items()}
+PIXELS = np.array([[100.0, 100.0], [110.0, 120.0], [320.0, 240.0], [500.0, 300.0]])
+
+
+def instance(label: int, rows: slice, columns: slice) -> Instance:
+    mask = np.zeros((480, 640), bool)
+    mask[rows, columns] = True
+    return Instance(mask, mask_box(mask), label, certain(label, len(LABELS)), 1.0, 1.0)
+
+
+CHAIR = instance(2, slice(80, 180), slice(80, 200))
+PERSON = instance(1, slice(250, 400), slice(400, 560))
+
+
+def seen(number: int, T: Array | None = None) -> SeenKeyframe:
+    """Keyframes that all observe four landmarks, which are the same only in number."""
+    T = POSES[number] if T is None else T
+    ids, points = np.arange(4), np.tile([0.0, 0.0, PLANE_Z_M], (4, 1))
+    return SeenKeyframe(number, 0, T, FRAMES[number], ids, points, PIXELS)
+
+
+def keeper(path: Path) -> tuple[DenseKeeper, list[Any]]:
+    path.mkdir()
+    (path / "config.yaml").write_text(dump(SystemConfig()))
+    said: list[Any] = []
+    masks = SegmenterOptions("truth")
+    return DenseKeeper(DenseOrder(path, CAMERA, masks, LABELS, shown=500), said.append), said
+
+
+def to_map(number: int, instances: list[Instance], T: Array | None = None) -> KeyframeToMap:
+    whole = seen(number, T)
+    return KeyframeToMap(whole, instances, {number: whole.T_world_camera})
+
+
+def mapped(said: list[Any]) -> list[int]:
+    return [m.keyframe_id for m in said if isinstance(m, Mapped)]
+
+
+def test_a_submap_comes_after_its_neighbours_and_lies_on_the_surface(tmp_path) -> None:
+    keep, said = keeper(tmp_path / "run")
+    for number in POSES:
+        keep.handle(to_map(number, []))
+    assert mapped(said) == [0, 1]
+    submap = DenseFolder.opened(tmp_path / "run").submap(1)
+    points_world, _ = submap.placed(POSES[1])
+    assert np.abs(points_world[:, 2] - PLANE_Z_M).max() < 0.003
+    preview = next(m.preview for m in said if isinstance(m, Mapped) and m.keyframe_id == 1)
+    assert 300 < len(preview.points) <= 500
+    shown = preview.points @ POSES[1][:3, :3].T + POSES[1][:3, 3]
+    assert np.abs(shown[:, 2] - PLANE_Z_M).max() < 0.003
+
+
+def test_poses_that_move_before_fusion_are_followed(tmp_path) -> None:
+    """Keyframe 0 comes 0.3 m off; were it left there, none of its depth would be confirmed."""
+    keep, _ = keeper(tmp_path / "run")
+    off = POSES[0].copy()
+    off[2, 3] += 0.3
+    keep.handle(to_map(0, [], off))
+    for number in range(1, 7):
+        message = to_map(number, [])
+        keep.handle(KeyframeToMap(message.seen, [], {k: POSES[k] for k in range(number + 1)}))
+    folder = DenseFolder.opened(tmp_path / "run")
+    sigma = float(np.median(np.sqrt(folder.submap(0).variances)))
+    alone, _ = keeper(tmp_path / "alone")
+    alone.handle(to_map(0, []))
+    alone._tell(alone._fusion.finish())
+    single = DenseFolder.opened(tmp_path / "alone").submap(0)
+    assert sigma < 0.8 * float(np.median(np.sqrt(single.variances)))
+
+
+@pytest.fixture(scope="module")
+def in_time(tmp_path_factory: pytest.TempPathFactory) -> DenseFolder:
+    """The dense map of seven keyframes of which the first has masks."""
+    path = tmp_path_factory.mktemp("dense") / "run"
+    keep, _ = keeper(path)
+    for number in range(7):
+        keep.handle(to_map(number, [CHAIR, PERSON] if number == 0 else []))
+    return DenseFolder.opened(path)
+
+
+def with_late_masks(path: Path, last: int) -> DenseFolder:
+    """The same, but the masks come after keyframe ``last``."""
+    keep, said = keeper(path)
+    for number in range(7):
+        keep.handle(to_map(number, []))
+        if number == last:
+            keep.handle(LateMasks(0, [CHAIR, PERSON], np.arange(4), PIXELS))
+    assert mapped(said) == [0]
+    return DenseFolder.opened(path)
+
+
+def same_evidence(one: DenseFolder, other: DenseFolder) -> bool:
+    pairs = zip(vars(one.evidence(0)).values(), vars(other.evidence(0)).values(), strict=True)
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
+def test_masks_that_come_before_a_keyframe_is_fused_are_as_if_in_time(tmp_path, in_time) -> None:
+    late = with_late_masks(tmp_path / "run", 3)
+    for name in ("points", "colours", "variances", "instances"):
+        mine, theirs = getattr(late.submap(0), name), getattr(in_time.submap(0), name)
+        np.testing.assert_array_equal(mine, theirs)
+    assert same_evidence(late, in_time)
+    assert in_time.evidence(0).landmark_instances.tolist() == [1, 1, 2]
+
+
+def test_masks_that_come_after_that_reach_its_submap(tmp_path, in_time) -> None:
+    late = with_late_masks(tmp_path / "run", 6)
+    for folder in (late, in_time):
+        submap = folder.submap(0)
+        columns, rows = np.rint(CAMERA.project(submap.points.astype(float))).astype(int).T
+        assert CHAIR.mask[rows, columns].sum() > 50
+        np.testing.assert_array_equal(submap.instances == 1, CHAIR.mask[rows, columns])
+    submap = late.submap(0)
+    columns, rows = np.rint(CAMERA.project(submap.points.astype(float))).astype(int).T
+    assert not PERSON.mask[rows, columns].any()
+    assert not np.isfinite(late.fused(0).depth_m()[PERSON.mask]).any()
+    assert same_evidence(late, in_time)
+
+
+def test_what_is_forgotten_is_gone_before_and_after_it_is_saved(tmp_path) -> None:
+    keep, said = keeper(tmp_path / "run")
+    for number in range(7):
+        keep.handle(to_map(number, []))
+    assert mapped(said) == [0]
+    keep.handle(Forget([0, 3]))
+    keep._tell(keep._fusion.finish())
+    assert mapped(said) == [0, 1, 2, 4, 5, 6]
+    folder = DenseFolder.opened(tmp_path / "run")
+    assert [k for k in POSES if folder.is_done(k)] == [1, 2, 4, 5, 6]
+    assert not list(folder.path.glob("*/000000"))
+
+
+def test_a_keyframe_that_cannot_be_mapped_is_said(tmp_path) -> None:
+    keep, said = keeper(tmp_path / "run")
+    keep.handle(to_map(0, [], np.full((4, 4), np.nan)))
+    assert isinstance(said[0], NotMapped)
+    assert "not finite" in said[0].reason
+
+
+def test_what_is_done_is_said_again_to_one_who_missed_it(tmp_path) -> None:
+    keep, _ = keeper(tmp_path / "run")
+    for number in range(7):
+        keep.handle(to_map(number, []))
+    said: list[Any] = []
+    again = DenseKeeper(keep._order, said.append)
+    again.handle(to_map(0, []))
+    assert mapped(said) == [0]

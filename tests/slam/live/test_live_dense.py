@@ -1,0 +1,134 @@
+"""``live --map``: a process that dies, hangs or finds no room costs submaps, never the loop."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from feeding import feed
+from synthetic_view import CAMERA, render_plane
+from test_live_faults import fill, running
+
+from graph.errors import InputError
+from graph.geometry import se3_exp
+from graph.ply import read_ply
+from graph.trajectory import read_tum
+from slam.configuration import resolve
+from slam.dense_folder import DenseFolder
+from slam.dense_input import read_saved_map
+from slam.live import workers
+from slam.live.live_slam import LiveOptions, LiveSlam
+from slam.live.remote_dense import LATE, RemoteDenseMapper
+from slam.live.supervision import Patience
+from slam.results import TrackingStatus
+from slam.system_config import SystemConfig
+
+SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=1.1"]
+SETTINGS += ["mapping.redundant_share=1.0"]  # the same plane again and again
+CONFIG = resolve(SystemConfig, None, SETTINGS)
+FRAMES = [
+    render_plane(se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a, 0, 0])), index)
+    for index, a in enumerate(np.arange(20) * 0.02)
+]
+
+
+def wait_for(slam: LiveSlam, deaths: int) -> None:
+    """Until the dense map's process has died so often and nothing waits for it."""
+    deadline_s = time.monotonic() + 60
+    while time.monotonic() < deadline_s:
+        slam.catch_up()
+        health = slam.health()
+        if health.dense_deaths == deaths and not health.submaps_waiting:
+            return
+        time.sleep(0.02)
+    raise AssertionError(slam.health())
+
+
+def keyframes_without(run: Path) -> dict[int, str]:
+    """Keyframes of the map without a submap, and what dense.json says why; some have one."""
+    folder = DenseFolder.opened(run)
+    ids = [k.id for k in read_saved_map(run).keyframes]
+    done = [k for k in range(100) if folder.is_done(k)]
+    assert len(done) > 3
+    assert set(done) <= set(ids)
+    told = json.loads((run / "dense" / "dense.json").read_text())["keyframes_left_out"]
+    assert sorted(map(int, told)) == sorted(set(ids) - set(done))
+    return {int(k): str(reason) for k, reason in told.items()}
+
+
+def off_the_plane_m(run: Path) -> float:
+    """How far the cloud's points are from the plane that was seen, 95 % of them."""
+    cloud = read_ply(run / "dense" / "cloud.ply")
+    world_camera = read_tum(run / "trajectory.txt").poses_world_camera[0]
+    depth_m = float(FRAMES[0].depth_m[240, 320])
+    at_centre = world_camera[:3, :3] @ [0, 0, depth_m] + world_camera[:3, 3]
+    points = np.stack([cloud[c] for c in "xyz"], axis=1)
+    return float(np.percentile(np.abs((points - at_centre)[:, 2]), 95))
+
+
+def test_a_killed_process_comes_back_and_no_keyframe_is_left_out(tmp_path) -> None:
+    run = tmp_path / "run"
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
+        feed(slam, FRAMES[:10], 0)
+        os.kill(slam.processes()["dense"], signal.SIGKILL)
+        assert set(feed(slam, FRAMES[10:], 0)) == {TrackingStatus.OK}
+        wait_for(slam, deaths=1)
+        pids = list(slam.processes().values())
+    assert set(keyframes_without(run).values()) <= {LATE}  # busy machines restart it slowly
+    assert off_the_plane_m(run) < 0.01
+    health = json.loads((run / "health.json").read_text())
+    assert (health["dense_deaths"], health["map_deaths"]) == (1, 0)
+    assert health["submaps"] > 3
+    assert not running(pids)
+
+
+def test_one_that_hangs_is_started_again(tmp_path, monkeypatch) -> None:
+    patient = partial(RemoteDenseMapper, rules=Patience(answer_s=4.0))
+    monkeypatch.setattr(workers, "RemoteDenseMapper", patient)
+    run = tmp_path / "run"
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
+        first = slam.processes()["dense"]
+        feed(slam, FRAMES[:8], 0)
+        os.kill(first, signal.SIGSTOP)
+        assert set(feed(slam, FRAMES[8:], 0)) == {TrackingStatus.OK}
+        wait_for(slam, deaths=1)
+        assert slam.processes()["dense"] != first
+        pids = [first, *slam.processes().values()]
+    assert set(keyframes_without(run).values()) <= {LATE}
+    assert not running(pids)
+
+
+@pytest.mark.parametrize("small_disk", ["150m"], indirect=True)
+def test_on_a_full_disk_tracking_goes_on_and_the_end_says_what_is_missing(
+    small_disk, caplog
+) -> None:
+    run = small_disk / "run"
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
+        feed(slam, FRAMES[:4], 0)
+        ballast = fill(small_disk)
+        assert set(feed(slam, FRAMES[4:], 0)) == {TrackingStatus.OK}
+        deadline_s = time.monotonic() + 60
+        while not slam._system.dense.unwritten and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+            slam.catch_up()
+        assert slam.health().unwritten > 0
+        assert slam.health().dense_deaths == 0
+        ballast.unlink()
+        pids = list(slam.processes().values())
+    missing = keyframes_without(run)
+    assert slam.dense is not None
+    assert slam.dense.missing == sorted(missing)
+    assert f"adds the {len(missing)} keyframes left out" in caplog.text
+    assert any("No space left" in reason for reason in missing.values())
+    assert not running(pids)
+
+
+def test_without_a_run_folder_it_is_refused() -> None:
+    with pytest.raises(InputError, match="run folder"):
+        LiveSlam(CAMERA, CONFIG, LiveOptions(dense=True))

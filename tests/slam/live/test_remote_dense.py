@@ -1,0 +1,215 @@
+"""Which keyframes the dense map's process gets: the stated policy, with a stand-in process."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, PLANE_Z_M, add_keyframe, make_features, random_descriptors
+
+from graph.geometry import make_pose
+from semantics.segmenter_table import SegmenterOptions
+from slam.frame import Frame
+from slam.live import remote_dense
+from slam.live.dense_messages import (
+    DenseOrder,
+    FinishMap,
+    Forget,
+    KeyframeToMap,
+    LateMasks,
+    Mapped,
+    MapWritten,
+    NotMapped,
+    Preview,
+    Taken,
+)
+from slam.live.messages import Masks
+from slam.live.remote_dense import MAX_WAITING, RemoteDenseMapper
+from slam.world_map import WorldMap
+
+ORDER = DenseOrder(Path("run"), CAMERA, SegmenterOptions(), ("background",))
+
+
+class StandIn:
+    """A process that does nothing by itself, and is told to die."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.sent: list[Any] = []
+        self.answers: list[Any] = []
+        self.deaths, self.given_up, self.dies = 0, False, False
+
+    def send(self, message: Any, begins: bool = False) -> None:
+        self.sent.append(message)
+
+    def receive(self) -> list[Any]:
+        found, self.answers = self.answers, []
+        return found
+
+    def was_restarted(self, busy: bool) -> bool:
+        died, self.dies = self.dies, False
+        self.deaths += died
+        return died
+
+    def keyframes(self) -> list[int]:
+        return [m.id for m in self.sent if isinstance(m, KeyframeToMap)]
+
+
+@pytest.fixture
+def dense(monkeypatch: pytest.MonkeyPatch) -> RemoteDenseMapper:
+    monkeypatch.setattr(remote_dense, "SupervisedWorker", StandIn)
+    return RemoteDenseMapper(ORDER)
+
+
+def process(dense: RemoteDenseMapper) -> StandIn:
+    worker = dense._worker
+    assert isinstance(worker, StandIn)
+    return worker
+
+
+def a_map(count: int) -> WorldMap:
+    """Keyframes side by side, each with landmarks of its own."""
+    world, rng = WorldMap(), np.random.default_rng(1)
+    for k in range(count):
+        T = make_pose(np.eye(3), np.array([0.1 * k, 0.0, 0.0]))
+        points = T[:3, 3] + rng.uniform([-0.5, -0.5, PLANE_Z_M], [0.5, 0.5, PLANE_Z_M], (5, 3))
+        features = make_features(T, points, random_descriptors(5, rng))
+        world.make_landmarks(add_keyframe(world, T, features), np.arange(5), points)
+    return world
+
+
+def ask(dense: RemoteDenseMapper, *ids: int) -> Frame:
+    frame = Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), np.ones((480, 640), np.float32))
+    for number in ids:
+        dense.ask(number, frame)
+    return frame
+
+
+def no(number: int) -> bool:
+    return False
+
+
+def test_the_newest_goes_first_and_one_at_a_time(dense) -> None:
+    world, worker = a_map(4), process(dense)
+    frame = ask(dense, 0, 1, 2)
+    frame.rgb[:] = 7  # the caller's buffer: it may be used again
+    dense.follow(world, no, no)
+    dense.follow(world, no, no)
+    assert worker.keyframes() == [2]
+    assert (worker.sent[0].seen.frame.rgb == 0).all()
+    ask(dense, 3)
+    for number in (2, 3, 1, 0):
+        worker.answers = [Taken(number)]
+        dense.follow(world, no, no)
+    assert worker.keyframes() == [2, 3, 1, 0]
+    assert (dense.waiting, dense.dropped) == (0, 0)
+    np.testing.assert_array_equal(worker.sent[1].poses[2], world.keyframes[2].T_world_camera)
+
+
+def test_too_many_drive_out_the_oldest_but_never_one_that_is_promised(dense) -> None:
+    world, worker = a_map(MAX_WAITING + 3), process(dense)
+    ask(dense, 0)
+    dense.follow(world, no, no)
+    ask(dense, *range(1, MAX_WAITING + 1))
+    assert dense.full
+    assert dense.dropped == 0
+    ask(dense, MAX_WAITING + 1, MAX_WAITING + 2)
+    assert list(dense.left_out) == [1, 2]
+    assert (dense.dropped, dense.waiting) == (2, MAX_WAITING + 1)
+    worker.answers = [Taken(0), Mapped(0, None)]
+    dense.follow(world, no, no)
+    assert dense.submaps == {0}
+
+
+def test_it_waits_for_the_map_and_some_time_for_masks(dense, monkeypatch) -> None:
+    world, worker = a_map(3), process(dense)
+    ask(dense, 0, 1, 2)
+    dense.follow(world, lambda k: k > 0, lambda k: k < 1)
+    assert worker.keyframes() == []
+    dense.see(Masks(0, ["an instance"]), world)
+    dense.follow(world, lambda k: k > 0, no)
+    assert worker.sent[0].instances == ["an instance"]
+    monkeypatch.setattr(remote_dense, "MASKS_S", -1.0)
+    worker.answers = [Taken(0)]
+    dense.follow(world, no, lambda k: True)
+    assert worker.keyframes() == [0, 2]
+    dense.see(Masks(2, ["late"]), world)
+    late = worker.sent[-1]
+    assert isinstance(late, LateMasks)
+    np.testing.assert_array_equal(late.landmark_ids, world.keyframes[2].landmark_ids)
+    np.testing.assert_allclose(late.pixels, world.keyframes[2].features.image_pixels)
+
+
+def test_what_leaves_the_map_is_forgotten_and_what_it_does_not_know_yet_is_not(dense) -> None:
+    world, worker = a_map(4), process(dense)
+    ask(dense, 0, 1)
+    dense.follow(world, no, no)
+    worker.answers = [Taken(1), Mapped(1, None)]
+    dense.follow(world, no, no)
+    ask(dense, 2, 3)
+    for number in (1, 2, 3):
+        del world.keyframes[number]
+    dense.forget_culled(world, lambda k: k == 3)
+    assert worker.sent[-1] == Forget([1, 2])
+    assert dense.submaps == set()
+    assert dense.waiting == 2  # 0 is being worked on, 3 is new
+
+
+def test_what_was_promised_is_sent_again_and_what_kills_twice_is_left_out(dense) -> None:
+    world, worker = a_map(3), process(dense)
+    ask(dense, 0)
+    dense.follow(world, no, no)
+    worker.answers = [Taken(0)]
+    ask(dense, 1)
+    dense.follow(world, no, no)
+    worker.dies = True
+    dense.follow(world, no, no)
+    assert worker.keyframes() == [0, 1, 0]
+    worker.answers = [Taken(0)]
+    dense.follow(world, no, no)
+    worker.dies = True
+    dense.follow(world, no, no)
+    assert worker.keyframes() == [0, 1, 0, 1, 0]
+    assert list(dense.left_out) == [1]
+    worker.answers = [Taken(0), Mapped(0, None)]
+    dense.follow(world, no, no)
+    assert (dense.submaps, dense.waiting) == ({0}, 0)
+
+
+def test_at_the_end_all_that_waits_is_sent_and_a_death_is_made_up_for(dense, monkeypatch) -> None:
+    world, worker = a_map(3), process(dense)
+    ask(dense, 0, 1)
+    preview = Preview(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8))
+
+    def send(message: Any, begins: bool = False) -> None:
+        worker.sent.append(message)
+        if isinstance(message, KeyframeToMap):
+            worker.answers.append(Taken(message.id))
+        elif not worker.deaths:
+            worker.dies = True
+        else:
+            full = NotMapped(1, "full", disk_full=True)
+            worker.answers += [Mapped(0, preview), full, MapWritten(5, [1, 2])]
+
+    monkeypatch.setattr(worker, "send", send)
+    assert dense.finish(world, 5.0) == MapWritten(5, [1, 2])
+    assert worker.keyframes() == [1, 0, 0, 1]
+    assert isinstance(worker.sent[-1], FinishMap)
+    assert set(worker.sent[-1].poses) == {0, 1, 2}
+    assert dense.previews == {0: preview}
+    assert dense.unwritten == 1
+
+
+def test_given_up_it_leaves_out_everything_and_the_end_says_so(dense) -> None:
+    world, worker = a_map(3), process(dense)
+    ask(dense, 0, 1)
+    dense.follow(world, no, no)
+    worker.given_up = True
+    dense.follow(world, no, no)
+    ask(dense, 2)
+    assert sorted(dense.left_out) == [0, 1, 2]
+    assert not dense.full
+    assert dense.finish(world, 5.0) == replace(MapWritten(), failure=dense.finish(world, 0).failure)
+    assert dense.finish(world, 5.0).failure
