@@ -40,6 +40,10 @@ class InverseDepthMap:
             torch.where(keep, self.rho, missing), torch.where(keep, self.variance, missing)
         )
 
+    def without(self, hidden: NDArray[np.bool_]) -> InverseDepthMap:
+        """The same, with everything in ``hidden`` (H, W) unknown."""
+        return self.where(torch.from_numpy(~hidden).to(self.rho.device))
+
     def depth_m(self) -> NDArray[np.float32]:
         """Depth (H, W) in metres, NaN where missing."""
         return np.asarray((1 / self.rho).cpu().numpy(), np.float32)

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from graph.array_file import FileKind, read_arrays, write_arrays
@@ -111,7 +110,7 @@ class DenseFolder:
         instances, moves = shown
         told = relabelled(self.submap(keyframe_id), camera, instances, moves)
         if moves.any():
-            still = self.fused(keyframe_id).where(torch.from_numpy(~moves))
+            still = self.fused(keyframe_id).without(moves)
             write_fused(self._file("depth", keyframe_id), still)
         write_arrays(self._file("labels", keyframe_id), LABEL_FILE, {}, vars(evidence))
         write_submap(self._file("submaps", keyframe_id), told)

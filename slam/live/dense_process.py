@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import cv2
-import torch
 
 from graph.errors import InputError
 from mapping.inverse_depth import InverseDepthMap
@@ -47,7 +46,6 @@ NICENESS = 15
 def serve_dense(channel: Channel, order: DenseOrder) -> None:
     """Map keyframes until the channel ends."""
     os.nice(NICENESS)
-    torch.set_num_threads(1)
     cv2.setNumThreads(1)
     keeper = DenseKeeper(order, channel.send)
     channel.send(Ready())
