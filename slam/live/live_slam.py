@@ -6,7 +6,7 @@ import logging
 import shutil
 import tempfile
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -26,6 +26,7 @@ from slam.live.dense_messages import MapWritten
 from slam.live.display import Display
 from slam.live.health import WINDOW, FrameMeter, Health
 from slam.live.incoming import checked
+from slam.live.live_options import LiveOptions
 from slam.live.recorder import Recorder, rescued
 from slam.live.sources.counts import SourceCounts
 from slam.live.system import LiveSystem
@@ -34,43 +35,15 @@ from slam.results import FrameResult
 from slam.run_folder import DISK_ERRORS, HEALTH, RunFolder
 from slam.run_results import Tally, measure, row, save
 from slam.system_config import SystemConfig
-from slam.viewer.scene import Scene, ViewOptions
+from slam.viewer.scene import Scene
 
+__all__ = ["LiveOptions", "LiveSlam", "Prepared"]
 logger = logging.getLogger(__name__)
 
 MAP_S = 1.0
 """The longest wait for the map in one go."""
 CLOUDS_S = 600.0
 """How long the dense map may take to be finished at the end."""
-
-
-@dataclass(frozen=True)
-class LiveOptions:
-    """Where results go and what they are compared to.
-
-    Attributes:
-        out: run folder, as an offline run's; None: nothing is written.
-        overwrite: replace the run that it holds.
-        reference: trajectory to compare with at the end.
-        view: where a viewer shows it, if anywhere.
-        images: folder that the frames are of, if any: a segmenter looks masks up for it, and
-            `bmask-slam map` reads it.
-        title: of the picture.
-        dense: make a dense map as well; needs ``out``.
-    """
-
-    out: Path | None = None
-    overwrite: bool = False
-    reference: Trajectory | None = None
-    view: ViewOptions = field(default_factory=ViewOptions)
-    images: Path = Path()
-    title: str = "live"
-    dense: bool = False
-
-    @property
-    def origin(self) -> str:
-        """What config.yaml says of where the frames are."""
-        return "live" if self.images == Path() else f"sequence {self.images}, stride 1"
 
 
 @dataclass(frozen=True, eq=False)
