@@ -35,6 +35,7 @@ from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.runner import RunOptions, run
 from slam.system_config import SystemConfig
 
+ROOM = "crowded_office"
 SCENES = {
     "nobody": {"people": 0},
     "1 walks": {"people": 1},
@@ -115,9 +116,9 @@ def rendered(sequences: Path, scene: str, seed: int) -> Path:
     """The sequence of a scene, rendered if it is not there."""
     what = SCENES[scene]
     name = "carry" if "carry" in what else what["people"]
-    folder = sequences / f"busy_office-{seed}-{name}"
+    folder = sequences / f"{ROOM}-{seed}-{name}"
     if not folder.is_dir():
-        render_sequence(RenderConfig("busy_office", seed=seed, fps=FPS_HZ, **what), folder)
+        render_sequence(RenderConfig(ROOM, seed=seed, fps=FPS_HZ, **what), folder)
     return folder
 
 

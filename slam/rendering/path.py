@@ -18,6 +18,7 @@ SWEEP = np.array(
 )
 """Amplitudes [rad, m] and frequencies [Hz] about and along x, y and z of one who calibrates: tilt,
 pan, roll, and steps aside, up and forth, on top of the path."""
+_FINE = 4000
 
 
 @dataclass(frozen=True)
@@ -54,20 +55,35 @@ def camera_poses(
     With ``delay_s`` those of the same motion that much later than each frame; ``sweeping``: see
     SWEEP.
     """
-    fine = _at(path, np.linspace(0, 1, 4000))
+    stamps = np.arange(int(_share_times_s(path)[-1] * fps) + 1) / fps + delay_s
+    poses = steady_poses(path, stamps)
+    if sweeping:
+        poses = poses @ _sweep(stamps)
+    return _shaken(poses, stamps, np.random.default_rng([seed, 7]))
+
+
+def steady_poses(path: CameraPath, times_s: Array) -> Array:
+    """Poses T_world_camera (N, 4, 4) along the path at times (N,), without tremor."""
+    shares_s = _share_times_s(path)
+    share = np.interp(_eased(times_s, shares_s[-1]), shares_s, np.linspace(0, 1, _FINE))
+    return _at(path, share)
+
+
+def duration_s(path: CameraPath) -> float:
+    """How long the camera takes, the slow start included."""
+    return float(_share_times_s(path)[-1]) + 0.5
+
+
+def _share_times_s(path: CameraPath) -> Array:
+    """When each of _FINE equal shares of the path is reached."""
+    fine = _at(path, np.linspace(0, 1, _FINE))
     step_m = np.linalg.norm(np.diff(fine[:, :3, 3], axis=0), axis=1)
     relative = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
     step_deg = np.rad2deg(np.linalg.norm(so3_log(relative), axis=1))
     slowness = np.maximum(step_m / path.speed_m_s, step_deg / path.turn_deg_s)
     slowness = np.maximum(gaussian_filter1d(slowness, 60, mode="nearest"), 0.9 * slowness)
     slowness = gaussian_filter1d(slowness, 25, mode="nearest")
-    time_s = np.r_[0.0, np.cumsum(slowness)]
-    stamps = np.arange(int(time_s[-1] * fps) + 1) / fps + delay_s
-    share = np.interp(_eased(stamps, time_s[-1]), time_s, np.linspace(0, 1, len(fine)))
-    poses = _at(path, share)
-    if sweeping:
-        poses = poses @ _sweep(stamps)
-    return _shaken(poses, stamps, np.random.default_rng([seed, 7]))
+    return np.r_[0.0, np.cumsum(slowness)]
 
 
 def _eased(stamps: Array, total_s: float) -> Array:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from graph.geometry import Array
 from slam.rendering import objects as o
@@ -16,10 +15,12 @@ from slam.rendering.builder import UNLABELLED, Image, Painter, Part, SceneBuilde
 from slam.rendering.furniture import lying_book, office_chair
 from slam.rendering.lighting import Lighting, irradiance
 from slam.rendering.meshes import Shape, ellipsoid, lathe, pose, tapered_capsule, tilt
+from slam.rendering.path import CameraPath
 from slam.rendering.prints import patchwork
 from slam.rendering.raycast import Floats, Geometry
 from slam.rendering.scene import Scene, assemble
 from slam.rendering.surfaces import Colour, as_image, fabric, field, flat, octaves, plain
+from slam.rendering.walks import Escort, on_round
 
 _SKIN: tuple[Colour, ...] = ((224, 178, 148), (198, 146, 112), (150, 102, 72), (108, 72, 52))
 _HAIR: tuple[Colour, ...] = ((40, 30, 24), (92, 60, 36), (150, 112, 62), (120, 118, 116))
@@ -32,6 +33,7 @@ class Role:
     Attributes:
         action: "stand", "sit" or "walk".
         places: (x, y) in metres: one to stand or sit at, or a closed round to walk.
+        escorts: whether the round goes along with the camera: x to its right, y ahead of it.
         facing_deg: where who stands or sits looks, 0 along -y, counter-clockwise.
         carries: "", "suitcase", "book", "cup", "cell phone", "umbrella" or "box".
         speed_m_s: walking speed.
@@ -46,15 +48,20 @@ class Role:
     speed_m_s: float = 0.8
     patched: bool = False
     pulls: bool = False
+    escorts: bool = False
 
 
 @dataclass(frozen=True)
 class Person:
-    """Somebody with a role; ``phase`` in [0, 1) tells apart who does the same."""
+    """Somebody with a role; ``phase`` in [0, 1) tells apart who does the same.
+
+    ``escort`` is the walk of who goes along with the camera.
+    """
 
     role: Role
     phase: float
     scale: float
+    escort: Escort | None = None
 
     def bones(self, time_s: float) -> dict[str, Array]:
         """Poses T_world_bone (4, 4) by name, for the body's size."""
@@ -73,22 +80,17 @@ class Person:
     def _posture(self, time_s: float) -> tuple[sk.Posture, Array]:
         role = self.role
         if role.action == "walk":
-            T_world_person, distance_m = self._on_round(time_s)
+            T_world_person, distance_m = self._walked(time_s)
             stride = 2 * np.pi * distance_m / (1.3 * self.scale)
             return sk.walking(stride, bool(role.carries)), T_world_person
         here = pose(*role.places[0], 0.0, role.facing_deg)
         act = sk.sitting if role.action == "sit" else sk.standing
         return act(time_s, self.phase), here
 
-    def _on_round(self, time_s: float) -> tuple[Array, float]:
-        places = np.array([*self.role.places, self.role.places[0]], float)
-        legs = np.linalg.norm(np.diff(places, axis=0), axis=1)
-        knots = np.r_[0.0, np.cumsum(legs)]
-        curve = CubicSpline(knots, places, bc_type="periodic")
-        distance_m = self.role.speed_m_s * time_s + self.phase * knots[-1]
-        x, y = curve(distance_m % knots[-1])
-        dx, dy = curve(distance_m % knots[-1], 1)
-        return pose(x, y, 0.0, float(np.rad2deg(np.arctan2(dx, -dy)))), distance_m
+    def _walked(self, time_s: float) -> tuple[Array, float]:
+        if self.escort is not None:
+            return self.escort.at(time_s)
+        return on_round(self.role.places, self.role.speed_m_s * time_s, self.phase)
 
 
 _GRIPS = {
@@ -136,12 +138,14 @@ class Cast:
         return assemble(placed, lights, scene.first_moving_texture)
 
 
-def hire(b: SceneBuilder, roles: tuple[Role, ...], lighting: Lighting, count: int) -> Cast:
-    """Dress the people for the first ``count`` roles; each is an instance of the builder."""
+def hire(b: SceneBuilder, roles: tuple[Role, ...], lighting: Lighting, path: CameraPath) -> Cast:
+    """Dress a person for each role; each is an instance of the builder."""
     people, parts, owners = [], [], []
-    for who, role in enumerate(roles[:count]):
+    for who, role in enumerate(roles):
         phase, scale = b.rng.random(), b.rng.uniform(0.94, 1.06)
-        person = Person(role, 0.0 if role.pulls else phase, scale)
+        phase = 0.0 if role.pulls else phase
+        escort = Escort(path, role.places, role.speed_m_s, phase) if role.escorts else None
+        person = Person(role, phase, scale, escort)
         people.append(person)
         load = [*_load(b, role.carries), *(_pulled(b) if role.pulls else [])]
         for bone, part in [*_body(b, person.scale, role.patched), *load]:

@@ -36,6 +36,7 @@ from slam.sequences.cameras import write_camera
 SCENES: dict[str, str] = {
     "office": "an office for three with desks, computers and bookcases; one round through it",
     "busy_office": "the same office from the door side, with room for people to walk before it",
+    "crowded_office": "the busy office with people who walk close before the camera",
     "living_room": "a living room with sofa, television, dining table and bookcase; one round",
     "corridor": "a square corridor, a loop of 30 m that ends where it began",
     "room": "a room drawn at random from the seed: size, walls, light, furniture and round",
@@ -195,7 +196,7 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     roles = plan.roles
     if config.carry:
         roles = (replace(roles[0], carries="box", pulls=True), *roles[1:])
-    cast = hire(builder, roles, plan.lighting, config.people)
+    cast = hire(builder, roles[: config.people], plan.lighting, plan.path)
     scene = build_scene(builder, plan.lighting, cast.parts, config.seed)
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]

@@ -352,7 +352,14 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
 
 
 def test_scenes_are_listed_without_open3d() -> None:
-    assert set(SCENES) == {"office", "busy_office", "living_room", "corridor", "room"}
+    assert set(SCENES) == {
+        "office",
+        "busy_office",
+        "crowded_office",
+        "living_room",
+        "corridor",
+        "room",
+    }
     code = "import sys, slam.rendering.sequence; assert 'open3d' not in sys.modules"
     root = Path(__file__).resolve().parents[3]
     subprocess.run([sys.executable, "-c", code], cwd=root, check=True)
