@@ -141,8 +141,26 @@ class InstanceTracks:
     def reach_m(self, track: Track) -> Array:
         """Half size (3,) m of a predicted track's box, widened by what is not known."""
         sigma_m = np.sqrt(max(np.trace(track.covariance[:3, :3]) / 3, 0.0))
-        slack_m = min(self.config.box_sigmas * sigma_m, self.config.box_slack_m)
-        return track.half_size + slack_m + self.config.box_margin_m
+        return track.half_size + self._slack_m(sigma_m)
+
+    def moving_boxes(self, time_s: float) -> tuple[Array, Array]:
+        """Centres in the world and half sizes (T, 3) m of the moving tracks' boxes at a time.
+
+        Those of ``predicted`` and ``reach_m``, of all at once: the trace of a constant-velocity
+        prediction's covariance of position is that of P_pp + 2 dt P_pv + dt^2 P_vv + dt^4 / 4 a^2.
+        """
+        moving = [track for track in self.tracks if track.moving]
+        if not moving:
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        dt = time_s - np.array([track.time_s for track in moving])
+        means = np.array([track.mean for track in moving])
+        P = np.array([track.covariance for track in moving]).reshape(-1, 2, 3, 2, 3)
+        traces = np.einsum("tajbj->abt", P)
+        variance = (traces[0, 0] + 2 * dt * traces[0, 1] + dt**2 * traces[1, 1]) / 3
+        variance += 0.25 * dt**4 * self.config.acceleration_m_s2**2
+        slack_m = self._slack_m(np.sqrt(np.maximum(variance, 0)))
+        sizes = np.array([track.half_size for track in moving])
+        return means[:, :3] + dt[:, None] * means[:, 3:], sizes + slack_m[:, None]
 
     def clear(self) -> None:
         """End all tracks: another recording."""
@@ -182,6 +200,11 @@ class InstanceTracks:
                 strict=True,
             )
         ]
+
+    def _slack_m(self, sigma_m: Array) -> Array:
+        """By how much boxes are widened whose centres are not known better."""
+        known = self.config.box_sigmas * sigma_m
+        return np.minimum(known, self.config.box_slack_m) + self.config.box_margin_m
 
     def _assign(self, ahead: list[Track], sightings: Sequence[Sighting]) -> list[int]:
         """The row of the track of each sighting, -1 for none: the cheapest pairs in the gate."""

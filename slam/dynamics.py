@@ -34,6 +34,9 @@ from slam.tracker import Tracked
 from slam.view_memory import PosedView, ViewMemory
 from slam.world_map import Keyframe, WorldMap
 
+NEAREST_M = 0.2
+"""A box whose middle is nearer to the camera is not looked for in the image."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -241,22 +244,18 @@ class Dynamics:
 
     def _on_tracks(self, features: Features, time_s: float, T_world_camera: Array) -> Mask:
         """Features (N,) in the predicted boxes of moving tracks, in the image and in depth."""
-        inside = np.zeros(len(features), bool)
         self.tracks.expire(time_s)
-        for track in self.tracks.tracks:
-            if not track.moving:
-                continue
-            ahead = self.tracks.predicted(track, time_s)
-            reach_m = self.tracks.reach_m(ahead)
-            centre = transform(inverse(T_world_camera), ahead.mean[None, :3])
-            z = float(centre[0, 2])
-            if z < 0.2:
-                continue
-            middle = distorted(self.camera, centre)[0]
-            half_px = np.array([self.camera.fx, self.camera.fy]) * reach_m[:2] / z
-            box = (np.abs(features.image_pixels - middle) < half_px).all(axis=1)
-            inside |= box & ~(np.abs(features.depth_m - z) > reach_m[2])
-        return inside
+        centres, reach_m = self.tracks.moving_boxes(time_s)
+        centres = transform(inverse(T_world_camera), centres)
+        ahead = centres[:, 2] >= NEAREST_M
+        centres, reach_m = centres[ahead], reach_m[ahead]
+        z = centres[:, 2:]
+        middle = distorted(self.camera, centres)
+        half_px = np.array([self.camera.fx, self.camera.fy]) * reach_m[:, :2] / z
+        inside = ~(np.abs(features.depth_m - z) > reach_m[:, 2:])
+        for k in (0, 1):
+            inside &= np.abs(features.image_pixels[:, k] - middle[:, k, None]) < half_px[:, k, None]
+        return np.asarray(inside.any(axis=0))
 
     def _sighting(self, k: int, masks: KeyframeMasks, mapper: Mapper) -> Sighting | None:
         """An instance in space, and whether it moves; None without depth."""

@@ -114,26 +114,26 @@ class StaticCheck:
 
         The views have one size and step.
         """
-        T_camera_world = np.stack([inverse(T) for _, T in views]).astype(np.float32)
-        points = points_world.astype(np.float32) @ T_camera_world[:, :3, :3].transpose(0, 2, 1)
-        points += T_camera_world[:, None, :3, 3]
-        z = points[..., 2]
+        T_camera_world = inverse(np.array([T for _, T in views])).astype(np.float32)
+        to_cameras = T_camera_world[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3)
+        x, y, z = (to_cameras @ points_world.T.astype(np.float32)).reshape(3, len(views), -1)
+        x, y, z = (
+            a + t[:, None] for a, t in zip((x, y, z), T_camera_world[:, :3, 3].T, strict=True)
+        )
         ahead = (z > 0.1) & (z < self.config.max_depth_m)
-        u, v = self._pixels(np.where(ahead[..., None], points, np.array([0, 0, 1], np.float32)))
+        u, v = self._pixels(x, y, np.where(ahead, z, np.float32(1)))
         ahead &= (u > 0) & (u < self.camera.width - 1) & (v > 0) & (v < self.camera.height - 1)
-        first = views[0][0]
-        height, width = first.nearest_m.shape
-        rows = np.minimum(np.rint(v / first.step).astype(np.int32), height - 1)
-        columns = np.minimum(np.rint(u / first.step).astype(np.int32), width - 1)
-        number = np.arange(len(views), dtype=np.int32)[:, None]
-        place = np.where(ahead, (number * height + rows) * width + columns, 0)
-        nearest = np.stack([view.nearest_m for view, _ in views]).ravel()[place]
-        farthest = np.stack([view.farthest_m for view, _ in views]).ravel()[place]
+        step = views[0][0].step
+        height, width = views[0][0].nearest_m.shape
+        rows, columns = (np.where(ahead, a, 0) / np.float32(step) for a in (v, u))
+        place = np.minimum(np.rint(rows), height - 1) * np.float32(width)
+        place += np.minimum(np.rint(columns), width - 1)
+        nearest, farthest = _looked_up([view for view, _ in views], place.astype(np.int64))
         margin = self._margin_m(z)
-        verdicts = (np.abs(nearest - z) < margin) | (np.abs(farthest - z) < margin)
-        free = nearest - z > self._margin_m(nearest)
-        told = np.where(free, np.int8(Verdict.MOVING), verdicts.astype(np.int8))
-        return np.where(ahead, told, np.int8(Verdict.UNKNOWN))
+        verdicts = ((np.abs(nearest - z) < margin) | (np.abs(farthest - z) < margin)).view(np.int8)
+        verdicts[nearest - z > self._margin_m(nearest)] = Verdict.MOVING
+        verdicts *= ahead
+        return verdicts
 
     def agree(self, verdicts: Verdicts) -> Verdicts:
         """What several views (K, N) say together (N,): the majority of those that say anything."""
@@ -178,16 +178,26 @@ class StaticCheck:
         """How far apart two depths as large as these may lie and still be one surface."""
         return np.float32(self.config.margin_m) + np.float32(self._sigmas_per_m2) * depth_m**2
 
-    def _pixels(self, points_camera: Depths) -> tuple[Depths, Depths]:
-        """Columns and rows (K, N) in the image as recorded of points (K, N, 3) before it."""
+    def _pixels(self, x: Depths, y: Depths, z: Depths) -> tuple[Depths, Depths]:
+        """Columns and rows (K, N) in the image as recorded of points (K, N) before it."""
         if any(self.camera.distortion):
-            flat = distorted(self.camera, points_camera.reshape(-1, 3).astype(float))
-            pixels = flat.astype(np.float32).reshape(*points_camera.shape[:2], 2)
-            return pixels[..., 0], pixels[..., 1]
-        camera, per_z = self.camera, 1 / points_camera[..., 2]
-        u = camera.fx * points_camera[..., 0] * per_z + camera.cx
-        v = camera.fy * points_camera[..., 1] * per_z + camera.cy
+            points = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(float)
+            u, v = distorted(self.camera, points).astype(np.float32).T.reshape(2, *z.shape)
+            return u, v
+        camera, per_z = self.camera, 1 / z
+        u = camera.fx * x * per_z + camera.cx
+        v = camera.fy * y * per_z + camera.cy
         return u.astype(np.float32, copy=False), v.astype(np.float32, copy=False)
+
+
+def _looked_up(views: Sequence[DepthView], place: NDArray[np.int64]) -> tuple[Depths, Depths]:
+    """Nearest and farthest depths (K, N) of each view at its places (K, N), counted by rows."""
+    nearest = np.empty(place.shape, np.float32)
+    farthest = np.empty(place.shape, np.float32)
+    for view, where, near, far in zip(views, place, nearest, farthest, strict=True):
+        view.nearest_m.take(where, out=near, mode="clip")
+        view.farthest_m.take(where, out=far, mode="clip")
+    return nearest, farthest
 
 
 def distorted(camera: Camera, points_camera: Array) -> Array:
