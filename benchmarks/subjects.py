@@ -48,7 +48,8 @@ LABELS = (
     "data/labels/*.yaml",
 )
 MOVING = _of("semantics", "instance_tracks.py movability.py") + _of(
-    "slam", "dynamics.py keyframe_masks.py stance.py static_check.py view_memory.py"
+    "slam",
+    "dynamics.py feature_check.py keyframe_masks.py stance.py static_check.py view_memory.py",
 )
 DENSE = _of(
     "mapping",

@@ -9,11 +9,11 @@ import numpy as np
 
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
-from graph.geometry import Array, inverse, transform
+from graph.geometry import Array, transform
 from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
 from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
-from semantics.objects import pixel_rays
-from slam.depth_regions import DepthRegionConfig, depth_regions
+from slam.depth_regions import DepthRegionConfig
+from slam.feature_check import FeatureCheck
 from slam.features import Features, select
 from slam.frame import Frame
 from slam.keyframe_masks import KeyframeMasks, surface_points
@@ -21,21 +21,10 @@ from slam.landmarks import Ints, Mask
 from slam.localiser import Localiser
 from slam.mapper import Mapper
 from slam.stance import Stance, stance
-from slam.static_check import (
-    DepthView,
-    StaticCheck,
-    StaticCheckConfig,
-    Verdict,
-    Verdicts,
-    depth_view,
-    distorted,
-)
+from slam.static_check import DepthView, StaticCheck, StaticCheckConfig, Verdict, depth_view
 from slam.tracker import Tracked
 from slam.view_memory import PosedView, ViewMemory
 from slam.world_map import Keyframe, WorldMap
-
-NEAREST_M = 0.2
-"""A box whose middle is nearer to the camera is not looked for in the image."""
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +97,7 @@ class Dynamics:
         self.tracks = InstanceTracks(config.tracks)
         self.memory = ViewMemory(config.check)
         self._check = StaticCheck(camera, disparity_sigma_px, config.check)
-        self._rays = pixel_rays(camera, config.regions.step_px)
+        self._features = FeatureCheck(camera, self._check, config.regions)
 
     def leave_out(
         self,
@@ -122,6 +111,7 @@ class Dynamics:
 
         If most seem to move, all are tracked first, and used if even they give no pose.
         """
+        self.tracks.expire(frame.timestamp_s)
         views = self.memory.posed(segment, mapper)
         predicted = localiser.prediction() if localiser is not None else None
         sifted = self.sift(frame, features, predicted, views)
@@ -147,8 +137,9 @@ class Dynamics:
         verdicts, moving = np.zeros(len(features), np.int8), np.zeros(len(features), bool)
         if T_world_camera is not None:
             if geometry:
-                verdicts = self._judge_features(frame, features, T_world_camera, views)
-            on_tracks = self._on_tracks(features, frame.timestamp_s, T_world_camera)
+                verdicts = self._features.judge(frame, features, T_world_camera, views)
+            boxes_world = self.tracks.moving_boxes(frame.timestamp_s)
+            on_tracks = self._features.in_boxes(features, boxes_world, T_world_camera)
             moving = (verdicts == Verdict.MOVING) | (on_tracks & (verdicts != Verdict.STATIC))
         if not moving.any():
             return Sifted(features, moving, False, view)
@@ -224,38 +215,6 @@ class Dynamics:
     def _least(self) -> float:
         """Log odds of a class that is movable enough to be tracked."""
         return float(log_odds(self.config.tracks.min_prior))
-
-    def _judge_features(
-        self, frame: Frame, features: Features, T_world_camera: Array, views: list[PosedView]
-    ) -> Verdicts:
-        """What earlier keyframes say about features (N,), at a predicted pose."""
-        if not views:
-            return np.zeros(len(features), np.int8)
-        regions = depth_regions(frame.depth_m, self.config.regions)
-        samples = (self._rays * regions.depth_m[..., None]).reshape(-1, 3)
-        points = self.camera.backproject(features.pixels, features.depth_m)
-        points_world = transform(T_world_camera, np.concatenate([points, samples]))
-        told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
-        verdicts = self._check.agree(told)
-        moving = regions.moving(verdicts[len(features) :].reshape(regions.labels.shape))
-        verdicts = self._check.spread(features.pixels, features.depth_m, verdicts[: len(features)])
-        on_moving = regions.on(moving, features.image_pixels, features.depth_m)
-        return np.where(on_moving, Verdict.MOVING, verdicts).astype(np.int8)
-
-    def _on_tracks(self, features: Features, time_s: float, T_world_camera: Array) -> Mask:
-        """Features (N,) in the predicted boxes of moving tracks, in the image and in depth."""
-        self.tracks.expire(time_s)
-        centres, reach_m = self.tracks.moving_boxes(time_s)
-        centres = transform(inverse(T_world_camera), centres)
-        ahead = centres[:, 2] >= NEAREST_M
-        centres, reach_m = centres[ahead], reach_m[ahead]
-        z = centres[:, 2:]
-        middle = distorted(self.camera, centres)
-        half_px = np.array([self.camera.fx, self.camera.fy]) * reach_m[:, :2] / z
-        inside = ~(np.abs(features.depth_m - z) > reach_m[:, 2:])
-        for k in (0, 1):
-            inside &= np.abs(features.image_pixels[:, k] - middle[:, k, None]) < half_px[:, k, None]
-        return np.asarray(inside.any(axis=0))
 
     def _sighting(self, k: int, masks: KeyframeMasks, mapper: Mapper) -> Sighting | None:
         """An instance in space, and whether it moves; None without depth."""

@@ -49,8 +49,8 @@ class ViewMemory:
         """Remember what a keyframe saw, unless the last is too recent."""
         if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.config.interval_s:
             return
-        views = view.thinned(THINNED), view.thinned(THINNED)
-        self.views.append(RememberedView(keyframe_id, timestamp_s, *views))
+        seen = view.thinned(THINNED)
+        self.views.append(RememberedView(keyframe_id, timestamp_s, seen.thinned(1), seen))
         del self.views[: -self.config.views]
 
     def posed(self, segment: int, mapper: Mapper) -> list[PosedView]:
