@@ -109,7 +109,7 @@ class WatchedSystem(SlamSystem):
     """The system; keeps the counts of every frame, and pictures of every ``every``-th.
 
     ``check_ms`` is the processor's time that a frame's dynamic check took, which other programs
-    do not change.
+    do not change. ``covered`` is the share of each frame that what moves covers.
     """
 
     truth: MovingTruth
@@ -121,6 +121,7 @@ class WatchedSystem(SlamSystem):
         self.counts: list[dict[str, Count]] = []
         self.pictures: list[Image] = []
         self.check_ms: list[float] = []
+        self.covered: list[float] = []
         return self
 
     def total(self, kind: str) -> Count:
@@ -134,6 +135,7 @@ class WatchedSystem(SlamSystem):
         masks = self.truth.masks(frame)
         seen = features.image_pixels, sifted.moving
         self.counts.append(count(*seen, masks))
+        self.covered.append(float(np.any(list(masks.values()), axis=0).mean()))
         if frame.index % self.every == self.every // 2:
             self.pictures.append(picture(frame, seen, masks))
         return sifted

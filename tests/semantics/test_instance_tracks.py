@@ -82,3 +82,16 @@ def test_state_and_back() -> None:
     other.restore(tracks.state())
     assert all(np.array_equal(a, other.state()[name]) for name, a in tracks.state().items())
     assert other.see(0.6, [seen(0.3), seen(5.0)]) == tracks.see(0.6, [seen(0.3), seen(5.0)])
+
+
+def test_all_boxes_at_once_are_those_of_each_track() -> None:
+    tracks = InstanceTracks()
+    for k in range(4):
+        tracks.see(0.3 * k, [seen(0.2 * k), seen(2.0 + 0.1 * k, z=2.0)])
+    tracks.see(1.1, [seen(0.75), Sighting(np.array([-2.0, 0, 2]), SIZE, CHAIR, -1.0)])
+    centres, sizes = tracks.moving_boxes(1.3)
+    ahead = [tracks.predicted(t, 1.3) for t in tracks.tracks if t.moving]
+    assert len(ahead) == 2 < len(tracks.tracks)
+    np.testing.assert_allclose(centres, [t.mean[:3] for t in ahead], atol=1e-12)
+    np.testing.assert_allclose(sizes, [tracks.reach_m(t) for t in ahead], atol=1e-12)
+    assert InstanceTracks().moving_boxes(0.0)[0].shape == (0, 3)
