@@ -4,8 +4,10 @@
 
 Sequences are rendered with --true-depth. A landmark is what the truth shows at its place in most
 keyframes that see it. Objects that at least two keyframes show with enough pixels are to be found
-at a 3-D IoU of 0.25, with their label: against the box of the surface that the keyframes show
-(what a camera can know), and against the whole object's.
+at a 3-D IoU of 0.25, with their label: against the box of the surface that the keyframes measure,
+by true depth where the sensor gave one that is right within four sigmas (what a camera can know; of
+a side seen at a glancing angle it gives none); against that of the surface that they show to a
+perfect sensor; and against the whole object's.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from semantics.label_store import LabelStore
 from semantics.objects import MapObject, pixel_rays
 from semantics.segmenter_table import make_segmenter
 from slam.configuration import resolve
+from slam.rendering.sensor import depth_sigma_m
 from slam.rendering.true_boxes import OBJECTS_TRUTH
 from slam.sequences import Sequence, open_sequence
 from slam.system import SlamSystem
@@ -37,6 +40,7 @@ MIN_PIXELS = 300
 MIN_IOU = 0.25
 BINS = 10
 UP = np.array([0.0, 0.0, 1.0])
+KINDS = ("measured", "visible", "whole")
 
 
 class RecordingStore(LabelStore):
@@ -72,16 +76,20 @@ class Tally:
     correct_best_view: list[Array] = field(default_factory=list)
     objects: int = 0
     told: int = 0
-    found: dict[str, int] = field(default_factory=lambda: {"visible": 0, "whole": 0})
+    found: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KINDS, 0))
     per_sequence: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A rendered keyframe: instances (H, W), true depth (H, W) m, T_truth_camera (4, 4)."""
+    """A rendered keyframe: instances (H, W), true depth (H, W) m, T_truth_camera (4, 4).
+
+    ``measured`` (H, W): the sensor gave a depth there, of the surface that is there.
+    """
 
     instances: np.ndarray
     depth_m: np.ndarray
+    measured: np.ndarray
     T_truth_camera: Array
 
 
@@ -147,7 +155,14 @@ def read_truth(sequence: Sequence, keyframe: Keyframe) -> Truth:
     row = np.abs(sequence.groundtruth.timestamps_s - keyframe.timestamp_s).argmin()
     pose = sequence.groundtruth.poses_world_camera[row]
     depth_m = np.where(depth > 0, depth / sequence.camera.depth_scale, np.nan)
-    return Truth(instances.astype(np.int64), depth_m, pose)
+    return Truth(instances.astype(np.int64), depth_m, measured(sequence, keyframe, depth_m), pose)
+
+
+def measured(sequence: Sequence, keyframe: Keyframe, depth_m: np.ndarray) -> np.ndarray:
+    """Where (H, W) the sensor's depth is within four sigmas of the truth (H, W)."""
+    file = sequence.pairs.depth_files[keyframe.frame_index]
+    given = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) / sequence.camera.depth_scale
+    return (given > 0) & (np.abs(given - depth_m) < 4 * depth_sigma_m(depth_m))
 
 
 def alignment(keyframes: list[Keyframe], truths: dict[int, Truth]) -> Array:
@@ -222,13 +237,13 @@ def measure_objects(
     tally: Tally,
 ) -> list[str]:
     truths, T_truth_world, categories = truth
-    visible, minor = visible_boxes(system, truths)
+    (visible, minor), (measurable, _) = (visible_boxes(system, truths, m) for m in (False, True))
     whole = whole_boxes(sequence.folder)
     told = [(o, moved(o, T_truth_world)) for o in system.objects().objects if o.label]
     lines, ids = [], sorted(visible)
     tally.objects += len(ids)
     ignored: set[int] = set()
-    for kind, boxes in (("whole", whole), ("visible", visible)):
+    for kind, boxes in (("whole", whole), ("visible", visible), ("measured", measurable)):
         ious = pair_ious(told, [(categories[i], boxes.get(i)) for i in ids])
         rows, columns = linear_sum_assignment(-ious)
         good = ious[rows, columns] >= MIN_IOU
@@ -272,19 +287,24 @@ def pair_ious(
 
 
 def visible_boxes(
-    system: SlamSystem, truths: dict[int, Truth]
+    system: SlamSystem, truths: dict[int, Truth], measurable: bool
 ) -> tuple[dict[int, OrientedBox], dict[int, OrientedBox]]:
-    """By instance, the box of the surface that keyframes show; of those shown well, and others."""
+    """By instance, the box of the surface that keyframes show; of those shown well, and others.
+
+    Or that they measure; shown well they are by what is shown.
+    """
     rays = pixel_rays(system.camera, 1)
     points: dict[int, list[Array]] = {}
     views: dict[int, int] = {}
     for truth in truths.values():
         shown = (truth.instances > 0) & np.isfinite(truth.depth_m) & (truth.depth_m < 6.0)
+        for i, n in zip(*np.unique(truth.instances[shown], return_counts=True), strict=True):
+            views[int(i)] = views.get(int(i), 0) + int(n >= MIN_PIXELS)
+        shown &= truth.measured | (not measurable)
         owners = truth.instances[shown]
         world = transform(truth.T_truth_camera, rays[shown] * truth.depth_m[shown][:, None])
         for i in np.unique(owners).tolist():
             mine = world[owners == i]
-            views[i] = views.get(i, 0) + (len(mine) >= MIN_PIXELS)
             points.setdefault(i, []).append(mine[:: max(1, len(mine) // 2000)])
     boxes = {i: box_around(np.concatenate(p), UP) for i, p in points.items()}
     well = {i: b for i, b in boxes.items() if views[i] >= 2}

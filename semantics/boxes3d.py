@@ -86,6 +86,21 @@ def box_around(points_world: Array, up_world: Array) -> OrientedBox:
     return OrientedBox(T, np.maximum(size_m, MIN_SIZE_M))
 
 
+def without_noise(points_world: Array, noise_world: Array, up_world: Array, share: float) -> Array:
+    """The points (N, 3), those moved in that noise may have carried out of the thing's box.
+
+    ``noise_world`` (N, 3) is what a sigma of its depth moves each by. Each side of the box moves in
+    by the median of this in its direction, but not beyond that share of the points.
+    """
+    T_world_box = box_around(points_world, up_world).T_world_box
+    axes = T_world_box[:3, :3]
+    local = (points_world - T_world_box[:3, 3]) @ axes
+    reach = np.median(np.abs(noise_world @ axes), axis=0)
+    low, high = np.quantile(local, [share, 1 - share], axis=0)
+    low, high = np.minimum(low, local.min(0) + reach), np.maximum(high, local.max(0) - reach)
+    return np.asarray(np.clip(local, low, high) @ axes.T + T_world_box[:3, 3])
+
+
 def box_iou(a: OrientedBox, b: OrientedBox) -> float:
     """Volume of the intersection over that of the union, by a grid of 4096 points in each box."""
     shares = [q.contains(_filled(p)).mean() * p.volume_m3 for p, q in ((a, b), (b, a))]

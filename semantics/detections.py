@@ -16,13 +16,22 @@ from semantics.votes import NOBODY, Claims, Ints
 class DetectionConfig:
     """Which pixels of an instance become points, and how many.
 
-    ``border_px``: nearer to a mask's border depth belongs to this side or the other. An instance
+    ``border_px``: nearer to a mask's border depth belongs to this side or the other; not where
+    both sides' masks have scores of ``exact_score`` or more. An instance
     with fewer than ``min_points`` is passed over, of more than ``max_points`` some are taken.
+
+    The inverse depth of a point is a mean over pixels of its instance in a window of
+    ``smooth_px`` to each side, of those whose depth is within three sigmas: at 1 m
+    ``depth_sigma_m``, growing with the square of the depth. Noise along the rays would else make
+    thin things thick.
     """
 
     border_px: int = 1
+    exact_score: float = 0.99
     min_points: int = 12
     max_points: int = 300
+    smooth_px: int = 4
+    depth_sigma_m: float = 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +64,7 @@ def detect(
     """
     step = claims.owner.shape[0] // depth_m.shape[0]
     height, width = depth_m.shape
-    owner = _without_border(claims.owner, config.border_px)[::step, ::step][:height, :width]
+    owner = _without_border(claims, config)[::step, ::step][:height, :width]
     rows, columns = np.nonzero((owner != NOBODY) & np.isfinite(depth_m))
     owners, z_m = owner[rows, columns].astype(np.int64), depth_m[rows, columns].astype(float)
     good = claims.on_surface(owners, z_m)
@@ -67,17 +76,43 @@ def detect(
     instances = np.flatnonzero(sizes >= config.min_points)
     number = np.full(len(claims.instances) + 1, -1)
     number[instances] = np.arange(len(instances))
-    points = rays[rows, columns] * depth_m[rows, columns, None]
+    z_m = _smoothed((owner, depth_m), rows, columns, config.smooth_px // step, config)
+    points = rays[rows, columns] * z_m[:, None]
     return Detections(instances, points, number[owners], number)
 
 
-def _without_border(owner: NDArray[np.int16], border_px: int) -> NDArray[np.int16]:
-    """Owners of pixels (H, W), nobody where another is within so many pixels."""
-    if border_px == 0:
+def _smoothed(
+    images: tuple[NDArray[np.int16], NDArray[np.float32]],
+    rows: Ints,
+    columns: Ints,
+    reach: int,
+    config: DetectionConfig,
+) -> Array:
+    """Depths (P,) of pixels of the images (h, w) of owners and depth, means over windows."""
+    owner, depth_m = images
+    shifts = np.arange(-reach, reach + 1)
+    v = np.clip(rows[:, None, None] + shifts[:, None], 0, depth_m.shape[0] - 1)
+    u = np.clip(columns[:, None, None] + shifts, 0, depth_m.shape[1] - 1)
+    z_m = depth_m[rows, columns].astype(float)[:, None, None]
+    near = depth_m[v, u]
+    with np.errstate(invalid="ignore"):
+        alike = np.abs(near - z_m) < 3 * config.depth_sigma_m * z_m**2
+    alike &= owner[v, u] == owner[rows, columns][:, None, None]
+    alike[:, reach, reach] = True
+    inverse = np.where(alike, 1 / near, 0.0)
+    return np.asarray(alike.sum(axis=(1, 2)) / inverse.sum(axis=(1, 2)))
+
+
+def _without_border(claims: Claims, config: DetectionConfig) -> NDArray[np.int16]:
+    """Owners of pixels (H, W), nobody where another is near and either may be wrong."""
+    owner, reach = claims.owner, config.border_px
+    vague = np.array([*(i.mask_score < config.exact_score for i in claims.instances), False])
+    if reach == 0 or not vague.any():
         return owner
-    square = np.ones((2 * border_px + 1, 2 * border_px + 1), np.uint8)
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     alone = cv2.erode(owner, square) == cv2.dilate(owner, square)
-    return np.where(alone, owner, np.int16(NOBODY))
+    near_vague = cv2.dilate(vague[owner].astype(np.uint8), square) > 0
+    return np.where(alone | ~near_vague, owner, np.int16(NOBODY))
 
 
 def _evenly(groups: Ints, sizes: Ints, most: int) -> NDArray[np.bool_]:

@@ -47,6 +47,15 @@ class ObjectPoints:
         moved = transform(T_world_anchor[where], points[:, None])[:, 0]
         return self._owners[rows], moved
 
+    def rays_in_world(self, poses: dict[int, Array]) -> Array:
+        """(N, 3) of the same rows: what an error of z^2 in its depth z moves a point by."""
+        rows = self.rows(poses)
+        anchors, where = np.unique(self._anchors[rows], return_inverse=True)
+        R_world_anchor = np.array([poses[k][:3, :3] for k in anchors.tolist()]).reshape(-1, 3, 3)
+        points = self._points[rows].astype(float)
+        turned = np.einsum("nij,nj->ni", R_world_anchor[where], points)
+        return np.asarray(turned * points[:, 2:])
+
     def rows(self, poses: dict[int, Array]) -> Ints:
         """The rows of points whose keyframe has a pose."""
         return np.flatnonzero(np.isin(self._anchors, list(poses)))

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
-from semantics.boxes3d import OrientedBox, box_around, supported
+from semantics.boxes3d import OrientedBox, box_around, supported, without_noise
 from semantics.detections import DetectionConfig, Detections, detect
 from semantics.label_store import LabelStore, LabelStoreConfig
 from semantics.object_association import (
@@ -33,7 +33,8 @@ class ObjectConfig:
     """How objects are made of detections.
 
     An object of fewer than ``min_keyframes`` is not told of; one keeps ``max_points`` points. In
-    its box are those that have ``neighbours`` others within ``support_m``.
+    its box are those that have ``neighbours`` others within ``support_m``; each side is moved in
+    by a sigma of the depth, but not beyond the share ``trim`` of the points.
     """
 
     enabled: bool = True
@@ -41,6 +42,7 @@ class ObjectConfig:
     max_points: int = 2000
     neighbours: int = 2
     support_m: float = 0.03
+    trim: float = 0.02
     detections: DetectionConfig = field(default_factory=DetectionConfig)
     association: AssociationConfig = field(default_factory=AssociationConfig)
     revision: RevisionConfig = field(default_factory=RevisionConfig)
@@ -150,6 +152,7 @@ class ObjectMap:
     def objects(self, poses: dict[int, Array], up_world: Array) -> list[MapObject]:
         """The objects as they are now, by id, of those keyframes whose poses are given."""
         owners, points = self.points.in_world(poses)
+        noise = self.config.association.depth_sigma_m * self.points.rays_in_world(poses)
         found = []
         for i in np.unique(owners).tolist():
             keyframe_ids, stamps_s = self.points.sightings(i)
@@ -157,8 +160,10 @@ class ObjectMap:
                 continue
             distribution = self.labels.probabilities(np.array([i]))[0]
             mine = points[owners == i]
-            mine = mine[supported(mine, self.config.neighbours, self.config.support_m)]
-            box = box_around(mine, up_world)
+            near = supported(mine, self.config.neighbours, self.config.support_m)
+            mine = mine[near]
+            inner = without_noise(mine, noise[owners == i][near], up_world, self.config.trim)
+            box = box_around(inner, up_world)
             label, landmarks = int(distribution.argmax()), self.points.landmarks_of(i)
             seen_s = float(stamps_s.min()), float(stamps_s.max())
             shape, by_whom = (mine.mean(axis=0), box), (keyframe_ids, landmarks)

@@ -7,7 +7,15 @@ import pytest
 
 from graph.camera import Camera
 from graph.geometry import Array, se3_exp, transform
-from semantics.boxes3d import EDGES, OrientedBox, box_around, box_iou, supported, upright_axes
+from semantics.boxes3d import (
+    EDGES,
+    OrientedBox,
+    box_around,
+    box_iou,
+    supported,
+    upright_axes,
+    without_noise,
+)
 from semantics.objects import pixel_rays
 from semantics.upright import Upright, sample_normals, up_direction
 
@@ -53,6 +61,28 @@ def test_a_face_of_few_points_stays_in_the_box() -> None:
     points = np.concatenate([back, cover])
     assert supported(points, 2, 0.03).all()
     assert not supported(points, 2, 0.01)[2000:].any()
+
+
+def test_noise_along_the_rays_does_not_make_a_box_thicker() -> None:
+    """A board that many views saw from the front, and a side of few points that they did not."""
+    rng = np.random.default_rng(5)
+    board = rng.uniform(-0.5, 0.5, (2000, 3)) * [0.4, 0.0, 0.3]
+    side = np.array([[0.2, y, z] for y in (0.18, 0.2) for z in (0.0, 0.01)])
+    for clean, thickness_m in ((board, 0.0), (np.concatenate([board, side]), 0.2)):
+        noise = np.zeros_like(clean)
+        noise[:, 1] = 0.02  # a sigma of the depth, all rays along y
+        points = clean + noise * rng.normal(0, 0.5, (len(clean), 1))
+        for T in (np.eye(4), T_B_A):
+            here, up = transform(T, points), T[:3, :3] @ UP
+            inner = without_noise(here, noise @ T[:3, :3].T, up, 0.02)
+            sizes = [np.sort(box_around(p, up).size_m) for p in (here, inner)]
+            if thickness_m:
+                thinner_m = sizes[0][0] - sizes[1][0]
+                assert 0.015 < thinner_m < 0.041  # at most a sigma at either side
+            else:
+                assert sizes[1][0] < 0.7 * sizes[0][0]
+            assert np.allclose(sizes[1][1:], [0.3, 0.4], atol=0.01)
+            assert np.allclose(without_noise(here, 0 * noise, up, 0.02), here)
 
 
 def test_support_is_what_counting_neighbours_says() -> None:

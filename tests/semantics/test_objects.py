@@ -123,6 +123,19 @@ def test_objects_follow_the_keyframes_that_saw_them() -> None:
         assert np.allclose(transform(moved, old[None])[0], o.centroid_world, atol=1e-6)
 
 
+def test_rays_say_what_an_error_of_depth_does_to_points() -> None:
+    scene = Scene(se3_exp(np.array([0.5, 0.2, -0.7, 1.0, 2.0, 3.0])))
+    for x in (0.0, 0.2):
+        scene.show(x, CHAIRS)
+    points = scene.map.points
+    before, rays = points.in_world(scene.poses)[1], points.rays_in_world(scene.poses)
+    z = points._points[:, 2:].astype(float)
+    points._points = (points._points * (1 + 1e-3 * z)).astype(np.float32)  # z to z + 1e-3 z^2
+    after = points.in_world(scene.poses)[1]
+    assert np.allclose(after - before, 1e-3 * rays, atol=1e-6)
+    assert np.allclose(np.abs(rays).max(), 4.0, rtol=0.6)
+
+
 def test_points_of_a_culled_keyframe_stay_where_they_are() -> None:
     scene = Scene()
     for x in PATH:
