@@ -20,6 +20,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 KITCHEN = ROOT.parent / "shared" / "data" / "redkitchen"
+NAME = 24
 COLUMNS = (
     ("ate_rmse", "ATE cm", 100.0),
     ("tracked_share", "tracked %", 100.0),
@@ -58,8 +59,9 @@ def main() -> None:
         "flat out": ["live", *common, *without],
         "realtime": ["live", *common, "--realtime", *without],
         f"realtime, {arguments.segmenter}": ["live", *common, "--realtime", *masks],
+        f"realtime, {arguments.segmenter}, dense": ["live", *common, "--realtime", *masks, "--map"],
     }
-    print(f"{'':18}" + "".join(f"{title:>12}" for _, title, _ in COLUMNS))
+    print(f"{'':{NAME}}" + "".join(f"{title:>12}" for _, title, _ in COLUMNS))
     with tempfile.TemporaryDirectory() as scratch:
         runs: dict[str, list[dict[str, float]]] = {name: [] for name in variants}
         for _ in range(arguments.repeats):  # interleaved, since the machine's mood changes
@@ -70,7 +72,7 @@ def main() -> None:
         for key, _, scale in COLUMNS:
             values = [scale * run[key] for run in found if key in run]
             cells.append(f"{np.median(values):12.2f}" if values else f"{'':12}")
-        print(f"{name:18}" + "".join(cells))
+        print(f"{name:{NAME}}" + "".join(cells))
 
 
 if __name__ == "__main__":

@@ -296,8 +296,9 @@ class LiveSlam:
         if self.dense.failure:
             logger.error("%s; bmask-slam map %s completes it", self.dense.failure, run)
         elif self.dense.missing:
-            count = len(self.dense.missing)
-            logger.warning("bmask-slam map %s adds the %d keyframes left out", run, count)
+            count, here = len(self.dense.missing), self.options.images != Path()
+            cure = "adds" if here else "with their images as --sequence adds"
+            logger.warning("bmask-slam map %s %s the %d keyframes left out", run, cure, count)
         ended = replace(health, submaps=len(dense.submaps), submaps_waiting=0)
         folder.write_text(HEALTH, ended.as_json())
 

@@ -124,7 +124,7 @@ def test_on_a_full_disk_tracking_goes_on_and_the_end_says_what_is_missing(
     missing = keyframes_without(run)
     assert slam.dense is not None
     assert slam.dense.missing == sorted(missing)
-    assert f"adds the {len(missing)} keyframes left out" in caplog.text
+    assert f"--sequence adds the {len(missing)} keyframes left out" in caplog.text
     assert any("No space left" in reason for reason in missing.values())
     assert not running(pids)
 

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from synthetic_view import CAMERA, render_plane
+from numpy.typing import NDArray
+from synthetic_view import CAMERA, make_features, render_plane
 
 from graph.errors import InputError
 from graph.geometry import se3_exp
 from slam.cli import main
+from slam.live.dense_messages import Preview
+from slam.live.display import Display
 from slam.live.live_slam import LiveOptions, LiveSlam
 from slam.viewer.scene import Scene, ViewOptions
+from slam.world_map import WorldMap
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(12)]
+NO_FEATURES = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
 FRAMES = [render_plane(pose, index) for index, pose in enumerate(POSES)]
 
 
@@ -25,7 +31,7 @@ def recorded(tmp_path_factory) -> Path:
     """A live run with its recording, and a replay of it."""
     folder = tmp_path_factory.mktemp("view")
     view = ViewOptions(record=folder / "live.rrd")
-    with LiveSlam(CAMERA, options=LiveOptions(folder / "run", view=view)) as slam:
+    with LiveSlam(CAMERA, options=LiveOptions(folder / "run", view=view, dense=True)) as slam:
         for frame in FRAMES:
             slam.track(frame.timestamp_s, frame.rgb, frame.depth_m)
     assert main(["view", str(folder / "run"), "--record", str(folder / "replay.rrd")]) == 0
@@ -48,6 +54,7 @@ def test_the_recording_holds_camera_map_and_plots(recorded, name) -> None:
     assert rows["/plots/status/status"] == len(FRAMES)
     for path in ("/world/landmarks", "/world/keyframes", "/world/camera/image"):
         assert rows[path] >= 1, path
+    assert rows["/world/submaps/0" if name == "live.rrd" else "/world/dense"] >= 1
 
 
 def test_without_rerun_it_says_what_to_install(monkeypatch, tmp_path) -> None:
@@ -59,3 +66,46 @@ def test_without_rerun_it_says_what_to_install(monkeypatch, tmp_path) -> None:
 def test_a_recording_in_no_folder_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         Scene("a", ViewOptions(record=tmp_path / "none" / "a.rrd"))
+
+
+def columns(path: Path, entity: str, name: str) -> list[NDArray[np.float64]]:
+    """What a recording holds of one component of an entity, row by row."""
+    found = []
+    for chunk in RrdReader(path).stream().to_chunks():
+        if str(chunk.entity_path) != entity:
+            continue
+        batch = chunk.to_record_batch()
+        for k, field in enumerate(batch.schema):
+            if field.name.endswith(name):
+                rows = [row for row in batch.column(k).to_pylist() if row]
+                found += [np.array(row, float) for row in rows]
+    return found
+
+
+def test_submaps_stand_where_their_keyframes_are_and_move_with_them(tmp_path) -> None:
+    scene = Scene("a", ViewOptions(record=tmp_path / "a.rrd"))
+    display, world = Display(scene), WorldMap()
+    world.keyframes = {
+        k: SimpleNamespace(segment=k // 2, T_world_camera=POSES[k]) for k in range(3)
+    }
+    points = np.arange(12, dtype=np.float32).reshape(4, 3)
+    previews = {k: Preview(points, np.full((4, 3), 9, np.uint8)) for k in range(3)}
+    dense = SimpleNamespace(previews=previews)  # all that it is asked for
+    display.submaps(dense, world, True, 1)
+    display.submaps(dense, world, False, 1)
+    assert list(previews) == [2]  # of another map segment
+    world.keyframes[0].T_world_camera = POSES[9]
+    world.keyframes[1].T_world_camera = POSES[1] @ se3_exp(np.full(6, 1e-5))
+    display.submaps(dense, world, True, 5)
+    del world.keyframes[1]
+    display.submaps(dense, world, True, 5)
+    scene.close()
+    moves = columns(tmp_path / "a.rrd", "/world/submaps/0", "Transform3D:translation")
+    expected = [POSES[0][:3, 3], POSES[9][:3, 3]]
+    np.testing.assert_allclose(np.ravel(moves).reshape(-1, 3), expected, atol=1e-6)
+    still = columns(tmp_path / "a.rrd", "/world/submaps/1", "Transform3D:translation")
+    np.testing.assert_allclose(np.ravel(still), POSES[1][:3, 3], atol=1e-6)
+    shown = columns(tmp_path / "a.rrd", "/world/submaps/0", "Points3D:positions")
+    np.testing.assert_allclose(shown[0].reshape(-1, 3), points)
+    assert columns(tmp_path / "a.rrd", "/world/submaps/1", "Clear:is_recursive")
+    assert not columns(tmp_path / "a.rrd", "/world/submaps/2", "Points3D:positions")
