@@ -4,14 +4,15 @@
     python benchmarks/segmentation.py rooms --rooms runs/bench/rooms
     python benchmarks/segmentation.py cost
 
-Photographs: the part of ../shared/data/coco_excerpt that no training saw (`--held-out 0.28
---seed 0`), boxes from YOLOX-Nano at 416 and at 640 pixels; by the project's own weights, and by
-three networks that went on from them on the excerpt's photographs alone ({} in ``--weights`` stands
-for the seed). Rooms: seeds that no training saw, the network's own boxes. Cost: a 640x480 image in
-a process of its own, two threads, random weights that take every proposal for an object, so that
-there are as many instances as the network gives at most. "IoU corr." is of predicted and true IoU
-of the masks in boxes that overlap an object of their class by half; "where good" of those masks
-alone that overlap it by half themselves.
+Photographs: the part of ../shared/data/coco_excerpt that no training saw (`--held-out 0.28 --seed
+0`), boxes from YOLOX-Nano at 416 and at 640 pixels; by the project's own weights, and by three
+networks that went on from them on the excerpt's photographs alone, first the masks, then the
+MaskIoU head in the detector's boxes ({} in ``--weights`` stands for the seed). Rooms: seeds that no
+training saw, the network's own boxes. Cost: a 640x480 image in a process of its own, two threads,
+random weights that take every proposal for an object, so that there are as many instances as the
+network gives at most. "IoU corr." is of predicted and true IoU of the masks in boxes that overlap
+an object of their class by half; "where good" of those masks alone that overlap it by half
+themselves.
 """
 
 from __future__ import annotations
@@ -74,8 +75,7 @@ def photographs(weights: str) -> None:
         folder = Path(weights.format(seed))
         file = None if seed is None else folder / "weights.safetensors"
         if file is not None and not file.is_file():
-            options_given = f"--photographs --seed {seed} --out {folder}"
-            print(f"seed {seed}: not trained; python benchmarks/train_light.py {options_given}")
+            print(f"seed {seed}: {folder} is not trained; see benchmarks/train_light.py")
             continue
         given = None if file is None else str(file)
         options = SegmenterOptions("light", weights=given, proposals=proposals, min_score=0.0)

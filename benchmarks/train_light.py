@@ -1,24 +1,34 @@
-"""Train the light network's weights that come with the project (data/weights/light.safetensors).
+r"""Train the light network's weights that come with the project (data/weights/light.safetensors).
 
     python benchmarks/train_light.py --out runs/light [--steps 4000] [--weights F]
-    python benchmarks/train_light.py --photographs --seed 1 --out runs/bench/light-1
+    python benchmarks/train_light.py --photographs --seed 1 --out runs/bench/masks-1
+    python benchmarks/train_light.py --detected --seed 1 --out runs/bench/light-1 \
+        --weights runs/bench/masks-1/weights.safetensors
 
 Learns from the COCO excerpt, without the share that is held out for testing, and from rooms that
 it renders to ``--rooms`` first. Goes on from its last checkpoint if it was stopped. --weights
 starts from a network that was trained before. --photographs: the project's weights go on with
-masks alone, on the excerpt alone, for use with another detector's boxes.
+masks alone, on the excerpt alone, for use with another detector's boxes. --detected: the MaskIoU
+head alone goes on, in the boxes and masks that come of YOLOX-Nano on the excerpt's photographs.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from semantics.checkpoints import find_weights, load_network, save_network  # noqa: E402
+from semantics.coco_files import read_coco  # noqa: E402
+from semantics.training.dataset import Dataset, split  # noqa: E402
+from semantics.training.detected import DetectedConfig, collect, train_maskiou  # noqa: E402
+from semantics.training.loop import WEIGHTS as WEIGHTS_NAME  # noqa: E402
 from semantics.training.run import Source, TrainingRun, run_training  # noqa: E402
+from semantics.yolox import YoloxDetector  # noqa: E402
 from slam.cli import main as slam  # noqa: E402
 from slam.progress import console_log, counting_bar  # noqa: E402
 
@@ -70,6 +80,25 @@ def training(arguments: argparse.Namespace) -> TrainingRun:
     )
 
 
+def in_detected_boxes(arguments: argparse.Namespace, progress: Callable[[int, int], None]) -> Path:
+    """The MaskIoU head's last stage; returns the weights file."""
+    network = load_network(find_weights(arguments.weights or str(WEIGHTS)))
+    head = network.model.eval().roi_heads.maskiou_head
+    assert head is not None
+    excerpt = DATA / "coco_excerpt"
+    content, _ = split(read_coco(excerpt / "instances.json"), HELD_OUT, SPLIT_SEED)
+    photographs = Dataset(content, excerpt / "images", network.labels)
+    detector = YoloxDetector(DATA / "weights" / "yolox_nano.onnx")
+    config = DetectedConfig(seed=arguments.seed)
+    found = collect(
+        network.model, photographs, lambda i: detector.detect(i, network.labels), config, progress
+    )
+    train_maskiou(head, found, config, progress)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    save_network(network, arguments.out / WEIGHTS_NAME)
+    return arguments.out / WEIGHTS_NAME
+
+
 def main() -> None:
     """Render, train."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -81,8 +110,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of batches and augmentation")
     parser.add_argument("--photographs", action="store_true")
     parser.add_argument("--only", default="", choices=("", "masks", "maskiou"))
+    parser.add_argument("--detected", action="store_true")
+    arguments = parser.parse_args()
     with console_log(), counting_bar(False) as progress:
-        print(run_training(training(parser.parse_args()), progress))
+        if arguments.detected:
+            print(in_detected_boxes(arguments, progress))
+        else:
+            print(run_training(training(arguments), progress))
 
 
 if __name__ == "__main__":

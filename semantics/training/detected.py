@@ -1,0 +1,181 @@
+"""Training of the MaskIoU head alone, in the boxes that another detector finds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from semantics.network import mask_heads
+from semantics.network.box_head import ClassifiedBoxes
+from semantics.network.boxes import enlarged, iou, mirrored, rescale
+from semantics.network.images import prepare
+from semantics.network.mask_heads import MaskIoUHead, expected_iou, of_class
+from semantics.network.model import ROI_LEVELS, MaskRCNN
+from semantics.network.paste import paste
+from semantics.network.roi_align import feature_table, roi_align
+from semantics.segmenter import Image
+from semantics.training.dataset import Dataset, as_tensors
+from semantics.training.targets import Target
+
+MASK_THRESHOLD = 0.5
+MATCH_IOU = 0.5
+WARM_UP = 20
+FIRST_LOOK = 256
+"""So many examples say how far the mean of the head's values is off at the beginning."""
+
+
+@dataclass(frozen=True)
+class DetectedConfig:
+    """Which boxes are learnt from, and how.
+
+    ``min_overlap``: of the box with an object of its class, so that badly placed boxes teach as
+    well. ``min_score``: of the class; of the many boxes below it only well placed ones are taken.
+    """
+
+    min_overlap: float = 0.1
+    min_score: float = 0.03
+    epochs: int = 3
+    batch: int = 64
+    rate: float = 1e-4
+    decay: float = 1e-2
+    max_gradient: float = 5.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Examples:
+    """Boxes of a detector as the MaskIoU head sees them.
+
+    Attributes:
+        features: (N, 2, C, 14, 14) half precision, of the image and of its mirror image.
+        masks: (N, 28, 28) half precision, the mean of both, as it is in the image.
+        labels: (N,) int64.
+        ious: (N,) IoU of the mask, pasted into the image, with the object of its
+            class that it overlaps most.
+    """
+
+    features: Tensor
+    masks: Tensor
+    labels: Tensor
+    ious: Tensor
+
+    def __len__(self) -> int:
+        return len(self.ious)
+
+
+def collect(
+    model: MaskRCNN,
+    data: Dataset,
+    detect: Callable[[Image], ClassifiedBoxes],
+    config: DetectedConfig,
+    progress: Callable[[int, int], None],
+) -> Examples:
+    """The examples of every image of a data set; ``detect`` takes (H, W, 3), red first."""
+    parts = []
+    for k in range(len(data)):
+        sample = data.load(k)
+        image, target = as_tensors(sample)
+        parts.append(examples(model, image, detect(sample.image), target, config))
+        progress(k + 1, len(data))
+    columns = zip(*((p.features, p.masks, p.labels, p.ious) for p in parts), strict=True)
+    return Examples(*(torch.cat(column) for column in columns))
+
+
+@torch.inference_mode()
+def examples(
+    model: MaskRCNN, image: Tensor, found: ClassifiedBoxes, target: Target, config: DetectedConfig
+) -> Examples:
+    """The examples of one image (3, H, W) with at least one object."""
+    same = found.labels[:, None] == target.labels
+    overlap = (iou(found.boxes, target.boxes) * same).amax(dim=1)
+    scored = (found.scores > config.min_score) | (overlap >= MATCH_IOU)
+    kept = (overlap >= config.min_overlap) & scored
+    boxes, labels = found.boxes[kept], found.labels[kept]
+    features = _both_ways(model, image, boxes)
+    heads = model.roi_heads
+    logits = heads.mask_predictor(heads.mask_head(features.flatten(0, 1)))
+    every = of_class(logits, labels.repeat_interleave(2)).sigmoid().unflatten(0, (-1, 2))
+    masks = (every[:, 0] + every[:, 1].flip(2)) / 2
+    around = enlarged(boxes, model.config.mask_context)
+    pasted = paste(masks, around, (image.shape[1], image.shape[2])) > MASK_THRESHOLD
+    ious = (mask_iou(pasted, target.masks) * same[kept]).amax(dim=1)
+    seen = pasted.flatten(1).any(dim=1)
+    return Examples(features[seen].half(), masks[seen].half(), labels[seen], ious[seen])
+
+
+def _both_ways(model: MaskRCNN, image: Tensor, boxes: Tensor) -> Tensor:
+    """RoI features (N, 2, C, 14, 14) of boxes (N, 4) in an image and in its mirror image."""
+    batch = prepare([image, image.flip(2)], model.config.image)
+    table = feature_table(model.backbone(batch.tensor)[:ROI_LEVELS], batch.size[0])
+    around = [
+        enlarged(rescale(b, old, new), model.config.mask_context)
+        for b, old, new in zip(
+            (boxes, mirrored(boxes, image.shape[2])), batch.original_sizes, batch.sizes, strict=True
+        )
+    ]
+    features = roi_align(table, around, mask_heads.BINS)
+    return torch.stack(features.split(len(boxes)), dim=1)
+
+
+def mask_iou(a: Tensor, b: Tensor) -> Tensor:
+    """IoU (N, G) of masks (N, H, W) and (G, H, W); 0 of two empty ones."""
+    both = a.flatten(1).float() @ b.flatten(1).float().T
+    either = a.sum(dim=(1, 2))[:, None] + b.sum(dim=(1, 2)) - both
+    return both / either.clamp(min=1)
+
+
+def train_maskiou(
+    head: MaskIoUHead, given: Examples, config: DetectedConfig, progress: Callable[[int, int], None]
+) -> float:
+    """Train so that the mean of the head's value and the expected IoU is the true IoU.
+
+    That mean is the mask's score where masks are made both ways. Returns the mean squared error
+    over the second half of the steps.
+    """
+    rng = np.random.default_rng(config.seed)
+    expected = expected_iou(given.masks.float())
+    _remove_offset(head, given, expected, rng)
+    optimiser = torch.optim.AdamW(head.parameters(), config.rate, weight_decay=config.decay)
+    order = np.concatenate([rng.permutation(len(given)) for _ in range(config.epochs + 1)])
+    steps = max(config.epochs * len(given) // config.batch, 1)
+    errors = []
+    head.train()
+    for step in range(steps):
+        chosen = order[step * config.batch : (step + 1) * config.batch]
+        cosine = 0.5 * (1 + math.cos(math.pi * step / steps))
+        for group in optimiser.param_groups:
+            group["lr"] = config.rate * min((step + 1) / WARM_UP, 1) * cosine
+        ways = torch.from_numpy(rng.integers(0, 2, len(chosen)))
+        judged = _judged(head, given, torch.from_numpy(chosen), ways)
+        loss = ((judged + expected[chosen]) / 2 - given.ious[chosen]).square().mean()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(head.parameters(), config.max_gradient)
+        optimiser.step()
+        errors.append(float(loss.detach()))
+        progress(step + 1, steps)
+    head.eval()
+    return float(np.mean(errors[steps // 2 :]))
+
+
+@torch.no_grad()
+def _remove_offset(
+    head: MaskIoUHead, given: Examples, expected: Tensor, rng: np.random.Generator
+) -> None:
+    """Move the head's values by a constant, so that they are right in the mean."""
+    some = torch.from_numpy(rng.choice(len(given), FIRST_LOOK))
+    judged = _judged(head, given, some, torch.zeros(len(some), dtype=torch.int64))
+    head.maskiou.bias += (2 * given.ious[some] - expected[some] - judged).mean()
+
+
+def _judged(head: MaskIoUHead, given: Examples, chosen: Tensor, ways: Tensor) -> Tensor:
+    """The head's values (B,) of chosen examples (B,), as they are (way 0) or mirrored (1)."""
+    masks = given.masks[chosen].float()
+    masks = torch.where(ways[:, None, None].bool(), masks.flip(2), masks)
+    values = head(given.features[chosen, ways].float(), masks)
+    return of_class(values, given.labels[chosen])
