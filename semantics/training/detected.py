@@ -170,7 +170,7 @@ def _remove_offset(
     """Move the head's values by a constant, so that they are right in the mean."""
     some = torch.from_numpy(rng.choice(len(given), FIRST_LOOK))
     judged = _judged(head, given, some, torch.zeros(len(some), dtype=torch.int64))
-    head.maskiou.bias += (2 * given.ious[some] - expected[some] - judged).mean()
+    head.maskiou.bias.add_((2 * given.ious[some] - expected[some] - judged).mean())
 
 
 def _judged(head: MaskIoUHead, given: Examples, chosen: Tensor, ways: Tensor) -> Tensor:
