@@ -138,7 +138,8 @@ def _add_render(commands: _Commands) -> None:
     text = "render an indoor sequence with exact ground truth, in TUM layout"
     parser = commands.add_parser("render", help=text, description=text)
     parser.set_defaults(handler=_render)
-    parser.add_argument("name", help="office, busy_office, crowded_office, living_room, corridor or room")
+    scenes = "office, busy_office, crowded_office, living_room, corridor or room"
+    parser.add_argument("name", help=scenes)
     parser.add_argument("--out", type=Path, required=True, help="folder to make")
     parser.add_argument("--frames", type=int, metavar="N", help="number of frames (default: all)")
     parser.add_argument("--fps", type=float, default=30.0, help="frame rate (default: 30)")
