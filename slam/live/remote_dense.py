@@ -1,9 +1,10 @@
 """Tracking's side of dense mapping: which keyframes the process gets, in which order.
 
 The policy. A keyframe waits until the map has optimised it and its masks have come, for these at
-most MASKS_S. Of those that are ready the newest goes first, one at a time. At most MAX_WAITING
-wait: one more drives out the oldest, which is counted, and named in dense.json; ``bmask-slam map
-RUN`` adds it. One that was sent is promised: it is sent again to another process if that one dies,
+most MASKS_S, and not at all where nothing else is to be done and CROWDED wait: masks may come
+later. Of those that are ready the newest goes first, one at a time. At most MAX_WAITING wait: one
+more drives out the oldest, which is counted, and named in dense.json; ``bmask-slam map RUN`` adds
+it. One that was sent is promised: it is sent again to another process if that one dies,
 and dropped only if two die of it. A keyframe that is culled is forgotten, its submap removed.
 """
 
@@ -36,7 +37,7 @@ from slam.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
-MAX_WAITING = 6
+MAX_WAITING, CROWDED = 6, 4
 MASKS_S = 3.0
 AROUND = 32
 """Keyframes whose poses go along: more than the fusion holds."""
@@ -144,11 +145,10 @@ class RemoteDenseMapper:
             self._send(self._promised[self._unsent.pop(0)])
             return
         old_s = time.monotonic() - MASKS_S
-        ready = [
-            number
-            for number, waiting in self._waiting.items()
-            if not is_new(number) and (waiting.since_s < old_s or not lacks_masks(number))
-        ]
+        known = {n: waiting for n, waiting in self._waiting.items() if not is_new(n)}
+        ready = [n for n, waiting in known.items() if waiting.since_s < old_s or not lacks_masks(n)]
+        if not ready and len(self._waiting) >= CROWDED:
+            ready = list(known)
         if ready:
             self._promise(max(ready), world)
 

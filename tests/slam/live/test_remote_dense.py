@@ -27,7 +27,7 @@ from slam.live.dense_messages import (
     Taken,
 )
 from slam.live.messages import Masks
-from slam.live.remote_dense import MAX_WAITING, RemoteDenseMapper
+from slam.live.remote_dense import CROWDED, MAX_WAITING, RemoteDenseMapper
 from slam.world_map import WorldMap
 
 ORDER = DenseOrder(Path("run"), CAMERA, SegmenterOptions(), ("background",))
@@ -140,6 +140,18 @@ def test_it_waits_for_the_map_and_some_time_for_masks(dense, monkeypatch) -> Non
     assert isinstance(late, LateMasks)
     np.testing.assert_array_equal(late.landmark_ids, world.keyframes[2].landmark_ids)
     np.testing.assert_allclose(late.pixels, world.keyframes[2].features.image_pixels)
+
+
+def test_where_many_wait_masks_are_not_waited_for_but_those_that_have_them_go_first(dense) -> None:
+    world, worker = a_map(CROWDED + 1), process(dense)
+    ask(dense, *range(CROWDED - 1))
+    dense.follow(world, no, lambda k: True)
+    assert worker.keyframes() == []
+    ask(dense, CROWDED - 1, CROWDED)
+    dense.follow(world, no, lambda k: k != 1)
+    worker.answers = [Taken(1)]
+    dense.follow(world, lambda k: k == CROWDED, lambda k: True)
+    assert worker.keyframes() == [1, CROWDED - 1]
 
 
 def test_what_leaves_the_map_is_forgotten_and_what_it_does_not_know_yet_is_not(dense) -> None:
