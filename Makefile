@@ -21,7 +21,7 @@ demo: $(DEMO)
 	@$(BIN)/bmask-slam run $(DEMO) --out runs/demo --overwrite
 	@$(BIN)/bmask-slam map runs/demo --mesh --plan
 	@$(BIN)/bmask-slam query runs/demo
-	@$(BIN)/bmask-slam live $(DEMO) --out runs/demo-live --overwrite
+	@$(BIN)/bmask-slam live $(DEMO) --map --out runs/demo-live --overwrite
 	@$(BIN)/bmask-slam compare rendered --out runs/demo-comparison --sequences office \
 	  --configurations "default,without registration" --seeds 0
 

@@ -83,16 +83,23 @@ REPORTS = {
             "beside_torchvision.py --environment {sequences}/torchvision",
         ),
         "labels-truth": (
-            "Labels and objects from true masks", "labels.py {sequences}/office-300"
+            "Labels and objects from true masks",
+            "labels.py {sequences}/office-300 {sequences}/room-930 {sequences}/room-931",
         ),
         "labels": (
             "Labels and objects from the network's masks",
-            "labels.py {sequences}/office-300 --segmenter light",
+            "labels.py {sequences}/office-300 {sequences}/room-930 {sequences}/room-931 "
+            "--segmenter light",
         ),
         "dynamic": (
             "People who walk, a carried box and a pulled chair",
-            "dynamic.py --sequences {sequences} --segmenter light --seed 1 "
+            "dynamic.py --sequences {sequences} --segmenter light --seed 2 "
             "--out {sequences}/dynamic",
+        ),
+        "dynamic-again": (
+            "The same with other people",
+            "dynamic.py --sequences {sequences} --segmenter light --seed 4 "
+            "--out {sequences}/dynamic-again",
         ),
         "harm": (
             "What the semantics cost where nothing moves",

@@ -164,10 +164,12 @@ def test_a_map_of_another_camera_is_not_continued(state: Arrays, tmp_path: Path)
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("other", ["map", "checkpoint_every"])
-def test_localisation_excludes_what_learns(other: str) -> None:
-    name = other.replace("_", "-")
-    with pytest.raises(InputError, match=f"--localise m: learns nothing that --{name} could"):
+@pytest.mark.parametrize(
+    ("other", "flag"),
+    [("map", "continue"), ("dense", "map"), ("checkpoint_every", "checkpoint-every")],
+)
+def test_localisation_excludes_what_learns(other: str, flag: str) -> None:
+    with pytest.raises(InputError, match=f"--localise m: learns nothing that --{flag} could"):
         RunOptions(Path("x"), localise=Path("m"), **{other: 7})
 
 
