@@ -12,7 +12,7 @@ map                   keyframes, landmarks and graph, for ``run --continue`` and
 labels.csv            with a segmenter: label, probability, entropy, views of every landmark
 objects.json, .ply    with a segmenter: objects with label, box, keyframes; the boxes as lines
 objects.png           with a segmenter: landmarks by label and objects, from above
-dense/                with ``--map``, or by ``bmask-slam map``: see `slam.dense_folder`
+dense/                with ``--map``, run or live, or by ``bmask-slam map``: `slam.dense_folder`
 covariances.txt       with ``--covariances``: of every keyframe's pose, see `slam.covariances`
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference
