@@ -164,5 +164,6 @@ def test_a_recording_is_read_late_and_given_in_time() -> None:
     for _ in paced(reading()):
         given_s.append(time.monotonic())
     due_s = given_s[0] + 0.1 * np.arange(5)
-    assert (np.array(given_s) > due_s - 1e-3).all()
-    assert (np.array(read_s)[2:] > due_s[2:] - 0.051).all()  # from the third on it knows when
+    late_s = 0.03  # the first may have been noted so much after it was given
+    assert (np.array(given_s) > due_s - late_s).all()
+    assert (np.array(read_s)[2:] > due_s[2:] - 0.05 - late_s).all()  # then it knows the interval

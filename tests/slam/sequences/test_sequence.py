@@ -69,14 +69,17 @@ def test_early_stop_ends_the_thread(folder):
 
 def test_early_stop_wastes_no_work(folder):
     """Only the frame in hand is finished; those that wait behind it are never prepared."""
-    prepared, go = [], threading.Event()
+    prepared, begun, go = [], threading.Event(), threading.Event()
 
     def prepare(frame):
         prepared.append(frame.index)
-        assert frame.index == 0 or go.wait(5)
+        if frame.index:
+            begun.set()
+            assert go.wait(5)
 
     frames = open_sequence(folder).frames(prepare=prepare)
     next(frames)
+    assert begun.wait(5)
     threading.Timer(0.05, go.set).start()
     frames.close()
     assert prepared == [0, 1]
