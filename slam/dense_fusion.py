@@ -19,7 +19,7 @@ from semantics.instances import Instance
 from semantics.labels import LabelSet
 from slam.configuration import resolve
 from slam.dense_folder import DenseFolder
-from slam.dense_input import undistorted_labels
+from slam.dense_input import run_semantics, undistorted_labels
 from slam.dense_options import MapOptions
 from slam.features import FeatureConfig
 from slam.landmarks import Ints
@@ -81,6 +81,7 @@ class KeyframeFusion:
         self._camera, self._folder, self._options = camera, folder, options
         self._classes = len(labels)
         self._moving = [labels.number(name) for name in options.without or ()]
+        self._least_score = run_semantics(options.run / "config.yaml").object_score
         self._mapper = DenseMapper(camera, dense_config(options))
         self._evidence: dict[int, InstanceEvidence] = {}
         self._segment: int | None = None
@@ -90,8 +91,10 @@ class KeyframeFusion:
     ) -> ShownInstances:
         """The instances of an image as it was taken, and which landmarks (L,) are on them.
 
-        ``pixels`` (L, 2) are where those were detected.
+        ``pixels`` (L, 2) are where those were detected. An instance that the run would make no
+        object of, since its class score is too low, does not count.
         """
+        instances = [i for i in instances if i.class_score >= self._least_score]
         shape = self._camera.height, self._camera.width
         labels = keyframe_labels(instances, shape, self._classes)
         columns, lines = np.rint(pixels).astype(np.int64).T
