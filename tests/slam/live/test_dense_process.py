@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,15 @@ def test_masks_that_come_before_a_keyframe_is_fused_are_as_if_in_time(tmp_path, 
         np.testing.assert_array_equal(mine, theirs)
     assert same_evidence(late, in_time)
     assert in_time.evidence(0).landmark_instances.tolist() == [1, 1, 2]
+
+
+def test_a_detection_too_weak_for_an_object_cuts_nothing_out(tmp_path) -> None:
+    keep, _ = keeper(tmp_path / "run")
+    for number in range(7):
+        keep.handle(to_map(number, [CHAIR, replace(PERSON, class_score=0.2)]))
+    folder = DenseFolder.opened(tmp_path / "run")
+    assert np.isfinite(folder.fused(0).depth_m()[PERSON.mask]).mean() > 0.9
+    assert set(folder.submap(0).instances.tolist()) == {0, 1}
 
 
 def test_masks_that_come_after_that_reach_its_submap(tmp_path, in_time) -> None:
