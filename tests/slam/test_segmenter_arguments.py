@@ -1,0 +1,33 @@
+"""What the command line makes of a run's segmenter."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from semantics.segmenter_table import SegmenterOptions
+from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from slam.semantic_mapping import SemanticsConfig
+
+BASE = SemanticsConfig().segmenter
+
+
+def parsed(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_segmenter_arguments(parser, "light")
+    return parser.parse_args(words)
+
+
+def test_what_is_not_given_stays() -> None:
+    assert segmenter_options(parsed(), BASE) == BASE
+
+
+def test_weak_detections_in_a_detectors_boxes_do_not_vote_unless_that_is_configured() -> None:
+    given = parsed("--proposals", "yolox.onnx")
+    found = segmenter_options(given, BASE)
+    assert found.proposals == Path("yolox.onnx").absolute()
+    assert BASE.min_score < found.min_score == SemanticsConfig().object_score
+    configured = replace(BASE, min_score=0.3)
+    assert segmenter_options(given, configured).min_score == 0.3
+    assert segmenter_options(given, SegmenterOptions(min_score=0.0)).min_score == 0.0
