@@ -29,8 +29,9 @@ from graph.geometry import Array, inverse, se3_exp, se3_log, transform
 from mapping.cloud import merged, spill
 from mapping.cloud_files import CloudWriter
 from mapping.dense import DenseKeyframe, DenseMapper, FusedKeyframe
-from mapping.labels import InstanceEvidence
+from mapping.labels import InstanceEvidence, LabelTable
 from mapping.submaps import Submap, make_submap
+from semantics.label_store import LabelStoreConfig
 from slam.dense_folder import DenseFolder
 from slam.dense_input import undistorted
 from slam.memory import peak_rss_mb
@@ -175,10 +176,11 @@ def _save(finished: list[FusedKeyframe], folder: DenseFolder, camera: Camera) ->
 def _write_cloud(folder: DenseFolder, poses: list[Array], temporary: Path) -> int:
     """Points in the cloud of all submaps, which is written as by bmask-slam map."""
     read: Callable[[int], Submap] = folder.submap
-    submaps = ((read(k), T, 0) for k, T in enumerate(poses))
+    table = LabelTable.of([NOTHING.log_likelihoods] * len(poses), LabelStoreConfig())
+    submaps = ((read(k), T, k) for k, T in enumerate(poses))
     with CloudWriter(folder.path / "cloud") as writer:
         files = spill(submaps, VOXEL_M, temporary)
-        for block in merged(files, VOXEL_M, NOTHING.log_likelihoods):
+        for block in merged(files, VOXEL_M, table):
             writer.write(block)
     return writer.count
 

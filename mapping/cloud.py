@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from graph.geometry import Array
+from mapping.labels import LabelTable
 from mapping.submaps import Submap, voxel_keys
 
 BLOCK_VOXELS = 256
+CELL_VOXELS = 3
+"""Sides of a cell in which a submap that has no point in a voxel is asked for its labels."""
 _POINT = np.dtype(
     [
         ("point", "<f4", 3),
@@ -76,23 +79,18 @@ def spill(submaps: Iterable[tuple[Submap, Array, int]], voxel_m: float, folder: 
     return [files[key] for key in sorted(files)]
 
 
-def merged(
-    files: Iterable[Path], voxel_m: float, log_likelihoods: NDArray[np.float32]
-) -> Iterator[Cloud]:
-    """The cloud of each block that ``spill`` wrote.
-
-    ``log_likelihoods`` (I, C) is the table of all submaps' instances.
-    """
+def merged(files: Iterable[Path], voxel_m: float, table: LabelTable) -> Iterator[Cloud]:
+    """The cloud of each block that ``spill`` wrote."""
     for path in files:
-        yield merge(np.fromfile(path, _POINT), voxel_m, log_likelihoods)
+        yield merge(np.fromfile(path, _POINT), voxel_m, table)
 
 
-def merge(rows: NDArray, voxel_m: float, log_likelihoods: NDArray[np.float32]) -> Cloud:
+def merge(rows: NDArray, voxel_m: float, table: LabelTable) -> Cloud:
     """One point a voxel of rows of type _POINT.
 
     Positions and normals are means weighted by 1 / sigma^2, colours plain means. The variance is
     the least of the voxel's points: their submaps were fused with each other and are no
-    independent views. Labels are those of the largest sum of log likelihoods.
+    independent views. Labels are what the submaps' instances say, each submap once.
     """
     _, voxel, views = np.unique(
         voxel_keys(rows["point"], voxel_m), return_inverse=True, return_counts=True
@@ -106,7 +104,8 @@ def merge(rows: NDArray, voxel_m: float, log_likelihoods: NDArray[np.float32]) -
     colours = _mean(voxel, rows["colour"], np.ones(len(rows)), views.astype(float))
     best = np.zeros(count, np.float32)
     np.maximum.at(best, voxel, rows["weight"])
-    labels, probabilities = _fused_labels(voxel, rows["instance"], log_likelihoods, count)
+    cell = np.unique(voxel_keys(points, CELL_VOXELS * voxel_m), return_inverse=True)[1]
+    labels, probabilities = _fused_labels(voxel, cell, rows["instance"], table)
     return Cloud(
         points.astype(np.float32),
         normals.astype(np.float32),
@@ -125,14 +124,47 @@ def _mean(voxel: NDArray, values: NDArray, weight: Array, total: Array) -> Array
 
 
 def _fused_labels(
-    voxel: NDArray, instance: NDArray, log_likelihoods: NDArray[np.float32], count: int
+    voxel: NDArray, cell: NDArray, instance: NDArray, table: LabelTable
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
-    """Class (M,) and its probability (M,) by the sum of the log likelihoods of each voxel."""
-    ones = np.ones(len(voxel), np.float32)
-    seen = csr_matrix((ones, (voxel, instance)), (count, len(log_likelihoods)))
-    evidence = np.asarray(seen @ log_likelihoods)
+    """Class (M,) and its probability (M,) of voxels, points (N,) in them being of instances (N,).
+
+    ``cell`` (M,) is that of each voxel.
+    """
+    if table.log_likelihoods.shape[1] == 1:
+        return np.zeros(len(cell), np.uint16), np.ones(len(cell), np.float32)
+    evidence = table.fused(_views(voxel, cell, instance, table.submaps))
     evidence -= evidence.max(axis=1, keepdims=True)
-    probability = np.exp(evidence)
-    probability /= probability.sum(axis=1, keepdims=True)
     label = evidence.argmax(axis=1)
-    return label.astype(np.uint16), probability[np.arange(count), label].astype(np.float32)
+    probability = 1 / np.exp(evidence, out=evidence).sum(axis=1)
+    return label.astype(np.uint16), probability
+
+
+def _views(
+    voxel: NDArray, cell: NDArray, instance: NDArray, submap_of: NDArray[np.int64]
+) -> csr_matrix:
+    """(M, I) shares of instances in what each submap shows of each voxel, one in all.
+
+    A submap that has points in a voxel's cell, but none in the voxel, since its own grid lies
+    otherwise, shows there what it shows in the cell.
+    """
+    submap, instances = submap_of[instance], len(submap_of)
+    count = int(submap_of[-1]) + 1
+    pairs, own = _shares(voxel * count + submap, instance, instances)
+    near_pairs, near = _shares(cell[voxel] * count + submap, instance, instances)
+    voxels, near_cells = pairs // count, near_pairs // count
+    beside = np.searchsorted(near_pairs, cell[voxels] * count + pairs % count)
+    missing = _sums(near_cells, near, int(cell.max()) + 1)[cell]
+    return missing + _sums(voxels, own - near[beside], len(cell))
+
+
+def _shares(pair: NDArray, instance: NDArray, instances: int) -> tuple[NDArray, csr_matrix]:
+    """The pairs (P,) that points (N,) have, rising, and the shares (P, I) of instances in each."""
+    pairs, row, points = np.unique(pair, return_inverse=True, return_counts=True)
+    share = (1 / points[row]).astype(np.float32)
+    return pairs, csr_matrix((share, (row, instance)), (len(pairs), instances))
+
+
+def _sums(group: NDArray, rows: csr_matrix, count: int) -> csr_matrix:
+    """Sums (count, I) of rows (P, I) by group (P,)."""
+    ones = np.ones(len(group), np.float32)
+    return csr_matrix((ones, (group, np.arange(len(group)))), (count, len(group))) @ rows

@@ -53,6 +53,21 @@ class LabelStoreConfig:
             np.array([self.prior_unknown] + [rest] * (classes - 1)) if classes > 1 else np.ones(1)
         )
 
+    def likelihoods(self, distributions: Floats, weights: Floats) -> Floats:
+        """Of each class given views (N, C) that are right with probability weight (N,) and else
+        say nothing, relative to no view.
+
+        A network's distribution is a posterior, so the likelihood is w p(c) / prior(c) + 1 - w:
+        after one view the belief is w p + (1 - w) prior.
+        """
+        prior = self.prior(distributions.shape[1]).astype(np.float32)
+        return weights[:, None] * distributions / prior + (1 - weights[:, None])
+
+    def log_missed(self, misses: Floats) -> Array:
+        """log P(m misses (N,) | a thing with a class), m not whole where a view was half sure."""
+        a, b = self.recall_found, self.recall_missed
+        return np.asarray(betaln(a, b + misses.astype(float)) - betaln(a, b))
+
 
 @dataclass(frozen=True)
 class LabelEstimates:
@@ -85,18 +100,15 @@ class LabelStore:
     def update(self, ids: Ints, distributions: Floats, weights: Floats) -> None:
         """Views of things ids (N,), each by a distribution (N, C) that is right with probability
         weight (N,) and else says nothing. An id may repeat.
-
-        A network's distribution is a posterior, so the likelihood is w p(c) / prior(c) + 1 - w:
-        after one view the belief is w p + (1 - w) prior.
         """
         if not len(ids):
             return
         self._reserve(int(ids.max()) + 1)
-        weighted = weights[:, None] * distributions
-        likelihood = weighted / self._prior.astype(np.float32) + (1 - weights[:, None])
+        likelihood = self.config.likelihoods(distributions, weights)
         floor = np.float32(np.exp(-self.config.max_log_odds))
         gained = np.float32(self.config.power) * np.log(np.maximum(likelihood, floor))
-        self._add(ids, gained, weighted, np.ones(len(ids), np.int32))
+        counts = weights[:, None] * distributions
+        self._add(ids, gained, counts, np.ones(len(ids), np.int32))
 
     def miss(self, ids: Ints, weights: Floats) -> None:
         """Views of things ids (N,) on which no mask lies, with weights (N,). An id may repeat."""
@@ -132,7 +144,7 @@ class LabelStore:
         inside = ids < len(self._views)
         log_p = np.tile(np.log(self._prior), (len(ids), 1))
         log_p[inside] += self._log_p[ids[inside]]
-        log_p[inside, 1:] += self._log_missed(self._misses[ids[inside]])[:, None]
+        log_p[inside, 1:] += self.config.log_missed(self._misses[ids[inside]])[:, None]
         p = np.exp(log_p - log_p.max(axis=1, keepdims=True, initial=-np.inf))
         return p / p.sum(axis=1, keepdims=True)
 
@@ -175,11 +187,6 @@ class LabelStore:
         self._views[ids] = state["views"]
         self._misses[ids] = state["misses"]
         self._resize(len(self))
-
-    def _log_missed(self, misses: Floats) -> Array:
-        """log P(m misses (N,) | a thing with a class), m not whole where a view was half sure."""
-        a, b = self.config.recall_found, self.config.recall_missed
-        return np.asarray(betaln(a, b + misses.astype(float)) - betaln(a, b))
 
     def _add(self, ids: Ints, gained: Floats, counts: Floats, views: NDArray[np.int32]) -> None:
         if len(np.unique(ids)) == len(ids):

@@ -81,7 +81,7 @@ class KeyframeFusion:
         self._camera, self._folder, self._options = camera, folder, options
         self._classes = len(labels)
         self._moving = [labels.number(name) for name in options.without or ()]
-        self._least_score = run_semantics(options.run / "config.yaml").object_score
+        self._semantics = run_semantics(options.run / "config.yaml")
         self._mapper = DenseMapper(camera, dense_config(options))
         self._evidence: dict[int, InstanceEvidence] = {}
         self._segment: int | None = None
@@ -94,9 +94,9 @@ class KeyframeFusion:
         ``pixels`` (L, 2) are where those were detected. An instance that the run would make no
         object of, since its class score is too low, does not count.
         """
-        instances = [i for i in instances if i.class_score >= self._least_score]
+        instances = [i for i in instances if i.class_score >= self._semantics.object_score]
         shape = self._camera.height, self._camera.width
-        labels = keyframe_labels(instances, shape, self._classes)
+        labels = keyframe_labels(instances, shape, self._classes, self._semantics.labels)
         columns, lines = np.rint(pixels).astype(np.int64).T
         on = labels.numbers[lines.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)]
         evidence = InstanceEvidence(labels.log_likelihoods, landmark_ids[on > 0], on[on > 0])

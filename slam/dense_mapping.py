@@ -26,7 +26,7 @@ from slam.world_map import Keyframe
 
 Progress = Callable[[int, int], None]
 LIKELY_MOVING = 0.5
-METHOD = 2
+METHOD = 3
 """Counts up when the same settings come to give other submaps."""
 
 

@@ -19,12 +19,13 @@ from graph.whole_file import whole_file
 from mapping.cloud import Cloud, merged, spill
 from mapping.cloud_files import CloudWriter
 from mapping.floor_plan import FloorPlan, plan_frame
+from mapping.labels import LabelTable
 from mapping.mesh import View, sampled, truncation_voxels, tsdf_mesh, write_mesh
 from mapping.object_clouds import ObjectClouds, ObjectRegion
 from mapping.pictures import Picture, palette, with_legend
 from semantics.labels import LabelSet
 from slam.dense_folder import DenseFolder
-from slam.dense_input import MappedRun, SavedMap, load
+from slam.dense_input import MappedRun, SavedMap, load, run_semantics
 from slam.dense_keyframes import OpenMap
 from slam.dense_options import MapOptions
 from slam.semantic_files import OBJECTS, read_objects
@@ -79,8 +80,8 @@ def write_clouds(opened: FusedMap) -> Products:
     run, folder, voxel_m = opened.run, opened.folder, opened.options.voxel_m
     names, keyframes = opened.labels.names, finished(run, folder)
     with tempfile.TemporaryDirectory(dir=folder.path, prefix=".blocks-") as temporary:
-        table, first = likelihood_table(opened, keyframes)
-        rows = zip(keyframes, first.tolist(), strict=True)
+        table = label_table(opened, keyframes)
+        rows = zip(keyframes, table.first.tolist(), strict=True)
         submaps = ((folder.submap(k.id), k.T_world_camera, row) for k, row in rows)
         files = spill(submaps, voxel_m, Path(temporary))
         floor = None
@@ -89,7 +90,7 @@ def write_clouds(opened: FusedMap) -> Products:
         gallery = _Gallery(_viewpoints(run, keyframes), voxel_m, names)
         written = _write_blocks(opened, merged(files, voxel_m, table), gallery, floor)
         written += gallery.write(folder)
-        written += _write_moving(opened, keyframes, (table, first), Path(temporary))
+        written += _write_moving(opened, keyframes, table, Path(temporary))
     if floor is not None:
         path = np.stack([k.T_world_camera[:3, 3] for k in keyframes])
         written.append(_write(folder, "plan.png", floor.picture(names, path)))
@@ -124,11 +125,11 @@ def _write_blocks(
 def _write_moving(
     opened: FusedMap,
     keyframes: list[Keyframe],
-    labels: tuple[NDArray[np.float32], NDArray[np.int64]],
+    table: LabelTable,
     temporary: Path,
 ) -> list[Path]:
     """The cloud of what moves, where it was kept: of every keyframe, in no order of time."""
-    kept = [(opened.folder.moving(k.id), k, f) for k, f in zip(keyframes, labels[1], strict=True)]
+    kept = [(opened.folder.moving(k.id), k, f) for k, f in zip(keyframes, table.first, strict=True)]
     submaps = [(s, k.T_world_camera, int(f)) for s, k, f in kept if s is not None]
     path = opened.folder.path / "moving"
     path.with_suffix(".ply").unlink(missing_ok=True)
@@ -138,7 +139,7 @@ def _write_moving(
     temporary.mkdir()
     voxel_m = opened.options.voxel_m
     with CloudWriter(path) as file:
-        for block in merged(spill(submaps, voxel_m, temporary), voxel_m, labels[0]):
+        for block in merged(spill(submaps, voxel_m, temporary), voxel_m, table):
             file.write(block)
     return [path.with_suffix(".ply")]
 
@@ -182,21 +183,20 @@ class _Gallery:
         ]
 
 
-def likelihood_table(
-    opened: FusedMap, keyframes: list[Keyframe]
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """All instances' log likelihoods (I, C), and the first row (K,) of each keyframe in it.
+def label_table(opened: FusedMap, keyframes: list[Keyframe]) -> LabelTable:
+    """What all keyframes' instances say.
 
     They hold what the run's label store believes at this moment, so that a label that changes
     there changes in the map.
     """
+    fusion = run_semantics(opened.run.path / "config.yaml").labels
+    prior = fusion.prior(len(opened.labels))
     rows = []
     for keyframe in keyframes:
         evidence = opened.folder.evidence(keyframe.id)
         told = opened.run.believed(evidence.landmark_ids, opened.labels)
-        rows.append(evidence.with_landmarks(*told))
-    first = np.cumsum([0, *(len(r) for r in rows)], dtype=np.int64)[:-1]
-    return np.concatenate(rows), first
+        rows.append(evidence.with_landmarks(*told, prior))
+    return LabelTable.of(rows, fusion)
 
 
 def _regions(opened: FusedMap) -> list[ObjectRegion]:

@@ -9,13 +9,14 @@ import numpy as np
 
 from graph.geometry import make_pose, se3_exp
 from graph.ply import read_ply
-from mapping.cloud import BLOCK_VOXELS, merged, spill
+from mapping.cloud import BLOCK_VOXELS, _fused_labels, merged, spill
 from mapping.cloud_files import CloudWriter
-from mapping.labels import keyframe_labels
+from mapping.labels import LabelTable, keyframe_labels
 from mapping.open3d_loader import load_open3d
 from mapping.pictures import palette
 from mapping.submaps import Submap
 from semantics.instances import Instance, certain, mask_box
+from semantics.label_store import LabelStore, LabelStoreConfig
 
 RNG = np.random.default_rng(0)
 VOXEL_M = 0.1
@@ -34,45 +35,92 @@ def submap(anchor: int, count: int = 400, instances: int = 3) -> Submap:
     )
 
 
+def table(rows: list[int], classes: int) -> LabelTable:
+    """Of submaps with so many rows each, the first of no instance."""
+    told = [RNG.normal(0, 2, (n, classes)).astype(np.float32) for n in rows]
+    for keyframe in told:
+        keyframe[0] = 0
+    return LabelTable.of(told, LabelStoreConfig())
+
+
 def test_it_is_that_of_a_loop_over_voxels(tmp_path: Path) -> None:
-    table = np.log(RNG.dirichlet(np.ones(4), 6)).astype(np.float32)
     placed = [(submap(0), se3_exp(RNG.normal(0, 0.3, 6)), 0), (submap(1), np.eye(4), 3)]
-    clouds = list(merged(spill(placed, VOXEL_M, tmp_path), VOXEL_M, table))
+    clouds = list(merged(spill(placed, VOXEL_M, tmp_path), VOXEL_M, table([3, 3], 4)))
     points = np.concatenate([c.points for c in clouds])
     expected = defaultdict(list)
-    for part, T, first in placed:
+    for part, T, _ in placed:
         at, _ = part.placed(T)
         for k in range(len(part)):
             voxel = tuple(np.floor(at[k] / VOXEL_M).astype(int))
-            expected[voxel].append((at[k], 1 / part.variances[k], first + part.instances[k]))
+            expected[voxel].append((at[k], 1 / part.variances[k]))
     assert len(points) == len(expected)
     for cloud in clouds:
         for k in range(len(cloud)):
             rows = expected[tuple(np.floor(cloud.points[k] / VOXEL_M).astype(int))]
-            weights = np.array([w for _, w, _ in rows])
-            mean = sum(p * w for p, w, _ in rows) / weights.sum()
+            weights = np.array([w for _, w in rows])
+            mean = sum(p * w for p, w in rows) / weights.sum()
             np.testing.assert_allclose(cloud.points[k], mean, atol=1e-5)
-            evidence = sum(table[i] for _, _, i in rows)
-            assert cloud.labels[k] == evidence.argmax()
-            share = np.exp(evidence) / np.exp(evidence).sum()
-            assert abs(cloud.probabilities[k] - share.max()) < 1e-4
             assert cloud.views[k] == len(rows)
             assert abs(cloud.sigmas_m[k] - weights.max() ** -0.5) < 1e-5
 
 
+def test_labels_are_those_of_a_loop_over_voxels_and_submaps() -> None:
+    """Each submap speaks once; one without a point in the voxel, by its points in the cell."""
+    told, points, voxels = table([3, 2, 4], 5), 300, 60
+    voxel = np.r_[np.arange(voxels), RNG.integers(0, voxels, points - voxels)]
+    cell = np.arange(voxels) // 7
+    instance = RNG.integers(0, len(told.submaps), points)
+    labels, probabilities = _fused_labels(voxel, cell, instance, told)
+    store, rows = LabelStoreConfig(), told.log_likelihoods.astype(float)
+    for v in range(voxels):
+        evidence, misses = np.log(store.prior(5)), 0.0
+        for submap in range(3):
+            of_submap = told.submaps[instance] == submap
+            mine = of_submap & (voxel == v)
+            if not mine.any():
+                mine = of_submap & (cell[voxel] == cell[v])
+            if mine.any():
+                evidence += rows[instance[mine]].mean(axis=0)
+                misses += np.mean(instance[mine] == told.first[submap])
+        evidence[1:] += store.log_missed(np.array(misses))
+        share = np.exp(evidence) / np.exp(evidence).sum()
+        assert labels[v] == share.argmax()
+        assert abs(probabilities[v] - share.max()) < 1e-4
+
+
+def test_a_thing_that_some_views_missed_is_still_there_and_one_seen_once_is_not() -> None:
+    """As in the label store: what was missed once is missed again."""
+    store, classes = LabelStoreConfig(), 40
+    seen = np.zeros(classes, np.float32)
+    seen[2] = 0.6
+    seen[0] = 0.4
+    word = np.log(store.likelihoods(seen[None], np.float32([0.8])))
+    for found, missed, label in ((3, 8, 2), (1, 100, 0), (0, 5, 0)):
+        keyframes = [np.r_[np.zeros((1, classes), np.float32), word]] * (found + missed)
+        told = LabelTable.of(keyframes, store)
+        instance = told.first + (np.arange(found + missed) < found)
+        views = np.zeros(len(instance), np.int64)
+        assert _fused_labels(views, np.zeros(1, np.int64), instance, told)[0] == [label]
+        labels = LabelStore(classes, store)
+        for k in range(found + missed):
+            if k < found:
+                labels.update(np.zeros(1, np.int64), seen[None], np.float32([0.8]))
+            else:
+                labels.miss(np.zeros(1, np.int64), np.ones(1, np.float32))
+        assert labels.estimates(np.zeros(1, np.int64)).labels == [label]
+
+
 def test_blocks_do_not_share_voxels(tmp_path: Path) -> None:
     far = make_pose(np.eye(3), np.array([BLOCK_VOXELS * VOXEL_M, 0, 0]))
-    files = spill([(submap(0), np.eye(4), 0), (submap(1), far, 0)], VOXEL_M, tmp_path)
+    files = spill([(submap(0, instances=1), np.eye(4), 0), (submap(1), far, 1)], VOXEL_M, tmp_path)
     assert len(files) > 2
-    table = np.zeros((3, 2), np.float32)
-    points = np.concatenate([c.points for c in merged(files, VOXEL_M, table)])
+    points = np.concatenate([c.points for c in merged(files, VOXEL_M, table([1, 3], 2))])
     assert len(np.unique(np.floor(points / VOXEL_M), axis=0)) == len(points)
 
 
 def test_files_hold_what_was_written(tmp_path: Path) -> None:
-    table = np.log(np.full((3, 5), 0.2)).astype(np.float32)
     files = spill([(submap(0), np.eye(4), 0)], VOXEL_M, tmp_path)
-    (cloud, *rest) = list(merged(files, VOXEL_M, table))
+    (cloud, *rest) = list(merged(files, VOXEL_M, table([3], 5)))
     with CloudWriter(tmp_path / "cloud") as writer:
         for part in (cloud, *rest):
             writer.write(part)
@@ -106,14 +154,14 @@ def instance(rows: slice, label: int, score: float, mask_score: float) -> Instan
 
 def test_where_masks_overlap_the_better_wins() -> None:
     found = [instance(slice(0, 3), 1, 0.9, 0.4), instance(slice(2, 5), 2, 0.9, 0.8)]
-    labels = keyframe_labels(found, (6, 8), 4)
+    labels = keyframe_labels(found, (6, 8), 4, LabelStoreConfig())
     np.testing.assert_array_equal(labels.numbers[:, 0], [1, 1, 2, 2, 2, 0])
 
 
 def test_a_trusted_mask_says_more() -> None:
     found = [instance(slice(0, 3), 1, 0.9, 0.9), instance(slice(3, 5), 1, 0.9, 0.3)]
-    table = keyframe_labels(found, (6, 8), 4).log_likelihoods
-    np.testing.assert_allclose(np.exp(table).sum(axis=1), 1, rtol=1e-5)
-    assert table[1, 1] > table[2, 1] > table[2, 2]
-    assert table[0].argmax() == 0
-    assert np.isfinite(table).all()
+    told = keyframe_labels(found, (6, 8), 4, LabelStoreConfig()).log_likelihoods
+    np.testing.assert_allclose(np.exp(told) @ LabelStoreConfig().prior(4), 1, rtol=1e-5)
+    assert told[1, 1] > told[2, 1] > 0 > told[2, 2] > told[1, 2]
+    assert not told[0].any()
+    assert np.isfinite(told).all()

@@ -9,24 +9,47 @@ import numpy as np
 from graph.geometry import se3_exp
 from graph.ply import read_ply
 from mapping.cloud import Cloud
-from mapping.labels import MIN_LANDMARKS, OTHER_SHARE, InstanceEvidence, widened
+from mapping.labels import ASTRAY, MIN_LANDMARKS, OTHER_SHARE, InstanceEvidence, widened
 from mapping.object_clouds import MARGIN_M, ObjectClouds, ObjectRegion, owners
 from semantics.boxes3d import OrientedBox
 
+PRIOR = np.array([0.5, 1 / 6, 1 / 6, 1 / 6])
 
-def test_landmarks_speak_for_the_instances_that_have_enough_of_them() -> None:
-    rng = np.random.default_rng(0)
-    masks = rng.normal(size=(4, 3)).astype(np.float32)
-    instances = np.array([1] * (MIN_LANDMARKS + 1) + [2] * (MIN_LANDMARKS - 1) + [3] * 9)
-    evidence = InstanceEvidence(masks, np.arange(len(instances)), instances.astype(np.uint16))
-    p = rng.dirichlet(np.ones(3), len(instances))
-    known = instances != 3
-    found = evidence.with_landmarks(p, known)
-    mean = np.mean([row for row, k in zip(p, instances, strict=True) if k == 1], axis=0)
-    np.testing.assert_allclose(
-        np.exp(found[1]), (1 - OTHER_SHARE) * mean + OTHER_SHARE / 3, rtol=1e-5
+
+def evidence(masks, instances) -> InstanceEvidence:
+    return InstanceEvidence(
+        np.log(masks / PRIOR).astype(np.float32), np.arange(len(instances)), np.array(instances)
     )
-    np.testing.assert_array_equal(found[[0, 2, 3]], masks[[0, 2, 3]])
+
+
+def test_landmarks_are_the_prior_of_an_instances_class() -> None:
+    rng = np.random.default_rng(0)
+    masks = rng.dirichlet(np.ones(4), 4)
+    instances = np.array([1] * 20 + [2] * MIN_LANDMARKS + [3] * 9)
+    given = evidence(masks, instances)
+    p = rng.dirichlet(np.ones(4), len(instances))
+    known = instances != 3
+    found = given.with_landmarks(p, known, PRIOR)
+    mean = p[:20, 1:].sum(axis=0) / p[:20, 1:].sum()
+    which = np.sqrt(masks[1, 1:] / PRIOR[1:]) * ((1 - ASTRAY) * mean + ASTRAY / 3)
+    believed = np.r_[masks[1, 0], (1 - masks[1, 0]) * which / which.sum()]
+    expected = np.log((1 - OTHER_SHARE) * believed / PRIOR + OTHER_SHARE)
+    np.testing.assert_allclose(found[1], expected, atol=1e-5)
+    others = [0, 2, 3]  # of 2 the landmarks are in part on nothing
+    np.testing.assert_array_equal(found[others], given.log_likelihoods[others])
+
+
+def test_landmarks_of_a_thing_on_an_instance_do_not_overrule_its_mask() -> None:
+    """A table whose mask covers a box with more landmarks than its own top."""
+    table = np.array([0.4, 0.588, 0.006, 0.006])
+    p = np.zeros((30, 4))
+    p[:16, 2] = 1
+    p[16:, 1] = 1
+    given = evidence(table[None], [0] * 30)
+    all_known = np.ones(30, bool)
+    assert given.with_landmarks(p, all_known, PRIOR)[0].argmax() == 1
+    p[:, 2], p[:, 1] = 1, 0  # all of them say that it is the other
+    assert given.with_landmarks(p, all_known, PRIOR)[0].argmax() == 2
 
 
 def test_widened_reaches_as_far_as_it_says() -> None:
