@@ -24,14 +24,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 from moving_points import KINDS, NEAR_PX, MovingTruth, WatchedSystem, strip
+from numpy.typing import NDArray
 from report import table
 
 from graph.camera import Camera
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
 from slam.configuration import resolve
 from slam.dynamics import Sifted
-from slam.features import Features, select
+from slam.features import Features
 from slam.frame import Frame
+from slam.refill import Refill
 from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.runner import RunOptions, run
 from slam.system_config import SystemConfig
@@ -89,9 +91,15 @@ class IdealSystem(WatchedSystem):
         sifted = super()._sift(frame, features)
         moves = np.any(list(self.truth.masks(frame).values()), axis=0).astype(np.uint8)
         moves = cv2.dilate(moves, np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8))
-        columns, rows = np.rint(features.image_pixels).astype(np.int64).T
-        moving = moves[rows, columns] > 0
-        return Sifted(select(features, np.flatnonzero(~moving)), moving, False, sifted.view)
+
+        def on_moving(found: Features) -> NDArray[np.bool_]:
+            columns, rows = np.rint(found.image_pixels).astype(np.int64).T
+            return moves[rows, columns] > 0
+
+        moving = on_moving(features)
+        refill = Refill(self.camera, self.config.features)
+        left = refill.filled_up(frame, features, moving, on_moving)
+        return Sifted(left, moving, False, sifted.view)
 
 
 def main() -> None:

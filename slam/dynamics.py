@@ -14,14 +14,22 @@ from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
 from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
 from slam.depth_regions import DepthRegionConfig
 from slam.feature_check import FeatureCheck
-from slam.features import Features, select
+from slam.features import FeatureConfig, Features
 from slam.frame import Frame
 from slam.keyframe_masks import KeyframeMasks, surface_points
 from slam.landmarks import Ints, Mask
 from slam.localiser import Localiser
 from slam.mapper import Mapper
+from slam.refill import Refill
 from slam.stance import Stance, stance
-from slam.static_check import DepthView, StaticCheck, StaticCheckConfig, Verdict, depth_view
+from slam.static_check import (
+    DepthView,
+    StaticCheck,
+    StaticCheckConfig,
+    Verdict,
+    Verdicts,
+    depth_view,
+)
 from slam.tracker import Tracked
 from slam.view_memory import PosedView, ViewMemory
 from slam.world_map import Keyframe, WorldMap
@@ -65,7 +73,8 @@ class Sifted:
     """A frame without what moves.
 
     Attributes:
-        features: those that are left; all of them where ``mostly_moving``.
+        features: those that are left and others in place of the rest; the frame's own where
+            ``mostly_moving``.
         moving: (N,) of the frame's own features, those on moving things.
         mostly_moving: too few would have been left.
         view: what the frame's depth says about space; None if geometry is switched off.
@@ -81,23 +90,25 @@ class Sifted:
     @property
     def ignored(self) -> int:
         """How many features were left out."""
-        return len(self.moving) - len(self.features)
+        return 0 if self.mostly_moving else int(np.count_nonzero(self.moving))
 
 
 class Dynamics:
     """Keeps which landmarks and instances move; map and graph belong to the caller."""
 
     def __init__(
-        self, camera: Camera, config: DynamicsConfig, disparity_sigma_px: float = 0.08
+        self, camera: Camera, config: DynamicsConfig, features: FeatureConfig | None = None
     ) -> None:
+        features = features or FeatureConfig()
         self.camera = camera
         self.config = config
         self.priors = read_priors(config.priors)
         self.movability = MovabilityFilter(self.priors.unknown, config.movability)
         self.tracks = InstanceTracks(config.tracks)
         self.memory = ViewMemory(config.check)
-        self._check = StaticCheck(camera, disparity_sigma_px, config.check)
+        self._check = StaticCheck(camera, features.disparity_sigma_px, config.check)
         self._features = FeatureCheck(camera, self._check, config.regions)
+        self._refill = Refill(camera, features)
 
     def leave_out(
         self,
@@ -134,21 +145,21 @@ class Dynamics:
         """Leave out the features on moving things, given a pose; none without it."""
         geometry = self.config.geometry
         view = depth_view(frame.depth_m, self.config.check.window_px) if geometry else None
-        verdicts, moving = np.zeros(len(features), np.int8), np.zeros(len(features), bool)
-        if T_world_camera is not None:
-            if geometry:
-                verdicts = self._features.judge(frame, features, T_world_camera, views)
-            boxes_world = self.tracks.moving_boxes(frame.timestamp_s)
-            on_tracks = self._features.in_boxes(features, boxes_world, T_world_camera)
-            moving = (verdicts == Verdict.MOVING) | (on_tracks & (verdicts != Verdict.STATIC))
+        if T_world_camera is None:
+            return Sifted(features, np.zeros(len(features), bool), False, view)
+        verdicts = self._verdicts(frame, features, T_world_camera, views)
+        moving = verdicts == Verdict.MOVING
         if not moving.any():
             return Sifted(features, moving, False, view)
         if np.count_nonzero(~moving) < self.config.min_static:
             logger.info("frame %d: nearly everything moves; all is used", frame.index)
             return Sifted(features, moving, True, view)
-        standing = int(np.count_nonzero((verdicts == Verdict.STATIC) & ~moving))
-        left = select(features, np.flatnonzero(~moving))
-        return Sifted(left, moving, False, view, standing)
+
+        def judge(others: Features) -> Mask:
+            return self._verdicts(frame, others, T_world_camera, views) == Verdict.MOVING
+
+        left = self._refill.filled_up(frame, features, moving, judge)
+        return Sifted(left, moving, False, view, int((verdicts == Verdict.STATIC).sum()))
 
     def watch(self, tracked: Tracked, view: DepthView | None, world: WorldMap) -> Ints:
         """Evidence of a tracked frame about landmarks; returns those in view believed moving."""
@@ -215,6 +226,18 @@ class Dynamics:
     def _least(self) -> float:
         """Log odds of a class that is movable enough to be tracked."""
         return float(log_odds(self.config.tracks.min_prior))
+
+    def _verdicts(
+        self, frame: Frame, features: Features, T_world_camera: Array, views: list[PosedView]
+    ) -> Verdicts:
+        """What views and the tracks' boxes say about features (N,)."""
+        verdicts = np.zeros(len(features), np.int8)
+        if self.config.geometry:
+            verdicts = self._features.judge(frame, features, T_world_camera, views)
+        boxes_world = self.tracks.moving_boxes(frame.timestamp_s)
+        on_tracks = self._features.in_boxes(features, boxes_world, T_world_camera)
+        verdicts[on_tracks & (verdicts != Verdict.STATIC)] = Verdict.MOVING
+        return verdicts
 
     def _sighting(self, k: int, masks: KeyframeMasks, mapper: Mapper) -> Sighting | None:
         """An instance in space, and whether it moves; None without depth."""

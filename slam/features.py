@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -93,16 +94,41 @@ class BriskExtractor:
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        pixels, response, threshold = self._corners(gray)
+        pixels, response, threshold = self._corners(gray, self.config.max_keypoints)
         if self.config.octaves > 0:
             return self._with_scales(frame, gray, threshold)
-        pixels = pixels[self._strongest_spread(pixels, response, gray.shape[1])]
+        order = self._spread(pixels, response, gray.shape[1])[: self.config.max_keypoints]
+        pixels = pixels[np.sort(order)]
         descriptors, angles_rad = self._describer.describe(gray, pixels)
         raw, scales = pixels.astype(float), np.ones(len(pixels))
         return self._assemble(frame, gray, (raw, scales, angles_rad), descriptors)
 
+    def reserve(self, frame: Frame, features: Features, share: float) -> Features:
+        """Further keypoints of a frame, best first, where a share of its features is of no use.
+
+        Together with the features they are those of so much larger a search. Their descriptors
+        are 0; see ``described``. With octaves there are none.
+        """
+        gray, width = features.gray, features.gray.shape[1]
+        enough = math.ceil(self.config.max_keypoints / (1 - share))
+        pixels, response, _ = self._corners(gray, enough)
+        if self.config.octaves > 0:
+            pixels, response = pixels[:0], response[:0]
+        pixels = pixels[self._spread(pixels, response, width)[:enough]]
+        places, known = ((p @ [1, width]).astype(np.int64) for p in (pixels, features.image_pixels))
+        raw = pixels[~np.isin(places, known)].astype(float)
+        descriptors = np.zeros((len(raw), features.descriptors.shape[1]), np.uint64)
+        return self._assemble(
+            frame, gray, (raw, np.ones(len(raw)), np.zeros(len(raw))), descriptors
+        )
+
+    def described(self, features: Features) -> Features:
+        """Keypoints of a ``reserve`` with their descriptors and orientations."""
+        found = self._describer.describe(features.gray, features.image_pixels.astype(np.float32))
+        return replace(features, descriptors=found[0], angles_rad=found[1])
+
     def _corners(
-        self, gray: NDArray[np.uint8]
+        self, gray: NDArray[np.uint8], enough: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], int]:
         """Pixels (N, 2) and responses (N,) at the highest threshold that gives enough, and it.
 
@@ -112,7 +138,7 @@ class BriskExtractor:
         registered to patches later.
         """
         inside = self._inside(gray)
-        thresholds, enough = self.config.thresholds, self.config.max_keypoints
+        thresholds = self.config.thresholds
         for lowest in (thresholds[len(thresholds) // 2], thresholds[-1]):
             found = self._fast[lowest].detect(gray, inside)
             if len(found) >= enough:
@@ -137,7 +163,8 @@ class BriskExtractor:
         found = brisk.detect(gray, self._inside(gray))
         pixels = np.reshape(cv2.KeyPoint_convert(found), (-1, 2))
         response = np.array([keypoint.response for keypoint in found])
-        kept = self._strongest_spread(pixels, response, gray.shape[1])
+        order = self._spread(pixels, response, gray.shape[1])
+        kept = np.sort(order[: self.config.max_keypoints])
         keypoints, descriptors = brisk.compute(gray, [found[i] for i in kept])
         table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], float).reshape(-1, 4)
         bits = np.zeros((0, 64), np.uint8) if descriptors is None else descriptors
@@ -149,14 +176,13 @@ class BriskExtractor:
             np.ascontiguousarray(bits).view(np.uint64),
         )
 
-    def _strongest_spread(
+    def _spread(
         self, pixels: NDArray[np.float32], response: Array, width: int
     ) -> NDArray[np.int64]:
-        """At most ``max_keypoints``: every bucket's strongest first, then the second, and so on."""
+        """The order of keypoints (N, 2): every bucket's strongest, then the second, and so on."""
         size = self.config.bucket_px
         column, row = (pixels // size).astype(np.int64).T
-        order = spread_order(row * -(-width // size) + column, response)
-        return np.sort(order[: self.config.max_keypoints])
+        return spread_order(row * -(-width // size) + column, response)
 
     def _assemble(
         self,
@@ -192,6 +218,13 @@ def select(features: Features, rows: NDArray[np.int64]) -> Features:
     """Some of the keypoints, by their rows (M,)."""
     columns = {f.name: getattr(features, f.name) for f in fields(features)}
     return Features(**{n: a if n == "gray" else a[rows] for n, a in columns.items()})
+
+
+def joined(first: Features, second: Features) -> Features:
+    """Keypoints of one frame, found at two times, one after the other."""
+    names = [f.name for f in fields(first) if f.name != "gray"]
+    pairs = {name: [getattr(first, name), getattr(second, name)] for name in names}
+    return replace(first, **{name: np.concatenate(pair) for name, pair in pairs.items()})
 
 
 def spread_order(bucket: NDArray[np.int64], score: Array) -> NDArray[np.int64]:

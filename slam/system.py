@@ -55,8 +55,7 @@ class SlamSystem:
         self.mapper = self._make_mapper(tracker)
         rules_here = (config.relocalisation, config.mapping)
         self.localiser = Localiser(tracker, self.mapper.places, rules_here)
-        sigma_px = config.features.disparity_sigma_px
-        self.dynamics = Dynamics(camera, config.dynamics, sigma_px)
+        self.dynamics = Dynamics(camera, config.dynamics, config.features)
         self.semantics = SemanticMapper(camera, config.semantics, segmenter, self.dynamics)
         self._segment = 0
         self._reference: Keyframe | None = None

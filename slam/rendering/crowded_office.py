@@ -1,4 +1,4 @@
-"""The busy office with one who walks to and fro so close that a fifth of the picture is hidden."""
+"""The busy office with people who keep step with the camera, so close that much is hidden."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ LIGHTING = busy_office.LIGHTING
 PATH = busy_office.PATH
 furnish = busy_office.furnish
 
-ROLES = (
-    Role("walk", ((0.0, 0.97), (-0.25, 0.86), (-0.42, 0.96), (-0.25, 1.08), (0.0, 0.97),
-                  (0.25, 0.86), (0.42, 0.96), (0.25, 1.08)),
-         speed_m_s=0.46, patched=True, escorts=True),
-    *busy_office.ROLES[1:],
-)  # fmt: skip
-"""The first goes along with the camera in an eight and turns away from it at both ends, so that
-what is carried in front stays off it; the others walk in their lanes behind."""
+
+def _in_step(right_m: float, ahead_m: float) -> Role:
+    """Somebody who keeps a place before the camera to within a hand's breadth."""
+    sway = ((0.05, 0.0), (0.0, 0.04), (-0.05, 0.0), (0.0, -0.04))
+    places = tuple((right_m + x, ahead_m + y) for x, y in sway)
+    return Role("walk", places, speed_m_s=0.05, patched=True, escorts=True)
+
+
+ROLES = (_in_step(0.0, 0.95), _in_step(-0.45, 1.5), *busy_office.ROLES[2:])
+"""The first two walk along with the camera, as who shows it around does; the others walk in their
+lanes behind."""

@@ -102,7 +102,7 @@ _GRIPS = {
     "box": "both",
 }
 
-PULLED_S = (3.4, 5.0)
+PULLED_S = (5.0, 7.0)
 """When a chair is pulled along."""
 _BESIDE = pose(-0.75, 0.3, 0.0, 30)
 

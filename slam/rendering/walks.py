@@ -14,7 +14,7 @@ Places = tuple[tuple[float, float], ...]
 """Way points (x, y) in metres of a closed round."""
 
 _STEPS_HZ = 50.0
-_TURN_S = 0.15
+_TURN_S = 0.3
 """Turns are spread over so long."""
 _BEYOND_S = 2.0
 """How much later than the camera's last frame somebody may be drawn."""
@@ -36,7 +36,7 @@ def on_round(places: Places, walked_m: float, phase: float) -> tuple[Array, floa
 class Escort:
     """A round that goes along with the camera: its places are to the camera's right and ahead.
 
-    Who walks it looks along the round, and steps as long as the motion in the room is.
+    Who walks it looks where the motion in the room goes, and steps as long as that is.
     """
 
     def __init__(self, path: CameraPath, places: Places, speed_m_s: float, phase: float) -> None:
@@ -45,15 +45,14 @@ class Escort:
         curve = _closed(places)
         walked_m = speed_m_s * self._times_s + phase * curve.x[-1]
         before = curve(walked_m % curve.x[-1])
-        along = curve(walked_m % curve.x[-1], 1)
         camera = steady_poses(path, self._times_s)
         ahead = camera[:, :2, 2] / np.linalg.norm(camera[:, :2, 2], axis=1, keepdims=True)
         right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
         self._world = camera[:, :2, 3] + before[:, :1] * right + before[:, 1:] * ahead
-        facing = along[:, :1] * right + along[:, 1:] * ahead
-        headings_deg = np.rad2deg(np.unwrap(np.arctan2(facing[:, 0], -facing[:, 1])))
-        self._headings_deg = gaussian_filter1d(headings_deg, _TURN_S * _STEPS_HZ, mode="nearest")
-        self._walked_m = np.cumsum(np.linalg.norm(np.gradient(self._world, axis=0), axis=1))
+        motion = np.gradient(self._world, axis=0)
+        facing = gaussian_filter1d(motion, _TURN_S * _STEPS_HZ, axis=0, mode="nearest")
+        self._headings_deg = np.rad2deg(np.unwrap(np.arctan2(facing[:, 0], -facing[:, 1])))
+        self._walked_m = np.cumsum(np.linalg.norm(motion, axis=1))
 
     def at(self, time_s: float) -> tuple[Array, float]:
         """The pose T_world_person (4, 4), and the distance walked in the room in metres."""
