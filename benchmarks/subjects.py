@@ -50,7 +50,8 @@ LABELS = (
 )
 MOVING = _of("semantics", "instance_tracks.py movability.py") + _of(
     "slam",
-    "dynamics.py feature_check.py keyframe_masks.py stance.py static_check.py view_memory.py",
+    "dynamics.py feature_check.py keyframe_masks.py refill.py stance.py static_check.py "
+    "view_memory.py",
 )
 DENSE = _of(
     "mapping",

@@ -14,7 +14,7 @@ from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
 from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
 from slam.depth_regions import DepthRegionConfig
 from slam.feature_check import FeatureCheck
-from slam.features import FeatureConfig, Features
+from slam.features import FeatureConfig, Features, select
 from slam.frame import Frame
 from slam.keyframe_masks import KeyframeMasks, surface_points
 from slam.landmarks import Ints, Mask
@@ -73,12 +73,13 @@ class Sifted:
     """A frame without what moves.
 
     Attributes:
-        features: those that are left and others in place of the rest; the frame's own where
-            ``mostly_moving``.
+        features: those that are left, and others in place of the rest once it is filled up; the
+            frame's own where ``mostly_moving``.
         moving: (N,) of the frame's own features, those on moving things.
         mostly_moving: too few would have been left.
         view: what the frame's depth says about space; None if geometry is switched off.
         standing: how many features lie where views saw a surface.
+        T_world_camera: (4, 4) that they were judged at; None if nothing was left out.
     """
 
     features: Features
@@ -86,6 +87,7 @@ class Sifted:
     mostly_moving: bool
     view: DepthView | None
     standing: int = 0
+    T_world_camera: Array | None = None
 
     @property
     def ignored(self) -> int:
@@ -155,11 +157,23 @@ class Dynamics:
             logger.info("frame %d: nearly everything moves; all is used", frame.index)
             return Sifted(features, moving, True, view)
 
-        def judge(others: Features) -> Mask:
-            return self._verdicts(frame, others, T_world_camera, views) == Verdict.MOVING
+        standing = int(np.count_nonzero(verdicts == Verdict.STATIC))
+        left = select(features, np.flatnonzero(~moving))
+        return Sifted(left, moving, False, view, standing, T_world_camera)
 
-        left = self._refill.filled_up(frame, features, moving, judge)
-        return Sifted(left, moving, False, view, int((verdicts == Verdict.STATIC).sum()))
+    def fill_up(
+        self, frame: Frame, features: Features, sifted: Sifted, segment: int, mapper: Mapper
+    ) -> Sifted:
+        """With further keypoints of the frame in place of its features that were left out."""
+        pose, views = sifted.T_world_camera, self.memory.posed(segment, mapper)
+        if pose is None or sifted.mostly_moving:
+            return sifted
+
+        def moving(others: Features) -> Mask:
+            return self._verdicts(frame, others, pose, views) == Verdict.MOVING
+
+        found = self._refill.filled_up(frame, features, sifted.moving, moving)
+        return replace(sifted, features=found)
 
     def watch(self, tracked: Tracked, view: DepthView | None, world: WorldMap) -> Ints:
         """Evidence of a tracked frame about landmarks; returns those in view believed moving."""

@@ -126,6 +126,8 @@ class SlamSystem:
             features = features if features is not None else self.prepare(frame)
         with clock.stage("moving"):
             sifted = self._sift(frame, features)
+        with clock.stage("features"):
+            sifted = self._fill_up(frame, features, sifted)
         with clock.stage("tracking"):
             tracked = self._track(sifted.features)
         with clock.stage("moving"):
@@ -262,6 +264,10 @@ class SlamSystem:
         """The frame's features without those on moving things."""
         localiser = self.localiser if self._reference is not None else None
         return self.dynamics.leave_out(frame, features, localiser, self._segment, self.mapper)
+
+    def _fill_up(self, frame: Frame, features: Features, sifted: Sifted) -> Sifted:
+        """With other keypoints in place of those on moving things."""
+        return self.dynamics.fill_up(frame, features, sifted, self._segment, self.mapper)
 
     def _watch(self, tracked: Tracked, sifted: Sifted) -> None:
         """Landmarks that are believed to move are not tracked against from now on."""

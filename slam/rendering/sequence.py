@@ -36,7 +36,7 @@ from slam.sequences.cameras import write_camera
 SCENES: dict[str, str] = {
     "office": "an office for three with desks, computers and bookcases; one round through it",
     "busy_office": "the same office from the door side, with room for people to walk before it",
-    "crowded_office": "the busy office with people who walk close before the camera",
+    "crowded_office": "the busy office with people who walk along close before the camera",
     "living_room": "a living room with sofa, television, dining table and bookcase; one round",
     "corridor": "a square corridor, a loop of 30 m that ends where it began",
     "room": "a room drawn at random from the seed: size, walls, light, furniture and round",

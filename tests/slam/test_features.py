@@ -13,6 +13,7 @@ from slam.features import (
     BriskExtractor,
     FeatureConfig,
     Features,
+    joined,
     sample_depth,
     spread_order,
     undistort,
@@ -292,3 +293,25 @@ def test_without_distortion_pixels_are_copied() -> None:
     same[0] = -1
     assert (pixels >= 0).all()
     assert undistort(FREIBURG1, np.zeros((0, 2))).shape == (0, 2)
+
+
+def test_a_reserve_is_what_a_larger_search_would_have_found_besides() -> None:
+    extractor = BriskExtractor(CAMERA, dataclasses.replace(CONFIG, max_keypoints=200))
+    features = extractor.extract(FRONTAL)
+    reserve = extractor.reserve(FRONTAL, features, 0.5)
+    larger = extract(FRONTAL, dataclasses.replace(CONFIG, max_keypoints=400))
+    both = joined(features, extractor.described(reserve))
+    places = {tuple(p) for p in both.image_pixels.tolist()}
+    assert len(places) == len(both) == len(features) + len(reserve)
+    assert {tuple(p) for p in larger.image_pixels.tolist()} <= places
+    expected = {tuple(p): k for k, p in enumerate(larger.image_pixels.tolist())}
+    rows = np.array([expected.get(tuple(p), -1) for p in both.image_pixels.tolist()])
+    for name in ("descriptors", "angles_rad", "depth_m", "sigmas_px", "pixels", "colours"):
+        mine, others = getattr(both, name)[rows >= 0], getattr(larger, name)[rows[rows >= 0]]
+        np.testing.assert_array_equal(mine, others, err_msg=name)
+
+
+def test_with_octaves_there_is_no_reserve() -> None:
+    extractor = BriskExtractor(CAMERA, dataclasses.replace(CONFIG, octaves=2))
+    features = extractor.extract(FRONTAL)
+    assert len(extractor.described(extractor.reserve(FRONTAL, features, 0.5))) == 0
