@@ -4,12 +4,14 @@
 
 The same camera path through the same room is rendered without people, with one, two and four who
 walk, and with one who carries a box of no class and pulls a chair along; the first two keep step
-with the camera. Sequences that are there already are used as they are. Each is run with nothing, with the labels of masks alone, with
-geometry alone, with both, and with the truth of every frame ("ideal"), which shows what the people
-cost by what they hide. "x clean" compares with the same camera path without people, run with
-nothing; "left out" is the share of the keypoints on people, the box, the chair while it is pulled,
-and on all the rest, that were not used. The times of the check, and of finding other keypoints in place of
-those left out ("refill"), are the processor's, of all frames. The second table is how much of the pictures they cover, box and pulled chair among them.
+with the camera. Sequences that are there already are used as they are. Each is run with nothing,
+with the labels of masks alone, with geometry alone, with both, and with the truth of every frame
+("ideal"), which shows what the people cost by what they hide. "x clean" compares with the same
+camera path without people, run with nothing; "left out" is the share of the keypoints on people,
+the box, the chair while it is pulled, and on all the rest, that were not used. The times of the
+check, and of finding other keypoints in place of those left out ("refill"), are the processor's, of
+all frames. The second table is how much of the pictures they cover, box and pulled chair among
+them.
 """
 
 from __future__ import annotations
