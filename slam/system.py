@@ -53,8 +53,8 @@ class SlamSystem:
         self.extractor = BriskExtractor(camera, config.features)
         tracker = Tracker(camera, config.tracking)
         self.mapper = self._make_mapper(tracker)
-        rules_here = (config.relocalisation, config.mapping)
-        self.localiser = Localiser(tracker, self.mapper.places, rules_here)
+        rules = (config.relocalisation, config.mapping)
+        self.localiser = Localiser(tracker, self.mapper.places, rules)
         self.dynamics = Dynamics(camera, config.dynamics, config.features)
         self.semantics = SemanticMapper(camera, config.semantics, segmenter, self.dynamics)
         self._segment = 0
@@ -63,9 +63,8 @@ class SlamSystem:
         self._first_keyframe = 0  # of this session
 
     def _make_mapper(self, tracker: Tracker) -> Mapper:
-        config = self.config
-        rules = (config.mapping, config.feed, config.graph, config.loops)
-        return Mapper(self.camera, tracker, rules)
+        c = self.config
+        return Mapper(self.camera, tracker, (c.mapping, c.feed, c.graph, c.loops))
 
     def state(self) -> Arrays:
         """All that the past has left behind, as named arrays."""
@@ -198,14 +197,13 @@ class SlamSystem:
         """The keyframes of the largest segment that this session made."""
         chosen = self.mapper.world.in_segment(largest(self.segments()))
         chosen = [k for k in chosen if k.id >= self._first_keyframe]
-        stamps = np.array([k.timestamp_s for k in chosen])
-        return Trajectory(stamps, np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4))
+        poses = np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4)
+        return Trajectory(np.array([k.timestamp_s for k in chosen]), poses)
 
     def keyframe_covariances(self) -> KeyframeCovariances:
         """How sure the graph is of the keyframes of the largest segment."""
         chosen = self.mapper.world.in_segment(largest(self.segments()))
-        stamps_s = {keyframe.id: keyframe.timestamp_s for keyframe in chosen}
-        return find_covariances(self.mapper.smoother, stamps_s)
+        return find_covariances(self.mapper.smoother, {k.id: k.timestamp_s for k in chosen})
 
     def landmarks(self) -> LandmarkCloud:
         """The living landmarks of the largest segment, with their colours."""
