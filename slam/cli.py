@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TypeAlias
 
@@ -142,6 +143,9 @@ def _add_render(commands: _Commands) -> None:
     parser.add_argument("name", help=scenes)
     parser.add_argument("--out", type=Path, required=True, help="folder to make")
     parser.add_argument("--frames", type=int, metavar="N", help="number of frames (default: all)")
+    parser.add_argument(
+        "--rounds", type=int, default=1, metavar="N", help="walk the corridor N times"
+    )
     parser.add_argument("--fps", type=float, default=30.0, help="frame rate (default: 30)")
     parser.add_argument("--width", type=int, default=640, metavar="PX", help="default: 640")
     parser.add_argument("--height", type=int, default=480, metavar="PX", help="default: 480")
@@ -166,9 +170,8 @@ def _render(arguments: argparse.Namespace) -> int:
     from slam.progress import console_log, counting_bar
     from slam.rendering.sequence import RenderConfig, render_sequence
 
-    names = ("name", "frames", "fps", "seed", "people", "depth_delay_ms", "width", "height")
-    flags = ("carry", "sweeping", "exposure_change", "motion_blur", "true_depth", "normals")
-    given = {name: getattr(arguments, name) for name in names + flags}
+    names = (f.name for f in fields(RenderConfig) if f.name != "noise")
+    given = {name: getattr(arguments, name) for name in names}
     config = RenderConfig(noise=not arguments.no_noise, **given)
     with console_log(), counting_bar(arguments.quiet) as progress:
         folder = render_sequence(config, arguments.out, progress)

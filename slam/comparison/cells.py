@@ -22,7 +22,7 @@ SEQUENCES, CELLS = "sequences", "cells"
 SEED_SETTING = "loops.verification.seed={}"
 Key = tuple[str, str, int]
 """A cell of this system: sequence, configuration, seed."""
-_VALUES = ("frames", "fps", "people", "depth_delay_ms", "width", "height")
+_VALUES = ("frames", "rounds", "fps", "people", "depth_delay_ms", "width", "height")
 _FLAGS = ("carry", "exposure_change", "motion_blur", "sweeping", "true_depth", "normals")
 
 

@@ -62,8 +62,8 @@ def _ring() -> Array:
     return np.c_[flat, np.zeros(len(flat))]
 
 
-def _path() -> CameraPath:
-    """Once around and 0.6 m on, weaving a little and glancing at the walls."""
+def path(rounds: int = 1) -> CameraPath:
+    """So often around and 0.6 m on, weaving a little and glancing at the walls."""
     ring = _ring()
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))]
 
@@ -71,7 +71,8 @@ def _path() -> CameraPath:
         wrapped = np.mod(distance_m, along[-1])
         return np.stack([np.interp(wrapped, along, column) for column in ring.T], axis=-1)
 
-    s = np.linspace(0, along[-1] + 0.6, 75)
+    length_m = rounds * along[-1] + 0.6
+    s = np.linspace(0, length_m, 1 + round(74 * length_m / (along[-1] + 0.6)))
     turns = 2 * np.pi * s / along[-1]
     eyes = at(s)
     left = np.cross([0, 0, 1.0], at(s + 0.3) - eyes) / 0.3
@@ -82,7 +83,7 @@ def _path() -> CameraPath:
     return CameraPath(eyes, targets, speed_m_s=0.5, turn_deg_s=30)
 
 
-PATH = _path()
+PATH = path()
 
 
 def furnish(b: SceneBuilder) -> None:

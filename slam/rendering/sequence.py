@@ -42,6 +42,8 @@ SCENES: dict[str, str] = {
     "room": "a room drawn at random from the seed: size, walls, light, furniture and round",
 }
 """Names and one-line descriptions of the scenes."""
+CLOSED = ("corridor",)
+"""Scenes whose path ends where it began: it can be walked more than once."""
 
 _WORKERS = 2
 _SHUTTER_SHARE = 0.6
@@ -55,6 +57,7 @@ class RenderConfig:
     Attributes:
         name: one of SCENES.
         frames: number of frames from the start of the path; None for the whole path.
+        rounds: how often the path is walked; more than once in a scene of CLOSED only.
         seed: of people, noise, textures and the hand's tremor, and of a random room.
         people: how many people stand, sit, walk and carry things in the scene.
         carry: the first of them carries a box, of no class, and pulls a chair along for a while.
@@ -85,6 +88,7 @@ class RenderConfig:
     height: int = 480
     true_depth: bool = False
     normals: bool = False
+    rounds: int = 1
 
 
 def kinect_camera(config: RenderConfig) -> Camera:
@@ -144,6 +148,13 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"scene {config.name!r} is unknown; choose one of {', '.join(SCENES)}")
     if config.frames is not None and config.frames < 1:
         raise InputError(f"frames={config.frames}: must be at least 1")
+    if config.rounds < 1:
+        raise InputError(f"rounds={config.rounds}: must be at least 1")
+    if config.rounds > 1 and config.name not in CLOSED:
+        raise InputError(
+            f"rounds={config.rounds}: the path of {config.name!r} does not end where it began; "
+            f"only {', '.join(CLOSED)} can be walked more than once"
+        )
     if config.people < 0:
         raise InputError(f"people={config.people}: must not be negative")
     if config.carry and not config.people:
@@ -166,16 +177,17 @@ class _Plan:
     furnish: Callable[[SceneBuilder], None]
 
 
-def _plan(name: str, seed: int) -> _Plan:
-    if name == "room":
-        room = draw_room(seed)
+def _plan(config: RenderConfig) -> _Plan:
+    if config.name == "room":
+        room = draw_room(config.seed)
         return _Plan(room.path, room.roles, room.lighting, room.furnish)
-    module = importlib.import_module(f"slam.rendering.{name}")
-    return _Plan(module.PATH, module.ROLES, module.LIGHTING, module.furnish)
+    module = importlib.import_module(f"slam.rendering.{config.name}")
+    path = module.path(config.rounds) if config.name in CLOSED else module.PATH
+    return _Plan(path, module.ROLES, module.LIGHTING, module.furnish)
 
 
 def _prepare(config: RenderConfig, folder: Path) -> _Job:
-    plan = _plan(config.name, config.seed)
+    plan = _plan(config)
     poses = camera_poses(plan.path, config.fps, config.seed, sweeping=config.sweeping)
     if config.frames is not None and config.frames > len(poses):
         raise InputError(

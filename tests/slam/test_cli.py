@@ -204,9 +204,11 @@ def test_render_options_reach_the_renderer(capsys, monkeypatch, tmp_path: Path) 
         "--motion-blur",
         "--fps",
         "15",
+        "--rounds",
+        "2",
     ]
     status, output, errors = call(capsys, "render", "corridor", "--out", tmp_path, *options)
-    expected = RenderConfig("corridor", 2, 7, 3, noise=False, motion_blur=True, fps=15.0)
+    expected = RenderConfig("corridor", 2, 7, 3, noise=False, motion_blur=True, fps=15.0, rounds=2)
     assert (status, calls) == (0, [(expected, tmp_path)])
     assert f"bmask-slam run {tmp_path}" in output
     assert "2/2" in errors

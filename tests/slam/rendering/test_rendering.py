@@ -309,6 +309,19 @@ def test_corridor_is_thirty_metres_and_ends_where_it_began() -> None:
     assert np.rad2deg(np.linalg.norm(so3_log(T[0, :3, :3].T @ T[-1, :3, :3]))) < 20
 
 
+def test_every_round_of_the_corridor_is_the_same() -> None:
+    one, three = corridor.path(), corridor.path(3)
+    length_m = (len(one.eyes_world) - 1) / (len(three.eyes_world) - 1)
+    assert length_m == pytest.approx(1 / 3, abs=0.01)
+    T = camera_poses(three, 10.0, seed=0)[:, :3, 3]
+    apart = np.linalg.norm(T[:, None] - T[None, :], axis=2)
+    later = np.abs(np.subtract.outer(np.arange(len(T)), np.arange(len(T)))) > len(T) // 6
+    first_end = int(np.argmin(np.linalg.norm(T[200:700] - T[0], axis=1))) + 200
+    nearest_later = np.where(later, apart, np.inf).min(axis=1)
+    assert first_end == pytest.approx(len(T) / 3, rel=0.05)
+    assert nearest_later.max() < 0.06  # half a step, and the hand's tremor
+
+
 def test_a_walker_keeps_feet_on_the_floor_and_looks_ahead() -> None:
     person = Person(Role("walk", ((0, 0), (3, 0), (3, 2), (0, 2))), phase=0.0, scale=1.0)
     before, now = person.bones(0.4), person.bones(0.5)
@@ -328,6 +341,8 @@ def test_a_walker_keeps_feet_on_the_floor_and_looks_ahead() -> None:
         ({"frames": 0}, "frames=0"),
         ({"frames": 10**6}, "has"),
         ({"people": 99}, "people=99"),
+        ({"rounds": 0}, "rounds=0"),
+        ({"rounds": 2}, "rounds=2.*only corridor"),
         ({"carry": True}, "nobody"),
         ({"fps": 0.0}, "fps=0"),
         ({"width": 2}, "2x120"),
