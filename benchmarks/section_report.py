@@ -55,6 +55,7 @@ REPORTS = {
             "loop_limits.py {sequences}/results/corridor-default "
             "{sequences}/results/corridor-no-loop-closed --reference {sequences}/corridor",
         ),
+        "rounds": ("Round after round", "corridor_rounds.py --out {sequences}/rounds"),
         "pose-graphs": ("Pose graphs, clean and with wrong loops", "pose_graphs.py"),
         "kills": (
             "Killed and resumed",

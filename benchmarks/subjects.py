@@ -67,6 +67,7 @@ SUBJECTS = {
     "beside_torchvision.py": NETWORK,
     "calibration.py": CALIBRATION,
     "composited.py": ODOMETRY + MOVING + NETWORK + WEIGHTS + METRICS,
+    "corridor_rounds.py": ODOMETRY + SMOOTHER + LOOPS + RENDERING + METRICS,
     "covariances.py": SMOOTHER,
     "dense.py": DENSE,
     "dense_pictures.py": DENSE,
