@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from graph.array_file import Arrays
 from graph.geometry import Array
 
+Mask = NDArray[np.bool_]
 _H = np.eye(3, 6)
 _NEVER = 1e9
 
@@ -25,10 +26,11 @@ class TrackConfig:
     ``acceleration_m_s2``: standard deviation of the white acceleration. ``speed_m_s``: that of
     an unknown speed. ``centroid_sigma_m``: that of a measured centroid, of which part may be
     hidden. ``gate_chi2`` (3 degrees of freedom) is where a detection no longer belongs to a track;
-    one with a quite different class costs ``class_cost`` more. A track ends ``patience_s`` after
-    it was last seen. Boxes are widened by ``box_sigmas`` of the prediction, but by no more than
-    ``box_slack_m``, and by ``box_margin_m``. Classes that move with less than ``min_prior`` have
-    no tracks.
+    one with a quite different class costs ``class_cost`` more. Of two things whose classes have
+    ``same_class`` in common, one in the middle of the other's box is a part of it. A track ends
+    ``patience_s`` after it was last seen. Boxes are widened by ``box_sigmas`` of the prediction,
+    but by no more than ``box_slack_m``, and by ``box_margin_m``. Classes that move with less than
+    ``min_prior`` have no tracks.
     """
 
     acceleration_m_s2: float = 1.0
@@ -36,6 +38,7 @@ class TrackConfig:
     centroid_sigma_m: float = 0.08
     gate_chi2: float = 16.0
     class_cost: float = 8.0
+    same_class: float = 0.5
     patience_s: float = 2.0
     box_sigmas: float = 1.0
     box_slack_m: float = 0.25
@@ -103,25 +106,33 @@ class InstanceTracks:
         self.tracks: list[Track] = []
         self._next_id = 0
 
-    def see(self, time_s: float, sightings: Sequence[Sighting]) -> list[int]:
+    def see(
+        self, time_s: float, sightings: Sequence[Sighting], R_world_camera: Array | None = None
+    ) -> list[int]:
         """The movable things of a keyframe; returns the id of the track of each.
 
-        Masks that come after those of a later keyframe, and tracks that have ended, are of no use.
+        A part that was seen besides its whole is on the whole's track. Masks that come after those
+        of a later keyframe, and tracks that have ended, are of no use. ``R_world_camera`` (3, 3)
+        turns the boxes' axes into the world's, by default they are the same.
         """
         self.expire(time_s)
         if any(track.time_s > time_s for track in self.tracks):
             return []
+        R = np.eye(3) if R_world_camera is None else R_world_camera
+        whole = self._wholes(sightings, R)
+        distinct = np.flatnonzero(whole == np.arange(len(sightings)))
         ahead = [self.predicted(track, time_s) for track in self.tracks]
-        chosen = self._assign(ahead, sightings)
-        ids = []
-        for sighting, row in zip(sightings, chosen, strict=True):
+        chosen = self._assign(ahead, [sightings[k] for k in distinct])
+        ids = np.zeros(len(sightings), np.int64)
+        for k, row in zip(distinct.tolist(), chosen, strict=True):
             if row < 0:
-                self.tracks.append(self._begun(sighting, time_s))
-                ids.append(self.tracks[-1].id)
+                self.tracks.append(self._begun(sightings[k], time_s))
             else:
-                self.tracks[row] = self._joined(ahead[row], sighting, time_s)
-                ids.append(self.tracks[row].id)
-        return ids
+                self.tracks[row] = self._joined(ahead[row], sightings[k], time_s)
+            ids[k] = self.tracks[row].id
+        self._end_doubles(time_s, R)
+        found: list[int] = ids[whole].tolist()
+        return found
 
     def expire(self, time_s: float) -> None:
         """End the tracks that were not seen for long."""
@@ -201,6 +212,36 @@ class InstanceTracks:
             )
         ]
 
+    def _wholes(self, sightings: Sequence[Sighting], R_world_box: Array) -> NDArray[np.int64]:
+        """(N,) the largest sighting that each is a part of, itself if there is none."""
+        if not sightings:
+            return np.zeros(0, np.int64)
+        centres = np.array([s.centroid_world for s in sightings])
+        sizes = np.array([s.half_size for s in sightings])
+        alike = [[_alike(a.distribution, b.distribution) for b in sightings] for a in sightings]
+        within = _within(centres, centres, sizes, R_world_box)
+        within &= np.array(alike) >= self.config.same_class
+        np.fill_diagonal(within, True)
+        volume = sizes.prod(axis=1)
+        whole = np.where(within, volume, -1.0).argmax(axis=1)
+        while not np.array_equal(whole, whole[whole]):
+            whole = whole[whole]
+        return whole
+
+    def _end_doubles(self, time_s: float, R_world_box: Array) -> None:
+        """End the tracks that were not seen where one of the same class was."""
+        now = [track for track in self.tracks if track.time_s == time_s]
+        others = [track for track in self.tracks if track.time_s != time_s]
+        if not now or not others:
+            return
+        centres = np.array([self.predicted(track, time_s).mean[:3] for track in others])
+        seen, sizes = np.array([t.mean[:3] for t in now]), np.array([t.half_size for t in now])
+        alike = [[_alike(a.distribution, b.distribution) for b in now] for a in others]
+        double = _within(centres, seen, sizes, R_world_box)
+        double &= np.array(alike) >= self.config.same_class
+        ended = {t.id for t, d in zip(others, double.any(axis=1), strict=True) if d}
+        self.tracks = [track for track in self.tracks if track.id not in ended]
+
     def _slack_m(self, sigma_m: Array) -> Array:
         """By how much boxes are widened whose centres are not known better."""
         known = self.config.box_sigmas * sigma_m
@@ -254,6 +295,12 @@ class InstanceTracks:
             log_odds=(ahead.log_odds + sighting.log_odds) / 2,
             sightings=ahead.sightings + 1,
         )
+
+
+def _within(points: Array, centres: Array, sizes: Array, R_world_box: Array) -> Mask:
+    """Whether points (N, 3) lie in boxes at centres (M, 3) of half sizes (M, 3): (N, M)."""
+    away = np.abs((points[:, None] - centres) @ R_world_box)
+    return np.asarray((away <= sizes).all(axis=2))
 
 
 def _alike(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:

@@ -205,7 +205,7 @@ class Dynamics:
         movable = [s for s in sightings if s is not None and s.log_odds > self._least]
         keyframe = mapper.world.keyframes.get(masks.keyframe_id)
         if keyframe is not None:
-            self.tracks.see(keyframe.timestamp_s, movable)
+            self.tracks.see(keyframe.timestamp_s, movable, masks.T_world_camera[:3, :3])
         odds = np.array([-np.inf if s is None else s.log_odds for s in sightings])
         still = np.array([s is not None and s.still for s in sightings], bool)
         self._believe(masks, odds > 0, still)

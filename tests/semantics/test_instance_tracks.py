@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from graph.geometry import so3_exp
 from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
 
 SIZE = np.array([0.25, 0.9, 0.2])
@@ -95,3 +96,32 @@ def test_all_boxes_at_once_are_those_of_each_track() -> None:
     np.testing.assert_allclose(centres, [t.mean[:3] for t in ahead], atol=1e-12)
     np.testing.assert_allclose(sizes, [tracks.reach_m(t) for t in ahead], atol=1e-12)
     assert InstanceTracks().moving_boxes(0.0)[0].shape == (0, 3)
+
+
+def part(x: float, y: float, z: float) -> Sighting:
+    return Sighting(np.array([x, y, z]), SIZE / 3, PERSON, 2.0)
+
+
+def test_a_part_seen_besides_its_whole_is_no_second_person() -> None:
+    tracks = InstanceTracks()
+    assert tracks.see(0.0, [part(0.1, -0.6, 3.1), seen(0.0), seen(0.0, what=CHAIR)]) == [0, 0, 1]
+    (person, _) = tracks.tracks
+    np.testing.assert_array_equal(person.half_size, SIZE)
+    first, second = tracks.see(0.3, [seen(0.05), part(0.1, -0.6, 3.3)])
+    assert first == 0 != second
+
+
+def test_boxes_have_the_axes_of_the_camera_that_saw_them() -> None:
+    R_world_camera = so3_exp(np.array([0.0, np.pi / 2, 0.0]))
+    beside = R_world_camera @ np.array([0.22, 0.0, 0.0])
+    behind = R_world_camera @ np.array([0.0, 0.0, 0.22])
+    for away, ids in ((beside, [0, 0]), (behind, [0, 1])):
+        both = [seen(0.0), part(*(np.array([0, 0, 3.0]) + away))]
+        assert InstanceTracks().see(0.0, both, R_world_camera) == ids
+
+
+def test_an_unseen_track_where_its_like_was_seen_ends() -> None:
+    tracks = InstanceTracks()
+    assert tracks.see(0.0, [seen(0.0), seen(0.3), seen(0.1, what=CHAIR), seen(1.0)]) == [0, 1, 2, 3]
+    (kept,) = tracks.see(0.2, [seen(0.12)])
+    assert [t.id for t in tracks.tracks] == [kept, 2, 3]
