@@ -120,11 +120,11 @@ class InstanceTracks:
             return []
         R = np.eye(3) if R_world_camera is None else R_world_camera
         whole = self._wholes(sightings, R)
-        distinct = np.flatnonzero(whole == np.arange(len(sightings)))
+        distinct = np.flatnonzero(whole == np.arange(len(sightings))).tolist()
         ahead = [self.predicted(track, time_s) for track in self.tracks]
         chosen = self._assign(ahead, [sightings[k] for k in distinct])
         ids = np.zeros(len(sightings), np.int64)
-        for k, row in zip(distinct.tolist(), chosen, strict=True):
+        for k, row in zip(distinct, chosen, strict=True):
             if row < 0:
                 self.tracks.append(self._begun(sightings[k], time_s))
             else:
@@ -239,7 +239,7 @@ class InstanceTracks:
         alike = [[_alike(a.distribution, b.distribution) for b in now] for a in others]
         double = _within(centres, seen, sizes, R_world_box)
         double &= np.array(alike) >= self.config.same_class
-        ended = {t.id for t, d in zip(others, double.any(axis=1), strict=True) if d}
+        ended = {others[k].id for k in np.flatnonzero(double.any(axis=1)).tolist()}
         self.tracks = [track for track in self.tracks if track.id not in ended]
 
     def _slack_m(self, sigma_m: Array) -> Array:
