@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
-from slam.landmarks import Ints
+from slam.landmarks import Ints, Mask
 from slam.mapper import Mapper
 from slam.static_check import distorted
 from slam.world_map import Keyframe
@@ -55,16 +55,30 @@ class Located:
     T_world_camera: Array
     segment: int
 
-    def with_visible(self, depth_m: NDArray[np.float32], camera: Camera, mapper: Mapper) -> Located:
+    def among(self, wanted: Mask) -> Located:
+        """Those of the ``wanted`` landmarks, a mask over all."""
+        keep = wanted[self.landmark_ids]
+        kept = self.pixels[keep], self.z_m[keep], self.landmark_ids[keep]
+        return Located(*kept, self.T_world_camera, self.segment)
+
+    def with_visible(
+        self,
+        depth_m: NDArray[np.float32],
+        camera: Camera,
+        mapper: Mapper,
+        wanted: Mask | None = None,
+    ) -> Located:
         """These and all others of the segment that lie where the keyframe's depth shows surface.
 
-        ``depth_m`` (H / s, W / s) is every s-th pixel of the depth image both ways.
+        ``depth_m`` (H / s, W / s) is every s-th pixel of the depth image both ways; ``wanted``
+        says which of all landmarks are asked for, else all that live are.
         """
         landmarks = mapper.world.landmarks
-        hosts = [k.id for k in mapper.world.in_segment(self.segment)]
-        others = landmarks.alive & np.isin(landmarks.host, hosts)
+        others = (landmarks.alive if wanted is None else wanted).copy()
         others[self.landmark_ids] = False
         ids = np.flatnonzero(others)
+        hosts = [k.id for k in mapper.world.in_segment(self.segment)]
+        ids = ids[np.isin(landmarks.host[ids], hosts)]
         local = transform(inverse(self.T_world_camera), landmarks.points_world[ids])
         ahead = np.flatnonzero(local[:, 2] > 0.1)
         pixels = distorted(camera, local[ahead])

@@ -21,13 +21,14 @@ from semantics.objects import KeyframeView, MapObject, ObjectConfig, ObjectMap, 
 from semantics.segmenter import NoSegmenter, Segmenter
 from semantics.segmenter_table import SegmenterOptions
 from semantics.upright import Upright
-from semantics.votes import Claims, VoteConfig, Votes, check_instances, claim_pixels, vote
+from semantics.votes import Claims, VoteConfig, check_instances, claim_pixels, vote
 from slam.dynamics import Dynamics
 from slam.frame import Frame
 from slam.keyframe_masks import KeyframeMasks
+from slam.label_votes import LabelVotes
 from slam.landmarks import Ints
 from slam.mapper import Mapper
-from slam.observed_landmarks import Located, Observed, observed_by
+from slam.observed_landmarks import Observed, observed_by
 from slam.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
@@ -175,10 +176,13 @@ class SemanticMapper:
         strong = [i for i in instances if i.class_score >= self.config.object_score]
         claims = claim_pixels(strong, waiting.depth_m, size, self.config.votes)
         seen = observed.located(mapper)
-        votes = self._votes(claims, seen)
+        votes = vote(claims, seen.pixels, seen.z_m, len(self.names), self.config.votes)
         ids = observed.landmark_ids[votes.rows[votes.sure]]
         on = votes.instances[votes.sure]
-        spoken = self._label((claims, instances), seen, waiting, mapper)
+        everything = claims
+        if len(strong) < len(instances):
+            everything = claim_pixels(instances, waiting.depth_m, size, self.config.votes)
+        spoken = self._label_votes.take(keyframe_id, everything, observed, mapper, self.labels)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
             objects = self._add_objects((keyframe_id, waiting), claims, observed, mapper)[on]
             self.objects.place_landmarks(ids[objects >= 0], objects[objects >= 0])
@@ -231,6 +235,7 @@ class SemanticMapper:
             "waiting_depth_m": np.array([w.depth_m for w in waiting], np.float32).ravel(),
             **nested(
                 labels=self.labels.state(),
+                votes=self._label_votes.state(),
                 objects=self.objects.state(),
                 upright=self._upright.state(),
             ),
@@ -252,6 +257,7 @@ class SemanticMapper:
             return  # nothing was learned
         self._begin(names)
         self.labels.restore(part(state, "labels"))
+        self._label_votes.restore(part(state, "votes"))
         self.objects.restore(part(state, "objects"))
         self._upright.restore(part(state, "upright"))
         self._done = set(state["done"].tolist())
@@ -268,32 +274,11 @@ class SemanticMapper:
         """Know nothing yet."""
         self.names = names
         self.labels = LabelStore(len(names), self.config.labels)
+        self._label_votes = LabelVotes(self.camera, self.config.votes)
         self.objects = ObjectMap(self.camera, len(names), self.config.objects, self.config.labels)
         self._upright = Upright()
         self._done = set()
         self._waiting = {}
-
-    def _votes(self, claims: Claims, seen: Located) -> Votes:
-        return vote(claims, seen.pixels, seen.z_m, len(self.names), self.config.votes)
-
-    def _label(
-        self,
-        masks: tuple[Claims, Sequence[Instance]],
-        observed: Located,
-        waiting: _Waiting,
-        mapper: Mapper,
-    ) -> Ints:
-        """All instances vote on all landmarks in sight; returns the ids (N,) of those."""
-        claims, instances = masks
-        if len(claims.instances) < len(instances):
-            size = claims.owner.shape
-            claims = claim_pixels(instances, waiting.depth_m, size, self.config.votes)
-        seen = observed.with_visible(waiting.depth_m, self.camera, mapper)
-        votes = self._votes(claims, seen)
-        ids, hit = seen.landmark_ids[votes.rows], ~votes.missed
-        self.labels.update(ids[hit], votes.distributions[hit], votes.weights[hit])
-        self.labels.miss(ids[~hit], votes.weights[~hit])
-        return ids
 
     def _add_objects(
         self, waited: tuple[int, _Waiting], claims: Claims, observed: Observed, mapper: Mapper
