@@ -44,6 +44,7 @@ LABELS = (
         "semantics",
         "boxes3d.py instances.py label_store.py labels.py object*.py upright.py votes.py",
     ),
+    "slam/label_votes.py",
     "slam/observed_landmarks.py",
     "slam/semantic_mapping.py",
     "data/labels/*.yaml",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graph.geometry import Array
 from graph.ply import write_ply
-from slam.semantic_mapping import LandmarkLabels
+from slam.semantic_results import LandmarkLabels
 
 LANDMARKS_COMMENT = "bmask-slam landmarks, world frame, metres"
 

@@ -13,7 +13,7 @@ from graph.trajectory import Trajectory
 from semantics.boxes3d import EDGES, upright_axes
 from semantics.overlay import class_colour
 from slam.landmark_cloud import LandmarkCloud
-from slam.semantic_mapping import MapObjects
+from slam.semantic_results import MapObjects
 
 UNKNOWN_COLOUR = "#c9c9c4"
 _MIN_NAMED_M = 0.25

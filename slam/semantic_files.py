@@ -20,7 +20,7 @@ from semantics.overlay import class_colour
 from slam.landmark_cloud import LandmarkCloud
 from slam.landmarks import Ints
 from slam.object_picture import draw_objects
-from slam.semantic_mapping import MapObjects
+from slam.semantic_results import MapObjects
 
 LABELS = "labels.csv"
 OBJECTS = "objects.json"

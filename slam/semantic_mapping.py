@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
 from graph.errors import InputError
-from graph.geometry import Array
 from semantics.instances import Instance
-from semantics.label_store import LabelEstimates, LabelStore, LabelStoreConfig
+from semantics.label_store import LabelStore, LabelStoreConfig
 from semantics.labels import LabelSet
-from semantics.objects import KeyframeView, MapObject, ObjectConfig, ObjectMap, pixel_rays
+from semantics.objects import KeyframeView, ObjectConfig, ObjectMap, pixel_rays
 from semantics.segmenter import NoSegmenter, Segmenter
 from semantics.segmenter_table import SegmenterOptions
 from semantics.upright import Upright
@@ -29,6 +28,7 @@ from slam.label_votes import LabelVotes
 from slam.landmarks import Ints
 from slam.mapper import Mapper
 from slam.observed_landmarks import Observed, observed_by
+from slam.semantic_results import LandmarkLabels, MapObjects
 from slam.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
@@ -72,23 +72,6 @@ class Attachment:
     instances: int = 0
     landmark_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     refused: str = ""
-
-
-@dataclass(frozen=True)
-class LandmarkLabels:
-    """What landmarks (N,) are: estimates of ``names``."""
-
-    names: LabelSet
-    estimates: LabelEstimates
-
-
-@dataclass(frozen=True)
-class MapObjects:
-    """The objects of a map's largest segment, with labels of ``names``; ``up_world`` (3,)."""
-
-    names: LabelSet
-    objects: list[MapObject]
-    up_world: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +240,8 @@ class SemanticMapper:
             return  # nothing was learned
         self._begin(names)
         self.labels.restore(part(state, "labels"))
-        self._label_votes.restore(part(state, "votes"))
+        if votes := part(state, "votes"):
+            self._label_votes.restore(votes)
         self.objects.restore(part(state, "objects"))
         self._upright.restore(part(state, "upright"))
         self._done = set(state["done"].tolist())

@@ -30,7 +30,8 @@ from slam.map_file import MAP, write_map
 from slam.mapper import Mapper
 from slam.results import FrameResult, TrackingStatus
 from slam.semantic_files import semantic_writers
-from slam.semantic_mapping import MapObjects, SemanticMapper
+from slam.semantic_mapping import SemanticMapper
+from slam.semantic_results import MapObjects
 from slam.stage_clock import StageClock
 from slam.system_config import SystemConfig
 from slam.tracker import Tracked, Tracker, lost, untracked

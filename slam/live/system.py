@@ -23,7 +23,8 @@ from slam.live.remote_mapper import RemoteMapper
 from slam.live.segmentation import RemoteSegmenter
 from slam.mapper import Mapper
 from slam.results import FrameResult
-from slam.semantic_mapping import LandmarkLabels, SemanticMapper
+from slam.semantic_mapping import SemanticMapper
+from slam.semantic_results import LandmarkLabels
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 from slam.tracker import Tracked, Tracker

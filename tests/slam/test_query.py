@@ -16,7 +16,7 @@ from semantics.objects import MapObject
 from slam.cli import main
 from slam.query import format_answer, query
 from slam.semantic_files import BOXES, OBJECTS, read_objects, write_boxes, write_objects
-from slam.semantic_mapping import MapObjects
+from slam.semantic_results import MapObjects
 
 NAMES = label_set(("chair", "desk", "cup"))
 
