@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from test_semantic_mapping import FRAMES, MANY_KEYFRAMES, Sides, estimates, right_share, run
 
