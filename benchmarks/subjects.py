@@ -42,7 +42,8 @@ TRAINING = _of("semantics", "training/*.py")
 LABELS = (
     *_of(
         "semantics",
-        "boxes3d.py instances.py label_store.py labels.py object*.py upright.py votes.py",
+        "boxes3d.py instances.py label_store.py labels.py mask_order.py object*.py upright.py "
+        "votes.py",
     ),
     "slam/label_votes.py",
     "slam/observed_landmarks.py",

@@ -13,13 +13,12 @@ from graph.errors import InputError
 from graph.geometry import Array
 from semantics.instances import Instance
 from semantics.labels import LabelSet
+from semantics.mask_order import painting_order, window
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 NOBODY = -1
 _MAD_TO_SIGMA = 1.4826
-_COARSE = 4
-"""Every so many pixels each way of masks are compared."""
 
 
 @dataclass(frozen=True)
@@ -139,16 +138,18 @@ def claim_pixels(
     depth_m: NDArray[np.float32],
     size: tuple[int, int],
     config: VoteConfig,
+    in_boxes: bool = False,
 ) -> Claims:
     """Give each pixel to the instance with the best mask score that covers it, or is in front.
 
     ``size`` is the image's (H, W); ``depth_m`` (H / s, W / s) may be every s-th pixel of the
-    depth image in both directions.
+    depth image in both directions. With ``in_boxes`` it is enough for being in front of another
+    to lie within the box around its mask: a bookcase's mask may leave out the books.
     """
     ranked = tuple(sorted(instances, key=lambda i: -i.mask_score))
     owner, under = np.full((2, *size), NOBODY, np.int16)
-    for k in _painting_order(ranked, config.nested).tolist():
-        x1, y1, x2, y2 = _window(ranked[k])
+    for k in painting_order(ranked, config.nested, in_boxes).tolist():
+        x1, y1, x2, y2 = window(ranked[k].mask)
         here = ranked[k].mask[y1:y2, x1:x2]
         under[y1:y2, x1:x2][here] = owner[y1:y2, x1:x2][here]
         owner[y1:y2, x1:x2][here] = k
@@ -161,18 +162,6 @@ def claim_pixels(
         inner &= ~near
     surfaces = _surfaces(owner, inner, depth_m, len(ranked), config)
     return Claims(ranked, owner, under, inner, depth_m, surfaces)
-
-
-def _painting_order(ranked: Sequence[Instance], nested: float) -> Ints:
-    """Numbers of instances, those at the back first: by how many each lies in, then by score."""
-    if not ranked:
-        return np.zeros(0, np.int64)
-    some = np.array([i.mask[::_COARSE, ::_COARSE].ravel() for i in ranked], np.float32)
-    labels = np.array([i.label for i in ranked])
-    both, areas = some @ some.T, some.sum(axis=1)
-    inside = (both >= nested * areas[:, None]) & (areas[:, None] > 0)
-    inside &= (areas[None] >= 2 * areas[:, None]) & (labels[None] != labels[:, None])
-    return np.lexsort((-np.arange(len(ranked)), inside.sum(axis=1)))
 
 
 def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteConfig) -> Votes:
@@ -256,15 +245,6 @@ def _at_edges(
 def _disc(radius_px: int) -> NDArray[np.uint8]:
     side = 2 * radius_px + 1
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
-
-
-def _window(instance: Instance) -> tuple[int, int, int, int]:
-    """x1, y1, x2, y2 of whole pixels around a mask's box, and some: boxes may be too tight."""
-    rows = np.flatnonzero(instance.mask.any(axis=1))
-    columns = np.flatnonzero(instance.mask.any(axis=0))
-    if not len(rows):
-        return 0, 0, 0, 0
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def _surfaces(

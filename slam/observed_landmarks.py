@@ -16,6 +16,7 @@ from slam.world_map import Keyframe
 
 _REACH = 0.02
 """How far off the depth image a landmark may lie, as a share of its depth."""
+_NINE = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(9, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +71,10 @@ class Located:
     ) -> Located:
         """These and all others of the segment that lie where the keyframe's depth shows surface.
 
-        ``depth_m`` (H / s, W / s) is every s-th pixel of the depth image both ways; ``wanted``
-        says which of all landmarks are asked for, else all that live are.
+        It need not be at the very pixel: at the rim of a thing, where many landmarks are, colour
+        and depth disagree by a pixel or two. ``depth_m`` (H / s, W / s) is every s-th pixel of the
+        depth image both ways, of which the nearest nine are looked at; ``wanted`` says which of
+        all landmarks are asked for, else all that live are.
         """
         landmarks = mapper.world.landmarks
         others = (landmarks.alive if wanted is None else wanted).copy()
@@ -87,9 +90,10 @@ class Located:
         rows, pixels = ahead[inside], pixels[inside]
         step = camera.height // depth_m.shape[0]
         limits = np.array(depth_m.shape) - 1
-        v, u = np.minimum(whole[inside, ::-1].astype(np.int64) // step, limits).T
+        nearest = whole[inside, ::-1].astype(np.int64) // step
+        v, u = np.moveaxis(np.clip(nearest[:, None] + _NINE, 0, limits), -1, 0)
         z_m = local[rows, 2]
-        there = np.abs(depth_m[v, u] - z_m) < _REACH * z_m
+        there = (np.abs(depth_m[v, u] - z_m[:, None]) < _REACH * z_m[:, None]).any(axis=1)
         return Located(
             np.concatenate([self.pixels, pixels[there]]),
             np.concatenate([self.z_m, z_m[there]]),

@@ -162,9 +162,7 @@ class SemanticMapper:
         votes = vote(claims, seen.pixels, seen.z_m, len(self.names), self.config.votes)
         ids = observed.landmark_ids[votes.rows[votes.sure]]
         on = votes.instances[votes.sure]
-        everything = claims
-        if len(strong) < len(instances):
-            everything = claim_pixels(instances, waiting.depth_m, size, self.config.votes)
+        everything = claim_pixels(instances, waiting.depth_m, size, self.config.votes, True)
         spoken = self._label_votes.take(keyframe_id, everything, observed, mapper, self.labels)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
             objects = self._add_objects((keyframe_id, waiting), claims, observed, mapper)[on]

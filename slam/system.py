@@ -13,12 +13,7 @@ from graph.camera import Camera
 from graph.geometry import Array
 from graph.trajectory import Trajectory
 from semantics.segmenter import Segmenter
-from slam.covariances import (
-    COVARIANCES,
-    KeyframeCovariances,
-    find_covariances,
-    write_covariances,
-)
+from slam.covariances import COVARIANCES, KeyframeCovariances, find_covariances, write_covariances
 from slam.dynamics import Dynamics, Sifted
 from slam.features import BriskExtractor, Features
 from slam.frame import Frame

@@ -37,7 +37,9 @@ def test_what_lies_where_the_depth_shows_surface_is_seen_too() -> None:
         if z > 0.1 and 0 <= column < CAMERA.width and 0 <= row < CAMERA.height:
             if i % 2:  # half of them on the surface
                 local[i] *= depth_m[row // 2, column // 2] * 1.01 / z
-            if abs(depth_m[row // 2, column // 2] - local[i, 2]) < 0.02 * local[i, 2]:
+            top, left = max(row // 2 - 1, 0), max(column // 2 - 1, 0)
+            around = depth_m[top : row // 2 + 2, left : column // 2 + 2]
+            if (np.abs(around - local[i, 2]) < 0.02 * local[i, 2]).any():
                 expected[i] = (u, v, local[i, 2])
     first = min(expected)  # was matched, two pixels off
     pixels = np.array([expected[first][:2]]) + 2.0

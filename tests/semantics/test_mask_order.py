@@ -1,0 +1,56 @@
+"""Which instances are in front of which."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semantics.instances import Instance, certain, mask_box
+from semantics.mask_order import painting_order, window
+
+
+def instance(mask: np.ndarray, label: int, score: float) -> Instance:
+    return Instance(mask, mask_box(mask), label, certain(label, 4, score), score, score)
+
+
+def case() -> dict[str, Instance]:
+    """A bookcase whose mask leaves out a book, a cup on its mask, a chair that reaches out of it.
+
+    All have worse masks than the bookcase.
+    """
+    bookcase, book, cup, chair = (np.zeros((120, 160), bool) for _ in range(4))
+    bookcase[20:100, 20:120] = True
+    bookcase[40:64, 40:80] = False
+    book[40:68, 40:80] = True
+    cup[80:92, 60:80] = True
+    chair[84:112, 100:150] = True
+    shapes = {"bookcase": bookcase, "book": book, "cup": cup, "chair": chair}
+    scores = (0.9, 0.5, 0.4, 0.3)
+    rows = zip(shapes.items(), scores, strict=True)
+    return {n: instance(m, k, s) for k, ((n, m), s) in enumerate(rows, 1) if k < 4} | {
+        "chair": instance(chair, 2, 0.3)
+    }
+
+
+def test_boxes_bring_forward_what_a_larger_mask_leaves_out() -> None:
+    found = case()
+    ranked, names = list(found.values()), list(found)
+    by_masks = [names[k] for k in painting_order(ranked, 0.8, False)]
+    by_boxes = [names[k] for k in painting_order(ranked, 0.8, True)]
+    assert by_masks == ["chair", "book", "bookcase", "cup"]
+    assert by_boxes == ["chair", "bookcase", "cup", "book"]
+
+
+def test_nothing_of_the_same_class_or_of_like_size_comes_forward() -> None:
+    found = case()
+    same = instance(found["cup"].mask, found["bookcase"].label, 0.4)
+    large = np.zeros((120, 160), bool)
+    large[24:96, 24:100] = True
+    for other in (same, instance(large, 2, 0.4)):
+        assert painting_order([found["bookcase"], other], 0.8, True).tolist() == [1, 0]
+    assert painting_order([], 0.8, True).tolist() == []
+
+
+def test_the_window_is_the_box_of_whole_pixels() -> None:
+    found = case()["cup"]
+    assert window(found.mask) == (60, 80, 80, 92)
+    assert window(np.zeros((5, 6), bool)) == (0, 0, 0, 0)
