@@ -68,11 +68,13 @@ def training(arguments: argparse.Namespace) -> TrainingRun:
         "body_rate": 0.4,
         "rois": "objects",
         "only": arguments.only or ("masks" if alone else ""),
+        "crowd": arguments.crowd,
     }
     return TrainingRun(
         (coco,) if alone else (coco, *rooms(arguments.rooms)),
         arguments.out,
         weights,
+        not alone,
         None if weights else DATA / "weights" / "mobilenet_v2_imagenet_folded.pth",
         "coco_paper",
         ("backbone.body",) if alone else EDGES,
@@ -109,7 +111,8 @@ def main() -> None:
     parser.add_argument("--rate", type=float)
     parser.add_argument("--seed", type=int, default=0, help="of batches and augmentation")
     parser.add_argument("--photographs", action="store_true")
-    parser.add_argument("--only", default="", choices=("", "masks", "maskiou"))
+    parser.add_argument("--only", default="", choices=("", "boxes", "masks", "maskiou"))
+    parser.add_argument("--crowd", type=float, default=0.0, help="draws images with many objects")
     parser.add_argument("--detected", action="store_true")
     arguments = parser.parse_args()
     with console_log(), counting_bar(False) as progress:

@@ -23,6 +23,7 @@ from semantics.network.config import (
     RESNET50,
     RESNET50_V2,
     RESNET101,
+    AnchorConfig,
     DetectionConfig,
     ImageConfig,
     NetworkConfig,
@@ -221,11 +222,17 @@ def _check(path: Path, state: State, model: MaskRCNN) -> None:
 
 def _described(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkConfig, LabelSet]:
     """What a file of this project says about itself."""
-    parts = {"image": ImageConfig, "proposals": ProposalConfig, "detections": DetectionConfig}
+    parts = {
+        "image": ImageConfig,
+        "anchors": AnchorConfig,
+        "proposals": ProposalConfig,
+        "detections": DetectionConfig,
+    }
     try:
         values = json.loads(metadata["network"])
         for name, cls in parts.items():
-            inner = {k: tuple(v) if isinstance(v, list) else v for k, v in values[name].items()}
+            given = values.get(name, {})
+            inner = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
             values[name] = cls(**inner)
         names = tuple(json.loads(metadata["labels"]))
         return NetworkConfig(**values), label_set(names[1:])

@@ -16,6 +16,9 @@ RPN_WEIGHTS = (1.0, 1.0, 1.0, 1.0)
 BOX_WEIGHTS = (10.0, 10.0, 5.0, 5.0)
 """Factors of the coded (dx, dy, dw, dh), which bring them to about unit variance."""
 
+AT_ONCE = 8192
+"""Overlaps with so many boxes are worked out together: what is in between stays in the cache."""
+
 Weights = tuple[float, float, float, float]
 
 
@@ -84,8 +87,17 @@ def rescale(boxes: Tensor, old: tuple[int, int], new: tuple[int, int]) -> Tensor
 
 def iou(a: Tensor, b: Tensor) -> Tensor:
     """Intersection over union (N, M) of boxes (N, 4) and (M, 4)."""
-    low = torch.maximum(a[:, None, :2], b[None, :, :2])
-    high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
-    size = (high - low).clamp(min=0)
-    intersection = size[..., 0] * size[..., 1]
-    return intersection / (area(a)[:, None] + area(b)[None, :] - intersection)
+    return torch.cat([_iou(a, part) for part in b.split(AT_ONCE)], dim=1)
+
+
+def _iou(a: Tensor, b: Tensor) -> Tensor:
+    widths, heights = (_overlap(a[:, k], a[:, k + 2], b[:, k], b[:, k + 2]) for k in (0, 1))
+    intersection = widths.mul_(heights)
+    union = (area(a)[:, None] + area(b)[None, :]).sub_(intersection)
+    return intersection / union
+
+
+def _overlap(low_a: Tensor, high_a: Tensor, low_b: Tensor, high_b: Tensor) -> Tensor:
+    """Length (N, M) that intervals (N,) and (M,) share; planes of one axis are fast to make."""
+    high = torch.minimum(high_a[:, None], high_b.contiguous()[None])
+    return high.sub_(torch.maximum(low_a[:, None], low_b.contiguous()[None])).clamp_(min=0)

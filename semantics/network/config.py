@@ -25,6 +25,27 @@ class ImageConfig:
 
 
 @dataclass(frozen=True)
+class AnchorConfig:
+    """The boxes that the RPN judges at every cell of a level.
+
+    Attributes:
+        sizes_px: square root of their area, one a level, finest first.
+        ratios: height over width of each.
+        half_ratios: the same of more anchors, of half the level's size: for what is smaller than
+            the finest level's size, or so thin that it overlaps nothing else well.
+    """
+
+    sizes_px: tuple[float, ...] = (32, 64, 128, 256, 512)
+    ratios: tuple[float, ...] = (0.5, 1.0, 2.0)
+    half_ratios: tuple[float, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Anchors of a cell."""
+        return len(self.ratios) + len(self.half_ratios)
+
+
+@dataclass(frozen=True)
 class ProposalConfig:
     """How the RPN's boxes are thinned out.
 
@@ -89,6 +110,7 @@ class NetworkConfig:
     class_agnostic: bool = False
     mask_context: float = 1.0
     image: ImageConfig = ImageConfig()
+    anchors: AnchorConfig = AnchorConfig()
     proposals: ProposalConfig = ProposalConfig()
     detections: DetectionConfig = DetectionConfig()
 
@@ -119,7 +141,8 @@ LIGHT = NetworkConfig(
     class_agnostic=True,
     mask_context=1.2,
     image=ImageConfig(480, 800, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
-    proposals=ProposalConfig(before_nms=600, after_nms=300),
+    anchors=AnchorConfig(half_ratios=(1.0, 2.0, 4.0)),
+    proposals=ProposalConfig(before_nms=1000, after_nms=500),
     detections=DetectionConfig(max_count=100),
 )
 """For robots without a GPU: MobileNetV2 and narrow heads; 640x480 is not enlarged."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from semantics.network import boxes as box_ops
-from semantics.network.anchors import RATIOS, make_anchors
+from semantics.network.anchors import make_anchors
 from semantics.network.config import NetworkConfig, ProposalConfig
 from semantics.network.images import ImageBatch
 from semantics.network.layers import conv_stack
@@ -20,11 +20,11 @@ MIN_SIZE_PX = 1e-3
 class RPNHead(nn.Module):
     """The convolutions of the RPN, the same at every pyramid level."""
 
-    def __init__(self, channels: int, convs: int) -> None:
+    def __init__(self, channels: int, convs: int, anchors: int) -> None:
         super().__init__()
         self.conv = nn.Sequential(*conv_stack(channels, channels, convs, "none"))
-        self.cls_logits = nn.Conv2d(channels, len(RATIOS), 1)
-        self.bbox_pred = nn.Conv2d(channels, 4 * len(RATIOS), 1)
+        self.cls_logits = nn.Conv2d(channels, anchors, 1)
+        self.bbox_pred = nn.Conv2d(channels, 4 * anchors, 1)
         for conv in self.modules():
             if isinstance(conv, nn.Conv2d):
                 nn.init.normal_(conv.weight, std=0.01)
@@ -45,15 +45,15 @@ class RegionProposalNetwork(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.head = RPNHead(config.channels, config.rpn_convs)
+        self.head = RPNHead(config.channels, config.rpn_convs, config.anchors.count)
         self.config = config.proposals
+        self.anchors = config.anchors
 
     def forward(self, levels: Sequence[Tensor], batch: ImageBatch) -> list[Tensor]:
         """Proposals (N <= after_nms, 4) of each image, best first, in pixels of the batch."""
         logits, offsets = self.head(levels)
-        return select_proposals(
-            make_anchors(levels, batch.size), logits, offsets, batch.sizes, self.config
-        )
+        anchors = make_anchors(levels, batch.size, self.anchors)
+        return select_proposals(anchors, logits, offsets, batch.sizes, self.config)
 
 
 @torch.no_grad()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -81,6 +82,11 @@ class Dataset:
         """Which images are higher than wide."""
         return np.array([image.height > image.width for image in self.images])
 
+    @cached_property
+    def objects(self) -> NDArray[np.float64]:
+        """How many objects each image has."""
+        return np.array([len(self._objects(image)) for image in self.images], np.float64)
+
     def load(self, index: int) -> Sample:
         """One image with its objects.
 
@@ -117,6 +123,11 @@ class JoinedDatasets:
         """Which images are higher than wide."""
         return np.concatenate([part.upright for part in self._parts])
 
+    @cached_property
+    def objects(self) -> NDArray[np.float64]:
+        """How many objects each image has."""
+        return np.concatenate([part.objects for part in self._parts])
+
     def load(self, index: int) -> Sample:
         """One image with its objects. Raises InputError."""
         k = int(np.searchsorted(self._ends, index, side="right"))
@@ -139,11 +150,14 @@ def split(content: CocoFile, share: float, seed: int) -> tuple[CocoFile, CocoFil
 
 
 def augmented(
-    sample: Sample, other: Sample, config: AugmentConfig, rng: np.random.Generator
+    sample: Sample, other: Callable[[], Sample], config: AugmentConfig, rng: np.random.Generator
 ) -> Sample:
-    """A random variation of a sample, with objects of another one pasted in now and then."""
+    """A random variation of a sample, with objects of another one pasted in now and then.
+
+    ``other`` loads that one, if it is wanted.
+    """
     if rng.random() < config.paste:
-        sample = copy_paste(sample, other, rng)
+        sample = copy_paste(sample, other(), rng)
     if rng.random() < config.flip:
         sample = flipped(sample)
     return scaled(sample, rng.uniform(config.min_scale, config.max_scale))

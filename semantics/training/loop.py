@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,14 +24,13 @@ from semantics.training.dataset import (
     as_tensors,
     augmented,
 )
-from semantics.training.losses import Losses, MaskRois, network_losses
+from semantics.training.losses import Losses, MaskRois, Only, network_losses
 from semantics.training.targets import Target
 
 STATE = "training.pt"
 CURVES = "losses.csv"
 WEIGHTS = "weights.safetensors"
 MASKIOU = "maskiou"
-Only = Literal["", "masks", "maskiou"]
 BODY = "backbone.body."
 BOX_PARTS = ("rpn.", "roi_heads.box_")
 
@@ -50,7 +50,10 @@ class TrainingConfig:
         max_gradient: gradients longer than this are shortened.
         freeze: beginnings of names of parameters that stay as they are.
         only: "masks": the RPN and the box head are not trained, for a network whose boxes come
-            from another detector; "maskiou": the MaskIoU head alone is; "": all are.
+            from another detector; "maskiou": the MaskIoU head alone is; "boxes": the RPN and the
+            box head alone are; "": all are.
+        crowd: an image's chance to be drawn grows with its number of objects to this power, so
+            that 0 draws images alike and 1 objects alike.
         rois: where masks are learnt: in the RPN's proposals, or in boxes around the objects.
         precision: "float32", or "mixed": float16 on a GPU, bfloat16 on a CPU.
         save_every: steps between checkpoints.
@@ -67,6 +70,7 @@ class TrainingConfig:
     max_gradient: float = 10.0
     freeze: tuple[str, ...] = ()
     only: Only = ""
+    crowd: float = 0.0
     rois: MaskRois = "proposals"
     precision: Literal["float32", "mixed"] = "mixed"
     save_every: int = 200
@@ -148,7 +152,9 @@ def _learns(name: str, only: Only) -> bool:
     """Whether the parameter of this name takes part where only some heads are trained."""
     if only == MASKIOU:
         return f".{MASKIOU}" in name
-    return only != "masks" or not name.startswith(BOX_PARTS)
+    if only == "":
+        return True
+    return name.startswith(BOX_PARTS) == (only == "boxes")
 
 
 def _optimiser(model: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
@@ -181,20 +187,28 @@ def _step_losses(
     images, targets = zip(*_batch(data, rng, config, device), strict=True)
     kind = torch.float16 if device == "cuda" else torch.bfloat16
     with torch.autocast(device, kind, enabled=config.precision == "mixed"):
-        losses = network_losses(model, images, targets, generator, config.rois, not config.only)
+        losses = network_losses(model, images, targets, generator, config.rois, config.only)
     return {k: v.float() for k, v in losses.items() if k == MASKIOU or config.only != MASKIOU}
 
 
 def _batch(
     data: Dataset | JoinedDatasets, rng: np.random.Generator, config: TrainingConfig, device: str
 ) -> Iterator[tuple[Tensor, Target]]:
-    first = int(rng.integers(len(data)))  # the others are as wide or as high: little padding
-    alike = np.flatnonzero(data.upright == data.upright[first])
-    for index in [first, *rng.choice(alike, config.batch - 1).tolist()]:
-        other = data.load(int(rng.integers(len(data))))
+    for index in draw_batch(data, rng, config):
+        other = partial(data.load, int(rng.integers(len(data))))
         image, target = as_tensors(augmented(data.load(index), other, config.augment, rng))
         moved = Target(*(t.to(device) for t in (target.boxes, target.labels, target.masks)))
         yield image.to(device), moved
+
+
+def draw_batch(
+    data: Dataset | JoinedDatasets, rng: np.random.Generator, config: TrainingConfig
+) -> list[int]:
+    """Indices of a batch's images, all as wide or all as high: so there is little padding."""
+    chance = data.objects**config.crowd
+    first = int(rng.choice(len(data), p=chance / chance.sum()))
+    chance *= data.upright == data.upright[first]
+    return [first, *rng.choice(len(data), config.batch - 1, p=chance / chance.sum()).tolist()]
 
 
 def _log(writer: Any, step: int, losses: Losses) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from semantics.network import boxes as box_ops
 from semantics.network import mask_heads
 from semantics.network.anchors import make_anchors
-from semantics.network.config import ProposalConfig
 from semantics.network.images import ImageBatch, prepare
 from semantics.network.mask_heads import of_class
 from semantics.network.model import ROI_LEVELS, MaskRCNN
@@ -43,6 +42,7 @@ MAX_ROIS = 64
 
 Losses = dict[str, Tensor]
 MaskRois = Literal["proposals", "objects"]
+Only = Literal["", "boxes", "masks", "maskiou"]
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ def network_losses(
     targets: Sequence[Target],
     generator: torch.Generator,
     rois: MaskRois = "proposals",
-    boxes: bool = True,
+    only: Only = "",
 ) -> Losses:
     """Every loss of a batch; their sum is what training minimises.
 
     Args:
         rois: where masks are learnt: in the RPN's proposals, or in boxes around the objects.
-        boxes: the RPN and the box head learn as well; they need not where boxes come from another
-            detector.
+        only: "boxes": the losses of the RPN and the box head alone; "masks" or "maskiou": without
+            those, where boxes come from another detector.
     """
     batch = prepare(images, model.config.image)
     scaled = [
@@ -82,12 +82,14 @@ def network_losses(
     table = feature_table(levels[:ROI_LEVELS], batch.size[0])
     losses: Losses = {}
     found = around_objects(scaled, targets, batch, generator)
-    if boxes or rois == "proposals":
+    if only in ("", "boxes") or rois == "proposals":
         rpn, proposals = rpn_losses(model, levels, batch, scaled, targets, generator)
         box, positives = box_losses(model, table, proposals, scaled, targets, generator)
         found = positives if rois == "proposals" else found
         losses |= rpn | box
-    return losses | mask_losses(model, table, found, targets, batch)
+    if only != "boxes":
+        losses |= mask_losses(model, table, found, targets, batch)
+    return losses
 
 
 def rpn_losses(
@@ -100,7 +102,7 @@ def rpn_losses(
 ) -> tuple[Losses, list[Tensor]]:
     """Losses of objectness and anchor offsets over drawn anchors; and the proposals."""
     logits, offsets = model.rpn.head(levels)
-    anchors = make_anchors(levels, batch.size)
+    anchors = make_anchors(levels, batch.size, model.config.anchors)
     every, all_logits, all_offsets = torch.cat(anchors), torch.cat(logits, 1), torch.cat(offsets, 1)
     judged, moved, wanted, truth = [], [], [], []
     for b, (boxes, target) in enumerate(zip(objects, targets, strict=True)):
@@ -116,9 +118,7 @@ def rpn_losses(
     objectness = F.binary_cross_entropy_with_logits(scores, torch.cat(truth).to(scores))
     box = _smooth_l1(torch.cat(moved), torch.cat(wanted), len(scores))
     usual = model.config.proposals
-    more = ProposalConfig(
-        PROPOSALS_FACTOR * usual.before_nms, PROPOSALS_FACTOR * usual.after_nms, usual.nms_iou
-    )
+    more = replace(usual, after_nms=PROPOSALS_FACTOR * usual.after_nms)
     proposals = select_proposals(anchors, logits, offsets, batch.sizes, more)
     return {"objectness": objectness, "rpn_box": box}, proposals
 

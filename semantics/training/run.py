@@ -50,6 +50,7 @@ class TrainingRun:
         data: where images come from; one that stands there twice is seen twice as often.
         out: folder of the results.
         weights: to start from; None: a new light network ...
+        light: the weights take the anchors and proposals of the light network.
         backbone: ... with this ImageNet MobileNetV2 as its body.
         labels: label set to learn, by name or file.
         freeze: parameters that stay, by the beginning of their names.
@@ -59,6 +60,7 @@ class TrainingRun:
     data: tuple[Source, ...]
     out: Path
     weights: str | None = None
+    light: bool = False
     backbone: Path | None = None
     labels: str = "coco"
     freeze: tuple[str, ...] = ()
@@ -96,7 +98,8 @@ def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork:
     """The network to begin with."""
     torch.manual_seed(seed)
     if run.weights is not None:
-        return transferred(load_network(find_weights(run.weights)), labels)
+        like = LIGHT if run.light else None
+        return transferred(load_network(find_weights(run.weights)), labels, like)
     model = MaskRCNN(replace(LIGHT, classes=len(labels)))
     if run.backbone is None:
         raise InputError(

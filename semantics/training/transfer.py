@@ -1,4 +1,4 @@
-"""A trained network for another label set: what both know is kept, the rest starts anew."""
+"""A trained network for other labels or anchors: what both know is kept, the rest starts anew."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from semantics.checkpoints import TrainedNetwork
 from semantics.labels import LabelSet
+from semantics.network.config import NetworkConfig
 from semantics.network.model import MaskRCNN
 
 PER_CLASS = {
@@ -18,17 +19,23 @@ PER_CLASS = {
     "roi_heads.maskiou_head.maskiou": 1,
 }
 """Layers with outputs for each class, and how many a class."""
+PER_ANCHOR = ("rpn.head.cls_logits", "rpn.head.bbox_pred")
+"""Layers with outputs for each anchor of a cell, those of half the size last."""
 
 
-def transferred(network: TrainedNetwork, labels: LabelSet) -> TrainedNetwork:
-    """The network with these labels and a MaskIoU head.
+def transferred(
+    network: TrainedNetwork, labels: LabelSet, like: NetworkConfig | None = None
+) -> TrainedNetwork:
+    """The network with these labels and a MaskIoU head; ``like`` gives anchors and proposals.
 
     Every parameter that does not depend on the classes is kept; in the layers that do, the rows
-    of classes of the same name (and of the background) are kept. New rows, and a new MaskIoU
-    head, are drawn at random.
+    of classes of the same name (and of the background) are kept, in the RPN's those of the
+    anchors that were there. New rows, and a new MaskIoU head, are drawn at random.
     """
     config = replace(network.model.config, classes=len(labels))
     config = config if config.maskiou_channels else config.with_maskiou()
+    if like is not None:
+        config = replace(config, anchors=like.anchors, proposals=like.proposals)
     model = MaskRCNN(config)
     old, new = network.model.state_dict(), model.state_dict()
     pairs = [
@@ -42,6 +49,9 @@ def transferred(network: TrainedNetwork, labels: LabelSet) -> TrainedNetwork:
             continue
         if layer in PER_CLASS and len(old[name]) > 1:
             _copy_rows(value, old[name], pairs, PER_CLASS[layer])
+        elif layer in PER_ANCHOR:
+            both = min(len(value), len(old[name]))
+            value[:both] = old[name][:both]
         else:
             value.copy_(old[name])
     return TrainedNetwork(model, labels)

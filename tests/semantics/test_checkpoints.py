@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import threading
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
 from graph.errors import InputError
@@ -21,6 +23,7 @@ from semantics.checkpoints import (
     TrainedNetwork,
     find_weights,
     load_network,
+    read_state,
     save_network,
 )
 from semantics.downloads import expected_sha256, fetch
@@ -207,6 +210,19 @@ def test_our_own_files_say_what_they_are(tmp_path: Path) -> None:
     assert again.labels.names == ("background", "cup", "mouse")
     for name, value in network.model.state_dict().items():
         assert torch.equal(again.model.state_dict()[name], value.half().float())
+
+
+def test_a_file_from_before_anchors_were_described(tmp_path: Path) -> None:
+    config = NetworkConfig(
+        classes=3, backbone="mobilenet_v2", norm="none", channels=8, box_hidden=8, mask_channels=8
+    )
+    network = TrainedNetwork(MaskRCNN(config).eval(), label_set(["cup", "mouse"]))
+    save_network(network, tmp_path / "new.safetensors")
+    state, metadata = read_state(tmp_path / "new.safetensors")
+    described = json.loads(metadata["network"])
+    del described["anchors"]
+    save_file(state, tmp_path / "old.safetensors", {**metadata, "network": json.dumps(described)})
+    assert load_network(tmp_path / "old.safetensors").model.config == config
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from semantics.network.config import (
     RESNET50,
     RESNET50_V2,
     RESNET101,
+    AnchorConfig,
     DetectionConfig,
     ImageConfig,
     NetworkConfig,
@@ -72,9 +73,35 @@ def given() -> Components:
 
 def test_anchors_also_where_the_coarsest_level_is_rounded_up() -> None:
     grids = [(40, 56), (20, 28), (10, 14), (5, 7), (3, 4)]
-    anchors = make_anchors([torch.zeros(1, 1, *grid) for grid in grids], (160, 224))
+    anchors = make_anchors([torch.zeros(1, 1, *grid) for grid in grids], (160, 224), AnchorConfig())
     assert [len(a) for a in anchors] == [3 * h * w for h, w in grids]
     assert_golden("component/anchors", torch.cat(anchors)[::3].float())
+
+
+def test_more_anchors_of_half_the_size_follow_those_of_a_cell() -> None:
+    levels = [torch.zeros(1, 1, 4 >> k, 8 >> k) for k in range(2)]
+    config = AnchorConfig((32, 64), half_ratios=(1.0, 4.0))
+    usual = make_anchors(levels, (16, 32), replace(config, half_ratios=()))
+    found = make_anchors(levels, (16, 32), config)
+    for level, size_px in enumerate(config.sizes_px):
+        cells = found[level].unflatten(0, (-1, config.count))
+        assert torch.equal(cells[:, :3].flatten(0, 1), usual[level])
+        x1, y1, x2, y2 = cells[:, 3:].unbind(-1)
+        assert torch.equal((x1 + x2)[:, 0], (usual[level][1::3, 0] + usual[level][1::3, 2]))
+        assert (x2 - x1).unique(dim=0).tolist() == [[size_px / 2, size_px / 4]]
+        assert (y2 - y1).unique(dim=0).tolist() == [[size_px / 2, size_px]]
+
+
+def test_overlap_of_boxes_one_by_one() -> None:
+    rng = np.random.default_rng(3)
+    a, b = (torch.from_numpy(random_boxes(rng, n, (40, 60))) for n in (7, 11))
+    found = box_ops.iou(a, b)
+    for i, j in np.ndindex(7, 11):
+        width = min(a[i, 2], b[j, 2]) - max(a[i, 0], b[j, 0])
+        height = min(a[i, 3], b[j, 3]) - max(a[i, 1], b[j, 1])
+        both = max(float(width), 0.0) * max(float(height), 0.0)
+        either = float(box_ops.area(a)[i] + box_ops.area(b)[j]) - both
+        assert float(found[i, j]) == pytest.approx(both / either, abs=1e-6)
 
 
 def test_box_coding(given: Components) -> None:

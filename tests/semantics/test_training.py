@@ -15,7 +15,7 @@ from semantics.network.box_head import ClassifiedBoxes
 from semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
 from semantics.network.model import MaskRCNN
 from semantics.network.paste import paste
-from semantics.training.losses import dice_loss, network_losses
+from semantics.training.losses import Only, dice_loss, network_losses
 from semantics.training.targets import (
     BOX_RULE,
     IGNORED,
@@ -137,8 +137,8 @@ def test_losses_are_finite_also_without_objects(rois: str) -> None:
     empty = Target(target.boxes[:0], target.labels[:0], target.masks[:0])
     generator = torch.Generator().manual_seed(0)
     for targets in ([target, empty],) if rois == "proposals" else ([empty, empty],):
-        boxes = rois == "proposals"
-        losses = network_losses(model, [image, image], targets, generator, rois, boxes)  # type: ignore[arg-type]
+        only = "" if rois == "proposals" else "masks"
+        losses = network_losses(model, [image, image], targets, generator, rois, only)  # type: ignore[arg-type]
         names = {"mask", "dice", "maskiou"}
         names |= {"objectness", "rpn_box", "class", "box"} if rois == "proposals" else set()
         assert set(losses) == names
@@ -160,9 +160,10 @@ def descend(model: MaskRCNN, steps: int, rois: Literal["proposals", "objects"]) 
     image, target = scene(0)
     generator = torch.Generator().manual_seed(0)
     optimiser = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], 3e-3)
+    only: Only = "" if rois == "proposals" else "masks"
     totals = []
     for _ in range(steps):
-        losses = network_losses(model, [image], [target], generator, rois, rois == "proposals")
+        losses = network_losses(model, [image], [target], generator, rois, only)
         total = sum(losses.values(), torch.zeros(()))
         optimiser.zero_grad()
         total.backward()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -31,7 +32,15 @@ from semantics.training.dataset import (
     scaled,
     split,
 )
-from semantics.training.loop import CURVES, STATE, Only, TrainingConfig, train, trainable
+from semantics.training.loop import (
+    CURVES,
+    STATE,
+    Only,
+    TrainingConfig,
+    draw_batch,
+    train,
+    trainable,
+)
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 LABELS = label_set(["cup", "mouse"])
@@ -84,7 +93,7 @@ def test_masks_stay_on_their_objects() -> None:
 
 def test_augmentation_repeats_from_its_seed() -> None:
     first, second = (
-        augmented(painted(0), painted(1), AugmentConfig(), np.random.default_rng(5))
+        augmented(painted(0), partial(painted, 1), AugmentConfig(), np.random.default_rng(5))
         for _ in range(2)
     )
     assert np.array_equal(first.image, second.image)
@@ -210,13 +219,29 @@ def test_joined_data_sets_follow_each_other(data: tuple[CocoFile, Path]) -> None
         assert np.array_equal(joined.load(k).image, sample.image)
 
 
-@pytest.mark.parametrize("only", ["", "masks", "maskiou"])
+@pytest.mark.parametrize("crowd", [0.0, 1.0])
+def test_images_with_many_objects_are_drawn_more_often(
+    data: tuple[CocoFile, Path], crowd: float
+) -> None:
+    dataset = Dataset(*data, LABELS)
+    dataset.objects = np.where(np.arange(len(dataset)) == 1, 6.0, 2.0)
+    config = replace(CONFIG, batch=2, crowd=crowd)
+    rng = np.random.default_rng(0)
+    drawn = [k for _ in range(300) for k in draw_batch(dataset, rng, config)]
+    share = np.bincount(drawn, minlength=len(dataset)) / len(drawn)
+    chance = dataset.objects**crowd
+    np.testing.assert_allclose(share, chance / chance.sum(), atol=0.08)
+
+
+@pytest.mark.parametrize("only", ["", "boxes", "masks", "maskiou"])
 def test_each_training_changes_its_parameters_alone(only: Only) -> None:
     model = MaskRCNN(TINY)
     trainable(model, replace(CONFIG, only=only, freeze=("backbone.body",)))
     learning = {n for n, p in model.named_parameters() if p.requires_grad}
     assert not any(n.startswith("backbone.body") for n in learning)
-    assert "roi_heads.maskiou_head.maskiou.weight" in learning
-    assert ("roi_heads.mask_predictor.conv5_mask.weight" in learning) == (only != "maskiou")
-    assert ("roi_heads.box_predictor.cls_score.weight" in learning) == (only == "")
-    assert ("rpn.head.cls_logits.weight" in learning) == (only == "")
+    assert ("roi_heads.maskiou_head.maskiou.weight" in learning) == (only != "boxes")
+    masks, boxes = only in ("", "masks"), only in ("", "boxes")
+    assert ("roi_heads.mask_predictor.conv5_mask.weight" in learning) == masks
+    assert ("backbone.fpn.layer_blocks.0.0.weight" in learning) == masks
+    assert ("roi_heads.box_predictor.cls_score.weight" in learning) == boxes
+    assert ("rpn.head.cls_logits.weight" in learning) == boxes
