@@ -37,8 +37,8 @@ def add_train(commands: _Commands) -> None:
                         help="parameters to keep, by the beginning of their names, such as "
                         "backbone.body; may be repeated")  # fmt: skip
     parser.add_argument(
-        "--only", choices=("masks", "maskiou"), default="",
-        help="masks: not the boxes, for use with --proposals FILE.onnx; maskiou: this head alone",
+        "--only", choices=("boxes", "masks", "maskiou"), default="",
+        help="boxes: RPN and box head alone; masks: all but these; maskiou: this head alone",
     )  # fmt: skip
     parser.add_argument(
         "--rois",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import pytest
@@ -144,6 +144,18 @@ def test_losses_are_finite_also_without_objects(rois: str) -> None:
         assert set(losses) == names
         assert all(torch.isfinite(v) for v in losses.values())
         sum(losses.values(), torch.zeros(())).backward()
+
+
+def test_boxes_alone_have_no_losses_of_masks_and_the_same_of_boxes() -> None:
+    torch.manual_seed(0)
+    model = MaskRCNN(TINY)
+    image, target = scene(0)
+    whole, alone = (
+        network_losses(model, [image], [target], torch.Generator().manual_seed(0), "objects", only)
+        for only in (cast(Only, ""), cast(Only, "boxes"))
+    )
+    assert set(alone) == {"objectness", "rpn_box", "class", "box"}
+    assert all(torch.equal(alone[name], whole[name]) for name in alone)
 
 
 def learner() -> MaskRCNN:
