@@ -7,9 +7,11 @@ r"""Train the light network's weights that come with the project (data/weights/l
 
 Learns from the COCO excerpt, without the share that is held out for testing, and from rooms that
 it renders to ``--rooms`` first. Goes on from its last checkpoint if it was stopped. --weights
-starts from a network that was trained before. --photographs: the project's weights go on with
-masks alone, on the excerpt alone, for use with another detector's boxes. --detected: the MaskIoU
-head alone goes on, in the boxes and masks that come of YOLOX-Nano on the excerpt's photographs.
+starts from a network that was trained before; with --only boxes --crowd 0.5 its RPN and box head
+alone go on, and see images with many objects more often. --photographs: the project's weights go
+on with masks alone, on the excerpt alone, for use with another detector's boxes. --detected: the
+MaskIoU head alone goes on, in the boxes and masks that come of YOLOX-Nano on the excerpt's
+photographs.
 """
 
 from __future__ import annotations
@@ -112,7 +114,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of batches and augmentation")
     parser.add_argument("--photographs", action="store_true")
     parser.add_argument("--only", default="", choices=("", "boxes", "masks", "maskiou"))
-    parser.add_argument("--crowd", type=float, default=0.0, help="draws images with many objects")
+    parser.add_argument(
+        "--crowd",
+        type=float,
+        default=0.0,
+        help="power of an image's number of objects in its chance to be drawn",
+    )
     parser.add_argument("--detected", action="store_true")
     arguments = parser.parse_args()
     with console_log(), counting_bar(False) as progress:

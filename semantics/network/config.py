@@ -142,7 +142,7 @@ LIGHT = NetworkConfig(
     mask_context=1.2,
     image=ImageConfig(480, 800, mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5)),
     anchors=AnchorConfig(half_ratios=(1.0, 2.0, 4.0)),
-    proposals=ProposalConfig(before_nms=1000, after_nms=500),
-    detections=DetectionConfig(max_count=100),
+    proposals=ProposalConfig(before_nms=1000, after_nms=600),
+    detections=DetectionConfig(max_count=130),
 )
 """For robots without a GPU: MobileNetV2 and narrow heads; 640x480 is not enlarged."""

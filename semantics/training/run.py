@@ -50,7 +50,7 @@ class TrainingRun:
         data: where images come from; one that stands there twice is seen twice as often.
         out: folder of the results.
         weights: to start from; None: a new light network ...
-        light: the weights take the anchors and proposals of the light network.
+        light: they take the light network's anchors and numbers of proposals and detections.
         backbone: ... with this ImageNet MobileNetV2 as its body.
         labels: label set to learn, by name or file.
         freeze: parameters that stay, by the beginning of their names.

@@ -26,7 +26,9 @@ PER_ANCHOR = ("rpn.head.cls_logits", "rpn.head.bbox_pred")
 def transferred(
     network: TrainedNetwork, labels: LabelSet, like: NetworkConfig | None = None
 ) -> TrainedNetwork:
-    """The network with these labels and a MaskIoU head; ``like`` gives anchors and proposals.
+    """The network with these labels and a MaskIoU head.
+
+    ``like`` gives the anchors, and how many proposals and detections there are.
 
     Every parameter that does not depend on the classes is kept; in the layers that do, the rows
     of classes of the same name (and of the background) are kept, in the RPN's those of the
@@ -35,7 +37,8 @@ def transferred(
     config = replace(network.model.config, classes=len(labels))
     config = config if config.maskiou_channels else config.with_maskiou()
     if like is not None:
-        config = replace(config, anchors=like.anchors, proposals=like.proposals)
+        shape = {name: getattr(like, name) for name in ("anchors", "proposals", "detections")}
+        config = replace(config, **shape)
     model = MaskRCNN(config)
     old, new = network.model.state_dict(), model.state_dict()
     pairs = [
