@@ -97,6 +97,7 @@ class IdealSystem(WatchedSystem):
         return Sifted(select(features, np.flatnonzero(~moving)), moving, False, sifted.view)
 
     def _fill_up(self, frame: Frame, features: Features, sifted: Sifted) -> Sifted:
+        super()._fill_up(frame, features, sifted)
         refill = Refill(self.camera, self.config.features)
         judge = partial(self._on_moving, frame)
         return replace(sifted, features=refill.filled_up(frame, features, sifted.moving, judge))
