@@ -22,9 +22,10 @@ class MappingConfig:
 
     ``fuse_neighbours`` covisible keyframes are searched for the new landmarks. A landmark is
     culled if it was found in less than ``min_found_ratio`` of the frames that should have
-    seen it, or if ``probation_keyframes`` after it was made fewer than ``min_observations`` see it.
+    seen it, or if ``probation_keyframes`` after it was made fewer than ``min_observations`` see it;
+    at once if none does.
     A keyframe is redundant if ``redundant_share`` of its landmarks are seen by at least
-    ``redundant_views`` others.
+    ``redundant_views`` others; at most ``max_culled`` such leave at a keyframe.
     """
 
     local_keyframes: int = 15
@@ -36,6 +37,7 @@ class MappingConfig:
     min_observations: int = 2
     redundant_share: float = 0.9
     redundant_views: int = 3
+    max_culled: int = 3
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
 
 
@@ -112,12 +114,10 @@ def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> 
     """Of the candidates, those rarely found again or seen by too few keyframes; removed here."""
     landmarks = world.landmarks
     ids = landmarks.living(candidates)
-    age = world.next_keyframe_id - 1 - landmarks.host[ids]
+    age, views = world.next_keyframe_id - 1 - landmarks.host[ids], landmarks.observations[ids]
     rarely = landmarks.found[ids] < config.min_found_ratio * landmarks.visible[ids]
-    few = (age >= config.probation_keyframes) & (
-        landmarks.observations[ids] < config.min_observations
-    )
-    culled = ids[rarely | few]
+    few = (age >= config.probation_keyframes) & (views < config.min_observations)
+    culled = ids[rarely | few | (views == 0)]
     landmarks.remove(culled)
     return culled
 

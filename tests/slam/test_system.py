@@ -134,6 +134,20 @@ def test_frames_of_culled_keyframes_keep_their_poses() -> None:
     assert largest_error_m(system, poses) < 0.003
 
 
+def test_a_place_walked_again_needs_no_more_keyframes() -> None:
+    system, there = SlamSystem(CAMERA), path(72)[::6]
+    poses = [*there, *there[-2::-1]]
+    made = np.array([r.keyframe_id is not None for r in feed(system, poses)])
+    assert made[: len(there)].sum() == 4
+    assert not made[len(there) :].any()
+    assert largest_error_m(system, poses) < 0.003
+    reference, centre_world = system._reference, system.trajectory().poses_world_camera[-1, :3, 3]
+    keyframes = list(system.mapper.world.keyframes.values())
+    away_m = [np.linalg.norm(k.T_world_camera[:3, 3] - centre_world) for k in keyframes]
+    assert reference is keyframes[int(np.argmin(away_m))]
+    assert reference is not keyframes[-1]
+
+
 @pytest.mark.parametrize(
     "override",
     [
