@@ -15,6 +15,8 @@ ENTRY = np.dtype(
 )
 """A frame's stamp and its pose as seen from its reference keyframe."""
 Entries = NDArray[np.void]
+NOBODY = -1
+"""Heir of a keyframe that was lost with its place: its frames have no pose."""
 
 
 class FrameHistory:
@@ -56,25 +58,30 @@ class FrameHistory:
         self._parent[keyframe_id] = (parent_id, T_parent_keyframe)
 
     def trajectories(self, world: WorldMap) -> dict[int, Trajectory]:
-        """Every tracked frame, by map segment, from the keyframes' current poses."""
+        """Every tracked frame whose keyframe was not lost, by map segment, from current poses."""
         entries = self._store[: self._size]
         ids, which = np.unique(entries["keyframe_id"], return_inverse=True)
         order = np.argsort(which, kind="stable")
         groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(ids)))[:-1])
-        poses, segments = np.empty((len(entries), 4, 4)), np.empty(len(entries), np.int64)
+        poses, segments = np.empty((len(entries), 4, 4)), np.full(len(entries), NOBODY)
         for keyframe_id, rows in zip(ids.tolist(), groups, strict=False):
             owner, T = self._resolve(keyframe_id, entries["T_keyframe_camera"][rows])
+            if owner == NOBODY:
+                continue
             keyframe = world.keyframes[owner]
             poses[rows], segments[rows] = keyframe.T_world_camera @ T, keyframe.segment
         return {
             segment: Trajectory(
                 entries["timestamp_s"][segments == segment], poses[segments == segment]
             )
-            for segment in np.unique(segments).tolist()
+            for segment in np.unique(segments[segments != NOBODY]).tolist()
         }
 
     def heir(self, keyframe_id: int) -> tuple[int, Array]:
-        """The keyframe that stands for one now, and T_heir_keyframe; itself if it has no heir."""
+        """The keyframe that stands for one now, or NOBODY, and T_heir_keyframe.
+
+        One that has no heir stands for itself.
+        """
         return self._resolve(keyframe_id, np.eye(4))
 
     def state(self) -> Arrays:

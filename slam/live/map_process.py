@@ -25,6 +25,7 @@ from semantics.labels import LabelSet
 from semantics.segmenter import NoSegmenter
 from slam.dynamics import Dynamics
 from slam.frame import Frame
+from slam.history import NOBODY
 from slam.keyframe_masks import KeyframeMasks
 from slam.live.channel import Channel
 from slam.live.messages import (
@@ -127,13 +128,7 @@ class MapKeeper:
                 mask = np.unpackbits(message.bits, count=size).reshape(message.shape) > 0
                 pruner.prune_mask(message.keyframe_id, mask)
             case SaveState():
-                try:
-                    write_arrays(message.path, STATE_FILE, {}, self.system.state())
-                except OSError as error:  # a later one may find room
-                    logger.warning("%s: cannot be written (%s)", message.path, error.strerror)
-                else:
-                    self._send(StateSaved(number, message.path))
-                give_back_memory()  # of the state, and of what the graph has changed since
+                self.save(number, message.path)
             case Finish():
                 self.system.mapper.history.extend(message.history)
                 self.system.finish()
@@ -142,10 +137,23 @@ class MapKeeper:
             case _:
                 raise TypeError(f"no message for the map: {message!r}")
 
+    def save(self, number: int, path: Path) -> None:
+        """Save the state, so that messages up to this number need not be sent again."""
+        try:
+            write_arrays(path, STATE_FILE, {}, self.system.state())
+        except OSError as error:  # a later one may find room
+            logger.warning("%s: cannot be written (%s)", path, error.strerror)
+        else:
+            self._send(StateSaved(number, path))
+        give_back_memory()  # of the state, and of what the graph has changed since
+
     def add(self, message: NewKeyframe) -> None:
         """Take in a keyframe as tracking made it; two deltas follow, the first at once."""
         started_s = time.perf_counter()
         system = self.system
+        if not self._has_place(message):
+            self.pass_over(LostKeyframe(message.id, NOBODY, np.eye(4), message.history))
+            return
         self._count(message.sightings)
         system.mapper.history.extend(message.history)
         tracked, segment = self._brought_up_to_date(message)
@@ -173,7 +181,14 @@ class MapKeeper:
         mapper.history.extend(message.history)
         mapper.history.hand_over(message.id, message.heir_id, message.T_heir_lost)
         mapper.world.next_keyframe_id = message.id + 1
+        landmarks = mapper.world.landmarks
+        landmarks.extend_to(max(message.landmarks, len(landmarks)))
         self.tell(message.id, done=True)
+
+    def _has_place(self, message: NewKeyframe) -> bool:
+        """Whether what its pose refers to is in the map; not if that was lost with its place."""
+        reference, history = message.reference, self.system.mapper.history
+        return reference is None or history.heir(reference[0])[0] != NOBODY
 
     def attach(self, message: Masks) -> None:
         """Use a keyframe's masks; those that cannot be used are passed over."""

@@ -63,13 +63,16 @@ class LostKeyframe:
 
     Attributes:
         id: of the keyframe. heir_id: a keyframe that takes its frames. T_heir_lost: (4, 4).
+            A keyframe that began a segment has no heir (NOBODY): the segment begins anew.
         history: as of the ``NewKeyframe``.
+        landmarks: ever made, as tracking knows; no id among them means another one from now on.
     """
 
     id: int
     heir_id: int
     T_heir_lost: Array
     history: Entries
+    landmarks: int = 0
 
 
 @dataclass(frozen=True)

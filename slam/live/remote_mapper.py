@@ -16,9 +16,9 @@ import numpy as np
 
 from graph.camera import Camera
 from graph.errors import InputError
-from graph.geometry import inverse
+from graph.geometry import Array, inverse
 from slam.frame import Frame
-from slam.history import Entries, FrameHistory
+from slam.history import NOBODY, Entries, FrameHistory
 from slam.landmarks import Ints, Mask
 from slam.live.messages import (
     Began,
@@ -215,11 +215,11 @@ class RemoteMapper:
             self.catch_up(0.1)
 
     def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:
-        """Wait until a keyframe's landmarks are there, or so long."""
+        """Wait until a keyframe's landmarks are there, or so long; not for one that was lost."""
         deadline_s = time.monotonic() + timeout_s
         while len(self.world.observed(keyframe)[1]) == 0 and not self.given_up:
             left_s = deadline_s - time.monotonic()
-            if left_s <= 0:
+            if left_s <= 0 or self.history.heir(keyframe.id)[0] == NOBODY:
                 return False
             self.catch_up(min(left_s, 0.05))
         return True
@@ -271,11 +271,12 @@ class RemoteMapper:
         message = self._journal.pop(number, None)
         logger.error("message %d, %s, is passed over", number, type(message).__name__)
         match message:
-            case NewKeyframe(reference=(heir_id, T_world_heir)):
-                T_heir_lost = inverse(T_world_heir) @ message.tracked.T_world_camera
+            case NewKeyframe():
+                heir_id, T_heir_lost = _heir(message)
                 self.history.hand_over(message.id, heir_id, T_heir_lost)
-                heir = LostKeyframe(message.id, heir_id, T_heir_lost, message.history)
-                self._journal[number] = heir
+                known = len(self.world.landmarks)
+                about = (message.id, heir_id, T_heir_lost, message.history, known)
+                self._journal[number] = LostKeyframe(*about)
 
     def _apply(self, message: MapChanged) -> None:
         apply_delta(message.delta, self.world, self.history)
@@ -305,3 +306,11 @@ class RemoteMapper:
         entries = self.history.since(self._told_frames)
         self._told_frames += len(entries)
         return entries
+
+
+def _heir(lost: NewKeyframe) -> tuple[int, Array]:
+    """The keyframe that takes the frames of one that cannot be in the map, and T_heir_lost."""
+    if lost.reference is None:
+        return NOBODY, np.eye(4)
+    heir_id, T_world_heir = lost.reference
+    return heir_id, inverse(T_world_heir) @ lost.tracked.T_world_camera

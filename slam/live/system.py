@@ -12,9 +12,11 @@ import numpy as np
 
 from graph.array_file import nested, read_arrays
 from graph.camera import Camera
+from graph.geometry import Array
 from semantics.segmenter import NoSegmenter
 from slam.features import Features
 from slam.frame import Frame
+from slam.history import NOBODY
 from slam.landmarks import Ints
 from slam.live.map_process import STATE_FILE, LabelledNothing
 from slam.live.messages import ImageToSegment
@@ -79,12 +81,13 @@ class LiveSystem(SlamSystem):
         """Take in what the other processes have found, then the same step as offline."""
         self.catch_up()
         result = super().process(frame, features)
-        reference = self._reference
-        if result.keyframe_id is not None and reference is not None:
-            world = self.remote.world
-            if len(world.in_segment(reference.segment)) == 1:
-                self.remote.wait_for(reference, FIRST_MAP_S)
-                self.localiser.new_local_map(world, reference)
+        first = self._reference
+        if result.keyframe_id is None or first is None:
+            return result
+        if self.remote.world.in_segment(first.segment) == [first]:
+            T_before = first.T_world_camera
+            self.remote.wait_for(first, FIRST_MAP_S)
+            self._go_with_map(first, T_before)
         return result
 
     def catch_up(self) -> None:
@@ -99,9 +102,19 @@ class LiveSystem(SlamSystem):
                 self.dense.see(found, self.remote.world)
         if self.dense is not None:
             self._follow(self.dense, moved=self.remote.changes != changes)
-        if reference is None or T_before is None or self.remote.changes == changes:
-            return
+        if reference is not None and T_before is not None and self.remote.changes != changes:
+            self._go_with_map(reference, T_before)
+
+    def _go_with_map(self, reference: Keyframe, T_before: Array) -> None:
+        """Stay where a keyframe was that had the pose T_before (4, 4), in the map as it is.
+
+        If the keyframe was lost with its place, the next frame begins the segment anew.
+        """
         heir_id, T_heir_reference = self.remote.history.heir(reference.id)
+        if heir_id == NOBODY:
+            self._reference = None
+            self.localiser.forget(0)
+            return
         heir = self.remote.world.keyframes[heir_id]
         T_now = heir.T_world_camera @ T_heir_reference
         self.localiser.moved(T_before, T_now, self.remote.world)

@@ -34,9 +34,9 @@ TRUTH = [se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a, 0, 0])) for a in np.a
 FRAMES = [render_plane(pose, index) for index, pose in enumerate(TRUTH)]
 
 
-def error_m(poses: Array) -> float:
+def error_m(poses: Array, first: int = 0) -> float:
     """RMS position error of poses (N, 4, 4) in the first one's frame, against the truth."""
-    truth = np.array([inverse(TRUTH[0]) @ pose for pose in TRUTH[: len(poses)]])
+    truth = np.array([inverse(TRUTH[first]) @ pose for pose in TRUTH[first : first + len(poses)]])
     found = inverse(poses[0]) @ poses
     return float(np.sqrt(np.mean(np.sum((found - truth)[:, :3, 3] ** 2, axis=1))))
 
@@ -111,28 +111,51 @@ def test_a_map_that_dies_again_and_again_costs_the_map_but_not_the_trajectory(tm
     assert "the trajectory is saved" in (tmp_path / "run" / "log.txt").read_text()
 
 
+def poison_next_keyframe(slam: LiveSlam, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Its message kills the map's process; the list will hold its id."""
+    remote, poisoned = slam._system.remote, []
+    tell = remote.tell
+
+    def poison(message: object) -> None:
+        if isinstance(message, NewKeyframe) and not poisoned:
+            poisoned.append(message.id)
+            message = replace(message, sightings=None)
+        tell(message)
+
+    monkeypatch.setattr(remote, "tell", poison)
+    return poisoned
+
+
+def wait_for_the_map(slam: LiveSlam) -> None:
+    deadline_s = time.monotonic() + 60
+    while slam.health().keyframes_waiting and time.monotonic() < deadline_s:
+        slam.catch_up()
+
+
 def test_a_keyframe_that_kills_the_map_is_passed_over(tmp_path, monkeypatch) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         feed(slam, FRAMES[:6])
-        remote, poisoned = slam._system.remote, []
-        tell = remote.tell
-
-        def poison(message: object) -> None:
-            if isinstance(message, NewKeyframe) and not poisoned:
-                poisoned.append(message.id)
-                message = replace(message, sightings=None)
-            tell(message)
-
-        monkeypatch.setattr(remote, "tell", poison)
+        poisoned = poison_next_keyframe(slam, monkeypatch)
         assert set(feed(slam, FRAMES[6:])) == {TrackingStatus.OK}
-        deadline_s = time.monotonic() + 60
-        while slam.health().keyframes_waiting and time.monotonic() < deadline_s:
-            slam.catch_up()
+        wait_for_the_map(slam)
         assert slam.health().map_deaths == 2
-        assert poisoned[0] not in remote.world.keyframes
+        assert poisoned[0] not in slam._system.remote.world.keyframes
     trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
     assert len(trajectory) == len(FRAMES)
     assert error_m(trajectory.poses_world_camera) < 0.02
+
+
+def test_a_first_keyframe_that_kills_the_map_costs_its_frame(tmp_path, monkeypatch) -> None:
+    with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
+        poison_next_keyframe(slam, monkeypatch)
+        feed(slam, FRAMES[:1])
+        wait_for_the_map(slam)
+        assert slam.health().map_deaths == 2
+        assert len(slam.trajectory()) == 0
+        assert set(feed(slam, FRAMES[1:])) == {TrackingStatus.OK}
+    trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
+    assert len(trajectory) == len(FRAMES) - 1
+    assert error_m(trajectory.poses_world_camera, first=1) < 0.02
 
 
 def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> None:

@@ -1,0 +1,60 @@
+"""What the map's process does with what tracking tells it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from synthetic_view import CAMERA, render_plane
+
+from graph.geometry import Array, se3_exp
+from slam.history import ENTRY, NOBODY
+from slam.live.map_process import MapKeeper
+from slam.live.messages import LostKeyframe, MapChanged, NewKeyframe, Sightings
+from slam.system import SlamSystem
+from slam.tracker import untracked
+
+NO_IDS = np.zeros(0, np.int64)
+
+
+def keyframe(
+    system: SlamSystem,
+    number: int,
+    reference: tuple[int, Array] | None,
+    sightings: Sightings | None = None,
+) -> NewKeyframe:
+    T_world_camera = se3_exp(np.array([0, 0, 0, 0.02 * number, 0, 0]))
+    frame = render_plane(T_world_camera, number)
+    entries = np.array([(number / 30, number, np.eye(4))], ENTRY)
+    return NewKeyframe(
+        number,
+        frame.index,
+        frame.timestamp_s,
+        untracked(T_world_camera, system.prepare(frame)),
+        0,
+        reference,
+        NO_IDS,
+        sightings or Sightings(NO_IDS, NO_IDS, NO_IDS),
+        entries,
+        frame.depth_m[::2, ::2],
+    )
+
+
+def test_after_the_loss_of_its_first_keyframe_a_segment_begins_anew() -> None:
+    answers: list[Any] = []
+    system = SlamSystem(CAMERA)
+    keeper = MapKeeper(system, answers.append)
+    nothing = np.zeros(0, ENTRY)
+    keeper.handle(1, LostKeyframe(0, NOBODY, np.eye(4), nothing, 500))
+    keeper.handle(2, keyframe(system, 1, (0, np.eye(4))))  # made while the first was being lost
+    seen = Sightings(np.arange(500), np.ones(500, int), np.ones(500, int))
+    keeper.handle(3, keyframe(system, 2, None, seen))
+    world = system.mapper.world
+    assert list(world.keyframes) == [2]
+    assert not world.landmarks.alive[:500].any()
+    assert world.landmarks.alive.sum() > 100
+    deltas = [answer.delta for answer in answers if isinstance(answer, MapChanged)]
+    heirs = {k: heir for delta in deltas for k, (heir, _) in delta.heirs.items()}
+    assert heirs == {0: NOBODY, 1: NOBODY}
+    trajectory = system.trajectory()
+    assert trajectory.timestamps_s.tolist() == [2 / 30]  # those of the lost ones have no pose
