@@ -16,7 +16,8 @@ class KeyframeConfig:
     tracked while ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three
     keyframes see; here all points of the reference keyframe count, of which BRISK finds about 60 %
     again in the next frame, so that half is the equal of it. The reference keyframe is the last
-    one; where it shows less, the one that shows most, so that a known view needs no new one.
+    one, until a keyframe would be made that another shows more of than the reference does: that
+    one is the reference from then on, and the next frame decides. So a known view needs no new one.
     "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """

@@ -275,33 +275,29 @@ class SlamSystem:
         if self._reference is None:
             return "first frame" if self._segment == 0 else "new segment"
         self._frames_since_keyframe += 1
-        if self._shared(tracked) < self.config.keyframes.max_shared:
-            self._refer_to_most_covisible(tracked.landmark_ids)
+        _, points = self.mapper.world.observed(self._reference)
         close = tracked.features.depth_m < 40 * self.camera.baseline_m
         close_tracked = int(close[tracked.keypoints].sum())
         evidence = KeyframeEvidence(
             frames_since=self._frames_since_keyframe,
             mapping_idle=self.mapper.idle,
             tracked=len(tracked.landmark_ids),
-            shared=self._shared(tracked),
+            shared=len(tracked.landmark_ids) / max(len(points), 1),
             close_tracked=close_tracked,
             close_new=int(close.sum()) - close_tracked,
         )
-        return keyframe_reason(evidence, self.config.keyframes)
+        reason = keyframe_reason(evidence, self.config.keyframes)
+        return "" if reason and self._changed_reference(tracked.landmark_ids) else reason
 
-    def _shared(self, tracked: Tracked) -> float:
-        """Tracked points over those of the reference keyframe."""
-        assert self._reference is not None
-        _, points = self.mapper.world.observed(self._reference)
-        return len(tracked.landmark_ids) / max(len(points), 1)
-
-    def _refer_to_most_covisible(self, landmark_ids: Ints) -> None:
-        """The keyframe that shows most of these landmarks becomes the reference."""
+    def _changed_reference(self, landmark_ids: Ints) -> bool:
+        """Whether another keyframe shows most of these landmarks; it is the reference then."""
         world = self.mapper.world
         strong = world.covisible(landmark_ids, 1)
-        if strong and strong[0][1] is not self._reference:
-            self._reference = strong[0][1]
-            self.localiser.new_local_map(world, self._reference)
+        if not strong or strong[0][1] is self._reference:
+            return False
+        self._reference = strong[0][1]
+        self.localiser.new_local_map(world, self._reference)
+        return True
 
     def _join_segments(self, tracked: Tracked) -> Tracked:
         """Where other segments exist, look for this frame in them; found, they become one map."""
