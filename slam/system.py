@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,31 +10,26 @@ import numpy as np
 from graph.array_file import Arrays, check_like, nested, part
 from graph.camera import Camera
 from graph.geometry import Array
-from graph.trajectory import Trajectory
 from semantics.segmenter import Segmenter
-from slam.covariances import COVARIANCES, KeyframeCovariances, find_covariances, write_covariances
 from slam.dynamics import Dynamics, Sifted
 from slam.features import BriskExtractor, Features
 from slam.frame import Frame
 from slam.keyframes import KeyframeEvidence, keyframe_reason
-from slam.landmark_cloud import LandmarkCloud
 from slam.landmarks import Ints
 from slam.localiser import Localiser
-from slam.map_file import MAP, write_map
 from slam.mapper import Mapper
 from slam.results import FrameResult, TrackingStatus
-from slam.semantic_files import semantic_writers
 from slam.semantic_mapping import SemanticMapper
-from slam.semantic_results import MapObjects
 from slam.stage_clock import StageClock
 from slam.system_config import SystemConfig
+from slam.system_results import SystemResults, largest
 from slam.tracker import Tracked, Tracker, lost, untracked
 from slam.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 
 
-class SlamSystem:
+class SlamSystem(SystemResults):
     """RGB-D frames in, poses out; the map and the graph grow on the way."""
 
     def __init__(
@@ -179,67 +173,6 @@ class SlamSystem:
         if self._first_keyframe and known and known[0].id >= self._first_keyframe:
             logger.warning("never recognised in the map: the trajectory has a frame of its own")
 
-    def trajectory(self) -> Trajectory:
-        """Every frame with a pose in the largest segment, from the keyframes as they are now."""
-        nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-        segments = self.segments()
-        return segments.get(largest(segments), nothing)
-
-    def segments(self) -> dict[int, Trajectory]:
-        """The frames of every map segment that was not joined, each in a frame of its own."""
-        return self.mapper.history.trajectories(self.mapper.world)
-
-    def keyframe_trajectory(self) -> Trajectory:
-        """The keyframes of the largest segment that this session made."""
-        chosen = self.mapper.world.in_segment(largest(self.segments()))
-        chosen = [k for k in chosen if k.id >= self._first_keyframe]
-        poses = np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4)
-        return Trajectory(np.array([k.timestamp_s for k in chosen]), poses)
-
-    def keyframe_covariances(self) -> KeyframeCovariances:
-        """How sure the graph is of the keyframes of the largest segment."""
-        chosen = self.mapper.world.in_segment(largest(self.segments()))
-        return find_covariances(self.mapper.smoother, {k.id: k.timestamp_s for k in chosen})
-
-    def landmarks(self) -> LandmarkCloud:
-        """The living landmarks of the largest segment, with their colours."""
-        table = self.mapper.world.landmarks
-        chosen = self.mapper.world.in_segment(largest(self.segments()))
-        hosts = [k.id for k in chosen]
-        ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
-        labels = self.semantics.landmark_labels(ids)
-        columns = table.points_world[ids], table.colours[ids], table.observations[ids]
-        return LandmarkCloud(ids, *columns, labels)
-
-    def objects(self) -> MapObjects:
-        """The objects of the largest segment."""
-        return self.semantics.map_objects(self.mapper.world.in_segment(largest(self.segments())))
-
-    def files(self) -> dict[str, Callable[[Path], None]]:
-        """What it saves so that it loads again: a function that writes a file, by its name."""
-        found: dict[str, Callable[[Path], None]] = {
-            "graph": self.mapper.smoother.save,
-            MAP: self.save_map,
-        }
-        if self.semantics.enabled:
-            found |= semantic_writers(self.landmarks(), self.objects(), self.trajectory())
-        if self.config.covariances:
-            found[COVARIANCES] = lambda path: write_covariances(path, self.keyframe_covariances())
-        return found
-
-    def save_map(self, path: Path) -> None:
-        """Write all that was learned, but no times: the same run gives the same bytes."""
-        write_map(path, self.state() | {"mapper.update_ms": np.zeros(0)}, self.camera)
-
-    def statistics(self) -> dict[str, float | list[float]]:
-        """Sizes of the map and the time of every graph update in milliseconds."""
-        return {
-            "keyframes": len(self.mapper.world.keyframes),
-            "landmarks": int(self.mapper.world.landmarks.alive.sum()),
-            "loops_closed": len(self.mapper.loops.closed),
-            "isam2_update_ms": list(self.mapper.update_ms),
-        }
-
     def _track(self, features: Features) -> Tracked:
         """Against the map; where there is none, or it is long lost, the frame begins a new one."""
         rules = self.config.relocalisation
@@ -330,8 +263,3 @@ class SlamSystem:
             frame.timestamp_s, reference.id, T_world_reference, T_world_camera
         )
         return T_world_camera
-
-
-def largest(segments: dict[int, Trajectory]) -> int:
-    """The segment with most frames, the older of equal ones; 0 where there is none."""
-    return max(segments, key=lambda s: (len(segments[s]), -s), default=0)

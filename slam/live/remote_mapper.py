@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +18,19 @@ from graph.errors import InputError
 from graph.geometry import Array, inverse
 from slam.frame import Frame
 from slam.history import NOBODY, Entries, FrameHistory
-from slam.landmarks import Ints, Mask
+from slam.landmarks import Ints
 from slam.live.messages import (
     Began,
     Finish,
     LostKeyframe,
     MapChanged,
     NewKeyframe,
-    PruneLandmarks,
-    PruneMask,
     Ready,
     SaveState,
     Sightings,
     StateSaved,
 )
+from slam.live.remote_pruner import RemotePruner
 from slam.live.replica import apply_delta
 from slam.live.worker import Failure, Worker
 from slam.loop_verification import LoopConstraint
@@ -49,24 +47,6 @@ SAVE_EVERY = 20
 """Keyframes from one saved state to the next."""
 MAX_DEATHS = 3
 """Deaths without a saved state between them, after which the map is given up."""
-
-
-@dataclass(frozen=True)
-class RemotePruner:
-    """Passes requests on; the map is changed when the answer comes."""
-
-    mapper: RemoteMapper
-    border_px: int = 2
-
-    def prune_landmarks(self, landmark_ids: Ints) -> None:
-        """As ``MapPruner.prune_landmarks``. Tracking drops them at once."""
-        self.mapper.world.landmarks.alive[landmark_ids] = False
-        self.mapper.tell(PruneLandmarks(landmark_ids))
-
-    def prune_mask(self, keyframe_id: int, mask: Mask) -> None:
-        """As ``MapPruner.prune_mask``."""
-        bits = np.packbits(mask)
-        self.mapper.tell(PruneMask(keyframe_id, bits, mask.shape, self.border_px))
 
 
 class RemoteMapper:
@@ -165,7 +145,7 @@ class RemoteMapper:
 
     def pruner(self) -> RemotePruner:
         """Takes things out of the map."""
-        return RemotePruner(self)
+        return RemotePruner(self.world, self.tell)
 
     def tell(self, message: Any) -> None:
         """Send a message, to be sent again to another process if this one dies."""

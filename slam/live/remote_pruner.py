@@ -1,0 +1,32 @@
+"""Stands where an offline system has its ``MapPruner``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from slam.landmarks import Ints, Mask
+from slam.live.messages import PruneLandmarks, PruneMask
+from slam.world_map import WorldMap
+
+
+@dataclass(frozen=True)
+class RemotePruner:
+    """Passes requests on through ``tell``; the map is changed when the answer comes."""
+
+    world: WorldMap
+    tell: Callable[[Any], None]
+    border_px: int = 2
+
+    def prune_landmarks(self, landmark_ids: Ints) -> None:
+        """As ``MapPruner.prune_landmarks``. Tracking drops them at once."""
+        self.world.landmarks.alive[landmark_ids] = False
+        self.tell(PruneLandmarks(landmark_ids))
+
+    def prune_mask(self, keyframe_id: int, mask: Mask) -> None:
+        """As ``MapPruner.prune_mask``."""
+        bits = np.packbits(mask)
+        self.tell(PruneMask(keyframe_id, bits, mask.shape, self.border_px))

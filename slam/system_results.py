@@ -1,0 +1,106 @@
+"""What a system knows about the camera's path and the map whenever it is asked."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from graph.array_file import Arrays
+from graph.camera import Camera
+from graph.trajectory import Trajectory
+from slam.covariances import (
+    COVARIANCES,
+    KeyframeCovariances,
+    find_covariances,
+    write_covariances,
+)
+from slam.landmark_cloud import LandmarkCloud
+from slam.map_file import MAP, write_map
+from slam.mapper import Mapper
+from slam.semantic_files import semantic_writers
+from slam.semantic_mapping import SemanticMapper
+from slam.semantic_results import MapObjects
+from slam.system_config import SystemConfig
+
+
+class SystemResults(ABC):
+    """Answers of a system; to give them changes nothing."""
+
+    camera: Camera
+    config: SystemConfig
+    mapper: Mapper
+    semantics: SemanticMapper
+    _first_keyframe: int
+
+    @abstractmethod
+    def state(self) -> Arrays:
+        """All that the past has left behind, as named arrays."""
+
+    def trajectory(self) -> Trajectory:
+        """Every frame with a pose in the largest segment, from the keyframes as they are now."""
+        nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+        segments = self.segments()
+        return segments.get(largest(segments), nothing)
+
+    def segments(self) -> dict[int, Trajectory]:
+        """The frames of every map segment that was not joined, each in a frame of its own."""
+        return self.mapper.history.trajectories(self.mapper.world)
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """The keyframes of the largest segment that this session made."""
+        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        chosen = [k for k in chosen if k.id >= self._first_keyframe]
+        poses = np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4)
+        return Trajectory(np.array([k.timestamp_s for k in chosen]), poses)
+
+    def keyframe_covariances(self) -> KeyframeCovariances:
+        """How sure the graph is of the keyframes of the largest segment."""
+        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        return find_covariances(self.mapper.smoother, {k.id: k.timestamp_s for k in chosen})
+
+    def landmarks(self) -> LandmarkCloud:
+        """The living landmarks of the largest segment, with their colours."""
+        table = self.mapper.world.landmarks
+        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        hosts = [k.id for k in chosen]
+        ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
+        labels = self.semantics.landmark_labels(ids)
+        columns = table.points_world[ids], table.colours[ids], table.observations[ids]
+        return LandmarkCloud(ids, *columns, labels)
+
+    def objects(self) -> MapObjects:
+        """The objects of the largest segment."""
+        return self.semantics.map_objects(self.mapper.world.in_segment(largest(self.segments())))
+
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """What it saves so that it loads again: a function that writes a file, by its name."""
+        found: dict[str, Callable[[Path], None]] = {
+            "graph": self.mapper.smoother.save,
+            MAP: self.save_map,
+        }
+        if self.semantics.enabled:
+            found |= semantic_writers(self.landmarks(), self.objects(), self.trajectory())
+        if self.config.covariances:
+            found[COVARIANCES] = lambda path: write_covariances(path, self.keyframe_covariances())
+        return found
+
+    def save_map(self, path: Path) -> None:
+        """Write all that was learned, but no times: the same run gives the same bytes."""
+        write_map(path, self.state() | {"mapper.update_ms": np.zeros(0)}, self.camera)
+
+    def statistics(self) -> dict[str, float | list[float]]:
+        """Sizes of the map and the time of every graph update in milliseconds."""
+        return {
+            "keyframes": len(self.mapper.world.keyframes),
+            "landmarks": int(self.mapper.world.landmarks.alive.sum()),
+            "loops_closed": len(self.mapper.loops.closed),
+            "isam2_update_ms": list(self.mapper.update_ms),
+        }
+
+
+def largest(segments: dict[int, Trajectory]) -> int:
+    """The segment with most frames, the older of equal ones; 0 where there is none."""
+    return max(segments, key=lambda s: (len(segments[s]), -s), default=0)
