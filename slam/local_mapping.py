@@ -25,7 +25,7 @@ class MappingConfig:
     seen it, or if ``probation_keyframes`` after it was made fewer than ``min_observations`` see it;
     at once if none does.
     A keyframe is redundant if ``redundant_share`` of its landmarks are seen by at least
-    ``redundant_views`` others; at most ``max_culled`` such leave at a keyframe.
+    ``redundant_views`` others.
     """
 
     local_keyframes: int = 15
@@ -37,7 +37,6 @@ class MappingConfig:
     min_observations: int = 2
     redundant_share: float = 0.9
     redundant_views: int = 3
-    max_culled: int = 3
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
 
 

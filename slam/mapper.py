@@ -121,9 +121,9 @@ class Mapper:
         return keyframe
 
     def optimise(self, keyframe: Keyframe) -> None:
-        """Put a keyframe into the graph, read all poses and points back, cull redundant ones."""
+        """Put a keyframe into the graph, read all poses and points back, cull a redundant one."""
         self._apply(self.smoother.update(self._feed.keyframe_update(self.world, keyframe)))
-        self._cull_keyframes(keyframe)
+        self._cull_keyframe(keyframe)
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
         """Look for known places from a keyframe; loops that hold move the map and fuse landmarks.
@@ -236,32 +236,27 @@ class Mapper:
             new_side.update({k.id: k for _, k in near})
         return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
 
-    def _cull_keyframes(self, newest: Keyframe) -> None:
-        """Take keyframes out that add nothing to those around the newest one, younger ones first.
+    def _cull_keyframe(self, newest: Keyframe) -> None:
+        """Take the youngest keyframe out that adds nothing to those around the newest one.
 
-        What the map has stood on for longest stays: it would wander if new views took its place.
+        With it go the landmarks that too few others see. What the map has stood on for longest
+        stays: it would wander if new views took its place.
         """
         _, seen = self.world.observed(newest)
         kept = self.loops.ends | {0}  # with a loop's end its relative pose would leave the graph
         near = {k.id: k for _, k in self.world.covisible(seen, 15)}
         old = [near[i] for i in sorted(near.keys() - kept, reverse=True) if i < newest.id - 2]
-        for _ in range(self._mapping.max_culled):
-            redundant = redundant_keyframe(self.world, old, self._mapping)
-            if redundant is None:
-                return
-            old.remove(redundant)
-            self._cull(redundant)
-
-    def _cull(self, keyframe: Keyframe) -> None:
-        """Take a keyframe out of map and graph, with the landmarks that too few others see."""
-        _, ids = self.world.observed(keyframe)
-        heir = next(k for _, k in self.world.covisible(ids, 0) if k is not keyframe)
-        T_heir_keyframe = inverse(heir.T_world_camera) @ keyframe.T_world_camera
-        self.history.hand_over(keyframe.id, heir.id, T_heir_keyframe)
-        self.world.remove_keyframe(keyframe, heir)
-        self._feed.forget_keyframe(keyframe.id)
+        redundant = redundant_keyframe(self.world, old, self._mapping)
+        if redundant is None:
+            return
+        _, ids = self.world.observed(redundant)
+        heir = next(k for _, k in self.world.covisible(ids, 0) if k is not redundant)
+        T_heir_keyframe = inverse(heir.T_world_camera) @ redundant.T_world_camera
+        self.history.hand_over(redundant.id, heir.id, T_heir_keyframe)
+        self.world.remove_keyframe(redundant, heir)
+        self._feed.forget_keyframe(redundant.id)
         self._feed.forget_landmarks(cull_landmarks(self.world, ids, self._mapping))
-        self.loops.remove(keyframe.id)
+        self.loops.remove(redundant.id)
 
 
 def add_keyframe(world: WorldMap, frame: Frame, tracked: Tracked, segment: int) -> Keyframe:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from synthetic_view import CAMERA, add_keyframe, make_features, points_before, random_descriptors
 
 from graph.geometry import se3_exp
@@ -47,26 +46,22 @@ def row_of_keyframes(count: int, mapping: MappingConfig) -> Mapper:
     return mapper
 
 
-@pytest.mark.parametrize("limit", [1, 3])
-def test_younger_redundant_keyframes_leave_first_and_only_so_many_at_a_time(limit: int) -> None:
-    mapper = row_of_keyframes(10, MappingConfig(max_culled=limit))
-    expected = [k for k in range(10) if not 6 - limit < k <= 6]
-    assert list(mapper.world.keyframes) == expected  # of 1 to 6; 7 to 9 are too new
+def test_the_youngest_redundant_keyframe_leaves_but_none_of_the_last_three() -> None:
+    mapper = row_of_keyframes(10, MappingConfig())
+    expected = [0, 1, 2, 3, 4, 5, 7, 8, 9]
+    assert list(mapper.world.keyframes) == expected
     assert mapper.places.keyframe_ids == expected
-    assert list(mapper.history.heirs) == [6, 5, 4][:limit]
+    assert list(mapper.history.heirs) == [6]
 
 
-def test_culling_stops_where_too_few_others_see_the_landmarks() -> None:
-    mapper = row_of_keyframes(6, MappingConfig(max_culled=9, redundant_views=3))
-    assert len(mapper.world.keyframes) == 4  # a landmark then has three others no more
-    assert 0 in mapper.world.keyframes
+def test_none_leaves_where_too_few_others_see_the_landmarks() -> None:
+    assert len(row_of_keyframes(10, MappingConfig(redundant_views=10)).world.keyframes) == 10
 
 
 def test_landmarks_of_a_culled_keyframe_alone_leave_with_it() -> None:
-    mapper = row_of_keyframes(10, MappingConfig(max_culled=3))
+    mapper = row_of_keyframes(10, MappingConfig())
     world = mapper.world
     held = {i for k in world.keyframes.values() for i in world.observed(k)[1].tolist()}
     assert set(np.flatnonzero(world.landmarks.alive).tolist()) == held
-    newest = row_of_keyframes(11, MappingConfig(max_culled=3))
-    update = newest.smoother.update(newest._feed.map_update(newest.world))
-    assert set(update.keyframe_ids.tolist()) == set(newest.world.keyframes)
+    estimate = mapper.smoother.update(mapper._feed.map_update(world))
+    assert set(estimate.keyframe_ids.tolist()) == set(world.keyframes)
