@@ -17,7 +17,8 @@ class KeyframeConfig:
     keyframes see; here all points of the reference keyframe count, of which BRISK finds about 60 %
     again in the next frame, so that half is the equal of it. The reference keyframe is the last
     one, until a keyframe would be made that another shows more of than the reference does: that
-    one is the reference from then on, and the next frame decides. So a known view needs no new one.
+    one is the reference from then on, and the next frame decides. So a known view needs no new
+    one; with ``max_shared`` of 1 or more no view is known.
     "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """

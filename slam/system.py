@@ -225,6 +225,8 @@ class SlamSystem(SystemResults):
     def _changed_reference(self, landmark_ids: Ints) -> bool:
         """Whether another keyframe shows most of these landmarks; it is the reference then."""
         world = self.mapper.world
+        if self.config.keyframes.max_shared >= 1:
+            return False
         strong = world.covisible(landmark_ids, 1)
         if not strong or strong[0][1] is self._reference:
             return False
