@@ -32,6 +32,7 @@ from slam.live.messages import (
 )
 from slam.live.remote_pruner import RemotePruner
 from slam.live.replica import apply_delta
+from slam.live.supervision import late_start
 from slam.live.worker import Failure, Worker
 from slam.loop_verification import LoopConstraint
 from slam.mapper import add_keyframe, without_image
@@ -189,9 +190,12 @@ class RemoteMapper:
         """Wait until the process can work. Raises InputError if it cannot start."""
         deadline_s = time.monotonic() + timeout_s
         while not self._is_ready:
-            if self.given_up or time.monotonic() > deadline_s:
+            if self.given_up:
                 self.close()
                 raise InputError("the map's process did not start; see the lines above")
+            if time.monotonic() > deadline_s:
+                self.close()
+                raise InputError(late_start("map", timeout_s))
             self.catch_up(0.1)
 
     def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:

@@ -19,14 +19,22 @@ class Patience:
     """When a worker counts as hanging, and how often it is started again.
 
     Attributes:
-        start_s: how long it may take to start.
+        start_s: how long it may take to start; a busy machine needs minutes to load a network.
         answer_s: how long it may be silent over its work.
         restarts: at most.
     """
 
-    start_s: float = 60.0
+    start_s: float = 300.0
     answer_s: float = 20.0
     restarts: int = 3
+
+
+def late_start(name: str, waited_s: float) -> str:
+    """What is said of a process that lives but has not begun in time."""
+    return (
+        f"the {name}'s process has not begun within {waited_s:.0f} s; is this machine overloaded? "
+        "End other work and try again"
+    )
 
 
 class SupervisedWorker:
@@ -57,7 +65,8 @@ class SupervisedWorker:
     def first_words(self) -> Ready:
         """Wait until it can work. Raises InputError, with its own words, if it cannot."""
         deadline_s = time.monotonic() + self._rules.start_s
-        while time.monotonic() < deadline_s:
+        while True:
+            alive = self._worker.alive
             for message in self._worker.receive(0.1):
                 match message:
                     case Ready():
@@ -66,10 +75,12 @@ class SupervisedWorker:
                     case Failure():
                         self.close()
                         raise InputError(message.text.strip().splitlines()[-1])
-            if not self._worker.alive:
-                break
-        self.close()
-        raise InputError(f"the {self.name}'s process did not start; see the lines above")
+            if not alive:
+                self.close()
+                raise InputError(f"the {self.name}'s process did not start; see the lines above")
+            if time.monotonic() > deadline_s:
+                self.close()
+                raise InputError(late_start(self.name, self._rules.start_s))
 
     def send(self, message: Any, begins: bool = False) -> None:
         """Give it a message; one that ``begins`` work is what its answer is waited for from."""

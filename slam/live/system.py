@@ -36,7 +36,7 @@ MAX_PENDING = 3
 """Keyframes that wait for the map; with so many no further one is promised."""
 FIRST_MAP_S = 5.0
 """How long the frame that begins a map may wait for its landmarks."""
-START_S = 60.0
+START_S = 300.0
 SWITCH_S = 0.0005
 """How long another thread may keep Python's lock, which tracking asks for many times a frame."""
 MASKS_S = 10.0

@@ -23,6 +23,7 @@ from slam.landmark_cloud import LandmarkCloud
 from slam.live.live_slam import LiveOptions, LiveSlam
 from slam.live.messages import NewKeyframe
 from slam.live.segmentation import RemoteSegmenter
+from slam.live.supervision import Patience
 from slam.results import TrackingStatus
 from slam.run_folder import HEALTH
 from slam.system import SlamSystem
@@ -207,3 +208,10 @@ def test_a_segmenter_that_cannot_start_says_why(tmp_path) -> None:
     options = SegmenterOptions("precomputed", masks=tmp_path / "none.json")
     with pytest.raises(InputError, match=r"none\.json"):
         RemoteSegmenter(options, tmp_path)
+
+
+def test_one_that_begins_too_late_is_said_to_be_late(tmp_path) -> None:
+    before = children()
+    with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):
+        RemoteSegmenter(SegmenterOptions("none"), tmp_path, rules=Patience(start_s=0.0))
+    assert children() == before
