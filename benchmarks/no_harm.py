@@ -5,10 +5,10 @@
 Each sequence is static. It is run without semantics and without the check of what moves
 ("nothing"), with the check alone ("geometry"), with the network's masks, with masks that are drawn
 at random ("random": up to eight ellipses a keyframe, half of them people), and with the network's
-masks under each other's names ("shuffled": what was a chair is a person to the system). Any change of the keypoints moves
-an ATE by a tenth or more, so each is run several times, with one or two keypoints more or fewer and
-with other random masks and names; the mean ATE, its range, and how much larger the mean is than
-with nothing.
+masks under each other's names ("shuffled": what was a chair is a person to the system). Any change
+of the keypoints moves an ATE by a tenth or more, so each is run several times, with a keypoint or
+two more or fewer and with other random masks and names: the mean ATE, its range, and how much
+larger the mean is than with nothing.
 """
 
 from __future__ import annotations
