@@ -22,6 +22,7 @@ from graph.calibration_model import PARAMETERS, parameters_of
 from graph.camera import Camera
 from slam.calibrate import CalibrateOptions, calibrate_run
 from slam.calibration_report import NORMAL_95, Calibrated, format_calibration
+from slam.evaluation import evaluate
 from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.runner import RunOptions, run
 from slam.sequences import read_camera, write_camera
@@ -105,7 +106,9 @@ def errors_of(sequence: Path, out: Path, name: str) -> dict[str, float]:
     options = RunOptions(
         sequence, camera=out / f"{name}.yaml", out=out / name, overwrite=True, quiet=True
     )
-    return {row["name"]: row["value"] for row in run(options).rows if row["name"] in ERRORS}
+    run(options)
+    rows = evaluate(out / name, sequence).rows
+    return {row["name"]: float(row["value"]) for row in rows if row["name"] in ERRORS}
 
 
 def table_of_parameters(done: Calibrated, truth: Camera) -> str:
