@@ -1,6 +1,6 @@
 """What the semantics cost where nothing moves, also when the masks are wrong.
 
-    python benchmarks/no_harm.py SEQUENCE [SEQUENCE ...] [--repeats 3]
+    python benchmarks/no_harm.py SEQUENCE [SEQUENCE ...] [--repeats 2]
 
 Each sequence is static. It is run without semantics and without the check of what moves
 ("nothing"), with the check alone ("geometry"), with the network's masks, with masks that are drawn
@@ -112,7 +112,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sequences", type=Path, nargs="+")
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=2)
     arguments = parser.parse_args()
     network = make_segmenter(SegmenterOptions("light"), Path())
     off = ["dynamics.labels=false", "dynamics.geometry=false"]
