@@ -113,8 +113,8 @@ UNMEASURED = (
         "machine.py "
         "map_file.py map_localisation.py memory.py object_picture.py optimise.py "
         "optimised_map.py progress.py query.py run_folder.py run_results.py runner.py "
-        "segmentation.py semantic_files.py sequences/*.py stage_clock.py stop.py "
-        "system_interface.py viewer/*.py yaml_text.py",
+        "segmentation.py semantic_files.py semantic_results.py sequences/*.py stage_clock.py "
+        "stop.py system_interface.py system_results.py viewer/*.py yaml_text.py",
     ),
 )
 """Reading, writing, drawing, commands."""

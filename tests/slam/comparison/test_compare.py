@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
@@ -112,7 +111,13 @@ def start(data: Path, out: Path) -> subprocess.Popen:
         env=environment(1),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
+        preexec_fn=_heeds_interrupts,  # noqa: PLW1509 - no threads are held here
     )
+
+
+def _heeds_interrupts() -> None:
+    """A shell's background job ignores SIGINT, and so would what the tests start there."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for(path: Path, process: subprocess.Popen) -> None:
@@ -121,15 +126,6 @@ def wait_for(path: Path, process: subprocess.Popen) -> None:
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < end_s
         time.sleep(0.02)
-
-
-def interrupt(process: subprocess.Popen) -> None:
-    """As by Ctrl-C, again if nothing happens: Python loses one that comes within a destructor."""
-    for patience_s in (3, 3, 60):
-        process.send_signal(signal.SIGINT)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(patience_s)
-            return
 
 
 def processes_on(folder: Path) -> list[str]:
@@ -160,7 +156,8 @@ def test_killed_and_interrupted_it_goes_on_without_repeating(data, tmp_path):
     logs[1].unlink()
     with start(data, out) as process:
         wait_for(logs[1], process)
-        interrupt(process)
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
     assert process.returncode == 130
     assert not processes_on(out)
     with start(data, out) as process:
