@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from slam.comparison.data_folders import Site
@@ -22,8 +22,6 @@ SEQUENCES, CELLS = "sequences", "cells"
 SEED_SETTING = "loops.verification.seed={}"
 Key = tuple[str, str, int]
 """A cell of this system: sequence, configuration, seed."""
-_VALUES = ("frames", "rounds", "fps", "people", "depth_delay_ms", "width", "height")
-_FLAGS = ("carry", "exposure_change", "motion_blur", "sweeping", "true_depth", "normals")
 
 
 @dataclass(frozen=True)
@@ -75,11 +73,12 @@ def drawn_place(source: SequenceSource, config: RenderConfig, seed: int, out: Pa
 def _render_arguments(config: RenderConfig) -> Iterator[str]:
     """The command line that gives this configuration."""
     yield from ("--seed", str(config.seed))
-    for name in _VALUES:
-        value = getattr(config, name)
-        if value is not None:
-            yield from (f"--{name.replace('_', '-')}", str(value))
-    yield from (f"--{name.replace('_', '-')}" for name in _FLAGS if getattr(config, name))
+    for name in (f.name for f in fields(config) if f.name not in ("name", "seed", "noise")):
+        flag, value = f"--{name.replace('_', '-')}", getattr(config, name)
+        if value is True:
+            yield flag
+        elif value is not None and value is not False:
+            yield from (flag, str(value))
     if not config.noise:
         yield "--no-noise"
 
