@@ -91,8 +91,10 @@ def true_depth_at(depth_m: Array, pixels: Array) -> Array:
     return np.where(inside & smooth, depth, np.nan)
 
 
-def true_pixels(first: _View, second: _View, camera: Camera) -> tuple[Ints, Array]:
+def true_pixels(first: _View, second: _View, camera: Camera) -> tuple[Ints, Array, Array]:
     """Indices of the first view's keypoints that the second one sees, and where (N, 2).
+
+    Also how many times larger (N,) things look there.
 
     A point counts as seen if the second view's noise-free depth there agrees with it.
     """
@@ -107,20 +109,22 @@ def true_pixels(first: _View, second: _View, camera: Camera) -> tuple[Ints, Arra
     places = camera.project(points)
     there_m = true_depth_at(second.true_depth_m, places)
     seen = np.abs(there_m - points[:, 2]) < FLAT_SHARE * points[:, 2]
-    return known[seen], places[seen]
+    return known[seen], places[seen], (depth_m[known] / points[:, 2])[seen]
 
 
 def match_errors(first: _View, second: _View, camera: Camera) -> tuple[Array, Array, Array]:
     """Errors (M, 2) of BRISK, (M, 2) after registration, and (M,) whether that counts."""
-    rows, truth = true_pixels(first, second, camera)
+    rows, truth, zooms = true_pixels(first, second, camera)
     pairs = WindowIndex(second.features.image_pixels).pairs(truth, np.full(len(truth), WINDOW_PX))
     tables = (first.features.descriptors[rows], second.features.descriptors)
     matches = match_pairs(pairs, tables, MatchConfig())
-    rows, truth = rows[matches.query], truth[matches.query]
+    rows, truth, zooms = (values[matches.query] for values in (rows, truth, zooms))
     start = second.features.image_pixels[matches.train]
     patches = cut_patches(first.features.gray, first.features.image_pixels[rows])
     config = SubpixelConfig()
-    moved, correlation = register_patches(second.features.gray, start, patches, config.iterations)
+    moved, correlation = register_patches(
+        second.features.gray, start, patches, config.iterations, zooms
+    )
     limit = config.max_shift_px * np.sqrt(second.features.scales[matches.train])
     shift = np.linalg.norm(moved - start, axis=1)
     good = (correlation > config.min_correlation) & (shift < limit)

@@ -11,6 +11,8 @@ from graph.array_file import Arrays
 from graph.geometry import Array, inverse, transform
 from slam.subpixel import PATCH_PX
 
+PATCHES = 4  # of a landmark: views from one walk past it, of which each patch serves a range
+
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
@@ -22,8 +24,8 @@ _LOOKS: _Columns = {
     "extent": ((), np.float64, 0.0),
     "angles_rad": ((), np.float64, 0.0),
     "colours": ((3,), np.uint8, 0),
-    "patches": ((PATCH_PX, PATCH_PX), np.uint8, 0),
-    "patch_views": ((3,), np.float64, np.nan),
+    "patches": ((PATCHES, PATCH_PX, PATCH_PX), np.uint8, 0),
+    "patch_views": ((PATCHES, 3), np.float64, np.nan),
 }
 """What only the living have: most landmarks die young, and a session has no end."""
 _OF_ALL: _Columns = {
@@ -61,6 +63,10 @@ class Looks:
         self._rows[self._place[ids]] = values
         self._rows[0] = nothing
 
+    def pick(self, ids: Ints, which: Ints) -> NDArray:
+        """Entry which[k] of the row of ids[k]."""
+        return self._rows[self._place[ids], which]
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
         return np.array(self._rows[self._place], dtype)
 
@@ -77,8 +83,8 @@ class LandmarkTable:
         colours: (N, 3) uint8.
         host: (N,) keyframe that made it; it moves the landmark while it is not in the graph.
         last_keyframe: (N,) newest keyframe that observes it.
-        patches: (N, 11, 11) uint8 image patch that sub-pixel registration aligns with.
-        patch_views: (N, 3) metres, from the point to the camera that took the patch.
+        patches: (N, PATCHES, 17, 17) uint8 image patches that sub-pixel registration aligns with.
+        patch_views: (N, PATCHES, 3) metres, from the point to the camera that took each, or NaN.
         observations: (N,) keyframes that observe it.
         visible, found: (N,) frames in which it should have been, and was, matched.
         replaced_by: (N,) the landmark that this one was fused into, -1 for none.
@@ -169,6 +175,41 @@ class LandmarkTable:
         self.alive[ids] = False
         self.in_graph[ids] = False
         self._vacate(np.unique(ids))
+
+    def patch_distances(self, ids: Ints, views: Array, limits: tuple[float, float]) -> Array:
+        """How far (N, PATCHES) patches are from views (N, 3), as shares of the limits.
+
+        The limits are a turn in radians and a factor of distance, of which the larger share
+        counts. Infinite where there is no patch.
+        """
+        max_turn_rad, max_zoom = limits
+        there = self.patch_views[ids]
+        distance_there = np.linalg.norm(there, axis=-1)
+        distance_here = np.linalg.norm(views, axis=-1)[:, None]
+        cosine = np.einsum("nj,nvj->nv", views, there) / (distance_here * distance_there)
+        turn = np.arccos(np.clip(cosine, -1, 1)) / max_turn_rad
+        zoom = np.abs(np.log(distance_here / distance_there)) / np.log(max_zoom)
+        return np.nan_to_num(np.maximum(turn, zoom), nan=np.inf, posinf=np.inf)
+
+    def nearest_patches(
+        self, ids: Ints, centre_world: Array, limits: tuple[float, float]
+    ) -> tuple[NDArray[np.uint8], Array]:
+        """Of every landmark the patch (N, 17, 17) of the view most like that from a camera (3,).
+
+        Also its zoom (N,): how many times larger than in the patch things look from there.
+        """
+        views = centre_world - self.points_world[ids]
+        nearest = self.patch_distances(ids, views, limits).argmin(axis=1)
+        there = self.patch_views.pick(ids, nearest)
+        zooms = np.linalg.norm(there, axis=1) / np.linalg.norm(views, axis=1)
+        return self.patches.pick(ids, nearest), np.nan_to_num(zooms, nan=1.0)
+
+    def put_patches(self, ids: Ints, slots: Ints, patches: NDArray[np.uint8], views: Array) -> None:
+        """Give landmarks (N,), each once, patches (N, 17, 17) and their views (N, 3) in slots."""
+        for column, values in ((self.patches, patches), (self.patch_views, views)):
+            all_slots = column[ids]
+            all_slots[np.arange(len(ids)), slots] = values
+            column[ids] = all_slots
 
     def move_with_hosts(self, ids: Ints, keyframe_ids: Ints, T_old: Array, T_new: Array) -> None:
         """Carry landmarks along with their host keyframes from poses T_old to T_new (K, 4, 4)."""

@@ -3,11 +3,14 @@
 A corner is found to half a pixel at best, and anew in every image. The pose error that this causes
 is why dense alignment beats plain features. Aligning the patch around each match with the
 landmark's own patch (Lucas-Kanade, inverse compositional: Baker and Matthews 2004) leaves a
-fraction of that; benchmarks/keypoint_noise.py measures it where the truth is exact.
+fraction of that; benchmarks/keypoint_noise.py measures it where the truth is exact. The error is
+then no longer drawn anew in every image: all that are aligned with one patch share it. So patches
+are compared at the scale at which things are seen, and are few (``WorldMap.renew_patches``).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +18,8 @@ from numpy.typing import NDArray
 
 from graph.geometry import Array
 
-PATCH_PX = 11  # side of a stored patch; the outermost ring only serves the gradients
-_RADIUS = PATCH_PX // 2
+PATCH_PX = 17  # side of a stored patch: enough of it to be made smaller
+_RADIUS = 5  # of the template; the outermost ring only serves the gradients
 
 
 @dataclass(frozen=True)
@@ -24,9 +27,9 @@ class SubpixelConfig:
     """``sigma_px`` is the standard deviation after registration; the rest are its gates.
 
     A registration counts if it moved the keypoint by less than ``max_shift_px`` times the square
-    root of its scale and the patches then correlate by at least ``min_correlation``. A landmark
-    gets a new patch where it is seen from more than ``max_angle_deg`` off the direction of the old
-    one, or nearer or farther by more than the factor ``max_zoom``.
+    root of its scale and the patches then correlate by at least ``min_correlation``. A patch
+    serves views within ``max_angle_deg`` of the direction of its own, nearer or farther by at most
+    the factor ``max_zoom``; a landmark gets a new one where none of its patches serves.
     """
 
     enabled: bool = True
@@ -35,27 +38,39 @@ class SubpixelConfig:
     max_shift_px: float = 2.0
     min_correlation: float = 0.8
     max_angle_deg: float = 20.0
-    max_zoom: float = 1.3
+    max_zoom: float = 1.5
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """How far from a patch's own view it serves: a turn in radians, a factor of distance."""
+        return math.radians(self.max_angle_deg), self.max_zoom
 
 
 def cut_patches(gray: NDArray[np.uint8], pixels: Array) -> NDArray[np.uint8]:
-    """Patches (M, 11, 11) uint8 around pixels (M, 2), interpolated linearly."""
-    window = np.rint(_sample(gray, pixels, _RADIUS)).astype(np.uint8)
+    """Patches (M, 17, 17) uint8 around pixels (M, 2), interpolated linearly."""
+    window = np.rint(_sample(gray, pixels, PATCH_PX // 2)).astype(np.uint8)
     return np.ascontiguousarray(window.transpose(2, 0, 1))
 
 
 def register_patches(
-    gray: NDArray[np.uint8], pixels: Array, patches: NDArray[np.uint8], iterations: int
+    gray: NDArray[np.uint8],
+    pixels: Array,
+    patches: NDArray[np.uint8],
+    iterations: int,
+    zooms: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Where patches (M, 11, 11) lie in an image near pixels (M, 2).
+    """Where patches (M, 17, 17) lie in an image near pixels (M, 2).
 
-    Each patch is aligned by translation, its brightness and contrast free. Returns the pixels
-    (M, 2) and the correlation (M,) of patch and image there, -1 to 1.
+    Each patch is first magnified by its zoom (M,), 1 without: a corner among other things comes to
+    lie beside its place where the two are not of one scale, every time the same way. Then it is
+    aligned by translation, its brightness and contrast free. Returns the pixels (M, 2) and the
+    correlation (M,) of patch and image there, -1 to 1.
 
     Inside, the patches are the last axis, so that every operation runs along contiguous memory.
     A gradient without its mean does not see the image's, and needs no normalised copy of it.
     """
-    template = patches.transpose(1, 2, 0).astype(np.float32, order="C")
+    zooms = np.ones(len(patches)) if zooms is None else zooms
+    template = _zoomed(patches, zooms)
     half = np.float32(0.5)
     gx = _centred((template[1:-1, 2:] - template[1:-1, :-2]) * half)
     gy = _centred((template[2:, 1:-1] - template[:-2, 1:-1]) * half)
@@ -75,6 +90,27 @@ def register_patches(
         moved -= np.clip(step, -1.0, 1.0)
     image = _centred(_sample(gray, moved, _RADIUS - 1))
     return moved, _dot(image, inner) / _norm(image)
+
+
+def _zoomed(patches: NDArray[np.uint8], zooms: Array) -> NDArray[np.float32]:
+    """The middles (11, 11, M) of patches (M, 17, 17), each magnified about its centre.
+
+    Interpolated linearly; what lies beyond a patch looks like its rim.
+    """
+    at = PATCH_PX // 2 + np.arange(-_RADIUS, _RADIUS + 1)[:, None] / zooms
+    at = np.clip(at, 0, PATCH_PX - 1 - 1e-3)  # (11, M), alike for rows and columns
+    whole = at.astype(np.int64)
+    share = (at - whole).astype(np.float32)
+    first = np.arange(len(patches)) * PATCH_PX**2
+    corner = (first + whole * PATCH_PX)[:, None] + whole
+    values = patches.reshape(-1).astype(np.float32)
+
+    def along_row(start: int) -> NDArray[np.float32]:
+        left = values[start:].take(corner)
+        return left + share * (values[start + 1 :].take(corner) - left)
+
+    top = along_row(0)
+    return top + share[:, None] * (along_row(PATCH_PX) - top)
 
 
 def _centred(values: NDArray[np.float32]) -> NDArray[np.float32]:

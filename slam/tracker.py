@@ -106,7 +106,9 @@ class Tracker:
             features, index, T_world_camera, local_ids, radius, landmarks
         )
         if self.config.subpixel.enabled:
-            features = self._registered(features, matches.train, visible[matches.query], world)
+            features = self._registered(
+                features, matches.train, visible[matches.query], T_world_camera[:3, 3], world
+            )
         estimate = self._optimise(
             features, matches, visible, T_world_camera, landmarks, self._narrow
         )
@@ -129,13 +131,19 @@ class Tracker:
         )
 
     def _registered(
-        self, features: Features, keypoints: Ints, ids: Ints, world: WorldMap
+        self,
+        features: Features,
+        keypoints: Ints,
+        ids: Ints,
+        centre_world: Array,
+        world: WorldMap,
     ) -> Features:
         """The features with the matched keypoints moved to where their landmarks' patches lie."""
         config = self.config.subpixel
         start = features.image_pixels[keypoints]
+        patches, zooms = world.landmarks.nearest_patches(ids, centre_world, config.limits)
         refined, correlation = register_patches(
-            features.gray, start, world.landmarks.patches[ids], config.iterations
+            features.gray, start, patches, config.iterations, zooms
         )
         shift = np.linalg.norm(refined - start, axis=1)
         limit = config.max_shift_px * np.sqrt(features.scales[keypoints])

@@ -200,22 +200,20 @@ class WorldMap:
             del self.culled[next(iter(self.culled))]
 
     def renew_patches(self, keyframe: Keyframe, config: SubpixelConfig) -> None:
-        """Give landmarks the patch of a keyframe that sees them too differently from their own.
+        """Give landmarks a patch of a keyframe that sees them unlike all that they have.
 
-        A patch is kept as long as it serves: every change moves the landmark's image a little.
+        It takes the place of the least similar one. Every new patch moves the landmark's image a
+        little, so one is kept as long as it may serve: where a place is passed again, its
+        landmarks are what they were the first time.
         """
-        landmarks = self.landmarks
+        landmarks, features = self.landmarks, keyframe.features
         rows, ids = self.observed(keyframe)
-        here = keyframe.T_world_camera[:3, 3] - landmarks.points_world[ids]
-        there = landmarks.patch_views[ids]
-        distance_here, distance_there = (np.linalg.norm(v, axis=1) for v in (here, there))
-        cosine = np.einsum("ij,ij->i", here, there) / (distance_here * distance_there)
-        zoom = np.maximum(distance_here / distance_there, distance_there / distance_here)
-        serves = (cosine > np.cos(np.deg2rad(config.max_angle_deg))) & (zoom < config.max_zoom)
-        rows, ids = rows[~serves], ids[~serves]  # a new landmark's view is NaN and never serves
-        features = keyframe.features
-        landmarks.patches[ids] = cut_patches(features.gray, features.image_pixels[rows])
-        landmarks.patch_views[ids] = here[~serves]
+        views = keyframe.T_world_camera[:3, 3] - landmarks.points_world[ids]
+        apart = landmarks.patch_distances(ids, views, config.limits)
+        unlike = np.flatnonzero(apart.min(axis=1) > 1)
+        patches = cut_patches(features.gray, features.image_pixels[rows[unlike]])
+        slots = apart[unlike].argmax(axis=1)
+        landmarks.put_patches(ids[unlike], slots, patches, views[unlike])
 
     def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
         """(shared landmarks, keyframe) of all that share at least a minimum, most shared first."""

@@ -8,6 +8,7 @@ from slam.subpixel import PATCH_PX, cut_patches, register_patches
 
 RNG = np.random.default_rng(3)
 HALF = PATCH_PX // 2
+MIDDLE = np.array([160.0, 120.0])
 
 
 def smooth_spectrum(seed: int) -> np.ndarray:
@@ -18,9 +19,21 @@ def smooth_spectrum(seed: int) -> np.ndarray:
     return np.stack([*waves, rng.uniform(0, 2 * np.pi, 60), rng.uniform(4, 12, 60)], axis=1)
 
 
-def image(shift: tuple[float, float] = (0.0, 0.0), gain: float = 1.0, offset: float = 0.0):
-    """The analytic image (240, 320) uint8, its content moved by ``shift`` (right, down) px."""
-    u, v = np.meshgrid(np.arange(320.0) - shift[0], np.arange(240.0) - shift[1])
+def image(
+    shift: tuple[float, float] = (0.0, 0.0),
+    gain: float = 1.0,
+    offset: float = 0.0,
+    zoom: float = 1.0,
+) -> np.ndarray:
+    """The analytic image (240, 320) uint8, its content moved by ``shift`` (right, down) px.
+
+    After that it is magnified about ``MIDDLE``.
+    """
+    u, v = (
+        (np.arange(n) - m) / zoom + m - s
+        for n, m, s in zip((320.0, 240.0), MIDDLE, shift, strict=True)
+    )
+    u, v = np.meshgrid(u, v)
     value = sum(
         a * np.sin(fx * u + fy * v + phase) for fx, fy, phase, a in smooth_spectrum(1).tolist()
     )
@@ -60,6 +73,33 @@ def test_a_patch_cut_between_pixels_is_found_where_it_was() -> None:
     assert np.sqrt(np.mean((moved - PIXELS) ** 2)) < 0.02
     assert np.abs((moved - PIXELS).mean(axis=0)).max() < 0.01
     assert correlation.min() > 0.98
+
+
+@pytest.mark.parametrize("zoom", [0.72, 0.8, 0.9, 1.1, 1.25, 1.4])
+def test_a_patch_is_found_where_things_look_larger_or_smaller(zoom: float) -> None:
+    """A template of another scale has a bias of its own at every corner."""
+    there = MIDDLE + zoom * (CORNERS - MIDDLE)
+    inside = (np.abs(there - MIDDLE) < MIDDLE - 15).all(axis=1)
+    patches, there = cut_patches(image(), CORNERS[inside]), there[inside]
+    assert len(there) > 20
+    errors = {}
+    for known in (False, True):
+        zooms = np.full(len(there), zoom) if known else None
+        moved, correlation = register_patches(image(zoom=zoom), there, patches, 10, zooms)
+        errors[known] = np.sqrt(np.mean((moved - there) ** 2))
+    assert errors[True] < 0.05
+    assert errors[True] < 0.3 * errors[False]
+    assert correlation.min() > 0.95
+
+
+def test_every_patch_has_its_own_zoom() -> None:
+    zooms = RNG.uniform(0.75, 1.3, len(PIXELS))
+    patches = cut_patches(image(), PIXELS)
+    together = register_patches(image(zoom=1.1), PIXELS, patches, 3, zooms)
+    for k in range(0, len(PIXELS), 7):
+        alone = register_patches(image(zoom=1.1), PIXELS[[k]], patches[[k]], 3, zooms[[k]])
+        np.testing.assert_allclose(together[0][k], alone[0][0], atol=1e-6)
+        np.testing.assert_allclose(together[1][k], alone[1][0], atol=1e-6)
 
 
 def test_patches_are_windows_column_first() -> None:

@@ -227,6 +227,27 @@ def test_images_are_tracked_and_registered_below_a_pixel() -> None:
     assert errors_px[True] < 0.6 * errors_px[False]
 
 
+def test_images_from_nearer_are_registered_as_well() -> None:
+    """The camera comes nearer by a fifth of the way, where a patch still serves."""
+    extractor = BriskExtractor(CAMERA, FeatureConfig())
+    world = WorldMap()
+    features = extractor.extract(render_plane(np.eye(4)))
+    keyframe = add_keyframe(world, np.eye(4), features)
+    good = np.flatnonzero(np.isfinite(features.depth_m))
+    points = CAMERA.backproject(features.pixels[good], features.depth_m[good])
+    world.make_landmarks(keyframe, good, points)
+    world.renew_patches(keyframe, SubpixelConfig())
+    T_nearer = se3_exp(np.array([0.0, 0.0, 0.0, 0.02, -0.01, 0.4]))
+    tracked = track(world, extractor.extract(render_plane(T_nearer, 1)), T_nearer, TrackingConfig())
+    seen = tracked.features.pixels[tracked.keypoints]
+    true = CAMERA.project(
+        transform(inverse(T_nearer), world.landmarks.points_world[tracked.landmark_ids])
+    )
+    registered = tracked.features.sigmas_px[tracked.keypoints, 0] < 0.5
+    assert registered.mean() > 0.7
+    assert np.sqrt(np.mean((seen - true)[registered] ** 2)) < 0.12
+
+
 def test_registration_leaves_the_frames_own_features_alone() -> None:
     extractor = BriskExtractor(CAMERA, FeatureConfig())
     world = WorldMap()

@@ -14,7 +14,8 @@ from synthetic_view import (
 
 from graph.geometry import Array, inverse, se3_exp, transform
 from slam.features import BriskExtractor, FeatureConfig
-from slam.subpixel import SubpixelConfig, cut_patches
+from slam.landmarks import PATCHES
+from slam.subpixel import PATCH_PX, SubpixelConfig, cut_patches
 from slam.world_map import Keyframe, WorldMap
 
 RNG = np.random.default_rng(12)
@@ -175,23 +176,52 @@ def test_patches_are_renewed_only_where_they_no_longer_serve() -> None:
     ids = world.make_landmarks(keyframe, rows, points_of(keyframe, rows))
     world.renew_patches(keyframe, config)
     table = world.landmarks
-    np.testing.assert_array_equal(
-        table.patches[ids], cut_patches(features.gray, features.image_pixels)
-    )
-    np.testing.assert_allclose(table.patch_views[ids], -table.points_world[ids], atol=1e-12)
+    first = cut_patches(features.gray, features.image_pixels)
+    np.testing.assert_array_equal(table.patches[ids][:, 0], first)
+    views = table.patch_views[ids]
+    np.testing.assert_allclose(views[:, 0], -table.points_world[ids], atol=1e-12)
+    assert np.isnan(views[:, 1:]).all()
 
-    table.patch_views[0] = -table.points_world[0] * 1.25  # farther by less than 1.3
-    table.patch_views[1] = -table.points_world[1] * 1.35  # by more
-    table.patch_views[2] = -table.points_world[2] / 1.35
+    def see_from(landmark: int, view: Array) -> None:
+        table.patch_views[landmark] = [view, *[np.full(3, np.nan)] * (PATCHES - 1)]
+
+    see_from(0, -table.points_world[0] * 1.25)  # farther by less than 1.3
+    see_from(1, -table.points_world[1] * 1.35)  # by more
+    see_from(2, -table.points_world[2] / 1.35)
     for landmark, angle_deg in ((3, 18.0), (4, 22.0)):
         axis = np.cross(table.points_world[landmark], [1.0, 0.0, 0.0])
         axis *= np.deg2rad(angle_deg) / np.linalg.norm(axis)
         turn = se3_exp(np.r_[axis, 0, 0, 0])[:3, :3]
-        table.patch_views[landmark] = -turn @ table.points_world[landmark]
-    table.patches[:5] = 0
+        see_from(landmark, -turn @ table.points_world[landmark])
+    before = table.patches[:5].copy()
     world.renew_patches(keyframe, config)
-    renewed = (table.patches[:5] > 0).any(axis=(1, 2))
-    assert renewed.tolist() == [False, True, True, False, True]
+    patches = table.patches[:5]
+    np.testing.assert_array_equal(patches[:, 0], before[:, 0])  # what there was stays
+    taken = np.isfinite(table.patch_views[:5]).all(axis=2).sum(axis=1) - 1
+    assert taken.tolist() == [0, 1, 1, 0, 1]
+    np.testing.assert_array_equal(patches[[1, 2, 4], 1], first[[1, 2, 4]])
+
+
+def test_the_least_similar_patch_makes_room_and_the_most_similar_serves() -> None:
+    """Seen from 1, 2, 4 and 8 times as far, then from half as far: the farthest view leaves."""
+    world = make_world(1)
+    keyframe = world.keyframes[0]
+    ids = world.make_landmarks(keyframe, np.arange(COUNT), points_of(keyframe, np.arange(COUNT)))
+    table, limits = world.landmarks, (0.3, 1.3)
+    for slot, factor in enumerate((8.0, 1.0, 4.0, 2.0)):
+        grey = np.full((COUNT, PATCH_PX, PATCH_PX), int(factor), np.uint8)
+        views = -factor * table.points_world[ids]
+        table.put_patches(ids, np.full(COUNT, slot), grey, views)
+    half = -0.5 * table.points_world[ids]
+    apart = table.patch_distances(ids, half, limits)
+    slow = np.log([16.0, 2.0, 8.0, 4.0]) / np.log(1.3)
+    np.testing.assert_allclose(apart, np.tile(slow, (COUNT, 1)), rtol=1e-6)
+    assert set(apart.argmax(axis=1).tolist()) == {0}
+    for landmark in ids.tolist():
+        centre = table.points_world[landmark] * (1 - 2.6)  # 2.6 times as far
+        patches, zooms = table.nearest_patches(np.array([landmark]), centre, limits)
+        assert (patches == 2).all()
+        np.testing.assert_allclose(zooms, 2 / 2.6)  # things look smaller from there
 
 
 def test_the_map_moves_with_the_world() -> None:
