@@ -13,7 +13,9 @@ def _of(package: str, names: str) -> tuple[str, ...]:
     return tuple(f"{package}/{name}" for name in names.split())
 
 
-METRICS = _of("graph", "metrics.py trajectory.py") + _of("slam", "evaluation/evaluation.py")
+METRICS = _of("graph", "hand_eye.py metrics.py trajectory.py") + _of(
+    "slam", "evaluation/evaluation.py"
+)
 SMOOTHER = _of(
     "graph",
     "admission.py archive.py camera.py covariances.py factors.py gates.py geometry.py holding.py "

@@ -26,6 +26,7 @@ from graph.calibration_problem import (
     CalibrationState,
     anchor_rms,
     anchor_terms,
+    body_arm,
     prior_residuals,
 )
 from graph.geometry import Array, se3_exp
@@ -54,6 +55,7 @@ class CalibrationResult:
         poses_world_camera: (K, 4, 4); points_world: (L, 3).
         noise_scales: (2,) how many times the nominal sigmas of pixels and of depths the
             residuals are.
+        body_arm_m: (3,) where in the camera's frame the body of the anchors' positions sits.
         anchor_rms_m: RMS of what anchors and result differ by, NaN without any.
         inlier_share: of the views' measurements within 3 of those sigmas.
         converged: whether the last step was negligible.
@@ -64,6 +66,7 @@ class CalibrationResult:
     poses_world_camera: Array
     points_world: Array
     noise_scales: Array
+    body_arm_m: Array
     anchor_rms_m: float
     inlier_share: float
     converged: bool
@@ -93,6 +96,7 @@ def calibrate(
         poses_world_camera=state.poses,
         points_world=state.points,
         noise_scales=scales,
+        body_arm_m=body_arm(problem.anchors, state.poses) if problem.anchors else np.zeros(3),
         anchor_rms_m=anchor_rms(problem, state),
         inlier_share=float((e2[lin.valid[:, 1:]] < 9).mean()),
         converged=converged,

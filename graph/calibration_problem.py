@@ -20,6 +20,8 @@ class Anchors:
     Attributes:
         positions_world: (K, 3) of the keyframes, NaN where unknown.
         position_sigma_m: their standard deviation.
+        on_body: they are not the camera's, but those of a body fixed to it, such as markers, whose
+            place in the camera's frame is to be found.
         ends: (D, 2) pairs of keyframes between which a distance was measured,
         arms_m: (D, 2, 3) the points in those keyframes' frames at which it was,
         distances_m: (D,) the distances, and
@@ -28,6 +30,7 @@ class Anchors:
 
     positions_world: Array
     position_sigma_m: float = 0.01
+    on_body: bool = False
     ends: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     arms_m: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
     distances_m: Array = field(default_factory=lambda: np.zeros(0))
@@ -108,11 +111,7 @@ def anchor_terms(problem: CalibrationProblem, state: CalibrationState) -> tuple[
     K, anchors = len(state.poses), problem.anchors
     if anchors is None:
         return np.zeros(0), np.zeros((0, 6 * K))
-    known = np.flatnonzero(np.isfinite(anchors.positions_world).all(axis=1))
-    R, t = state.poses[:, :3, :3], state.poses[:, :3, 3]
-    r = (t[known] - anchors.positions_world[known]) / anchors.position_sigma_m
-    J = np.zeros((len(known), 3, K, 6))
-    J[np.arange(len(known)), :, known, 3:] = R[known] / anchors.position_sigma_m
+    r, J = _position_terms(anchors, state.poses)
     ends = transform_each(state.poses[anchors.ends], anchors.arms_m)
     between = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(between, axis=1)
@@ -124,9 +123,39 @@ def anchor_terms(problem: CalibrationProblem, state: CalibrationState) -> tuple[
         by_tangent = np.concatenate(
             [-skew(anchors.arms_m[:, end]), np.broadcast_to(np.eye(3), (len(k), 3, 3))], axis=2
         )
-        J_d[rows, k] += sign * np.einsum("di,dij->dj", unit, R[k] @ by_tangent)
+        turned = state.poses[k, :3, :3] @ by_tangent
+        J_d[rows, k] += sign * np.einsum("di,dij->dj", unit, turned)
     r_d = (length - anchors.distances_m) / anchors.distance_sigma_m
-    return np.r_[r.ravel(), r_d], np.concatenate([J.reshape(-1, 6 * K), J_d.reshape(-1, 6 * K)])
+    return np.r_[r, r_d], np.concatenate([J, J_d.reshape(-1, 6 * K)])
+
+
+def _position_terms(anchors: Anchors, poses: Array) -> tuple[Array, Array]:
+    """Whitened residuals (A,) of the positions and their derivatives (A, 6K).
+
+    A body's place is eliminated: residuals and derivatives are those at its best place, without
+    the part that another place would take (variable projection, Kaufman, BIT 1975).
+    """
+    known = np.flatnonzero(np.isfinite(anchors.positions_world).all(axis=1))
+    R, sigma = poses[known, :3, :3], anchors.position_sigma_m
+    r = ((poses[known, :3, 3] - anchors.positions_world[known]) / sigma).ravel()
+    J = np.zeros((len(known), 3, len(poses), 6))
+    J[np.arange(len(known)), :, known, 3:] = R / sigma
+    flat = J.reshape(len(r), 6 * len(poses))
+    if not anchors.on_body:
+        return r, flat
+    arm_m = body_arm(anchors, poses)
+    J[np.arange(len(known)), :, known, :3] = -R @ skew(arm_m) / sigma
+    by_arm = R.reshape(-1, 3)
+    return r + by_arm @ arm_m / sigma, flat - by_arm @ (by_arm.T @ flat) / len(known)
+
+
+def body_arm(anchors: Anchors, poses: Array) -> Array:
+    """Where (3,) in the camera's frame the body whose positions are known sits; 0 for its own."""
+    if not anchors.on_body:
+        return np.zeros(3)
+    known = np.isfinite(anchors.positions_world).all(axis=1)
+    T_camera_world = inverse(poses[known])
+    return transform_each(T_camera_world, anchors.positions_world[known]).mean(axis=0)
 
 
 def transform_each(T: Array, points: Array) -> Array:

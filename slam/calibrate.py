@@ -78,6 +78,7 @@ class CalibrateOptions:
         out: camera.yaml to write; None: into the run folder.
         sequence: of the run; None: the one that its config.yaml names.
         reference: TUM file or sequence folder with the camera's positions in metres.
+        on_body: they are those of a body fixed to the camera, whose place is found too.
         known_distance: two stamps in seconds and how many metres apart the camera then was.
         anchor_sigma_m: standard deviation of these positions and of that distance.
         fixed: names of PARAMETERS that keep their values.
@@ -89,6 +90,7 @@ class CalibrateOptions:
     out: Path | None = None
     sequence: Path | None = None
     reference: Path | None = None
+    on_body: bool = False
     known_distance: tuple[float, float, float] | None = None
     anchor_sigma_m: float = 0.01
     fixed: tuple[str, ...] = ()
@@ -145,6 +147,8 @@ def _check(options: CalibrateOptions, out: Path) -> None:
     for name in options.fixed:
         if name not in PARAMETERS:
             raise InputError(f"--fix {name}: is no parameter; they are {', '.join(PARAMETERS)}")
+    if options.on_body and options.reference is None:
+        raise InputError("--hand-eye: finds where the reference sits; give it as --reference")
     if not options.anchor_sigma_m > 0:
         raise InputError(f"--anchor-sigma {options.anchor_sigma_m}: must be positive metres")
 
@@ -182,7 +186,8 @@ def make_problem(
         positions, T_reference_world = _reference_positions(options.reference, stamps, poses)
         poses, points = T_reference_world @ poses, transform(T_reference_world, points)
         gauge = FREE_SIGMAS
-    anchors = Anchors(positions, options.anchor_sigma_m, distance_sigma_m=options.anchor_sigma_m)
+    sigma_m = options.anchor_sigma_m
+    anchors = Anchors(positions, sigma_m, options.on_body, distance_sigma_m=sigma_m)
     if options.known_distance is not None:
         anchors = _with_distance(anchors, options.known_distance, run, stamps, keyframe_ids)
     sigmas = options.priors.sigmas(run.camera)

@@ -124,6 +124,11 @@ def _statements(done: Calibrated) -> list[str]:
             "The depth scale is not observable: images and depths fit a world of any size equally "
             "well. It keeps its value; with --reference or --known-distance it is estimated."
         )
+    if done.result.body_arm_m.any():
+        x, y, z = 1e3 * done.result.body_arm_m
+        lines.append(
+            f"The reference is of a point ({x:.0f}, {y:.0f}, {z:.0f}) mm in the camera's frame."
+        )
     for i, name in enumerate(PARAMETERS):
         share = _share(done, i)
         if share <= WEAK or (i == FACTOR and not done.has_anchor):

@@ -114,6 +114,8 @@ def _add_evaluate(commands: _Commands) -> None:
     parser.add_argument("--json", action="store_true", help="print the rows as JSON")
     parser.add_argument("--plot", type=Path, metavar="F", help="write the picture (png, pdf, svg)")
     parser.add_argument("--with-scale", action="store_true", help="align with Sim(3): monocular")
+    text = "the reference is of another body on the camera, as markers or an IMU: find its place"
+    parser.add_argument("--hand-eye", action="store_true", help=text)
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
@@ -127,6 +129,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
             arguments.plot,
             arguments.with_scale,
             arguments.times,
+            arguments.hand_eye,
         )
     print(format_json(result.rows) if arguments.json else format_table(result.rows))
     return 0

@@ -36,6 +36,11 @@ def add_calibrate(commands: _Commands) -> None:
         help="TUM trajectory in metres, or sequence with one",
     )
     parser.add_argument(
+        "--hand-eye",
+        action="store_true",
+        help="the reference is of another body on the camera, as markers or an IMU: find its place",
+    )
+    parser.add_argument(
         "--known-distance",
         type=float,
         nargs=3,
@@ -63,6 +68,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         out=arguments.out,
         sequence=arguments.sequence,
         reference=arguments.reference,
+        on_body=arguments.hand_eye,
         known_distance=tuple(known) if known else None,
         anchor_sigma_m=arguments.anchor_sigma,
         fixed=tuple(arguments.fix),

@@ -12,7 +12,8 @@ from typing import TypedDict
 import numpy as np
 
 from graph.errors import InputError
-from graph.geometry import Array
+from graph.geometry import Array, so3_log
+from graph.hand_eye import body_trajectory, hand_eye
 from graph.metrics import (
     AbsoluteError,
     RelativeError,
@@ -110,15 +111,21 @@ def evaluate(
     plot: Path | None = None,
     with_scale: bool = False,
     times: Path | None = None,
+    with_body: bool = False,
 ) -> EvaluationResult:
     """Evaluate a run folder or a trajectory against a trajectory or a sequence folder.
 
     Trajectories are in the format of TUM, EuRoC or KITTI. The latter's stamps are those of the file
-    ``times``, or of the run's frames.
+    ``times``, or of the run's frames. ``with_body`` takes the reference's poses for those of
+    another body, such as markers or an IMU, finds where it sits on the camera, and compares its
+    path.
 
     Raises:
-        InputError: a file that is missing or broken, or trajectories that share no time.
+        InputError: a file that is missing or broken, trajectories that share no time, or a body on
+            a camera that does not turn or whose scale is unknown.
     """
+    if with_body and with_scale:
+        raise InputError("--hand-eye with --with-scale: a body's place needs metres; leave one out")
     run_or_trajectory, reference = Path(run_or_trajectory), Path(reference)
     file = _file_in(run_or_trajectory, "trajectory.txt", "a run folder or a trajectory file")
     truth_file = _reference_file(reference)
@@ -127,7 +134,12 @@ def evaluate(
     estimate, truth = (read_trajectory(path, stamps_s) for path in (file, truth_file))
     frames = None if frames_s is None else len(frames_s)
     try:
+        body: list[Row] = []
+        if with_body:
+            T_camera_body = hand_eye(*associate(estimate, truth))
+            estimate, body = body_trajectory(estimate, T_camera_body), _body_rows(T_camera_body)
         result = evaluate_trajectory(estimate, truth, frames, with_scale)
+        result.rows.extend(body)
     except InputError as error:
         raise InputError(f"{file} against {truth_file}: {error}") from error
     if plot is not None:
@@ -202,6 +214,14 @@ def _relative_rows(step: str, error: RelativeError | None) -> list[Row]:
         _row(f"rpe_trans_rmse_{step}", error.translation_m.rmse, "m"),
         _row(f"rpe_rot_rmse_{step}", degrees, "deg"),
     ]
+
+
+def _body_rows(T_camera_body: Array) -> list[Row]:
+    """Where the reference's body sits on the camera."""
+    names = ("body_x", "body_y", "body_z")
+    rows = [_row(name, float(t), "m") for name, t in zip(names, T_camera_body[:3, 3], strict=True)]
+    angle_rad = np.linalg.norm(so3_log(T_camera_body[:3, :3]))
+    return [*rows, _row("body_angle", float(np.rad2deg(angle_rad)), "deg")]
 
 
 def _coverage_rows(estimate: Trajectory, reference: Trajectory, matched: Trajectory) -> list[Row]:

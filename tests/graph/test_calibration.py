@@ -12,7 +12,12 @@ from graph.calibration import calibrate
 from graph.calibration_covariance import _clustered_variance
 from graph.calibration_equations import normal_equations
 from graph.calibration_model import FACTOR, OFFSET, PARAMETERS, TIME, linearise
-from graph.calibration_problem import Anchors, CalibrationProblem, CalibrationState
+from graph.calibration_problem import (
+    Anchors,
+    CalibrationProblem,
+    CalibrationState,
+    anchor_terms,
+)
 from graph.geometry import Array, se3_exp
 
 START = TRUTH + np.array([15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010])
@@ -91,13 +96,64 @@ def test_without_an_anchor_the_scale_keeps_its_prior_and_all_else_is_found() -> 
     assert np.abs(result.calibration - TRUTH)[:4].max() < 0.5
 
 
+ARM_M = np.array([0.05, 0.16, -0.11])
+
+
+def on_body(problem: CalibrationProblem, poses: Array, sigma_m: float) -> CalibrationProblem:
+    """The problem anchored at a body's positions in place of the camera's."""
+    body = poses.copy()
+    body[:, :3, 3] += poses[:, :3, :3] @ ARM_M
+    problem = anchored(problem, body, sigma_m)
+    return dataclasses.replace(problem, anchors=dataclasses.replace(problem.anchors, on_body=True))
+
+
+def test_an_anchor_on_another_body_tells_scale_and_place() -> None:
+    problem, poses, _ = make_problem(start=START)
+    problem = on_body(problem, poses, 1e-4)
+    result = calibrate(problem)
+    np.testing.assert_allclose(result.body_arm_m, ARM_M, atol=1e-3)
+    assert result.anchor_rms_m < 2e-4
+    assert result.calibration[FACTOR] == pytest.approx(TRUTH[FACTOR], abs=1e-3)
+    taken_for_camera = dataclasses.replace(problem.anchors, on_body=False)
+    wrong = calibrate(dataclasses.replace(problem, anchors=taken_for_camera))
+    errors_px = [np.abs(r.calibration - TRUTH)[:4].max() for r in (result, wrong)]
+    assert errors_px[0] < 0.1 < 2 < errors_px[1]
+    # Its place is one more unknown: the scale is told less surely than by the camera's positions.
+    sigmas = [
+        np.sqrt(
+            calibrate(anchor(make_problem(start=START)[0], poses, 0.01)).covariance[FACTOR, FACTOR]
+        )
+        for anchor in (on_body, anchored)
+    ]
+    assert sigmas[0] > 1.05 * sigmas[1]
+
+
+def test_derivatives_of_a_body_s_positions_at_its_best_place() -> None:
+    problem, poses, points = make_problem(keyframes=5, points=40)
+    problem, h = on_body(problem, poses, 0.01), 1e-6
+    start = poses @ se3_exp(0.02 * np.random.default_rng(3).standard_normal((5, 6)))
+
+    def terms(xi: Array) -> tuple[Array, Array]:
+        state = CalibrationState(start @ se3_exp(xi.reshape(5, 6)), points, TRUTH)
+        return anchor_terms(problem, state)
+
+    r, J = terms(np.zeros(30))
+    steps = h * np.eye(30)
+    costs = [[0.5 * float(terms(x)[0] @ terms(x)[0]) for x in (-step, step)] for step in steps]
+    np.testing.assert_allclose(J.T @ r, np.diff(costs)[:, 0] / (2 * h), rtol=1e-4, atol=1e-3)
+
+
 def test_one_known_distance_is_an_anchor() -> None:
     problem, poses, _ = make_problem(start=START)
     arms = np.array([[[0.02, 0.01, 0.03], [-0.01, 0.0, 0.05]]])
     ends = np.einsum("eij,ej->ei", poses[[1, 9], :3, :3], arms[0]) + poses[[1, 9], :3, 3]
     distance = np.linalg.norm(ends[1] - ends[0])
     anchors = Anchors(
-        np.full((len(poses), 3), np.nan), 0.01, np.array([[1, 9]]), arms, np.array([distance]), 1e-3
+        np.full((len(poses), 3), np.nan),
+        ends=np.array([[1, 9]]),
+        arms_m=arms,
+        distances_m=np.array([distance]),
+        distance_sigma_m=1e-3,
     )
     result = calibrate(dataclasses.replace(problem, anchors=anchors))
     assert result.calibration[FACTOR] == pytest.approx(TRUTH[FACTOR], abs=1e-3)

@@ -173,3 +173,26 @@ def test_view_plane_is_the_plane_of_motion():
 def test_published_figures(estimate, reference, ate_cm):
     result = evaluate(SHARED / estimate, SHARED / reference)
     assert 100 * result.value("ate_rmse") == pytest.approx(ate_cm, abs=0.006)
+
+
+def test_a_reference_of_another_body(tmp_path: Path):
+    """An IMU beside the camera, with axes of its own: its place is found and its path compared."""
+    wobble = 0.3 * np.sin(np.outer(np.arange(300) / 30, [1.1, 1.7, 2.3]))
+    level = arc()
+    turned = level.poses_world_camera @ make_pose(so3_exp(wobble), np.zeros((300, 3)))
+    camera = Trajectory(level.timestamps_s, turned)
+    T_camera_imu = make_pose(so3_exp(np.array([0.0, 1.5, 0.0])), np.array([0.08, 0.0, -0.12]))
+    imu = Trajectory(camera.timestamps_s, camera.poses_world_camera @ T_camera_imu)
+    write_tum(tmp_path / "camera.txt", shaken(camera, 0.002))
+    write_tum(tmp_path / "imu.txt", imu)
+    both = (tmp_path / "camera.txt", tmp_path / "imu.txt")
+    alone = evaluate(*both)
+    found = evaluate(*both, plot=tmp_path / "plot.png", with_body=True)
+    assert alone.value("rpe_trans_rmse_second") > 0.05
+    assert found.value("rpe_trans_rmse_second") < 0.008
+    assert found.value("ate_rmse") < 0.008 and (tmp_path / "plot.png").is_file()
+    place_m = [found.value(f"body_{axis}") for axis in "xyz"]
+    np.testing.assert_allclose(place_m, [0.08, 0.0, -0.12], atol=0.004)
+    assert found.value("body_angle") == pytest.approx(np.rad2deg(1.5), abs=0.3)
+    with pytest.raises(InputError, match="--hand-eye with --with-scale"):
+        evaluate(*both, with_scale=True, with_body=True)

@@ -1,0 +1,62 @@
+"""Where the body whose poses a reference holds sits on the camera (hand-eye calibration).
+
+Motion capture follows markers, EuRoC's reference an IMU, another program its own sensor: such a
+body is fixed to the camera, but is not it, and every turn of the camera moves it in its own way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from graph.errors import InputError
+from graph.geometry import Array, inverse, make_pose, se3_exp, so3_log
+from graph.metrics import time_pairs
+from graph.trajectory import Trajectory
+
+MIN_TURN_RAD = 0.05
+ARM_M = 1.0
+"""An error of 1 rad counts as one of so many metres."""
+HELD = 1e-3
+"""Weight that keeps what no motion shows at zero."""
+
+
+def hand_eye(estimate: Trajectory, reference: Trajectory) -> Array:
+    """T_camera_body (4, 4) that brings the motions of camera and body nearest to each other.
+
+    Poses of the same index belong together. Over all pairs a second apart, with the motions A of
+    the camera and B of the body, ``A X = X B`` (Tsai and Lenz, T-RA 1989) is solved for X: the
+    rotation first, from the rotation vectors, which X turns (Park and Martin, T-RA 1994), then all
+    of X by least squares over ``B^-1 X^-1 A X``, the relative pose error. About one axis only, the
+    part of the offset along it shows in no motion and stays zero.
+
+    Raises:
+        InputError: the camera hardly turns in any second.
+    """
+    i, j = time_pairs(estimate.timestamps_s)
+    P, Q = estimate.poses_world_camera, reference.poses_world_camera
+    A, B = inverse(P[i]) @ P[j], inverse(Q[i]) @ Q[j]
+    turns_a, turns_b = so3_log(A[:, :3, :3]), so3_log(B[:, :3, :3])
+    most_rad = np.linalg.norm(turns_a, axis=1).max(initial=0.0)
+    if most_rad < MIN_TURN_RAD:
+        raise InputError(
+            f"in {len(i)} pairs of poses a second apart the camera turns by at most "
+            f"{np.rad2deg(most_rad):.2f} degrees: where the reference's body sits cannot be seen; "
+            "evaluate without --hand-eye"
+        )
+    U, _, Vt = np.linalg.svd(turns_a.T @ turns_b)
+    no_reflection = np.array([1.0, 1.0, np.linalg.det(U @ Vt)])
+    start = make_pose((U * no_reflection) @ Vt, np.zeros(3))
+
+    def residuals(xi: Array) -> Array:
+        X = start @ se3_exp(xi)
+        E = inverse(B) @ inverse(X) @ A @ X
+        e = np.concatenate([E[:, :3, 3], ARM_M * so3_log(E[:, :3, :3])])
+        return np.concatenate([e.ravel(), HELD * xi[3:]])
+
+    return start @ se3_exp(least_squares(residuals, np.zeros(6)).x)
+
+
+def body_trajectory(camera: Trajectory, T_camera_body: Array) -> Trajectory:
+    """The trajectory of a body that is fixed to the camera, in the same world frame."""
+    return Trajectory(camera.timestamps_s, camera.poses_world_camera @ T_camera_body)
