@@ -31,7 +31,9 @@ ODOMETRY = _of(
     "system.py system_config.py tracker.py triangulation.py world_map.py",
 )
 POSE_GRAPHS = _of("graph", "pose_graph*.py graduation.py g2o.py g2o_lines.py")
-CALIBRATION = _of("graph", "calibration*.py") + _of("slam", "calibrate.py calibration_views.py")
+CALIBRATION = _of("graph", "calibration*.py") + _of(
+    "slam", "calibrate.py calibration_rounds.py calibration_views.py"
+)
 STATE = _of("graph", "archive_storage.py array_file.py storage.py") + _of(
     "slam", "checkpoint.py map_state.py run_options.py saved_run.py"
 )

@@ -105,8 +105,7 @@ def calibrate_run(options: CalibrateOptions) -> Calibrated:
         InputError: a run, sequence or reference that is missing, broken or too small, an unknown
             parameter, or an output that is there already.
     """
-    out = options.out or options.run / "camera.yaml"
-    _check(options, out)
+    out = refuse_early(options)
     run = read_run(options.run)
     sequence = open_sequence(options.sequence or sequence_of(options.run), camera=run.camera)
     problem, _ = make_problem(options, run, sequence)
@@ -138,8 +137,13 @@ def _with_rate_error(result: CalibrationResult) -> CalibrationResult:
     return dataclasses.replace(result, covariance=covariance)
 
 
-def _check(options: CalibrateOptions, out: Path) -> None:
-    """What would fail after the work is refused before it."""
+def refuse_early(options: CalibrateOptions) -> Path:
+    """The file to write; what would fail after the work is refused before it.
+
+    Raises:
+        InputError: the file is there, its folder is not, or an option that cannot be.
+    """
+    out = options.out or options.run / "camera.yaml"
     if out.exists() and not options.overwrite:
         raise InputError(f"{out}: is there already; choose another --out or add --overwrite")
     if not out.parent.is_dir():
@@ -151,6 +155,7 @@ def _check(options: CalibrateOptions, out: Path) -> None:
         raise InputError("--hand-eye: finds where the reference sits; give it as --reference")
     if not options.anchor_sigma_m > 0:
         raise InputError(f"--anchor-sigma {options.anchor_sigma_m}: must be positive metres")
+    return out
 
 
 def sequence_of(run: Path) -> Path:

@@ -13,8 +13,9 @@ MORE = """\
 Focal lengths, principal point, distortion, depth offset and the time between colour and depth are
 estimated together with all poses and landmarks, each with its 95 % bounds; what the motion did not
 show is named. The depth scale needs something metric from outside: --reference, the camera's
-positions by motion capture or odometry, or --known-distance. Use the result with
-"bmask-slam run SEQUENCE --camera RUN/camera.yaml"."""
+positions by motion capture or odometry, or --known-distance. What a run with a wrong camera has
+matched leans toward that camera: --rounds 2 runs the sequence again with the camera found and
+calibrates that run. Use the result with "bmask-slam run SEQUENCE --camera RUN/camera.yaml"."""
 
 
 def add_calibrate(commands: _Commands) -> None:
@@ -54,12 +55,16 @@ def add_calibrate(commands: _Commands) -> None:
         "--fix", action="append", default=[], metavar="NAME", help="keep a parameter, such as k1"
     )
     parser.add_argument("--k3", action="store_true", help="estimate k3 too")
+    parser.add_argument(
+        "--rounds", type=int, default=1, metavar="N", help="calibrate N times (default: 1)"
+    )
     parser.add_argument("--quiet", action="store_true", help="print only the file's path")
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from slam.calibrate import CalibrateOptions, CalibrationPriors, calibrate_run
+    from slam.calibrate import CalibrateOptions, CalibrationPriors
     from slam.calibration_report import format_calibration
+    from slam.calibration_rounds import calibrate_in_rounds
     from slam.progress import console_log
 
     known = arguments.known_distance
@@ -76,6 +81,6 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         overwrite=arguments.overwrite,
     )
     with console_log():
-        done = calibrate_run(options)
+        done = calibrate_in_rounds(options, arguments.rounds, arguments.quiet)
     print(done.path if arguments.quiet else f"{format_calibration(done)}\n\nCamera  {done.path}")
     return 0

@@ -17,6 +17,7 @@ from slam.calibrate import CalibrateOptions, calibrate_run, sequence_of
 from slam.calibration_report import format_calibration
 from slam.calibration_views import raw_pixels, smooth_value
 from slam.features import undistort
+from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.sequences import open_sequence, read_camera, write_camera
 
 TRUTH = Camera(320, 240, 262.0, 260.0, 158.0, 121.0, depth_scale=5000.0, depth_offset_m=0.015)
@@ -143,3 +144,30 @@ def test_the_sequence_of_a_run_is_named_by_its_configuration(made, tmp_path) -> 
     (tmp_path / "config.yaml").write_text("# bmask-slam 0.1.0, sequence /nowhere, stride 2\n")
     with pytest.raises(InputError, match="names '/nowhere', which is not there; give the folder"):
         sequence_of(tmp_path)
+
+
+def test_two_rounds_run_again_with_the_camera_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On rendered images, with focal lengths 3 % off: nothing but the camera.yaml is left over."""
+    sequence, run = tmp_path / "office", tmp_path / "run"
+    config = RenderConfig("office", 36, fps=10.0, width=320, height=240, sweeping=True)
+    render_sequence(config, sequence)
+    truth = read_camera(sequence / "camera.yaml")
+    wrong = dataclasses.replace(truth, fx=truth.fx * 1.03, fy=truth.fy * 1.03)
+    write_camera(tmp_path / "wrong.yaml", wrong)
+    options = ["--camera", str(tmp_path / "wrong.yaml"), "--segmenter", "none", "--quiet"]
+    assert cli.main(["run", str(sequence), *options, "--out", str(run)]) == 0
+    before = sorted(path.name for path in run.iterdir())
+    assert cli.main(["calibrate", str(run), "--reference", str(sequence), "--rounds", "0"]) == 1
+    assert "--rounds 0: must be a whole number" in capsys.readouterr().err
+    calibrate = ["calibrate", str(run), "--reference", str(sequence), "--quiet"]
+    assert cli.main([*calibrate, "--out", str(tmp_path / "one.yaml")]) == 0
+    assert cli.main([*calibrate, "--rounds", "2"]) == 0
+    assert sorted(path.name for path in run.iterdir()) == sorted([*before, "camera.yaml"])
+    text = (run / "camera.yaml").read_text()
+    assert f"{wrong.fx:.2f}" in text.split("after")[1].splitlines()[1]  # before: the first run's
+    found = [read_camera(path) for path in (tmp_path / "one.yaml", run / "camera.yaml")]
+    assert found[0] != found[1]
+    for camera in found:
+        assert camera.fx == pytest.approx(truth.fx, rel=0.01)
