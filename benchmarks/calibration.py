@@ -5,8 +5,10 @@
 Renders an office with a sweeping camera and late depth, runs on it with focal lengths and depth
 scale 3 % off, the principal point 6 px off and the delay unknown, calibrates (reference: the exact
 trajectory), runs again with the camera that was found, calibrates and runs once more. Then the red
-kitchen, whose camera is an estimate: without a reference, since its own comes from another
-program's depth scale. Tables in Markdown.
+kitchen, whose camera is an estimate. Its reference is of another program that tracked depth images
+alone, and follows a point beside the camera (see kitchen_reference.py): calibrated and compared
+with the place of that point found too (``--hand-eye``), over some runs that differ by their number
+of keypoints. Tables in Markdown.
 """
 
 from __future__ import annotations
@@ -22,11 +24,14 @@ from graph.calibration_model import PARAMETERS, parameters_of
 from graph.camera import Camera
 from slam.calibrate import CalibrateOptions, calibrate_run
 from slam.calibration_report import NORMAL_95, Calibrated, format_calibration
+from slam.configuration import resolve
 from slam.evaluation import evaluate
 from slam.rendering.sequence import RenderConfig, render_sequence
 from slam.runner import RunOptions, run
 from slam.sequences import read_camera, write_camera
+from slam.system_config import SystemConfig
 
+KEYPOINTS = (800, 825, 850, 875, 900)
 KITCHEN = Path(__file__).resolve().parents[1] / "../shared/data/redkitchen"
 DELAY_S = 0.010
 FOCAL_SHARE, CENTRE_PX, DEPTH_SHARE = 0.03, 6.0, 0.03
@@ -81,11 +86,36 @@ def main() -> None:
 def kitchen(sequence: Path, out: Path) -> None:
     """Print what is found of a real camera, and the errors before and after."""
     write_camera(out / "given.yaml", read_camera(sequence / "camera.yaml"))
-    errors = {"given": errors_of(sequence, out, "given")}
-    done = calibrate_run(CalibrateOptions(out / "given", out / "calibrated.yaml", overwrite=True))
-    errors["calibrated"] = errors_of(sequence, out, "calibrated")
-    print(f"\nRed kitchen, without a reference:\n\n{format_calibration(done)}\n")
-    print(table_of_errors(errors))
+    errors_of(sequence, out, "given")
+    options = CalibrateOptions(
+        out / "given", out / "calibrated.yaml", reference=sequence, on_body=True, overwrite=True
+    )
+    done = calibrate_run(options)
+    print(f"\nRed kitchen, reference of a point beside the camera:\n\n{format_calibration(done)}\n")
+    print("Mean of the runs and its standard error:\n")
+    print("| camera, reference of | " + " | ".join(ERRORS.values()) + " |")
+    print("|" + " --- |" * (1 + len(ERRORS)))
+    for camera in ("given", "calibrated"):
+        runs = [repeated(sequence, out, camera, keypoints) for keypoints in KEYPOINTS]
+        for title, with_body in (("the camera", False), ("a point beside it", True)):
+            rows = [evaluate(path, sequence, with_body=with_body) for path in runs]
+            values = np.array([[row.value(name) for name in ERRORS] for row in rows])
+            spread = values.std(axis=0, ddof=1) / np.sqrt(len(runs))
+            pairs = zip(values.mean(axis=0), spread, strict=True)
+            cells = " | ".join(f"{mean:.4f} ± {sigma:.4f}" for mean, sigma in pairs)
+            print(f"| {camera}, {title} | {cells} |", flush=True)
+
+
+def repeated(sequence: Path, out: Path, camera: str, keypoints: int) -> Path:
+    """A run with that camera and at most so many keypoints a frame."""
+    config = resolve(SystemConfig, None, (f"features.max_keypoints={keypoints}",))
+    path = out / f"{camera}-{keypoints}"
+    run(
+        RunOptions(
+            sequence, config, camera=out / f"{camera}.yaml", out=path, overwrite=True, quiet=True
+        )
+    )
+    return path
 
 
 def spoiled(truth: Camera) -> Camera:
