@@ -62,6 +62,10 @@ REPORTS = {
             "kill_and_resume.py {sequences}/office-300 --every 30 --kills 10 --max-frames 150",
         ),
         "calibration": ("Self-calibration", "calibration.py --out {sequences}/calibration"),
+        "kitchen-reference": (
+            "The red kitchen's reference, judged by its images",
+            "kitchen_reference.py {sequences}/calibration/given",
+        ),
         "covariances": (
             "How honest the covariances are",
             "covariances.py --runs 200 --sequence {sequences}/living_room",
@@ -101,6 +105,10 @@ REPORTS = {
             "The same with other people",
             "dynamic.py --sequences {sequences} --segmenter light --seed 7 "
             "--out {sequences}/dynamic-again",
+        ),
+        "people": (
+            "Three rooms full of people, three runs each",
+            "dynamic_seeds.py --sequences {sequences} --seeds 6,7,8",
         ),
         "harm": (
             "What the semantics cost where nothing moves",
