@@ -6,7 +6,9 @@ Between keyframes that are 0.3 to 1.6 s apart, the keypoints that a run matched 
 other's epipolar lines. Their Sampson distances (Hartley and Zisserman, eq. 11.9) are computed with
 the run's poses and with the reference's, each with the camera and with the point beside the camera
 that fit these poses best. Then ATE and RPE against the reference, taken for the camera's poses and
-for those of a point beside it (``bmask-slam evaluate --hand-eye``).
+for those of a point beside it (``bmask-slam evaluate --hand-eye``), of the run and of an estimate
+that shares nothing with it: Open3D's odometry from frame to frame. Were the point an error of the
+run, another system would not find the same.
 """
 
 from __future__ import annotations
@@ -15,20 +17,24 @@ import argparse
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
+from report import table
 from scipy.optimize import least_squares
 
 from graph.calibration_model import CalibrationViews
 from graph.geometry import Array, inverse, se3_exp, skew
-from graph.trajectory import associate, nearest_indices, read_tum
+from graph.trajectory import Trajectory, associate, nearest_indices, read_tum, write_tum
+from mapping.open3d_loader import load_open3d
 from slam.calibrate import CalibrateOptions, make_problem
 from slam.evaluation import evaluate
 from slam.saved_run import read_run
-from slam.sequences import open_sequence
+from slam.sequences import Sequence, open_sequence
 
 KITCHEN = Path(__file__).resolve().parents[1] / "../shared/data/redkitchen"
+MAX_DEPTH_M = 8.0
 APART_S, MIN_MATCHES = (0.3, 1.6), 15
 CAMERA_STEPS = np.array([5.0, 5, 5, 5, 0.05, 0.05, 0.002, 0.002])
 PLACE_STEPS = np.array([0.02] * 3 + [0.05] * 3)
@@ -109,8 +115,7 @@ def main() -> None:
     at = nearest_indices(estimate.timestamps_s, stamps_s)
     camera = problem.calibration[:8]
     print(f"{len(matches.first)} matches; Sampson distance, median [px]\n")
-    print("| poses | with the run's camera | the best camera | and the best point beside it |")
-    print("|" + " --- |" * 4)
+    rows = []
     for name, trajectory in (("run", estimate), ("reference", reference)):
         poses = trajectory.poses_world_camera[at]
         tried = [(camera, np.zeros(6))]
@@ -119,14 +124,47 @@ def main() -> None:
             np.median(np.abs(sampson_px(matches, poses @ se3_exp(place), fitted)))
             for fitted, place in tried
         )
-        print(f"| {name} | " + " | ".join(f"{median:.2f}" for median in medians) + " |")
-    print("\n| reference of | ATE [m] | RPE a second [m] | a second [deg] | point [m] |")
-    print("|" + " --- |" * 5)
-    for name, with_body in (("the camera", False), ("a point beside it", True)):
-        result = evaluate(arguments.run, arguments.sequence, with_body=with_body)
-        place = ", ".join(f"{result.value(f'body_{axis}'):.3f}" for axis in "xyz" * with_body)
-        cells = " | ".join(f"{result.value(n):.4f}" for n in NAMES)
-        print(f"| {name} | {cells} | {place} |")
+        rows.append((name, *(f"{median:.2f}" for median in medians)))
+    header = ("poses", "with the run's camera", "the best camera", "and the best point beside it")
+    print(table(header, rows))
+    print(f"\n{errors_by_reference(arguments.run, arguments.sequence, sequence)}")
+
+
+def errors_by_reference(run: Path, folder: Path, sequence: Sequence) -> str:
+    """ATE and RPE of the run and of Open3D's odometry, as a table in Markdown."""
+    header = ("estimate", "reference of", "ATE [m]", "RPE a second [m]", "[deg]", "point [m]")
+    rows = []
+    with TemporaryDirectory() as scratch:
+        other = Path(scratch) / "open3d.txt"
+        write_tum(other, open3d_odometry(sequence))
+        for title, path in (("run", run), ("Open3D hybrid odometry", other)):
+            for name, with_body in (("the camera", False), ("a point beside it", True)):
+                result = evaluate(path, folder, with_body=with_body)
+                place = [f"{result.value(f'body_{axis}'):.3f}" for axis in "xyz" * with_body]
+                cells = (f"{result.value(n):.4f}" for n in NAMES)
+                rows.append((title, name, *cells, ", ".join(place)))
+    return table(header, rows)
+
+
+def open3d_odometry(sequence: Sequence) -> Trajectory:
+    """Every frame registered to the one before by colour and depth (Open3D's defaults)."""
+    o3d = load_open3d()
+    odometry, camera = o3d.t.pipelines.odometry, sequence.camera
+    K, start = o3d.core.Tensor(camera.K), o3d.core.Tensor(np.eye(4))
+    criteria = [odometry.OdometryConvergenceCriteria(steps) for steps in (10, 5, 3)]
+    poses, before = [np.eye(4)], None
+    for index in range(len(sequence)):
+        frame = sequence.load(index)
+        pair = (frame.rgb, np.nan_to_num(frame.depth_m))
+        images = (o3d.t.geometry.Image(o3d.core.Tensor(a)) for a in pair)
+        rgbd = o3d.t.geometry.RGBDImage(*images)
+        if before is not None:
+            found = odometry.rgbd_odometry_multi_scale(
+                rgbd, before, K, start, 1.0, MAX_DEPTH_M, criteria, odometry.Method.Hybrid
+            )
+            poses.append(poses[-1] @ found.transformation.numpy())
+        before = rgbd
+    return Trajectory(sequence.timestamps_s, np.array(poses))
 
 
 if __name__ == "__main__":
