@@ -72,7 +72,10 @@ class FeatureCheck:
         views: Sequence[PosedView],
         boxes_world: Boxes,
     ) -> Judged:
-        """What views say about features; ``boxes_world`` move, and what they hold."""
+        """What views say about features; ``boxes_world`` move, and what they hold.
+
+        A region that was seen to move does so with all that is on it.
+        """
         regions = depth_regions(frame.depth_m, self.config)
         samples = (self._rays * regions.depth_m[..., None]).reshape(-1, 3)
         points = self.camera.backproject(features.pixels, features.depth_m)
@@ -81,12 +84,15 @@ class FeatureCheck:
         verdicts = self._check.agree(told)
         by_sample = verdicts[len(features) :].reshape(regions.labels.shape)
         where = self._samples, regions.depth_m.ravel().astype(float)
-        moving = self.in_boxes(where, boxes_world, T_world_camera).reshape(by_sample.shape)
-        moving &= (by_sample != Verdict.STATIC) & (regions.labels > 0)
-        moving |= regions.moving(by_sample)
-        space = regions.space(moving | regions.held(moving, by_sample))
+        moving = regions.moving(by_sample)
+        taken = self.in_boxes(where, boxes_world, T_world_camera).reshape(by_sample.shape)
+        taken &= (by_sample != Verdict.STATIC) & (regions.labels > 0)
+        taken |= regions.held(moving | taken, by_sample)
+        seen, space = regions.space(moving), regions.space(moving | taken)
         verdicts = self._check.spread(features.pixels, features.depth_m, verdicts[: len(features)])
-        verdicts[space.on(features.image_pixels, features.depth_m)] = Verdict.MOVING
+        where = features.image_pixels, features.depth_m
+        verdicts[space.on(*where) & (verdicts != Verdict.STATIC)] = Verdict.MOVING
+        verdicts[seen.on(*where)] = Verdict.MOVING
         return Judged(verdicts, space)
 
     def in_boxes(

@@ -153,6 +153,11 @@ def test_what_moves_is_not_remembered_but_was_seen() -> None:
     assert not kept.view.nearest_m[there].any()
     assert not kept.view.farthest_m[there].any()
     np.testing.assert_array_equal(kept.view.nearest_m[~there], kept.seen.nearest_m[~there])
+    memory.recall_space(1, np.ones(depth_m.shape, bool))
+    assert not kept.view.nearest_m[there].any()
+    memory.recall_space(0, np.ones(depth_m.shape, bool))
+    np.testing.assert_array_equal(kept.view.nearest_m, kept.seen.nearest_m)
+    np.testing.assert_array_equal(kept.view.farthest_m, kept.seen.farthest_m)
     assert all(v.seen.nearest_m.any() for v in memory.views)
 
 
@@ -160,8 +165,3 @@ def test_what_moves_is_not_remembered_but_was_seen() -> None:
 def test_bad_configuration_is_refused(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         StaticCheckConfig(**bad)  # type: ignore[arg-type]
-    memory.recall_space(1, np.ones(depth_m.shape, bool))
-    assert not kept.view.nearest_m[there].any()
-    memory.recall_space(0, np.ones(depth_m.shape, bool))
-    np.testing.assert_array_equal(kept.view.nearest_m, kept.seen.nearest_m)
-    np.testing.assert_array_equal(kept.view.farthest_m, kept.seen.farthest_m)
