@@ -3,8 +3,9 @@
     python benchmarks/corridor_rounds.py --out runs/bench/rounds [--rounds 8] [--fps 10]
 
 The rendered corridor is walked so many times; without loops the drift goes on to grow with every
-round, with them it ends with the first. After one round the ratio is near a half whatever the
-system: a random walk that is held at its end only falls to that (see loop_limits.py).
+round, with them it ends with the first. After one round closed loops take away a part only: a
+random walk that is held at its end falls to half, whatever the system (see loop_limits.py), and
+what is no drift stays.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ LABELS = (
 MOVING = _of("semantics", "instance_tracks.py movability.py") + _of(
     "slam",
     "dynamics.py feature_check.py keyframe_masks.py refill.py stance.py static_check.py "
-    "view_memory.py",
+    "view_memory.py witness.py",
 )
 DENSE = _of(
     "mapping",

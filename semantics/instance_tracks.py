@@ -28,9 +28,9 @@ class TrackConfig:
     hidden. ``gate_chi2`` (3 degrees of freedom) is where a detection no longer belongs to a track;
     one with a quite different class costs ``class_cost`` more. Of two things whose classes have
     ``same_class`` in common, one in the middle of the other's box is a part of it. A track ends
-    ``patience_s`` after it was last seen. Boxes are widened by ``box_sigmas`` of the prediction,
-    but by no more than ``box_slack_m``, and by ``box_margin_m``. Classes that move with less than
-    ``min_prior`` have no tracks.
+    ``patience_s`` after it was last seen, which is longer than keyframes are mostly apart. Boxes
+    are widened by ``box_sigmas`` of the prediction, but by no more than ``box_slack_m``, and by
+    ``box_margin_m``. Classes that move with less than ``min_prior`` have no tracks.
     """
 
     acceleration_m_s2: float = 1.0
@@ -39,7 +39,7 @@ class TrackConfig:
     gate_chi2: float = 16.0
     class_cost: float = 8.0
     same_class: float = 0.5
-    patience_s: float = 2.0
+    patience_s: float = 3.0
     box_sigmas: float = 1.0
     box_slack_m: float = 0.25
     box_margin_m: float = 0.08

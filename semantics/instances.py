@@ -41,8 +41,10 @@ def _from_bits(bits: NDArray[np.uint8], shape: tuple[int, int], rest: tuple) -> 
 
 
 def mask_box(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The box (4,) around the pixels of a mask that has at least one."""
+    """The box (4,) around the pixels of a mask (H, W), all 0 if there are none."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return np.zeros(4, np.float32)
     return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float32)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from semantics.instances import Instance
+from semantics.instances import Instance, mask_box
 
 Ints = NDArray[np.int64]
 _COARSE = 4
@@ -35,16 +35,7 @@ def painting_order(ranked: Sequence[Instance], nested: float, in_boxes: bool) ->
 
 def _filled(mask: NDArray[np.float32]) -> NDArray[np.float32]:
     """The box around a mask (H, W), as one."""
-    x1, y1, x2, y2 = window(mask)
+    x1, y1, x2, y2 = mask_box(mask > 0).astype(int)
     box = np.zeros_like(mask)
     box[y1:y2, x1:x2] = 1
     return box
-
-
-def window(mask: NDArray) -> tuple[int, int, int, int]:
-    """x1, y1, x2, y2 of whole pixels, the box around a mask (H, W)."""
-    rows = np.flatnonzero(mask.any(axis=1))
-    columns = np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return 0, 0, 0, 0
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

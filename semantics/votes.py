@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from graph.errors import InputError
 from graph.geometry import Array
-from semantics.instances import Instance
+from semantics.instances import Instance, mask_box
 from semantics.labels import LabelSet
-from semantics.mask_order import painting_order, window
+from semantics.mask_order import painting_order
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -149,7 +149,7 @@ def claim_pixels(
     ranked = tuple(sorted(instances, key=lambda i: -i.mask_score))
     owner, under = np.full((2, *size), NOBODY, np.int16)
     for k in painting_order(ranked, config.nested, in_boxes).tolist():
-        x1, y1, x2, y2 = window(ranked[k].mask)
+        x1, y1, x2, y2 = mask_box(ranked[k].mask).astype(int)
         here = ranked[k].mask[y1:y2, x1:x2]
         under[y1:y2, x1:x2][here] = owner[y1:y2, x1:x2][here]
         owner[y1:y2, x1:x2][here] = k

@@ -9,29 +9,28 @@ import numpy as np
 
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
-from graph.geometry import Array, transform
-from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
+from graph.geometry import Array
+from semantics.instance_tracks import InstanceTracks, TrackConfig
 from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
-from slam.depth_regions import DepthRegionConfig
-from slam.feature_check import FeatureCheck
+from slam.depth_regions import DepthRegionConfig, MovingSpace
+from slam.feature_check import FeatureCheck, Judged
 from slam.features import FeatureConfig, Features, select
 from slam.frame import Frame
-from slam.keyframe_masks import KeyframeMasks, surface_points
+from slam.keyframe_masks import KeyframeMasks
 from slam.landmarks import Ints, Mask
 from slam.localiser import Localiser
 from slam.mapper import Mapper
 from slam.refill import Refill
-from slam.stance import Stance, stance
 from slam.static_check import (
     DepthView,
     StaticCheck,
     StaticCheckConfig,
     Verdict,
-    Verdicts,
     depth_view,
 )
 from slam.tracker import Tracked
 from slam.view_memory import PosedView, ViewMemory
+from slam.witness import Witness
 from slam.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
@@ -80,6 +79,7 @@ class Sifted:
         view: what the frame's depth says about space; None if geometry is switched off.
         standing: how many features lie where views saw a surface.
         T_world_camera: (4, 4) that they were judged at; None if nothing was left out.
+        space: where the frame moves; None if that is not known.
     """
 
     features: Features
@@ -88,6 +88,7 @@ class Sifted:
     view: DepthView | None
     standing: int = 0
     T_world_camera: Array | None = None
+    space: MovingSpace | None = None
 
     @property
     def ignored(self) -> int:
@@ -111,6 +112,8 @@ class Dynamics:
         self._check = StaticCheck(camera, features.disparity_sigma_px, config.check)
         self._features = FeatureCheck(camera, self._check, config.regions)
         self._refill = Refill(camera, features)
+        rules = config.movability.step, config.min_judged
+        self._witness = Witness(camera, self._check, self.priors, *rules)
 
     def leave_out(
         self,
@@ -149,28 +152,29 @@ class Dynamics:
         view = depth_view(frame.depth_m, self.config.check.window_px) if geometry else None
         if T_world_camera is None:
             return Sifted(features, np.zeros(len(features), bool), False, view)
-        verdicts = self._verdicts(frame, features, T_world_camera, views)
+        verdicts, space = self._judge(frame, features, T_world_camera, views)
         moving = verdicts == Verdict.MOVING
         if not moving.any():
-            return Sifted(features, moving, False, view)
+            return Sifted(features, moving, False, view, space=space)
         if np.count_nonzero(~moving) < self.config.min_static:
             logger.info("frame %d: nearly everything moves; all is used", frame.index)
             return Sifted(features, moving, True, view)
 
         standing = int(np.count_nonzero(verdicts == Verdict.STATIC))
         left = select(features, np.flatnonzero(~moving))
-        return Sifted(left, moving, False, view, standing, T_world_camera)
+        return Sifted(left, moving, False, view, standing, T_world_camera, space)
 
     def fill_up(
         self, frame: Frame, features: Features, sifted: Sifted, segment: int, mapper: Mapper
     ) -> Sifted:
         """With further keypoints of the frame in place of its features that were left out."""
-        pose, views = sifted.T_world_camera, self.memory.posed(segment, mapper)
+        pose = sifted.T_world_camera
         if pose is None or sifted.mostly_moving:
             return sifted
+        views = self.memory.posed(segment, mapper)
 
         def moving(others: Features) -> Mask:
-            return self._verdicts(frame, others, pose, views) == Verdict.MOVING
+            return self._judge(frame, others, pose, views).verdicts == Verdict.MOVING
 
         found = self._refill.filled_up(frame, features, sifted.moving, moving)
         return replace(sifted, features=found)
@@ -190,25 +194,35 @@ class Dynamics:
         self.movability.update(ids[told], gone[told], self.config.movability.frame_power)
         return ids[self.movability.moving(ids)]
 
-    def remember(self, keyframe: Keyframe, view: DepthView | None, mapper: Mapper) -> None:
-        """A keyframe was made: landmarks that move leave map and graph, its depth is kept."""
+    def remember(self, keyframe: Keyframe, sifted: Sifted, mapper: Mapper) -> None:
+        """A keyframe was made: landmarks that move leave map and graph, its depth is kept.
+
+        Not that of what moves: it would be a surface that the same thing is found at next.
+        """
         self._follow(mapper.world)
         self._remove(self.movability.known(), mapper)
-        if view is not None:
-            self.memory.add(keyframe.id, keyframe.timestamp_s, view)
+        if sifted.view is not None:
+            self.memory.add(keyframe.id, keyframe.timestamp_s, sifted.view, sifted.space)
 
     def see(self, masks: KeyframeMasks, mapper: Mapper) -> None:
         """A keyframe's masks, now or late: what is on moving things leaves map and graph."""
         if not self.config.labels:
             return
-        sightings = [self._sighting(k, masks, mapper) for k in range(len(masks.claims.instances))]
-        movable = [s for s in sightings if s is not None and s.log_odds > self._least]
         keyframe = mapper.world.keyframes.get(masks.keyframe_id)
+        views: list[PosedView] = []
+        if keyframe is not None and self.config.geometry:
+            views = self.memory.posed(keyframe.segment, mapper)
+        now_s = np.nan if keyframe is None else keyframe.timestamp_s
+        sightings = self._witness.sightings(masks, views, now_s)
+        least = log_odds(self.config.tracks.min_prior)
+        movable = [s for s in sightings if s is not None and s.log_odds > least]
         if keyframe is not None:
             self.tracks.see(keyframe.timestamp_s, movable, masks.T_world_camera[:3, :3])
         odds = np.array([-np.inf if s is None else s.log_odds for s in sightings])
         still = np.array([s is not None and s.still for s in sightings], bool)
         self._believe(masks, odds > 0, still)
+        standing = np.isin(masks.claims.owner, np.flatnonzero(still))
+        self.memory.recall_space(masks.keyframe_id, standing)
         if not (odds > 0).any():
             return
         covered = np.isin(masks.claims.owner, np.flatnonzero(odds > 0))
@@ -236,49 +250,13 @@ class Dynamics:
         self.tracks.restore(part(state, "tracks"))
         self.memory.restore(part(state, "memory"))
 
-    @property
-    def _least(self) -> float:
-        """Log odds of a class that is movable enough to be tracked."""
-        return float(log_odds(self.config.tracks.min_prior))
-
-    def _verdicts(
+    def _judge(
         self, frame: Frame, features: Features, T_world_camera: Array, views: list[PosedView]
-    ) -> Verdicts:
+    ) -> Judged:
         """What views and the tracks' boxes say about features (N,)."""
-        verdicts = np.zeros(len(features), np.int8)
-        if self.config.geometry:
-            verdicts = self._features.judge(frame, features, T_world_camera, views)
         boxes_world = self.tracks.moving_boxes(frame.timestamp_s)
-        on_tracks = self._features.in_boxes(features, boxes_world, T_world_camera)
-        verdicts[on_tracks & (verdicts != Verdict.STATIC)] = Verdict.MOVING
-        return verdicts
-
-    def _sighting(self, k: int, masks: KeyframeMasks, mapper: Mapper) -> Sighting | None:
-        """An instance in space, and whether it moves; None without depth."""
-        points = surface_points(self.camera, masks, k, self.config.min_judged)
-        if points is None:
-            return None
-        low, centroid, high = np.percentile(points, (4, 50, 96), axis=0)
-        half_size = np.maximum(high - centroid, centroid - low)
-        distribution = masks.claims.instances[k].distribution
-        found = self._stance(transform(masks.T_world_camera, points), masks, mapper)
-        still = found is Stance.STILL
-        prior = float(distribution @ self.priors.of(masks.names))
-        prior = min(prior, self.priors.unknown) if still else prior
-        odds = float(log_odds(np.clip(prior, 0.01, 0.99)))
-        odds += self.config.movability.step * (int(found is Stance.MOVING) - int(found.is_static))
-        centre_world = transform(masks.T_world_camera, centroid[None])[0]
-        return Sighting(centre_world, half_size, distribution, odds, still)
-
-    def _stance(self, points_world: Array, masks: KeyframeMasks, mapper: Mapper) -> Stance:
-        """What other keyframes saw where an instance is."""
-        keyframe = mapper.world.keyframes.get(masks.keyframe_id)
-        if keyframe is None or not self.config.geometry:
-            return Stance.UNKNOWN
-        here = self.memory.posed(keyframe.segment, mapper)
-        views = [v for v in here if v.keyframe_id != masks.keyframe_id]
-        least, now_s = self.config.min_judged, keyframe.timestamp_s
-        return stance(points_world, now_s, views, self._check, least)
+        views = views if self.config.geometry else []
+        return self._features.judge(frame, features, T_world_camera, views, boxes_world)
 
     def _believe(self, masks: KeyframeMasks, moving: Mask, still: Mask) -> None:
         """Landmarks on instances have their classes' priors, and move if their instance does; of

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
 from semantics.objects import pixel_rays
-from slam.depth_regions import DepthRegionConfig, depth_regions
+from slam.depth_regions import DepthRegionConfig, MovingSpace, depth_regions
 from slam.features import Features
 from slam.frame import Frame
 from slam.landmarks import Mask
@@ -20,6 +21,18 @@ NEAREST_M = 0.2
 """A box whose middle is nearer to the camera is not looked for in the image."""
 
 
+Boxes = tuple[Array, Array]
+"""Centres in the world (T, 3) m, and half sizes (T, 3) m along an image's columns, its rows and
+the depth."""
+
+
+class Judged(NamedTuple):
+    """What is said about features (N,), and where the frame moves; None if no view says it."""
+
+    verdicts: Verdicts
+    space: MovingSpace | None
+
+
 class FeatureCheck:
     """Judges keypoints and the depth regions that they lie on: pure functions of a camera."""
 
@@ -28,35 +41,68 @@ class FeatureCheck:
         self.config = config
         self._check = check
         self._rays = pixel_rays(camera, config.step_px)
+        places = np.indices(self._rays.shape[:2])[::-1]
+        self._samples = config.step_px * places.reshape(2, -1).T.astype(float)
 
     def judge(
-        self, frame: Frame, features: Features, T_world_camera: Array, views: Sequence[PosedView]
-    ) -> Verdicts:
-        """What earlier keyframes say about features (N,), at a predicted pose."""
-        if not views:
-            return np.zeros(len(features), np.int8)
+        self,
+        frame: Frame,
+        features: Features,
+        T_world_camera: Array,
+        views: Sequence[PosedView],
+        moving: Boxes,
+    ) -> Judged:
+        """What earlier keyframes and boxes that move say about features, at a predicted pose.
+
+        What was seen to be static stays so in a box.
+        """
+        judged = Judged(np.zeros(len(features), np.int8), None)
+        if views:
+            judged = self._by_views(frame, features, T_world_camera, views, moving)
+        where = features.image_pixels, features.depth_m
+        in_boxes = self.in_boxes(where, moving, T_world_camera)
+        judged.verdicts[in_boxes & (judged.verdicts != Verdict.STATIC)] = Verdict.MOVING
+        return judged
+
+    def _by_views(
+        self,
+        frame: Frame,
+        features: Features,
+        T_world_camera: Array,
+        views: Sequence[PosedView],
+        boxes_world: Boxes,
+    ) -> Judged:
+        """What views say about features; ``boxes_world`` move, and what they hold.
+
+        A region that was seen to move does so with all that is on it.
+        """
         regions = depth_regions(frame.depth_m, self.config)
         samples = (self._rays * regions.depth_m[..., None]).reshape(-1, 3)
         points = self.camera.backproject(features.pixels, features.depth_m)
         points_world = transform(T_world_camera, np.concatenate([points, samples]))
         told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
         verdicts = self._check.agree(told)
-        moving = regions.moving(verdicts[len(features) :].reshape(regions.labels.shape))
+        by_sample = verdicts[len(features) :].reshape(regions.labels.shape)
+        where = self._samples, regions.depth_m.ravel().astype(float)
+        moving = regions.moving(by_sample)
+        taken = self.in_boxes(where, boxes_world, T_world_camera).reshape(by_sample.shape)
+        taken &= (by_sample != Verdict.STATIC) & (regions.labels > 0)
+        taken |= regions.held(moving | taken, by_sample)
+        seen, space = regions.space(moving), regions.space(moving | taken)
         verdicts = self._check.spread(features.pixels, features.depth_m, verdicts[: len(features)])
-        on_moving = regions.on(moving, features.image_pixels, features.depth_m)
-        return np.where(on_moving, Verdict.MOVING, verdicts).astype(np.int8)
+        where = features.image_pixels, features.depth_m
+        verdicts[space.on(*where) & (verdicts != Verdict.STATIC)] = Verdict.MOVING
+        verdicts[seen.on(*where)] = Verdict.MOVING
+        return Judged(verdicts, space)
 
     def in_boxes(
-        self, features: Features, boxes_world: tuple[Array, Array], T_world_camera: Array
+        self, where: tuple[Array, Array], boxes_world: Boxes, T_world_camera: Array
     ) -> Mask:
-        """Features (N,) in any of some boxes, in the image and in depth.
+        """Points of a frame (N,) in any of some boxes, in the image and in depth.
 
-        Args:
-            features: those of a frame; without depth only the image counts.
-            boxes_world: centres (T, 3) m, and half sizes (T, 3) m along the image's columns, its
-                rows and the depth.
-            T_world_camera: (4, 4).
+        ``where`` are their pixels (N, 2) and depths (N,) m; without depth only the image counts.
         """
+        pixels, depth_m = where
         centres_world, half_sizes_m = boxes_world
         centres = transform(inverse(T_world_camera), centres_world)
         ahead = centres[:, 2] >= NEAREST_M
@@ -64,7 +110,7 @@ class FeatureCheck:
         z = centres[:, 2:]
         middle = distorted(self.camera, centres)
         half_px = np.array([self.camera.fx, self.camera.fy]) * half_sizes_m[:, :2] / z
-        inside = ~(np.abs(features.depth_m - z) > half_sizes_m[:, 2:])
+        inside = ~(np.abs(depth_m - z) > half_sizes_m[:, 2:])
         for k in (0, 1):
-            inside &= np.abs(features.image_pixels[:, k] - middle[:, k, None]) < half_px[:, k, None]
+            inside &= np.abs(pixels[:, k] - middle[:, k, None]) < half_px[:, k, None]
         return np.asarray(inside.any(axis=0))

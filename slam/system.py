@@ -134,7 +134,7 @@ class SlamSystem(SystemResults):
                 self._refer_to(keyframe)
         with clock.stage("semantics"):
             if keyframe:
-                self.dynamics.remember(keyframe, sifted.view, self.mapper)
+                self.dynamics.remember(keyframe, sifted, self.mapper)
                 self.semantics.observe(frame, keyframe, self.mapper)
         return FrameResult(
             index=frame.index,

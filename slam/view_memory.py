@@ -9,6 +9,7 @@ import numpy as np
 
 from graph.array_file import Arrays
 from graph.geometry import Array
+from slam.depth_regions import MovingSpace
 from slam.landmarks import Mask
 from slam.mapper import Mapper
 from slam.static_check import DepthView, StaticCheckConfig
@@ -45,12 +46,21 @@ class ViewMemory:
         self.config = config
         self.views: list[RememberedView] = []
 
-    def add(self, keyframe_id: int, timestamp_s: float, view: DepthView) -> None:
-        """Remember what a keyframe saw, unless the last is too recent."""
+    def add(
+        self,
+        keyframe_id: int,
+        timestamp_s: float,
+        view: DepthView,
+        moving: MovingSpace | None = None,
+    ) -> None:
+        """Remember what a keyframe saw, unless the last is too recent; of what moved nothing."""
         if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.config.interval_s:
             return
         seen = view.thinned(THINNED)
-        self.views.append(RememberedView(keyframe_id, timestamp_s, seen.thinned(1), seen))
+        told = seen.thinned(1)
+        if moving is not None:
+            _forget(told, moving.covers(told.nearest_m, told.step))
+        self.views.append(RememberedView(keyframe_id, timestamp_s, told, seen))
         del self.views[: -self.config.views]
 
     def posed(self, segment: int, mapper: Mapper) -> list[PosedView]:
@@ -67,12 +77,15 @@ class ViewMemory:
 
     def forget_space(self, keyframe_id: int, covered: Mask) -> None:
         """A keyframe's view says nothing about space where something (H, W) moved."""
-        for kept in self.views:
-            if kept.keyframe_id == keyframe_id:
-                step = kept.view.step
-                height, width = kept.view.nearest_m.shape
-                hidden = covered[::step, ::step][:height, :width]
-                kept.view.nearest_m[hidden] = kept.view.farthest_m[hidden] = 0.0
+        for kept in self._of(keyframe_id):
+            _forget(kept.view, _thinned_to(kept.view, covered))
+
+    def recall_space(self, keyframe_id: int, covered: Mask) -> None:
+        """A keyframe's view says all it saw where something (H, W) stood after all."""
+        for kept in self._of(keyframe_id):
+            where = _thinned_to(kept.view, covered)
+            kept.view.nearest_m[where] = kept.seen.nearest_m[where]
+            kept.view.farthest_m[where] = kept.seen.farthest_m[where]
 
     def clear(self) -> None:
         """Forget all: another recording."""
@@ -101,3 +114,17 @@ class ViewMemory:
             RememberedView(i, t, *(DepthView(n[k].copy(), f[k].copy(), s) for k in (0, 1)))
             for i, t, n, f, s in zip(ids, stamps_s, *depths, steps, strict=True)
         ]
+
+    def _of(self, keyframe_id: int) -> list[RememberedView]:
+        return [kept for kept in self.views if kept.keyframe_id == keyframe_id]
+
+
+def _thinned_to(view: DepthView, mask: Mask) -> Mask:
+    """A mask (H, W) at a view's pixels."""
+    height, width = view.nearest_m.shape
+    return mask[:: view.step, :: view.step][:height, :width]
+
+
+def _forget(view: DepthView, where: Mask) -> None:
+    """Let a view say nothing at some of its pixels (h, w)."""
+    view.nearest_m[where] = view.farthest_m[where] = 0.0

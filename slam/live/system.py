@@ -23,6 +23,7 @@ from slam.live.messages import ImageToSegment
 from slam.live.remote_dense import RemoteDenseMapper
 from slam.live.remote_mapper import RemoteMapper
 from slam.live.segmentation import RemoteSegmenter
+from slam.live.supervision import Patience
 from slam.mapper import Mapper
 from slam.results import FrameResult
 from slam.semantic_mapping import SemanticMapper
@@ -36,7 +37,6 @@ MAX_PENDING = 3
 """Keyframes that wait for the map; with so many no further one is promised."""
 FIRST_MAP_S = 5.0
 """How long the frame that begins a map may wait for its landmarks."""
-START_S = 300.0
 SWITCH_S = 0.0005
 """How long another thread may keep Python's lock, which tracking asks for many times a frame."""
 MASKS_S = 10.0
@@ -65,7 +65,7 @@ class LiveSystem(SlamSystem):
         self._names = (segmenter or NoSegmenter).labels.names
         self.remote = RemoteMapper(camera, config, self._names, folder)
         super().__init__(camera, config)
-        self.remote.wait_until_ready(START_S)
+        self.remote.wait_until_ready(Patience().start_s)
         if dense is not None:
             dense.wait_until_ready()
         self.semantics = _Asked(self)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from semantics.instances import Instance, certain, mask_box
-from semantics.mask_order import painting_order, window
+from semantics.mask_order import painting_order
 
 
 def instance(mask: np.ndarray, label: int, score: float) -> Instance:
@@ -50,7 +50,6 @@ def test_nothing_of_the_same_class_or_of_like_size_comes_forward() -> None:
     assert painting_order([], 0.8, True).tolist() == []
 
 
-def test_the_window_is_the_box_of_whole_pixels() -> None:
-    found = case()["cup"]
-    assert window(found.mask) == (60, 80, 80, 92)
-    assert window(np.zeros((5, 6), bool)) == (0, 0, 0, 0)
+def test_a_box_is_that_of_whole_pixels() -> None:
+    assert mask_box(case()["cup"].mask).tolist() == [60, 80, 80, 92]
+    assert mask_box(np.zeros((5, 6), bool)).tolist() == [0, 0, 0, 0]

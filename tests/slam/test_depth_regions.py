@@ -54,8 +54,69 @@ def test_keypoints_are_on_what_is_as_far_away_as_they_are() -> None:
     moving = regions.moving(free_in(slice(40, 216), slice(80, 104)))
     pixels = np.array([[120, 100], [163, 100], [163, 100], [163, 100], [200, 100], [75, 60.0]])
     depth_m = np.array([2.0, 4.0, 2.0, np.nan, np.nan, 2.05])
-    found = regions.on(moving, pixels, depth_m)
+    found = regions.space(moving).on(pixels, depth_m)
     assert found.tolist() == [True, False, True, True, False, True]
+
+
+@pytest.mark.parametrize("step", [2, 4])
+def test_every_few_pixels_are_covered_where_keypoints_there_are(step: int) -> None:
+    regions = depth_regions(scene(), CONFIG)
+    space = regions.space(regions.moving(free_in(slice(40, 216), slice(80, 104))))
+    few = scene()[::step, ::step]
+    rows, columns = np.indices(few.shape)
+    pixels = step * np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+    slow = space.on(pixels, few.ravel().astype(float)).reshape(few.shape)
+    np.testing.assert_array_equal(space.covers(few, step), slow)
+    assert slow[48 // step : 208 // step, 80 // step : 160 // step].all()
+    assert not slow[: 24 // step].any()
+
+
+def loaded(box_m: float = 1.9) -> np.ndarray:
+    """The scene, and beside the card a box whose side falls away from it, 8 % every 8 pixels."""
+    depth_m = scene()
+    depth_m[80:160, 160:224] = box_m * 1.08 ** (np.arange(64) // 8)
+    return depth_m
+
+
+def held(depth_m: np.ndarray, seen: np.ndarray, **config: float) -> np.ndarray:
+    """What the card holds, where views spoke of samples ``seen`` (30, 40) and nothing else."""
+    regions = depth_regions(depth_m, DepthRegionConfig(step_px=8, **config))  # type: ignore[arg-type]
+    return regions.held(CARD, seen.astype(np.int8))
+
+
+BOX, CARD = np.zeros((2, 240, 320), bool)
+CARD[40:216, 80:160] = True
+BOX[80:160, 160:224] = True
+BOX, CARD = BOX[::8, ::8], CARD[::8, ::8]
+ROOM = ~BOX & ~CARD
+
+
+def test_what_moves_holds_what_it_touches_and_no_view_spoke_of() -> None:
+    np.testing.assert_array_equal(held(loaded(), ROOM), BOX)
+
+
+def test_what_was_seen_to_stand_is_not_held() -> None:
+    assert not held(loaded(), ROOM | BOX).any()
+    lower = BOX.copy()
+    lower[:15] = False
+    np.testing.assert_array_equal(held(loaded(), ROOM | lower), BOX & ~lower)
+
+
+def test_a_room_that_was_never_seen_is_not_held() -> None:
+    assert not held(loaded(), np.zeros((30, 40))).any()
+
+
+@pytest.mark.parametrize(
+    ("box_m", "config"),
+    [
+        (2.6, {}),  # far behind the card
+        (1.9, {"load": 0.1}),  # too much for who holds it
+        (1.9, {"held_jump": 0.05}),  # in pieces
+        (1.9, {"largest": 0.15}),  # no single thing any more
+    ],
+)
+def test_not_everything_is_held(box_m: float, config: dict[str, float]) -> None:
+    assert held(loaded(box_m), ROOM, **config).sum() < 0.15 * BOX.sum()
 
 
 def test_regions_are_those_of_a_flood_fill() -> None:
@@ -88,7 +149,17 @@ def reached(region: np.ndarray, depth_m: np.ndarray) -> int:
     return len(seen)
 
 
-@pytest.mark.parametrize("bad", [{"step_px": 0}, {"jump": 0.0}, {"share": 0.0}, {"largest": 2.0}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"step_px": 0},
+        {"jump": 0.0},
+        {"share": 0.0},
+        {"largest": 2.0},
+        {"held_jump": 0.0},
+        {"load": -1.0},
+    ],
+)
 def test_bad_configuration_is_refused(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         DepthRegionConfig(**bad)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Keypoints in boxes in space, against one keypoint and one box at a time."""
+"""Keypoints in boxes in space, and what those in the boxes hold."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from graph.geometry import Array, inverse, se3_exp, transform
 from slam.depth_regions import DepthRegionConfig
 from slam.feature_check import FeatureCheck
 from slam.features import Features
-from slam.static_check import StaticCheck, StaticCheckConfig
+from slam.frame import Frame
+from slam.static_check import DepthView, StaticCheck, StaticCheckConfig, depth_view
+from slam.view_memory import PosedView
 
 CAMERA = Camera(640, 480, fx=525.0, fy=480.0, cx=319.5, cy=239.5, fps=30.0, stereo_bf_px_m=40.0)
 
@@ -47,10 +49,44 @@ def test_keypoints_in_boxes_one_by_one(count: int) -> None:
     depth_m[::5] = np.nan
     centres = transform(T_world_camera, rng.uniform([-1, -0.6, -1], [1, 0.6, 4], (count, 3)))
     sizes = rng.uniform(0.2, 1.0, (count, 3))
-    found = check().in_boxes(keypoints(pixels, depth_m), (centres, sizes), T_world_camera)
+    found = check().in_boxes((pixels, depth_m), (centres, sizes), T_world_camera)
     slow = [
         any(inside_one(p, z, (c, s), T_world_camera) for c, s in zip(centres, sizes, strict=True))
         for p, z in zip(pixels, depth_m, strict=True)
     ]
     np.testing.assert_array_equal(found, slow)
     assert found.any() == (count > 1)
+
+
+def man_with_box() -> np.ndarray:
+    """Metres: a man at 1.5 before a wall at 3, and what he holds beside him."""
+    depth_m = np.full((480, 640), 3.0, np.float32)
+    depth_m[96:384, 200:360] = 1.5
+    depth_m[192:304, 360:456] = 1.45
+    return depth_m
+
+
+def judged(view: DepthView, T_world_camera: Array) -> list[int]:
+    """Of keypoints on the man, what he holds and the wall, where his box is known to move."""
+    depth_m = man_with_box()
+    frame = Frame(1, 1.0, np.zeros((480, 640, 3), np.uint8), depth_m, "1")
+    pixels = np.array([[280.0, 240.0], [410.0, 250.0], [560.0, 250.0]])
+    features = keypoints(pixels, np.array([1.5, 1.45, 3.0]))
+    centre = CAMERA.backproject(np.array([[280.0, 240.0]]), np.array([1.5]))
+    size = np.array([[80 * 1.5 / CAMERA.fx, 144 * 1.5 / CAMERA.fy, 0.1]])
+    box = transform(T_world_camera, centre), size
+    views = [PosedView(0, 0.0, view, view, T_world_camera)]
+    found = check().judge(frame, features, T_world_camera, views, box)
+    assert found.space is not None
+    on_space = found.space.on(pixels, features.depth_m)
+    np.testing.assert_array_equal(on_space, found.verdicts == -1)
+    return found.verdicts.tolist()  # type: ignore[no-any-return]
+
+
+def test_what_a_man_holds_moves_unless_it_was_seen_to_stand() -> None:
+    T_world_camera = se3_exp(np.array([0.1, -0.4, 0.2, 1.0, 0.3, -0.5]))
+    blind = depth_view(np.full((480, 640), np.nan, np.float32), 5)
+    assert judged(blind, T_world_camera) == [-1, -1, 0]
+    saw_it = man_with_box()
+    saw_it[:, :360] = np.nan
+    assert judged(depth_view(saw_it, 5), T_world_camera) == [-1, 1, 1]

@@ -7,6 +7,7 @@ import pytest
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse, se3_exp, transform
+from slam.depth_regions import DepthRegionConfig, depth_regions
 from slam.static_check import StaticCheck, StaticCheckConfig, Verdict, depth_view
 from slam.view_memory import ViewMemory
 
@@ -138,6 +139,25 @@ def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
             np.testing.assert_array_equal(one.nearest_m, two.nearest_m)
             np.testing.assert_array_equal(one.farthest_m, two.farthest_m)
     assert [bool(v.view.nearest_m.any()) for v in memory.views] == [True, False, True]
+
+
+def test_what_moves_is_not_remembered_but_was_seen() -> None:
+    depth_m = box_before_wall()
+    regions = depth_regions(depth_m, DepthRegionConfig(step_px=8))
+    nearer = regions.depth_m < 2.5
+    memory = ViewMemory(StaticCheckConfig())
+    memory.add(0, 0.0, depth_view(depth_m, 5), regions.space(nearer))
+    kept = memory.views[0]
+    there = (kept.seen.nearest_m < 2.5) & (kept.seen.nearest_m > 0)
+    assert there.any()
+    assert not kept.view.nearest_m[there].any()
+    assert not kept.view.farthest_m[there].any()
+    np.testing.assert_array_equal(kept.view.nearest_m[~there], kept.seen.nearest_m[~there])
+    memory.recall_space(1, np.ones(depth_m.shape, bool))
+    assert not kept.view.nearest_m[there].any()
+    memory.recall_space(0, np.ones(depth_m.shape, bool))
+    np.testing.assert_array_equal(kept.view.nearest_m, kept.seen.nearest_m)
+    np.testing.assert_array_equal(kept.view.farthest_m, kept.seen.farthest_m)
     assert all(v.seen.nearest_m.any() for v in memory.views)
 
 

@@ -1,0 +1,66 @@
+"""Where a keyframe's instances are in space, and whether they move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graph.camera import Camera
+from graph.geometry import transform
+from semantics.instance_tracks import Sighting
+from semantics.movability import MovabilityPriors, log_odds
+from slam.keyframe_masks import KeyframeMasks, surface_points
+from slam.stance import Stance, stance
+from slam.static_check import StaticCheck
+from slam.view_memory import PosedView
+
+
+@dataclass(frozen=True, eq=False)
+class Witness:
+    """Tells of instances by their masks, their classes' priors and what other keyframes saw.
+
+    Attributes:
+        step: by how much the log odds of an instance that was seen to move or to stand change.
+        min_judged: it is judged by at least so many of its pixels.
+    """
+
+    camera: Camera
+    check: StaticCheck
+    priors: MovabilityPriors
+    step: float
+    min_judged: int
+
+    def sightings(
+        self, masks: KeyframeMasks, views: Sequence[PosedView], now_s: float
+    ) -> list[Sighting | None]:
+        """A keyframe's instances in space; None for those without depth.
+
+        Of the views the keyframe's own does not count. It was taken at ``now_s``.
+        """
+        others = [v for v in views if v.keyframe_id != masks.keyframe_id]
+        instances = range(len(masks.claims.instances))
+        return [self._sighting(k, masks, others, now_s) for k in instances]
+
+    def _sighting(
+        self, k: int, masks: KeyframeMasks, views: Sequence[PosedView], now_s: float
+    ) -> Sighting | None:
+        points = surface_points(self.camera, masks, k, self.min_judged)
+        if points is None:
+            return None
+        low, centroid, high = np.percentile(points, (4, 50, 96), axis=0)
+        points_world = transform(masks.T_world_camera, points)
+        found = stance(points_world, now_s, views, self.check, self.min_judged)
+        distribution, still = masks.claims.instances[k].distribution, found is Stance.STILL
+        prior = float(distribution @ self.priors.of(masks.names))
+        prior = min(prior, self.priors.unknown) if still else prior
+        odds = float(log_odds(np.clip(prior, 0.01, 0.99)))
+        odds += self.step * (int(found is Stance.MOVING) - int(found.is_static))
+        return Sighting(
+            centroid_world=transform(masks.T_world_camera, centroid[None])[0],
+            half_size=np.maximum(high - centroid, centroid - low),
+            distribution=distribution,
+            log_odds=odds,
+            still=still,
+        )
