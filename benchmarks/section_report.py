@@ -115,6 +115,10 @@ REPORTS = {
             "no_harm.py {sequences}/office-300 {sequences}/living_room ../shared/data/redkitchen",
         ),
         "pairs": ("A real man who walks, by geometry alone", "dynamic_pairs.py"),
+        "pairs-labels": (
+            "The same with the network's masks",
+            "dynamic_pairs.py --segmenter light",
+        ),
         "composited": (
             "A real man put into a real recording",
             "composited.py --segmenter light --out {sequences}/composited",
