@@ -198,9 +198,8 @@ def test_a_keypoint_of_another_scale_is_no_candidate() -> None:
     assert len(matches) > 40
 
 
-def test_images_are_tracked_and_registered_below_a_pixel() -> None:
-    """A rendered textured plane from end to end, moved by a few degrees and centimetres."""
-    extractor = BriskExtractor(CAMERA, FeatureConfig())
+def map_of_plane(extractor: BriskExtractor) -> tuple[WorldMap, np.ndarray]:
+    """A map of one keyframe of the rendered plane, and the ids of its landmarks with patches."""
     world = WorldMap()
     features = extractor.extract(render_plane(np.eye(4)))
     keyframe = add_keyframe(world, np.eye(4), features)
@@ -208,6 +207,13 @@ def test_images_are_tracked_and_registered_below_a_pixel() -> None:
     points = CAMERA.backproject(features.pixels[good], features.depth_m[good])
     ids = world.make_landmarks(keyframe, good, points)
     world.renew_patches(keyframe, SubpixelConfig())
+    return world, ids
+
+
+def test_images_are_tracked_and_registered_below_a_pixel() -> None:
+    """A rendered textured plane from end to end, moved by a few degrees and centimetres."""
+    extractor = BriskExtractor(CAMERA, FeatureConfig())
+    world, ids = map_of_plane(extractor)
     second = extractor.extract(render_plane(T_WORLD_CAMERA, 1))
     errors_px = {}
     for enabled in (False, True):
@@ -230,13 +236,7 @@ def test_images_are_tracked_and_registered_below_a_pixel() -> None:
 def test_images_from_nearer_are_registered_as_well() -> None:
     """The camera comes nearer by a fifth of the way, where a patch still serves."""
     extractor = BriskExtractor(CAMERA, FeatureConfig())
-    world = WorldMap()
-    features = extractor.extract(render_plane(np.eye(4)))
-    keyframe = add_keyframe(world, np.eye(4), features)
-    good = np.flatnonzero(np.isfinite(features.depth_m))
-    points = CAMERA.backproject(features.pixels[good], features.depth_m[good])
-    world.make_landmarks(keyframe, good, points)
-    world.renew_patches(keyframe, SubpixelConfig())
+    world, _ = map_of_plane(extractor)
     T_nearer = se3_exp(np.array([0.0, 0.0, 0.0, 0.02, -0.01, 0.4]))
     tracked = track(world, extractor.extract(render_plane(T_nearer, 1)), T_nearer, TrackingConfig())
     seen = tracked.features.pixels[tracked.keypoints]
