@@ -26,12 +26,11 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from dynamic import SCENES, VARIANTS, rendered
-from no_harm import ate_m
+from no_harm import ate_m, other_keypoints
 from report import table
 
 from graph.geometry import Array
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
-from slam.features import FeatureConfig
 
 Job = tuple[Path, str, int]
 """Sequence, name of the variant, number of the repeat."""
@@ -49,11 +48,6 @@ def measured_mm(job: Job) -> float:
     ]
     segmenter = make_segmenter(SegmenterOptions("light" if labels else "none"), sequence)
     return 1e3 * ate_m(sequence, segmenter, settings)
-
-
-def other_keypoints(repeat: int) -> str:
-    """The setting of a grid that is a little finer or coarser than usual; 0: the usual one."""
-    return f"features.bucket_px={FeatureConfig().bucket_px + (repeat + 1) // 2 * (-1) ** repeat}"
 
 
 def ratio(above: Array, below: Array) -> tuple[float, float, Array]:

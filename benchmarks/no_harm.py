@@ -1,22 +1,25 @@
 """What the semantics cost where nothing moves, also when the masks are wrong.
 
-    python benchmarks/no_harm.py SEQUENCE [SEQUENCE ...] [--repeats 4]
+    python benchmarks/no_harm.py SEQUENCE [SEQUENCE ...] [--repeats 8]
 
 Each sequence is static. It is run without semantics and without the check of what moves
 ("nothing"), with the check alone ("geometry"), with the network's masks, with masks that are drawn
 at random ("random": up to eight ellipses a keyframe, half of them people), and with the network's
 masks under each other's names ("shuffled": what was a chair is a person to the system). Any change
-of the keypoints moves an ATE by a tenth or more, so each is run several times, with a keypoint or
-two more or fewer and with other random masks and names: the mean ATE, its range, and how much
-larger the mean is than with nothing. Last the change over all sequences: the mean of the logarithms
-of all runs' ratios to the mean with nothing, and its standard error.
+of the keypoints moves an ATE by a tenth or more, so each is run several times, with keypoints
+spread over a grid whose cells are a few pixels wider or narrower, and with other random masks and
+names: the mean ATE, its range, and the mean of the logarithms of the runs' ratios to those with
+nothing, as a change. Last the same over all sequences. Standard errors are of both sides' runs.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,14 +27,16 @@ from zlib import crc32
 
 import cv2
 import numpy as np
+import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.report import table
 from graph.camera import Camera
+from graph.geometry import Array
 from semantics.instances import Instance, certain, mask_box
 from semantics.labels import LabelSet
-from semantics.segmenter import Image, NoSegmenter, Segmenter
+from semantics.segmenter import Image, Segmenter
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
 from slam.configuration import resolve
 from slam.features import FeatureConfig
@@ -39,6 +44,9 @@ from slam.runner import RunOptions, run
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 
+VARIANTS = ("nothing", "geometry", "network", "random", "shuffled")
+Job = tuple[Path, str, int]
+"""Sequence, one of VARIANTS, number of the repeat."""
 SCORES = (0.5, 0.95)
 MOST, RADII_PX = 8, (20, 120)
 
@@ -90,11 +98,9 @@ class ShuffledLabels:
         ]
 
 
-def keypoints(seed: int) -> str:
-    """The setting of a few keypoints more or fewer than usual."""
-    return (
-        f"features.max_keypoints={FeatureConfig().max_keypoints + (seed + 1) // 2 * (-1) ** seed}"
-    )
+def other_keypoints(repeat: int) -> str:
+    """The setting of a grid that is a little finer or coarser than usual; 0: the usual one."""
+    return f"features.bucket_px={FeatureConfig().bucket_px + (repeat + 1) // 2 * (-1) ** repeat}"
 
 
 def ate_m(sequence: Path, segmenter: Segmenter, settings: list[str]) -> float:
@@ -109,41 +115,53 @@ def ate_m(sequence: Path, segmenter: Segmenter, settings: list[str]) -> float:
     return {row["name"]: row["value"] for row in summary.rows}["ate_rmse"]
 
 
+def measured_mm(job: Job) -> float:
+    """ATE of one run."""
+    sequence, variant, repeat = job
+    torch.set_num_threads(1)
+    kind = "light" if variant in ("network", "random", "shuffled") else "none"
+    segmenter = make_segmenter(SegmenterOptions(kind), sequence)
+    if variant == "random":
+        segmenter = RandomMasks(segmenter.labels, repeat)
+    elif variant == "shuffled":
+        segmenter = ShuffledLabels(segmenter, repeat)
+    off = ["dynamics.labels=false", "dynamics.geometry=false"] if variant == "nothing" else []
+    return 1e3 * ate_m(sequence, segmenter, [*off, other_keypoints(repeat)])
+
+
+def change(ates_mm: Array, base_mm: Array) -> str:
+    """By how much ATEs (sequences, repeats) are larger than others, and its standard error."""
+    logs, base = np.log(ates_mm), np.log(base_mm)
+    variance = (logs.var(axis=1, ddof=1) + base.var(axis=1, ddof=1)) / logs.shape[1]
+    error = np.sqrt(variance.sum()) / len(logs)
+    return f"{100 * np.expm1((logs - base).mean()):+.1f} ± {100 * error:.1f} %"
+
+
+def report(names: Sequence[str], ates_mm: Array) -> str:
+    """The table in Markdown, of ATEs (sequences, VARIANTS, repeats)."""
+    rows = []
+    for name, errors_mm in zip(names, ates_mm, strict=True):
+        for variant, of_one in zip(VARIANTS, errors_mm, strict=True):
+            span = f"{of_one.min():.2f} to {of_one.max():.2f}"
+            by = change(of_one[None], errors_mm[:1]) if variant != VARIANTS[0] else ""
+            rows.append((name, variant, f"{of_one.mean():.2f}", span, by))
+    for k, variant in enumerate(VARIANTS[1:], 1):
+        of_all = f"{ates_mm[:, k].size} runs"
+        rows.append(("all", variant, "", of_all, change(ates_mm[:, k], ates_mm[:, 0])))
+    return table(("sequence", "with", "ATE mm", "of which", "change"), rows)
+
+
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("sequences", type=Path, nargs="+")
-    parser.add_argument("--repeats", type=int, default=4)
+    parser.add_argument("--repeats", type=int, default=8)
     arguments = parser.parse_args()
-    network = make_segmenter(SegmenterOptions("light"), Path())
-    off = ["dynamics.labels=false", "dynamics.geometry=false"]
-    variants: dict[str, tuple[Callable[[int], Segmenter], list[str]]] = {
-        "nothing": (lambda seed: NoSegmenter(), off),
-        "geometry": (lambda seed: NoSegmenter(), []),
-        "network": (lambda seed: network, []),
-        "random": (lambda seed: RandomMasks(network.labels, seed), []),
-        "shuffled": (lambda seed: ShuffledLabels(network, seed), []),
-    }
-    rows = []
-    changes: dict[str, list[float]] = {name: [] for name in variants}
-    for sequence in arguments.sequences:
-        base_m = float("nan")
-        for name, (segmenter, settings) in variants.items():
-            errors_m = [
-                ate_m(sequence, segmenter(seed), [*settings, keypoints(seed)])
-                for seed in range(arguments.repeats)
-            ]
-            mean_m = float(np.mean(errors_m))
-            base_m = mean_m if name == "nothing" else base_m
-            changes[name] += np.log(np.array(errors_m) / base_m).tolist()
-            change = f"{100 * (mean_m / base_m - 1):+.1f} %"
-            span = f"{1e3 * min(errors_m):.2f} to {1e3 * max(errors_m):.2f}"
-            rows.append((sequence.name, name, f"{1e3 * mean_m:.2f}", span, change))
-    for name, logs in changes.items():
-        error = np.std(logs, ddof=1) / np.sqrt(len(logs))
-        change = f"{100 * np.expm1(np.mean(logs)):+.1f} +- {100 * error:.1f} %"
-        rows.append(("all", name, "", f"{len(logs)} runs", change))
-    print(table(("sequence", "with", "ATE mm", "of which", "change"), rows))
+    jobs = list(itertools.product(arguments.sequences, VARIANTS, range(arguments.repeats)))
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        errors_mm = np.array(list(pool.map(measured_mm, jobs)))
+    shape = (len(arguments.sequences), len(VARIANTS), arguments.repeats)
+    print(report([path.name for path in arguments.sequences], errors_mm.reshape(shape)))
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ LABELS = (
     "slam/semantic_mapping.py",
     "data/labels/*.yaml",
 )
-MOVING = _of("semantics", "instance_tracks.py movability.py") + _of(
+MOVING = _of("semantics", "instance_track.py instance_tracks.py movability.py") + _of(
     "slam",
     "dynamics.py feature_check.py keyframe_masks.py refill.py stance.py static_check.py "
     "view_memory.py witness.py",

@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from graph.array_file import Arrays
 from graph.geometry import Array
+from semantics.instance_track import Sighting, Track
 
 Mask = NDArray[np.bool_]
 _H = np.eye(3, 6)
@@ -30,7 +31,9 @@ class TrackConfig:
     ``same_class`` in common, one in the middle of the other's box is a part of it. A track ends
     ``patience_s`` after it was last seen, which is longer than keyframes are mostly apart. Boxes
     are widened by ``box_sigmas`` of the prediction, but by no more than ``box_slack_m``, and by
-    ``box_margin_m``. Classes that move with less than ``min_prior`` have no tracks.
+    ``box_margin_m``. Classes that move with less than ``min_prior`` have no tracks. All evidence
+    moves a track's log odds by at most ``max_evidence``; ``max_missed`` keyframes in a row that
+    show its place, but not it, end it.
     """
 
     acceleration_m_s2: float = 1.0
@@ -44,58 +47,16 @@ class TrackConfig:
     box_slack_m: float = 0.25
     box_margin_m: float = 0.08
     min_prior: float = 0.2
+    max_evidence: float = 2.7
+    max_missed: int = 2
 
     def __post_init__(self) -> None:
         if min(self.acceleration_m_s2, self.speed_m_s, self.centroid_sigma_m) <= 0:
             raise ValueError("acceleration, speed and centroid sigma must be positive")
         if self.patience_s <= 0 or self.gate_chi2 <= 0:
             raise ValueError("patience_s and gate_chi2 must be positive")
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """A movable thing in a keyframe.
-
-    Attributes:
-        centroid_world: (3,) m.
-        half_size: (3,) m, along the image's columns, its rows and the depth.
-        distribution: (C,) over classes.
-        log_odds: that it moves, by its class's prior and this keyframe's geometry.
-        still: it stood still for so long that its class does not count.
-    """
-
-    centroid_world: Array
-    half_size: Array
-    distribution: NDArray[np.float32]
-    log_odds: float
-    still: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """A thing that was seen, as of the last time.
-
-    Attributes:
-        id: its number.
-        time_s: when it was last seen.
-        mean: (6,) centroid m and velocity m/s in the world; covariance: (6, 6).
-        half_size, distribution, log_odds: see Sighting, fused over sightings.
-        sightings: how many.
-    """
-
-    id: int
-    time_s: float
-    mean: Array
-    covariance: Array
-    half_size: Array
-    distribution: NDArray[np.float32]
-    log_odds: float
-    sightings: int
-
-    @property
-    def moving(self) -> bool:
-        """Whether it is more likely moving than not."""
-        return self.log_odds > 0
+        if self.max_evidence <= 0 or self.max_missed < 1:
+            raise ValueError("max_evidence must be positive, max_missed at least 1")
 
 
 class InstanceTracks:
@@ -133,6 +94,12 @@ class InstanceTracks:
         self._end_doubles(time_s, R)
         found: list[int] = ids[whole].tolist()
         return found
+
+    def miss(self, time_s: float, shown: Sequence[Track]) -> None:
+        """A keyframe showed the places of these tracks; those it did not show were missed."""
+        unseen = {track.id for track in shown if track.time_s < time_s}
+        tracks = [replace(t, missed=t.missed + (t.id in unseen)) for t in self.tracks]
+        self.tracks = [t for t in tracks if t.missed < self.config.max_missed]
 
     def expire(self, time_s: float) -> None:
         """End the tracks that were not seen for long."""
@@ -188,8 +155,10 @@ class InstanceTracks:
             "covariances": np.array([t.covariance for t in tracks], float).ravel(),
             "half_sizes": np.array([t.half_size for t in tracks], float).ravel(),
             "distributions": np.array([t.distribution for t in tracks], np.float32).ravel(),
-            "log_odds": np.array([t.log_odds for t in tracks], float),
+            "priors": np.array([t.prior for t in tracks], float),
+            "evidence": np.array([t.evidence for t in tracks], float),
             "sightings": np.array([t.sightings for t in tracks], np.int64),
+            "missed": np.array([t.missed for t in tracks], np.int64),
         }
 
     def restore(self, state: Arrays) -> None:
@@ -206,8 +175,10 @@ class InstanceTracks:
                 state["covariances"].reshape(n, 6, 6).copy(),
                 state["half_sizes"].reshape(n, 3).copy(),
                 distributions.astype(np.float32),
-                state["log_odds"].tolist(),
+                state["priors"].tolist(),
+                state["evidence"].tolist(),
                 state["sightings"].tolist(),
+                state["missed"].tolist(),
                 strict=True,
             )
         ]
@@ -276,11 +247,13 @@ class InstanceTracks:
             covariance=np.diag(variances),
             half_size=sighting.half_size,
             distribution=sighting.distribution,
-            log_odds=sighting.log_odds,
+            prior=sighting.prior,
+            evidence=sighting.evidence,
             sightings=1,
         )
 
     def _joined(self, ahead: Track, sighting: Sighting, time_s: float) -> Track:
+        limit = self.config.max_evidence
         noise = self.config.centroid_sigma_m**2 * np.eye(3)
         mean, covariance = update(
             ahead.mean, ahead.covariance, sighting.centroid_world, noise, H=_H
@@ -292,8 +265,10 @@ class InstanceTracks:
             covariance=covariance,
             half_size=np.maximum(sighting.half_size, 0.8 * ahead.half_size),
             distribution=np.float32(0.5) * (ahead.distribution + sighting.distribution),
-            log_odds=(ahead.log_odds + sighting.log_odds) / 2,
+            prior=(ahead.prior + sighting.prior) / 2,
+            evidence=float(np.clip(ahead.evidence + sighting.evidence, -limit, limit)),
             sightings=ahead.sightings + 1,
+            missed=0,
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
 from graph.geometry import Array
+from semantics.instance_track import Sighting
 from semantics.instance_tracks import InstanceTracks, TrackConfig
 from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
 from slam.depth_regions import DepthRegionConfig, MovingSpace
@@ -214,18 +216,16 @@ class Dynamics:
             views = self.memory.posed(keyframe.segment, mapper)
         now_s = np.nan if keyframe is None else keyframe.timestamp_s
         sightings = self._witness.sightings(masks, views, now_s)
-        least = log_odds(self.config.tracks.min_prior)
-        movable = [s for s in sightings if s is not None and s.log_odds > least]
+        moving = np.array([s is not None and s.log_odds > 0 for s in sightings], bool)
         if keyframe is not None:
-            self.tracks.see(keyframe.timestamp_s, movable, masks.T_world_camera[:3, :3])
-        odds = np.array([-np.inf if s is None else s.log_odds for s in sightings])
-        still = np.array([s is not None and s.still for s in sightings], bool)
-        self._believe(masks, odds > 0, still)
+            self._track(masks, sightings, moving, keyframe.timestamp_s)
+        self._believe(masks, sightings)
+        still = [s is not None and s.still for s in sightings]
         standing = np.isin(masks.claims.owner, np.flatnonzero(still))
         self.memory.recall_space(masks.keyframe_id, standing)
-        if not (odds > 0).any():
+        if not moving.any():
             return
-        covered = np.isin(masks.claims.owner, np.flatnonzero(odds > 0))
+        covered = np.isin(masks.claims.owner, np.flatnonzero(moving))
         self.memory.forget_space(masks.keyframe_id, covered)
         pruner = replace(mapper.pruner(), border_px=-self.config.mask_border_px)
         pruner.prune_mask(masks.keyframe_id, covered)
@@ -258,18 +258,39 @@ class Dynamics:
         views = views if self.config.geometry else []
         return self._features.judge(frame, features, T_world_camera, views, boxes_world)
 
-    def _believe(self, masks: KeyframeMasks, moving: Mask, still: Mask) -> None:
-        """Landmarks on instances have their classes' priors, and move if their instance does; of
-        what stood still for long the class says nothing.
+    def _track(
+        self,
+        masks: KeyframeMasks,
+        sightings: Sequence[Sighting | None],
+        moving: Mask,
+        time_s: float,
+    ) -> None:
+        """Follow what may move; ``moving`` (K,) becomes what the tracks say of the sightings."""
+        least = log_odds(self.config.tracks.min_prior)
+        movable = [k for k, s in enumerate(sightings) if s is not None and s.log_odds > least]
+        seen = [s for k in movable if (s := sightings[k]) is not None]
+        ids = self.tracks.see(time_s, seen, masks.T_world_camera[:3, :3])
+        ahead = [self.tracks.predicted(track, time_s) for track in self.tracks.tracks]
+        self.tracks.miss(time_s, [t for t in ahead if self._witness.shows(masks, t)])
+        if not ids:
+            return
+        by_id = {track.id: track.moving for track in self.tracks.tracks}
+        for k, track_id in zip(movable, ids, strict=True):
+            moving[k] = by_id[track_id]
+
+    def _believe(self, masks: KeyframeMasks, sightings: Sequence[Sighting | None]) -> None:
+        """Landmarks on instances have their classes' priors, and move if views say so of their
+        instance; of what stood still for long the class says nothing.
         """
         ids, first = np.unique(masks.landmark_ids, return_index=True)
         priors = masks.label_distributions[first] @ self.priors.of(masks.names)
         instances = masks.instances[first]
-        on_one = instances >= 0
-        parked = np.append(still, False)[instances]
-        priors[parked] = np.minimum(priors[parked], self.priors.unknown)
+        still = np.array([s is not None and s.still for s in sightings] + [False])
+        evidence = np.array([0.0 if s is None else s.evidence for s in sightings] + [0.0])
+        priors[still[instances]] = np.minimum(priors[still[instances]], self.priors.unknown)
         self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
-        self.movability.update(ids[on_one], moving[instances[on_one]])
+        told = evidence[instances] != 0
+        self.movability.update(ids[told], evidence[instances[told]] > 0)
 
     def _remove(self, ids: Ints, mapper: Mapper) -> None:
         """Take those of the landmarks (N,) that move out of map and graph."""

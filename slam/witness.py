@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from graph.camera import Camera
-from graph.geometry import transform
-from semantics.instance_tracks import Sighting
+from graph.geometry import inverse, transform
+from semantics.instance_track import Sighting, Track
 from semantics.movability import MovabilityPriors, log_odds
+from slam.feature_check import NEAREST_M
 from slam.keyframe_masks import KeyframeMasks, surface_points
 from slam.stance import Stance, stance
-from slam.static_check import StaticCheck
+from slam.static_check import StaticCheck, distorted
 from slam.view_memory import PosedView
 
 
@@ -43,6 +44,20 @@ class Witness:
         instances = range(len(masks.claims.instances))
         return [self._sighting(k, masks, others, now_s) for k in instances]
 
+    def shows(self, masks: KeyframeMasks, track: Track) -> bool:
+        """Whether a keyframe shows the place of a track, as predicted, or what is behind it."""
+        (centre,) = transform(inverse(masks.T_world_camera), track.mean[None, :3])
+        if centre[2] < NEAREST_M:
+            return False
+        column, row = distorted(self.camera, centre[None])[0]
+        if not (0 <= column < self.camera.width and 0 <= row < self.camera.height):
+            return False
+        depth_m, owner = masks.depth_m, masks.claims.owner
+        step = max(owner.shape[0] // max(depth_m.shape[0], 1), 1)
+        height, width = depth_m.shape
+        there_m = depth_m[min(int(row / step), height - 1), min(int(column / step), width - 1)]
+        return bool(there_m > centre[2] - track.half_size[2])
+
     def _sighting(
         self, k: int, masks: KeyframeMasks, views: Sequence[PosedView], now_s: float
     ) -> Sighting | None:
@@ -55,12 +70,11 @@ class Witness:
         distribution, still = masks.claims.instances[k].distribution, found is Stance.STILL
         prior = float(distribution @ self.priors.of(masks.names))
         prior = min(prior, self.priors.unknown) if still else prior
-        odds = float(log_odds(np.clip(prior, 0.01, 0.99)))
-        odds += self.step * (int(found is Stance.MOVING) - int(found.is_static))
         return Sighting(
             centroid_world=transform(masks.T_world_camera, centroid[None])[0],
             half_size=np.maximum(high - centroid, centroid - low),
             distribution=distribution,
-            log_odds=odds,
+            prior=float(log_odds(np.clip(prior, 0.01, 0.99))),
+            evidence=self.step * (int(found is Stance.MOVING) - int(found.is_static)),
             still=still,
         )

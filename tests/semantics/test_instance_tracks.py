@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from graph.geometry import so3_exp
-from semantics.instance_tracks import InstanceTracks, Sighting, TrackConfig
+from semantics.instance_track import Sighting
+from semantics.instance_tracks import InstanceTracks, TrackConfig
 
 SIZE = np.array([0.25, 0.9, 0.2])
 PERSON, CHAIR = np.eye(3, dtype=np.float32)[1:]
@@ -74,6 +77,41 @@ def test_masks_out_of_order_change_nothing() -> None:
     before = tracks.state()
     assert tracks.see(0.5, [seen(1.0)]) == []
     assert all(np.array_equal(a, before[name]) for name, a in tracks.state().items())
+
+
+def moving_after(evidence: list[float], prior: float) -> bool:
+    tracks = InstanceTracks()
+    for k, told in enumerate(evidence):
+        tracks.see(0.3 * k, [replace(seen(0.0), prior=prior, evidence=told)])
+    return tracks.tracks[0].moving
+
+
+def test_what_views_say_adds_up_until_it_outweighs_the_class() -> None:
+    dog, person, step = np.log(0.89 / 0.11), np.log(0.95 / 0.05), np.log(9)
+    assert moving_after([0.0], dog)
+    assert not moving_after([-step] * 2, dog)
+    assert moving_after([-step] * 9, person)
+    assert moving_after([-step] * 9 + [step] * 2, dog)
+    assert not moving_after([step] * 9 + [-step] * 4, dog)
+
+
+def test_a_track_that_keyframes_miss_where_they_look_ends() -> None:
+    tracks = InstanceTracks(TrackConfig(max_missed=2))
+    tracks.see(0.0, [seen(0.0), seen(3.0)])
+    missed = tracks.tracks[0]
+    tracks.miss(0.2, [missed])
+    tracks.see(0.3, [seen(0.0)])
+    tracks.miss(0.4, [missed])
+    assert [t.missed for t in tracks.tracks] == [1, 0]
+    tracks.miss(0.4, [missed])
+    assert [t.id for t in tracks.tracks] == [1]
+
+
+def test_what_a_keyframe_shows_it_does_not_miss() -> None:
+    tracks = InstanceTracks(TrackConfig(max_missed=1))
+    tracks.see(0.2, [seen(0.0)])
+    tracks.miss(0.2, tracks.tracks)
+    assert [t.missed for t in tracks.tracks] == [0]
 
 
 def test_state_and_back() -> None:

@@ -10,7 +10,7 @@ import pytest
 from synthetic_view import CAMERA, TEXTURE, render_plane
 
 from graph.geometry import Array, inverse, se3_exp, transform
-from semantics.instance_tracks import Sighting
+from semantics.instance_track import Sighting
 from semantics.instances import Instance, certain, mask_box
 from semantics.labels import label_set
 from semantics.segmenter import Image

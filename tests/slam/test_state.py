@@ -18,7 +18,7 @@ from graph.geometry import Array, se3_exp
 from graph.shadow import Shadow
 from graph.storage import graph_arrays
 from graph.updates import GraphUpdate, RelativePose
-from semantics.instance_tracks import Sighting
+from semantics.instance_track import Sighting
 from semantics.instances import Instance, certain, mask_box
 from semantics.labels import label_set
 from semantics.segmenter import Image
