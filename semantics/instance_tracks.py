@@ -96,7 +96,12 @@ class InstanceTracks:
         return found
 
     def miss(self, time_s: float, shown: Sequence[Track]) -> None:
-        """A keyframe showed the places of these tracks; those it did not show were missed."""
+        """A keyframe showed the places of these tracks; those not seen in it were missed.
+
+        Masks that come after those of a later keyframe are of no use here either.
+        """
+        if any(track.time_s > time_s for track in self.tracks):
+            return
         unseen = {track.id for track in shown if track.time_s < time_s}
         tracks = [replace(t, missed=t.missed + (t.id in unseen)) for t in self.tracks]
         self.tracks = [t for t in tracks if t.missed < self.config.max_missed]

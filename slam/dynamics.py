@@ -216,9 +216,7 @@ class Dynamics:
             views = self.memory.posed(keyframe.segment, mapper)
         now_s = np.nan if keyframe is None else keyframe.timestamp_s
         sightings = self._witness.sightings(masks, views, now_s)
-        moving = np.array([s is not None and s.log_odds > 0 for s in sightings], bool)
-        if keyframe is not None:
-            self._track(masks, sightings, moving, keyframe.timestamp_s)
+        moving = self._tracked(masks, sightings, now_s)
         self._believe(masks, sightings)
         still = [s is not None and s.still for s in sightings]
         standing = np.isin(masks.claims.owner, np.flatnonzero(still))
@@ -258,25 +256,25 @@ class Dynamics:
         views = views if self.config.geometry else []
         return self._features.judge(frame, features, T_world_camera, views, boxes_world)
 
-    def _track(
-        self,
-        masks: KeyframeMasks,
-        sightings: Sequence[Sighting | None],
-        moving: Mask,
-        time_s: float,
-    ) -> None:
-        """Follow what may move; ``moving`` (K,) becomes what the tracks say of the sightings."""
+    def _tracked(
+        self, masks: KeyframeMasks, sightings: Sequence[Sighting | None], now_s: float
+    ) -> Mask:
+        """Which of a keyframe's sightings (K,) move, by their tracks, if they have one.
+
+        A culled keyframe, whose time ``now_s`` is NaN, adds nothing to the tracks.
+        """
+        moving = np.array([s is not None and s.log_odds > 0 for s in sightings], bool)
+        if np.isnan(now_s):
+            return moving
         least = log_odds(self.config.tracks.min_prior)
-        movable = [k for k, s in enumerate(sightings) if s is not None and s.log_odds > least]
-        seen = [s for k in movable if (s := sightings[k]) is not None]
-        ids = self.tracks.see(time_s, seen, masks.T_world_camera[:3, :3])
-        ahead = [self.tracks.predicted(track, time_s) for track in self.tracks.tracks]
-        self.tracks.miss(time_s, [t for t in ahead if self._witness.shows(masks, t)])
-        if not ids:
-            return
-        by_id = {track.id: track.moving for track in self.tracks.tracks}
-        for k, track_id in zip(movable, ids, strict=True):
-            moving[k] = by_id[track_id]
+        movable = {k: s for k, s in enumerate(sightings) if s is not None and s.log_odds > least}
+        ids = self.tracks.see(now_s, list(movable.values()), masks.T_world_camera[:3, :3])
+        ahead = [self.tracks.predicted(track, now_s) for track in self.tracks.tracks]
+        by_id = {track.id: track.moving for track in ahead}
+        if ids:
+            moving[list(movable)] = [by_id[track_id] for track_id in ids]
+        self.tracks.miss(now_s, [track for track in ahead if self._witness.shows(masks, track)])
+        return moving
 
     def _believe(self, masks: KeyframeMasks, sightings: Sequence[Sighting | None]) -> None:
         """Landmarks on instances have their classes' priors, and move if views say so of their

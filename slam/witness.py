@@ -56,7 +56,7 @@ class Witness:
         step = max(owner.shape[0] // max(depth_m.shape[0], 1), 1)
         height, width = depth_m.shape
         there_m = depth_m[min(int(row / step), height - 1), min(int(column / step), width - 1)]
-        return bool(there_m > centre[2] - track.half_size[2])
+        return bool(there_m > centre[2] - track.half_size[2] - self.check.config.margin_m)
 
     def _sighting(
         self, k: int, masks: KeyframeMasks, views: Sequence[PosedView], now_s: float

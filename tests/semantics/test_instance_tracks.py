@@ -76,6 +76,7 @@ def test_masks_out_of_order_change_nothing() -> None:
     tracks.see(1.0, [seen(0.0)])
     before = tracks.state()
     assert tracks.see(0.5, [seen(1.0)]) == []
+    tracks.miss(0.5, tracks.tracks)
     assert all(np.array_equal(a, before[name]) for name, a in tracks.state().items())
 
 

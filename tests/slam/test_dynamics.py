@@ -25,7 +25,7 @@ from slam.system_config import SystemConfig
 CARD_Z_M = 1.3
 FRAMES = 36
 SETTINGS = ["keyframes.min_interval_frames=6", "keyframes.max_shared=2.0"]
-NAMES = label_set(("person", "picture"))
+NAMES = label_set(("person", "picture", "dog"))
 _PATTERN = TEXTURE[100:340, 100:340].astype(np.uint8)
 
 
@@ -153,6 +153,42 @@ def test_what_is_called_a_person_and_stands_for_long_is_structure_again() -> Non
     assert counts[1:10, 1].sum() > 0.9 * counts[1:10, 0].sum()
     assert counts[-5:, 1].sum() == 0
     assert landmarks_on_card(system) > 50
+
+
+def test_a_person_whom_only_one_keyframe_shows_is_not_looked_for_any_longer() -> None:
+    once = CardSegmenter(1)
+    segment = once.segment
+    once.segment = lambda image, name: segment(image, name) if not calls else []  # type: ignore
+    calls: list[str] = []
+    config = resolve(SystemConfig, None, [*SETTINGS, "dynamics.geometry=false"])
+    system = SlamSystem(CAMERA, config, once)
+    left_out = []
+    for frame in standing(30):
+        sifted = SlamSystem._sift(system, frame, system.prepare(frame))
+        left_out.append(sifted.ignored)
+        if system.process(frame).keyframe_id is not None:
+            calls.append(frame.name)
+    assert len(calls) > 3
+    assert min(left_out[1:6]) > 50
+    assert max(left_out[-6:]) == 0
+
+
+def test_landmarks_that_are_found_in_place_stay_until_what_they_are_on_moves(
+    frames: list[Frame],
+) -> None:
+    late = CardSegmenter(1)
+    segment, late.segment = late.segment, lambda image, name: []  # type: ignore[method-assign]
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), late)
+    for frame in standing(20):
+        system.process(frame)
+    before = landmarks_on_card(system)
+    late.segment = segment  # type: ignore[method-assign]
+    for frame in standing(27)[20:]:
+        system.process(frame)
+    assert landmarks_on_card(system) > 0.8 * before > 50
+    for frame in frames[9:]:
+        system.process(replace(frame, index=frame.index + 20, timestamp_s=frame.timestamp_s + 0.6))
+    assert landmarks_on_card(system) < 0.1 * before
 
 
 def test_what_is_seen_to_stand_still_is_used_in_a_walkers_box_too(frames: list[Frame]) -> None:
