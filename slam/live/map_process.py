@@ -52,7 +52,7 @@ from slam.tracker import Tracked
 
 logger = logging.getLogger(__name__)
 
-STATE_FILE = FileKind("live state", 2)
+STATE_FILE = FileKind("live state", 3)
 NICENESS = 5
 """Tracking goes first where there is a processor too few."""
 
