@@ -16,7 +16,8 @@ class Camera:
     Pixels are (column, row) with centres at integers. ``distortion`` is OpenCV's
     (k1, k2, p1, p2, k3). A stored depth value ``d`` means ``d / depth_scale + depth_offset_m``
     metres (paper eq. 9, and an offset), taken at the depth image's stamp plus
-    ``depth_time_offset_s``.
+    ``depth_time_offset_s``. Images are exposed row by row from the top, the last row
+    ``rolling_shutter_s`` after the first, and their stamps are those of the middle row.
     ``stereo_bf_px_m`` is the product of focal length and baseline of the pseudo-stereo pair that
     stands for the depth sensor: u_right = u_left - bf / z (ORB-SLAM2 eq. 1); for a Kinect
     about 40 px m (baseline 7.5 cm), so that one pixel of disparity noise is z^2/bf of depth noise.
@@ -34,6 +35,7 @@ class Camera:
     stereo_bf_px_m: float = 40.0
     depth_offset_m: float = 0.0
     depth_time_offset_s: float = 0.0
+    rolling_shutter_s: float = 0.0
 
     @property
     def K(self) -> Array:

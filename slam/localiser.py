@@ -12,6 +12,7 @@ from slam.local_mapping import MappingConfig, local_landmarks
 from slam.place_recognition import DescriptorIndex
 from slam.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from slam.results import TrackingStatus
+from slam.rolling_shutter import PreviousPose
 from slam.tracker import Tracked, Tracker
 from slam.world_map import Keyframe, WorldMap
 
@@ -19,6 +20,9 @@ UNEVEN = 0.25
 """Frames count as evenly spaced if their intervals differ by a smaller share."""
 MAX_STEPS = 4.0
 """A motion is not believed to go on for longer than so many times its own length."""
+
+MAX_AGO_S = 0.2
+"""An older pose tells too little of the velocity."""
 
 
 class Localiser:
@@ -84,7 +88,9 @@ class Localiser:
     def preview(self, features: Features, world: WorldMap) -> Array | None:
         """The pose that tracking would find, None if it would not; nothing is remembered of it."""
         recent_ids, local_ids = self._recent_ids, world.landmarks.living(self._local_ids)
-        tracked = self.tracker.track(features, self._predicted(), recent_ids, local_ids, world)
+        tracked = self.tracker.track(
+            features, self._predicted(), recent_ids, local_ids, world, self._previous()
+        )
         return None if tracked.status is TrackingStatus.LOST else tracked.T_world_camera
 
     def leave_out(self, landmark_ids: Ints) -> None:
@@ -99,7 +105,7 @@ class Localiser:
         T_predicted = self._predicted()
         self._local_ids = world.landmarks.living(self._local_ids)
         tracked = self.tracker.track(
-            features, T_predicted, self._recent_ids, self._local_ids, world
+            features, T_predicted, self._recent_ids, self._local_ids, world, self._previous()
         )
         if tracked.status is TrackingStatus.LOST:
             found = self.find(features, world.in_segment(reference.segment), world)
@@ -154,6 +160,12 @@ class Localiser:
             return orthonormalised(self._T_world_last @ self._T_last_next)
         motion = min(steps, MAX_STEPS) * se3_log(self._T_last_next)
         return orthonormalised(self._T_world_last @ se3_exp(motion))
+
+    def _previous(self) -> PreviousPose | None:
+        """The last frame's pose, None where it is too old to tell a velocity."""
+        ago_s = self._now_s - self._last_s
+        recent = self.lost_frames == 0 and 0 < ago_s < MAX_AGO_S  # False for NaN
+        return PreviousPose(self._T_world_last, ago_s) if recent else None
 
     def restart(self, T_world_camera: Array) -> None:
         """Begin anew at a pose, without speed: a new segment, or a map that was moved."""

@@ -10,7 +10,7 @@ import numpy as np
 from graph.geometry import Array, make_pose
 from slam.features import Features
 from slam.local_mapping import MappingConfig, local_landmarks
-from slam.matching import MatchConfig, WindowIndex, consistent_rotation, match_brute_force
+from slam.matching import MatchConfig, consistent_rotation, match_brute_force
 from slam.place_recognition import DescriptorIndex
 from slam.results import TrackingStatus
 from slam.tracker import Tracked, Tracker
@@ -56,8 +56,7 @@ def relocalise(
             continue
         _, seen = world.observed(keyframe)
         local_ids = local_landmarks(world, seen, mapping)
-        index = WindowIndex(features.pixels)
-        tracked = tracker.refine(features, index, T_world_camera, local_ids, world)
+        tracked = tracker.refine(features, T_world_camera, local_ids, world)
         enough = len(tracked.landmark_ids) >= rules.min_inliers
         if tracked.status is not TrackingStatus.LOST and enough:
             return tracked

@@ -8,11 +8,12 @@ import numpy as np
 
 from graph.camera import Camera
 from graph.geometry import Array, inverse, transform
-from slam.features import Features, undistort
+from slam.features import Features, select, undistort
 from slam.landmarks import Ints, LandmarkTable
 from slam.matching import MatchConfig, Matches, WindowIndex, consistent_rotation, match_pairs
 from slam.pose_optimisation import PoseEstimate, PoseOptimisationConfig, optimise_pose
 from slam.results import TrackingStatus
+from slam.rolling_shutter import Motion, PreviousPose, at_one_moment, corrected, motion_since
 from slam.subpixel import SubpixelConfig, register_patches
 from slam.world_map import WorldMap
 
@@ -81,36 +82,46 @@ class Tracker:
         recent_ids: Ints,
         local_ids: Ints,
         world: WorldMap,
+        previous: PreviousPose | None = None,
     ) -> Tracked:
-        """The frame's pose from landmarks seen a moment ago, then from the whole local map."""
-        index = WindowIndex(features.pixels)
+        """The frame's pose from landmarks seen a moment ago, then from the whole local map.
+
+        The previous pose tells how fast the camera moves, which matters to a rolling shutter.
+        """
         recent_ids = world.landmarks.living(recent_ids)
+        motion = motion_since(previous, T_predicted, self.camera)
         estimate = self._first_estimate(
-            features, index, T_predicted, recent_ids, local_ids, world.landmarks
+            at_one_moment(features, self.camera, motion),
+            T_predicted,
+            recent_ids,
+            local_ids,
+            world.landmarks,
         )
         if estimate is None:
             return lost(T_predicted, features)
-        return self.refine(features, index, estimate.T_world_camera, local_ids, world)
+        return self.refine(features, estimate.T_world_camera, local_ids, world, previous)
 
     def refine(
         self,
         features: Features,
-        index: WindowIndex,
         T_world_camera: Array,
         local_ids: Ints,
         world: WorldMap,
+        previous: PreviousPose | None = None,
     ) -> Tracked:
         """The pose from all landmarks of the local map, given a good first one."""
         radius, landmarks = self.config.local_radius_px, world.landmarks
+        motion = motion_since(previous, T_world_camera, self.camera)
+        still = at_one_moment(features, self.camera, motion)
         visible, matches = self.search(
-            features, index, T_world_camera, local_ids, radius, landmarks
+            still, WindowIndex(still.pixels), T_world_camera, local_ids, radius, landmarks
         )
         if self.config.subpixel.enabled:
             features = self._registered(
                 features, matches.train, visible[matches.query], T_world_camera[:3, 3], world
             )
-        estimate = self._optimise(
-            features, matches, visible, T_world_camera, landmarks, self._narrow
+        features, estimate = self._refined(
+            features, matches, visible, T_world_camera, landmarks, motion
         )
         inliers = int(estimate.inliers.sum())
         if not estimate.ok or inliers < self.config.weak_inliers:
@@ -128,6 +139,29 @@ class Tracker:
             matches=len(matches),
             visible_ids=visible,
             information=estimate.information,
+        )
+
+    def _refined(
+        self,
+        features: Features,
+        matches: Matches,
+        ids: Ints,
+        T_world_camera: Array,
+        landmarks: LandmarkTable,
+        motion: Motion | None,
+    ) -> tuple[Features, PoseEstimate]:
+        """The pose, and the features as they are at one moment, by what they tell of the motion."""
+        still = at_one_moment(features, self.camera, motion)
+        estimate = self._optimise(still, matches, ids, T_world_camera, landmarks, self._narrow)
+        if motion is None or not estimate.ok:
+            return still, estimate
+        kept = matches[estimate.inliers]
+        points_world = landmarks.points_world[ids[kept.query]]
+        seen = select(still, kept.train)
+        motion = corrected(motion, estimate, points_world, seen, self.camera)
+        still = at_one_moment(features, self.camera, motion)
+        return still, self._optimise(
+            still, matches, ids, estimate.T_world_camera, landmarks, self._narrow
         )
 
     def _registered(
@@ -208,13 +242,13 @@ class Tracker:
     def _first_estimate(
         self,
         features: Features,
-        index: WindowIndex,
         T_predicted: Array,
         recent_ids: Ints,
         local_ids: Ints,
         landmarks: LandmarkTable,
     ) -> PoseEstimate | None:
         """A pose near the prediction, from the last frame's landmarks or from the local map."""
+        index = WindowIndex(features.pixels)
         near, wide = self.config.search_radius_px, self.config.wide_radius_px
         for ids, radius in ((recent_ids, near), (local_ids, near), (local_ids, wide)):
             visible, matches = self.search(features, index, T_predicted, ids, radius, landmarks)

@@ -40,10 +40,11 @@ OPTIONAL = {
     "stereo_bf": "stereo_bf_px_m",
     "depth_offset": "depth_offset_m",
     "depth_time_offset": "depth_time_offset_s",
+    "rolling_shutter": "rolling_shutter_s",
 }
 """Optional numbers by the name of Camera's attribute."""
 KEYS = (*REQUIRED, "distortion", *OPTIONAL)
-LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0}
+LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0, "rolling_shutter": 1.0}
 """Largest magnitude, in metres and seconds: beyond, it is another unit."""
 
 
@@ -145,7 +146,7 @@ def _check_range(path: Path, numbers: dict[str, float]) -> None:
         if abs(value) > LIMITS.get(key, math.inf):
             raise InputError(
                 f"{path}: {key} is {value:g}, more than {LIMITS[key]:g} either way; "
-                "depth_offset is in metres, depth_time_offset in seconds"
+                "depth_offset is in metres, depth_time_offset and rolling_shutter in seconds"
             )
     for key in ("width", "height"):
         if numbers[key] != int(numbers[key]):
