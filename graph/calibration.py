@@ -51,7 +51,7 @@ class CalibrationResult:
     """Where the solver ended.
 
     Attributes:
-        calibration: (12,), and its covariance (12, 12), zero in fixed parameters.
+        calibration: (13,), and its covariance (13, 13), zero in fixed parameters.
         poses_world_camera: (K, 4, 4); points_world: (L, 3).
         noise_scales: (2,) how many times the nominal sigmas of pixels and of depths the
             residuals are.
@@ -128,7 +128,7 @@ def _descend(
 def _step(
     problem: CalibrationProblem, state: CalibrationState, scales: Array, damping: float
 ) -> tuple[Array, Array, Array] | None:
-    """Step of poses (K, 6), points (L, 3) and calibration (12,); None: not positive definite."""
+    """Step of poses (K, 6), points (L, 3) and calibration (13,); None: not positive definite."""
     reduced = normal_equations(problem, state, scales, damping)
     try:
         x = -cho_solve(cho_factor(reduced.S), reduced.b)

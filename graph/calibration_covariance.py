@@ -21,7 +21,7 @@ STRETCHES = 8
 
 
 def covariance_of(problem: CalibrationProblem, state: CalibrationState, scales: Array) -> Array:
-    """Covariance (12, 12) of the calibration, zero in what is held fixed.
+    """Covariance (13, 13) of the calibration, zero in what is held fixed.
 
     The inverse of the normal equations is right if errors are independent. They are not: a
     landmark's patch looks different, in the same way, from neighbouring views, and a stretch of the
@@ -63,7 +63,7 @@ def _clusters(views: CalibrationViews) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _clustered_variance(scores: Array, clusters: IntArray) -> Array:
-    """Variances (12,) from scores (M, 12) whose errors depend on each other within clusters (M,).
+    """Variances (13,) from scores (M, 13) whose errors depend on each other within clusters (M,).
 
     Few clusters tell their spread badly: the variance is raised so that 1.96 of its roots are the
     bound of Student's t with as many degrees of freedom.

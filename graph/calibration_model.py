@@ -15,6 +15,10 @@ with the rate of change of 1 / raw at the fixed pixel, which is measured: the de
 and after differ by it. (The alternative, rate = -(z' + slope . flow) / z^2 from the camera's
 velocity and the surface's slope, needs that slope from one noisy image, whose error biases tau
 toward zero.)
+
+The rows of a rolling shutter are exposed one after the other: a point with the velocity p' in the
+camera's frame is seen at p + (row / rows - 1/2) rolling_shutter p'. The depth image is taken to
+roll along.
 """
 
 from __future__ import annotations
@@ -29,12 +33,12 @@ from graph.geometry import Array, inverse, skew
 
 PARAMETERS = (
     *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
-    *("depth_factor", "depth_offset_m", "time_offset_s"),
+    *("depth_factor", "depth_offset_m", "time_offset_s", "rolling_shutter_s"),
 )
-"""The calibration as a vector (12,): pixels, OpenCV's distortion, metres a raw depth unit,
-metres, seconds."""
+"""The calibration as a vector (13,): pixels, OpenCV's distortion, metres a raw depth unit,
+metres, seconds, seconds."""
 F, C, K, P = slice(0, 2), slice(2, 4), [4, 5, 8], slice(6, 8)
-FACTOR, OFFSET, TIME = 9, 10, 11
+FACTOR, OFFSET, TIME, SHUTTER = 9, 10, 11, 12
 MIN_DEPTH_M = 0.05
 
 
@@ -50,6 +54,8 @@ class CalibrationViews:
         lag_s: (M,) what the depth image's stamp says it was taken later than the colour image.
         sigma_px: (M,) standard deviation of u and of v.
         sigma_inverse: (M,) standard deviation of ``inverse_depth``.
+        shutter_velocity: (M, 3) the point's velocity in the camera's frame in m/s, times the share
+            of the image, from -1/2 to 1/2, by which its row lies below the middle.
     """
 
     keyframes: NDArray[np.int64]
@@ -60,6 +66,7 @@ class CalibrationViews:
     lag_s: Array
     sigma_px: Array
     sigma_inverse: Array
+    shutter_velocity: Array
 
 
 @dataclass(frozen=True)
@@ -67,7 +74,7 @@ class Linearised:
     """Residuals (M, 3), predicted - measured over sigma, and their derivatives.
 
     ``pose`` (M, 3, 6) is by the tangent of T_world_camera, ``point`` (M, 3, 3) by the point in
-    the world, ``calibration`` (M, 3, 12) by the vector of PARAMETERS. Rows are u, v and inverse
+    the world, ``calibration`` (M, 3, 13) by the vector of PARAMETERS. Rows are u, v and inverse
     depth; ``valid`` (M, 3) is False, and the row zero, for a missing depth or one whose rate is not
     known, and for a point behind the camera.
     """
@@ -80,12 +87,13 @@ class Linearised:
 
 
 def parameters_of(camera: Camera, raw_scale: float) -> Array:
-    """The vector (12,) of a camera whose raw depth is stored values over ``raw_scale``."""
+    """The vector (13,) of a camera whose raw depth is stored values over ``raw_scale``."""
     k1, k2, p1, p2, k3 = camera.distortion
     return np.array(
         [
             *(camera.fx, camera.fy, camera.cx, camera.cy, k1, k2, p1, p2, k3),
-            *(raw_scale / camera.depth_scale, camera.depth_offset_m, camera.depth_time_offset_s),
+            *(raw_scale / camera.depth_scale, camera.depth_offset_m),
+            *(camera.depth_time_offset_s, camera.rolling_shutter_s),
         ]
     )
 
@@ -108,16 +116,18 @@ def distort(normalised: Array, calibration: Array) -> Array:
 def linearise(
     views: CalibrationViews, poses: Array, points_world: Array, calibration: Array
 ) -> Linearised:
-    """Residuals and derivatives at poses (K, 4, 4), points (L, 3) and a calibration (12,)."""
+    """Residuals and derivatives at poses (K, 4, 4), points (L, 3) and a calibration (13,)."""
     T_camera_world = inverse(poses)[views.keyframes]
     R = T_camera_world[:, :3, :3]
     p = np.einsum("mij,mj->mi", R, points_world[views.landmarks]) + T_camera_world[:, :3, 3]
     in_front = p[:, 2] > MIN_DEPTH_M
     p = np.where(in_front[:, None], p, [0.0, 0.0, 1.0])
-    pixels, by_point, by_calibration = _pixel(p, calibration)
-    inverse_depth, depth_by_point, depth_by_calibration = _inverse_depth(views, p, calibration)
+    p_row = p + calibration[SHUTTER] * views.shutter_velocity
+    pixels, by_point, by_calibration = _pixel(p_row, calibration)
+    inverse_depth, depth_by_point, depth_by_calibration = _inverse_depth(views, p_row, calibration)
     by_point = np.concatenate([by_point, depth_by_point[:, None]], axis=1)
     by_calibration = np.concatenate([by_calibration, depth_by_calibration[:, None]], axis=1)
+    by_calibration[..., SHUTTER] = (by_point @ views.shutter_velocity[..., None])[..., 0]
     predicted = np.column_stack([pixels, inverse_depth])
     measured = np.column_stack([views.pixels, views.inverse_depth])
     weight = 1 / np.column_stack([views.sigma_px, views.sigma_px, views.sigma_inverse])
@@ -136,7 +146,7 @@ def linearise(
 
 
 def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
-    """Pixels (M, 2), and their derivatives (M, 2, 3) by p (M, 3) and (M, 2, 12)."""
+    """Pixels (M, 2), and their derivatives (M, 2, 3) by p (M, 3) and (M, 2, 13)."""
     inv_z = 1 / p[:, 2]
     normalised = p[:, :2] * inv_z[:, None]
     x, y = normalised.T
@@ -169,7 +179,7 @@ def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
 def _inverse_depth(
     views: CalibrationViews, p: Array, calibration: Array
 ) -> tuple[Array, Array, Array]:
-    """Raw inverse depth (M,) in the depth image, and its derivatives (M, 3) by p and (M, 12)."""
+    """Raw inverse depth (M,) in the depth image, and its derivatives (M, 3) by p and (M, 13)."""
     tau_s = views.lag_s + calibration[TIME]
     factor, z = calibration[FACTOR], np.maximum(p[:, 2] - calibration[OFFSET], MIN_DEPTH_M)
     by_p = np.zeros_like(p)

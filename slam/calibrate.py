@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from graph.calibration import CalibrationResult, calibrate
-from graph.calibration_model import FACTOR, OFFSET, PARAMETERS, TIME, parameters_of
+from graph.calibration_model import FACTOR, OFFSET, PARAMETERS, SHUTTER, TIME, parameters_of
 from graph.calibration_problem import Anchors, CalibrationProblem
 from graph.camera import Camera
 from graph.errors import InputError
@@ -18,6 +18,7 @@ from graph.geometry import Array, inverse, transform
 from graph.metrics import align
 from graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
 from graph.updates import IntArray
+from slam.calibration_motion import seen_motion
 from slam.calibration_report import Calibrated, format_calibration
 from slam.calibration_views import connected_views, make_views
 from slam.saved_run import SavedRun, read_run
@@ -44,6 +45,7 @@ class CalibrationPriors:
         k1, k2, p1, p2, k3: of the distortion; 0 holds a parameter fixed.
         depth_share: of the depth scale, as a share of it.
         depth_offset_m, depth_time_offset_s: of the offsets.
+        rolling_shutter_s: of the time in which the rows are exposed.
     """
 
     focal_share: float = 0.05
@@ -56,15 +58,17 @@ class CalibrationPriors:
     depth_share: float = 0.05
     depth_offset_m: float = 0.02
     depth_time_offset_s: float = 0.02
+    rolling_shutter_s: float = 0.02
 
     def sigmas(self, camera: Camera) -> Array:
-        """The vector (12,) of PARAMETERS."""
+        """The vector (13,) of PARAMETERS."""
         return np.array(
             [
                 *(self.focal_share * camera.fx, self.focal_share * camera.fy),
                 *(self.centre_share * camera.width,) * 2,
                 *(self.k1, self.k2, self.p1, self.p2, self.k3),
                 *(self.depth_share, self.depth_offset_m, self.depth_time_offset_s),
+                self.rolling_shutter_s,
             ]
         )
 
@@ -182,7 +186,8 @@ def make_problem(
             f"{run.path}: {count} keyframes share landmarks, too few to calibrate; use a run with "
             f"at least {MIN_KEYFRAMES}, better 20 or more"
         )
-    views, keyframe_ids, landmark_ids = make_views(seen, frames, sequence)
+    motion = seen_motion(seen, run)
+    views, keyframe_ids, landmark_ids = make_views(seen, frames, sequence, motion)
     poses = run.shadow.keyframes.get(keyframe_ids)
     points = run.shadow.landmarks.get(landmark_ids)
     stamps = np.array([stamps_s[k] for k in keyframe_ids.tolist()])
@@ -257,7 +262,7 @@ def _with_distance(
 
 
 def camera_from(before: Camera, calibration: Array) -> Camera:
-    """The camera (rounded to what is meaningful) that a vector (12,) of PARAMETERS says."""
+    """The camera (rounded to what is meaningful) that a vector (13,) of PARAMETERS says."""
     fx, fy, cx, cy = (round(float(x), 4) for x in calibration[:4])
     k1, k2, p1, p2, k3 = (round(float(x), 6) for x in calibration[4:9])
     return dataclasses.replace(
@@ -267,4 +272,5 @@ def camera_from(before: Camera, calibration: Array) -> Camera:
         depth_scale=round(before.depth_scale / float(calibration[FACTOR]), 3),
         depth_offset_m=round(float(calibration[OFFSET]), 6),
         depth_time_offset_s=round(float(calibration[TIME]), 6),
+        rolling_shutter_s=round(float(calibration[SHUTTER]), 6),
     )  # fmt: skip

@@ -15,7 +15,11 @@ from graph.geometry import Array
 NORMAL_95 = 1.96
 UNOBSERVED, WEAK = 0.8, 0.4
 """Shares of the prior's sigma above which a posterior's says nothing new, or little."""
-UNITS = {"depth_offset_m": ("depth offset", "mm", 1e3), "time_offset_s": ("time offset", "ms", 1e3)}
+UNITS = {
+    "depth_offset_m": ("depth offset", "mm", 1e3),
+    "time_offset_s": ("time offset", "ms", 1e3),
+    "rolling_shutter_s": ("rolling shutter", "ms", 1e3),
+}
 CURES = {
     **dict.fromkeys(("fx", "fy"), "turn the camera, over things near and far"),
     **dict.fromkeys(
@@ -25,6 +29,7 @@ CURES = {
     "depth_factor": "give --reference or --known-distance",
     "depth_offset_m": "look at the same things from near and far",
     "time_offset_s": "move faster, and toward and away from things",
+    "rolling_shutter_s": "turn the camera faster",
 }
 
 
@@ -34,7 +39,7 @@ class Calibrated:
 
     Attributes:
         path: the camera.yaml; camera: what it holds; before: the run's camera.
-        result: of the solver; prior_sigmas: (12,), 0 where held fixed.
+        result: of the solver; prior_sigmas: (13,), 0 where held fixed.
         has_anchor: whether anything metric was given.
         keyframes, landmarks, observations: how many were used.
     """
@@ -51,7 +56,7 @@ class Calibrated:
 
     @property
     def sigmas(self) -> Array:
-        """Standard deviations (12,) of PARAMETERS."""
+        """Standard deviations (13,) of PARAMETERS."""
         return np.sqrt(np.diag(self.result.covariance))
 
 
@@ -98,7 +103,8 @@ def _of(camera: Camera) -> Array:
     return np.array(
         [
             *(camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion),
-            *(camera.depth_scale, camera.depth_offset_m, camera.depth_time_offset_s),
+            *(camera.depth_scale, camera.depth_offset_m),
+            *(camera.depth_time_offset_s, camera.rolling_shutter_s),
         ]
     )
 

@@ -13,6 +13,8 @@ from graph.camera import Camera
 from graph.geometry import Array
 from graph.shadow import Shadow
 from graph.updates import IntArray, Observations
+from slam.calibration_motion import as_exposed
+from slam.rolling_shutter import share_of_rows
 from slam.sequences import Sequence
 from slam.sequences.images import SURFACE_STEP, read_depth
 
@@ -76,11 +78,13 @@ def make_views(
     seen: Observations,
     frames: dict[int, int],
     sequence: Sequence,
+    motion: tuple[Array, Array],
 ) -> tuple[CalibrationViews, IntArray, IntArray]:
     """The views of a run, and the ids (K,) and (L,) of keyframes and landmarks.
 
-    ``frames`` tells each keyframe's index in the sequence, whose camera must be the run's. Pixels
-    are distorted again as the image is; depths are read anew from the raw depth images.
+    ``frames`` tells each keyframe's index in the sequence, whose camera must be the run's;
+    ``motion`` is that of ``seen_motion``. Pixels are distorted and rolled again as the image is;
+    depths are read anew from the raw depth images.
 
     Raises:
         InputError: a keyframe's depth image is missing or broken.
@@ -88,7 +92,7 @@ def make_views(
     camera = sequence.camera
     keyframe_ids, keyframes = np.unique(seen.keyframe_ids, return_inverse=True)
     landmark_ids, landmarks = np.unique(seen.landmark_ids, return_inverse=True)
-    pixels = raw_pixels(seen.measurements[:, :2], camera)
+    pixels = raw_pixels(as_exposed(seen.measurements[:, :2], motion, camera), camera)
     inverse_depth, rms, rate = np.full((3, len(seen)), np.nan)
     lag_s = np.zeros(len(seen))
     # The graph's disparity sigma has the roughness of the surface in it, which is fitted here.
@@ -110,6 +114,7 @@ def make_views(
         lag_s=lag_s,
         sigma_px=seen.sigmas_px[:, 0],
         sigma_inverse=np.hypot(nominal, rms),
+        shutter_velocity=share_of_rows(pixels[:, 1], camera)[:, None] * motion[1],
     )
     return views, keyframe_ids, landmark_ids
 

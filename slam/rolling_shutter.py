@@ -48,9 +48,14 @@ def motion_since(
     return Motion(se3_log(between) / previous.ago_s, ACCELERATION * previous.ago_s)
 
 
+def share_of_rows(rows: Array, camera: Camera) -> Array:
+    """By what share (N,) of the image, from -1/2 to 1/2, rows (N,) lie below its middle."""
+    return (rows + 0.5) / camera.height - 0.5
+
+
 def exposed_after_s(rows: Array, camera: Camera) -> Array:
     """How many seconds (N,) after the image's middle its rows (N,) are exposed."""
-    return camera.rolling_shutter_s * ((rows + 0.5) / camera.height - 0.5)
+    return camera.rolling_shutter_s * share_of_rows(rows, camera)
 
 
 def velocities(points_camera: Array, twist: Array) -> Array:

@@ -10,8 +10,10 @@ from graph.calibration_model import CalibrationViews
 from graph.calibration_problem import CalibrationProblem
 from graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp, transform
 
-TRUTH = np.array([525.0, 520.0, 318.5, 241.5, 0.05, -0.08, 0.001, -0.002, 0.0, 0.97, 0.012, 0.010])
-PRIORS = np.array([30.0, 30, 10, 10, 0.2, 0.4, 0.01, 0.01, 0.0, 0.05, 0.05, 0.02])
+TRUTH = np.array(
+    [525.0, 520.0, 318.5, 241.5, 0.05, -0.08, 0.001, -0.002, 0.0, 0.97, 0.012, 0.010, 0.0]
+)
+PRIORS = np.array([30.0, 30, 10, 10, 0.2, 0.4, 0.01, 0.01, 0.0, 0.05, 0.05, 0.02, 0.02])
 SIZE = (640, 480)
 
 
@@ -37,6 +39,17 @@ def inverse_depth_of(pixels: Array, n: Array, d: Array, truth: Array) -> Array:
     return truth[9] / (z - truth[10])
 
 
+def rolled(points: Array, pixels: Array, twists: Array, truth: Array) -> tuple[Array, Array, Array]:
+    """Camera points (M, 3) and pixels when their rows are exposed, and T_middle_row (M, 4, 4)."""
+    then, T = points, np.tile(np.eye(4), (len(points), 1, 1))
+    for _ in range(5):
+        later_s = truth[12] * ((pixels[:, 1] + 0.5) / SIZE[1] - 0.5)
+        T = se3_exp(later_s[:, None] * twists)
+        then = transform(inverse(T), points[:, None])[:, 0]
+        pixels = project(then, truth) if truth[12] else pixels
+    return then, pixels, T
+
+
 def make_problem(
     seed: int = 0,
     noise: float = 0.0,
@@ -45,7 +58,7 @@ def make_problem(
     keyframes: int = 14,
     points: int = 150,
 ) -> tuple[CalibrationProblem, Array, Array]:
-    """A problem that starts at ``start`` (12,), and its true poses and points.
+    """A problem that starts at ``start`` (13,), and its true poses and points.
 
     ``noise`` is a factor on sigmas of 0.3 px and 0.002 / m, which the problem states. Poses and
     points start a little beside the truth, the first pose at it.
@@ -68,6 +81,8 @@ def make_problem(
     inside = (pixels > 0).all(axis=1) & (pixels < SIZE).all(axis=1) & (seen[:, 2] > 0.5) & facing
     k, seen_points = k[inside], seen_points[inside]
     seen, pixels, n = seen[inside], pixels[inside], n[inside]
+    seen, pixels, T_row = rolled(seen, pixels, velocities[k], truth)
+    n = np.einsum("mji,mj->mi", T_row[:, :3, :3], n)
     pixels = pixels + noise * 0.3 * rng.standard_normal(pixels.shape)
 
     def inverse_depth_at(time_s: float) -> Array:
@@ -77,6 +92,8 @@ def make_problem(
         point = np.einsum("mij,mj->mi", T[:, :3, :3], seen) + T[:, :3, 3]
         return inverse_depth_of(pixels, n_then, (n_then * point).sum(axis=1), truth)
 
+    share = (pixels[:, 1] + 0.5) / SIZE[1] - 0.5
+    point_velocities = -np.cross(velocities[k, :3], seen) - velocities[k, 3:]
     w = [inverse_depth_at(truth[11] + dt) for dt in (-1 / 30, 0, 1 / 30)]
     views = CalibrationViews(
         keyframes=k,
@@ -87,6 +104,7 @@ def make_problem(
         lag_s=np.zeros(len(k)),
         sigma_px=np.full(len(k), 0.3),
         sigma_inverse=np.full(len(k), 0.002),
+        shutter_velocity=share[:, None] * point_velocities,
     )
     spoiled = poses @ se3_exp(rng.normal(0, [0.002] * 3 + [0.01] * 3, (keyframes, 6)))
     spoiled[0] = poses[0]

@@ -11,7 +11,7 @@ from calibration_scene import PRIORS, TRUTH, make_problem
 from graph.calibration import calibrate
 from graph.calibration_covariance import _clustered_variance
 from graph.calibration_equations import normal_equations
-from graph.calibration_model import FACTOR, OFFSET, PARAMETERS, TIME, linearise
+from graph.calibration_model import FACTOR, OFFSET, PARAMETERS, SHUTTER, TIME, linearise
 from graph.calibration_problem import (
     Anchors,
     CalibrationProblem,
@@ -20,7 +20,9 @@ from graph.calibration_problem import (
 )
 from graph.geometry import Array, se3_exp
 
-START = TRUTH + np.array([15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010])
+START = TRUTH + np.array(
+    [15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010, 0.005]
+)
 FREE_GAUGE = np.array([1.0] * 3 + [10.0] * 3)
 
 
@@ -37,7 +39,7 @@ def test_model_fits_exact_views() -> None:
     assert len(residuals) > 500
     assert np.abs(residuals[:, :2]).max() < 1e-6
     assert np.abs(residuals[:, 2]).max() < 0.05  # second order in the 10 ms, a twentieth of sigma
-    on_time = np.where(np.arange(12) == TIME, 0.0, TRUTH)
+    on_time = np.where(np.arange(13) == TIME, 0.0, TRUTH)
     assert np.abs(linearise(problem.views, poses, points, on_time).residuals[:, 2]).max() > 1
 
 
@@ -54,13 +56,13 @@ def test_derivatives_are_those_of_finite_differences() -> None:
     for derivative, sizes in (
         ("pose", (6, 0, 0)),
         ("point", (0, 3, 0)),
-        ("calibration", (0, 0, 12)),
+        ("calibration", (0, 0, 13)),
     ):
         for i in range(sum(sizes)):
             step = h * (PRIORS[i] or 1.0) if derivative == "calibration" else h
             one = [
                 np.eye(n)[i] * step if n else np.zeros(k)
-                for n, k in zip(sizes, (6, 3, 12), strict=True)
+                for n, k in zip(sizes, (6, 3, 13), strict=True)
             ]
             two = residuals(*one) - residuals(*(-x for x in one))
             got = getattr(at, derivative)[..., i]
@@ -79,12 +81,26 @@ def test_everything_is_found_with_an_anchor() -> None:
     assert error[FACTOR] < 3e-4 and error[OFFSET] < 3e-4 and error[TIME] < 1e-4
 
 
+def test_a_rolling_shutter_is_found_with_its_sign() -> None:
+    rolling = np.where(np.arange(13) == SHUTTER, 0.020, TRUTH)
+    problem, poses, points = make_problem(truth=rolling, start=START)
+    residuals = linearise(problem.views, poses, points, rolling).residuals
+    assert np.abs(residuals).max() < 0.15  # of second order in the 10 ms from the middle
+    assert np.abs(linearise(problem.views, poses, points, TRUTH).residuals).max() > 5
+    result = calibrate(anchored(problem, poses, 1e-4))
+    assert result.calibration[SHUTTER] == pytest.approx(0.020, abs=2e-4)
+    assert (np.abs(result.calibration - rolling)[:4] < 0.1).all()
+    global_shutter, poses, _ = make_problem(start=START)
+    found = calibrate(anchored(global_shutter, poses, 1e-4)).calibration[SHUTTER]
+    assert found == pytest.approx(0.0, abs=1e-4)
+
+
 def test_without_an_anchor_the_scale_keeps_its_prior_and_all_else_is_found() -> None:
     problem, _, _ = make_problem(start=START, noise=0.1)
     result = calibrate(problem)
     sigma = np.sqrt(np.diag(result.covariance))
     assert sigma[FACTOR] > 0.9 * PRIORS[FACTOR]
-    others = (PRIORS > 0) & (np.arange(12) != FACTOR)
+    others = (PRIORS > 0) & (np.arange(13) != FACTOR)
     assert (sigma[others] < 0.2 * PRIORS[others]).all()
     # A world 3 % too large, with its depths, fits as well: only offset / factor is told.
     assert result.calibration[FACTOR] == pytest.approx(START[FACTOR], abs=0.01)
@@ -192,7 +208,7 @@ def test_stated_uncertainty_is_honest() -> None:
     for seed in range(10):
         problem, poses, _ = make_problem(seed=seed, noise=1.0, keyframes=10, points=90)
         rng = np.random.default_rng(100 + seed)
-        start = TRUTH + PRIORS * rng.standard_normal(12)
+        start = TRUTH + PRIORS * rng.standard_normal(13)
         problem = dataclasses.replace(anchored(problem, poses, 0.01), calibration=start)
         result = calibrate(problem)
         error = (result.calibration - TRUTH)[free]
@@ -218,7 +234,7 @@ def test_errors_that_a_stretch_of_the_path_shares_widen_the_bounds() -> None:
         result = calibrate(problem)
         state = CalibrationState(result.poses_world_camera, result.points_world, result.calibration)
         S = normal_equations(problem, state, result.noise_scales, 0.0).S
-        independent = np.sqrt(np.diag(np.linalg.inv(S))[-12:-10])
+        independent = np.sqrt(np.diag(np.linalg.inv(S))[-13:-11])
         return np.sqrt(np.diag(result.covariance)[:2]) / independent
 
     assert (ratio(0.0) < 1.5).all()
@@ -226,7 +242,7 @@ def test_errors_that_a_stretch_of_the_path_shares_widen_the_bounds() -> None:
 
 
 def test_clustered_variances_are_sums_of_squares_raised_to_students_bound() -> None:
-    scores = np.random.default_rng(0).standard_normal((40, 12))
+    scores = np.random.default_rng(0).standard_normal((40, 13))
     clusters = np.repeat(np.arange(5), 8)
     total = sum(scores[clusters == c].sum(axis=0) ** 2 for c in range(5))
     bound = 2.776445 / 1.959964  # Student's t, 4 degrees of freedom

@@ -14,6 +14,7 @@ from graph.storage import write_graph
 from graph.trajectory import Trajectory, write_tum
 from graph.updates import Observations
 from slam.rendering.writer import stored_depth, write_lists, write_png
+from slam.rolling_shutter import share_of_rows
 from slam.sequences import write_camera
 
 HALF_ROOM_M = np.array([1.6, 1.3, 1.7])
@@ -22,10 +23,14 @@ INVERSE_DEPTH_NOISE = 0.0005
 
 
 def room_depth(T_world_camera: Array, camera: Camera, pixels: Array) -> Array:
-    """Depth (N,) in metres of the room's walls at undistorted pixels (N, 2)."""
-    rays = camera.backproject(pixels, np.ones(len(pixels))) @ T_world_camera[:3, :3].T
+    """Depth (N,) in metres of the room's walls at undistorted pixels (N, 2).
+
+    From one pose (4, 4) or from one for each pixel (N, 4, 4).
+    """
+    rays = camera.backproject(pixels, np.ones(len(pixels)))
+    rays = (T_world_camera[..., :3, :3] @ rays[..., None])[..., 0]
     with np.errstate(divide="ignore"):
-        to_walls = (np.sign(rays) * HALF_ROOM_M - T_world_camera[:3, 3]) / rays
+        to_walls = (np.sign(rays) * HALF_ROOM_M - T_world_camera[..., :3, 3]) / rays
     return to_walls.min(axis=1)
 
 
@@ -43,6 +48,7 @@ def make_run(
     """Sequence and run folder: taken by ``truth``, run with ``used``; depth comes ``delay_s`` late.
 
     Neither may have distortion. The run's poses and landmarks are the truth, a little disturbed.
+    Images roll as the truth's do; a run whose camera does too has its pixels at one moment.
     """
     sequence, run = folder / "sequence", folder / "run"
     rng = np.random.default_rng(3)
@@ -55,18 +61,25 @@ def make_run(
     size = (truth.height, truth.width)
     v, u = np.mgrid[: size[0], : size[1]]
     pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
-    for stamp, T in zip(stamps, camera_path(times_s + delay_s), strict=True):
+    rows_s = truth.rolling_shutter_s * share_of_rows(np.arange(size[0]), truth)
+    for stamp, time_s in zip(stamps, times_s, strict=True):
+        T = camera_path(time_s + delay_s + rows_s).repeat(size[1], axis=0)
         inverse_depth = 1 / (room_depth(T, truth, pixels).reshape(size) - truth.depth_offset_m)
         depth_m = 1 / (inverse_depth + INVERSE_DEPTH_NOISE * rng.standard_normal(size))
         write_png(sequence / "depth" / f"{stamp}.png", stored_depth(depth_m, truth.depth_scale))
         write_png(sequence / "rgb" / f"{stamp}.png", np.zeros((*size, 3), np.uint8))
     write_lists(sequence, stamps, poses)
     write_camera(sequence / "camera.yaml", used)
-    _write_run(run, sequence, used, middle_s, _shadow(camera_path(middle_s), truth, used))
+    shadow = _shadow(middle_s, truth, used)
+    _write_run(run, sequence, used, middle_s, shadow)
+    T_true_disturbed = inverse(camera_path(middle_s)) @ shadow.keyframes.values
+    poses = poses @ np.repeat(T_true_disturbed, 3, axis=0)
+    write_tum(run / "trajectory.txt", Trajectory(np.array(stamps, float), poses))
     return sequence, run
 
 
-def _shadow(poses: Array, truth: Camera, used: Camera) -> Shadow:
+def _shadow(times_s: Array, truth: Camera, used: Camera) -> Shadow:
+    poses = camera_path(times_s)
     rng = np.random.default_rng(0)
     walls = rng.uniform(-1, 1, (1500, 3))
     side = rng.integers(0, 3, 1500)
@@ -75,6 +88,7 @@ def _shadow(poses: Array, truth: Camera, used: Camera) -> Shadow:
     seen = transform(inverse(poses), points)
     in_front = seen[..., 2] > 0.3
     pixels = truth.project(np.where(in_front[..., None], seen, [0.0, 0.0, 1.0]))
+    pixels = pixels if used.rolling_shutter_s else _rolled(pixels, points, times_s, truth)
     limit = np.array([truth.width, truth.height]) - 1.0
     k, landmark = np.nonzero(in_front & ((pixels > 0) & (pixels < limit)).all(axis=2))
     noise = rng.normal(0, 0.02, (len(k), 2))
@@ -89,6 +103,17 @@ def _shadow(poses: Array, truth: Camera, used: Camera) -> Shadow:
     return shadow
 
 
+def _rolled(pixels: Array, points_world: Array, times_s: Array, truth: Camera) -> Array:
+    """Pixels (K, L, 2) of points (L, 3) when the rows on which they lie are exposed."""
+    for _ in range(4 if truth.rolling_shutter_s else 0):
+        later_s = truth.rolling_shutter_s * share_of_rows(pixels[..., 1], truth)
+        T = camera_path((times_s[:, None] + later_s.clip(-0.1, 0.1)).ravel())
+        seen = transform(inverse(T), np.tile(points_world, (len(times_s), 1))[:, None])[:, 0]
+        in_front = seen[:, 2:] > 0.1
+        pixels = truth.project(np.where(in_front, seen, [0.0, 0.0, 1.0])).reshape(pixels.shape)
+    return pixels
+
+
 def _write_run(run: Path, sequence: Path, camera: Camera, times_s: Array, shadow: Shadow) -> None:
     """The files of a run, with keyframes at these times (K,)."""
     write_graph(run / "graph", shadow, camera)
@@ -98,6 +123,5 @@ def _write_run(run: Path, sequence: Path, camera: Camera, times_s: Array, shadow
     (run / "frames.csv").write_text("\n".join(["timestamp,keyframe", *rows]) + "\n")
     keyframes = Trajectory(np.round(times_s, 6), shadow.keyframes.values)
     write_tum(run / "keyframes.txt", keyframes)
-    write_tum(run / "trajectory.txt", keyframes)
     x, y, z = shadow.landmarks.values.T.astype(np.float32)
     write_ply(run / "landmarks.ply", {"x": x, "y": y, "z": z})

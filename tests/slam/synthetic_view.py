@@ -32,13 +32,16 @@ TEXTURE = _texture()
 
 
 def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
-    """What a camera sees of the plane z_world = 2 m; depth is exact."""
+    """What a camera sees of the plane z_world = 2 m; depth is exact.
+
+    Poses (480, 4, 4) are those of the rows of a rolling shutter.
+    """
     columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
     pixels = np.stack([columns, rows], axis=-1)
     rays_camera = CAMERA.backproject(pixels, np.array(1.0))
-    rays_world = rays_camera @ T_world_camera[:3, :3].T
-    z_m = (PLANE_Z_M - T_world_camera[2, 3]) / rays_world[..., 2]
-    hits = T_world_camera[:3, 3] + z_m[..., None] * rays_world
+    rays_world = rays_camera @ np.swapaxes(T_world_camera[..., :3, :3], -1, -2)
+    z_m = (PLANE_Z_M - T_world_camera[..., 2, 3, None]) / rays_world[..., 2]
+    hits = T_world_camera[..., None, :3, 3] + z_m[..., None] * rays_world
     texel = ((hits[..., :2] + _TEXTURE_HALF_M) * _TEXELS_PER_M).astype(np.float32)
     image = cv2.remap(TEXTURE, texel[..., 0], texel[..., 1], cv2.INTER_LINEAR)
     gray = np.rint(image).astype(np.uint8)

@@ -45,11 +45,26 @@ def test_wrong_camera_and_late_depth_are_found(made: tuple[Path, Path], tmp_path
     assert found.depth_scale == pytest.approx(TRUTH.depth_scale, rel=0.003)
     assert found.depth_offset_m == pytest.approx(TRUTH.depth_offset_m, abs=0.003)
     assert found.depth_time_offset_s == pytest.approx(DELAY_S, abs=0.001)
-    truth = [262, 260, 158, 121, 0, 0, 0, 0, 0, 1.03, 0.015, DELAY_S]
+    truth = [262, 260, 158, 121, 0, 0, 0, 0, 0, 1.03, 0.015, DELAY_S, 0]
     error = done.result.calibration - truth
-    second_order = np.where(np.arange(12) == TIME, 1e-4, 1e-9)  # in the 10 ms
+    second_order = np.where(np.arange(13) == TIME, 1e-4, 1e-9)  # in the 10 ms
     assert (np.abs(error) <= 3.5 * done.sigmas + second_order).all()
     assert "not observable" not in format_calibration(done)
+
+
+@pytest.mark.parametrize("known_s", [0.0, 0.020])
+def test_a_rolling_shutter_is_found(tmp_path: Path, known_s: float) -> None:
+    """By a run that did not know of it, and again by one that took its keypoints to one moment."""
+    truth = dataclasses.replace(TRUTH, rolling_shutter_s=0.020)
+    used = dataclasses.replace(WRONG, rolling_shutter_s=known_s)
+    sequence, run = make_run(tmp_path, truth, used, DELAY_S)
+    options = CalibrateOptions(run, reference=sequence, anchor_sigma_m=0.002)
+    done = calibrate_run(options)
+    found = read_camera(run / "camera.yaml")
+    assert found.rolling_shutter_s == pytest.approx(0.020, abs=0.001)
+    assert found.fx == pytest.approx(TRUTH.fx, rel=0.005)
+    assert (found.cx, found.cy) == pytest.approx((TRUTH.cx, TRUTH.cy), abs=1.0)
+    assert "rolling shutter ms" in format_calibration(done)
 
 
 def test_without_an_anchor_the_scale_stays_and_is_said_to_be_unobservable(

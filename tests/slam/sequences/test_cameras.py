@@ -69,6 +69,7 @@ def test_the_example_in_the_messages_is_valid(tmp_path):
         ({"distortion": "[0, 0, 0, 0, x]"}, "distortion is 'x'"),
         ({"depth_offset": "12"}, "depth_offset is 12, more than 1 either way; .* in metres"),
         ({"depth_time_offset": "-10"}, "depth_time_offset is -10, more than 1 .* in seconds"),
+        ({"rolling_shutter": "25"}, "rolling_shutter is 25, more than 1 .* in seconds"),
         ({"focal": "500"}, "unknown key 'focal'; the keys are width"),
         ({"fx": "[1, 2"}, "not YAML"),
     ],
