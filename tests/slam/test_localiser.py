@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from synthetic_view import T_NEW_OLD, add_keyframe, make_features
@@ -13,6 +15,7 @@ from slam.localiser import Localiser
 from slam.place_recognition import DescriptorIndex
 from slam.relocalisation import RelocalisationConfig
 from slam.results import TrackingStatus
+from slam.rolling_shutter import PreviousPose
 from slam.tracker import Tracked, lost, untracked
 from slam.world_map import WorldMap
 
@@ -25,10 +28,12 @@ class RecordingTracker:
 
     def __init__(self) -> None:
         self.predictions: list[Array] = []
+        self.previous: list[PreviousPose | None] = []
         self.is_lost = False
 
-    def track(self, features: Features, T_predicted: Array, *_: object) -> Tracked:
+    def track(self, features: Features, T_predicted: Array, *others: Any) -> Tracked:
         self.predictions.append(T_predicted)
+        self.previous.append(others[-1])
         return (lost if self.is_lost else untracked)(T_predicted, features)
 
 
@@ -69,6 +74,25 @@ def test_the_speed_is_of_tracking_the_place_of_the_optimised_keyframe() -> None:
     localiser.moved_on(STEP, correction @ STEP, NO_IDS)
     localiser.track(features, world, world.keyframes[0])
     assert np.allclose(tracker.predictions[-1], correction @ STEP @ STEP)
+
+
+def test_the_tracker_is_told_where_the_camera_was_a_moment_ago() -> None:
+    localiser, tracker, world, features = scene()
+    correction = se3_exp(np.array([0, 0, 0, 0.01, 0.02, 0.0]))
+    for stamp_s in (5.00, 5.04, 6.00):
+        localiser.expect(stamp_s)
+        localiser.track(features, world, world.keyframes[0])
+        localiser.moved_on(STEP, correction @ STEP, NO_IDS)
+    first, second, late = tracker.previous
+    assert first is None and late is None
+    assert second is not None and second.ago_s == pytest.approx(0.04)
+    np.testing.assert_array_equal(second.T_world_camera, correction @ STEP)
+    tracker.is_lost = True
+    for stamp_s in (6.04, 6.08):
+        localiser.expect(stamp_s)
+        localiser.track(features, world, world.keyframes[0])
+    before_lost, lost_already = tracker.previous[-2:]
+    assert before_lost is not None and lost_already is None
 
 
 def test_a_lost_camera_is_expected_where_it_was_last_seen() -> None:
