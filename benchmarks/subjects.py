@@ -27,12 +27,12 @@ ODOMETRY = _of(
     "slam",
     "depth_regions.py description.py features.py frame.py graph_feed.py history.py keyframes.py "
     "landmarks.py local_mapping.py localiser.py map_pruning.py mapper.py matching.py "
-    "pose_optimisation.py relocalisation.py reprojection.py results.py segments.py subpixel.py "
-    "system.py system_config.py tracker.py triangulation.py world_map.py",
+    "pose_optimisation.py relocalisation.py reprojection.py results.py rolling_shutter.py "
+    "segments.py subpixel.py system.py system_config.py tracker.py triangulation.py world_map.py",
 )
 POSE_GRAPHS = _of("graph", "pose_graph*.py graduation.py g2o.py g2o_lines.py")
 CALIBRATION = _of("graph", "calibration*.py") + _of(
-    "slam", "calibrate.py calibration_rounds.py calibration_views.py"
+    "slam", "calibrate.py calibration_motion.py calibration_rounds.py calibration_views.py"
 )
 STATE = _of("graph", "archive_storage.py array_file.py storage.py") + _of(
     "slam", "checkpoint.py map_state.py run_options.py saved_run.py"
