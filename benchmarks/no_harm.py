@@ -1,6 +1,6 @@
 """What the semantics cost where nothing moves, also when the masks are wrong.
 
-    python benchmarks/no_harm.py SEQUENCE [SEQUENCE ...] [--repeats 8]
+    python benchmarks/no_harm.py SEQUENCE [SEQUENCE ...] [--repeats 8] [--hand-eye]
 
 Each sequence is static. It is run without semantics and without the check of what moves
 ("nothing"), with the check alone ("geometry"), with the network's masks, with masks that are drawn
@@ -10,6 +10,7 @@ of the keypoints moves an ATE by a tenth or more, so each is run several times, 
 spread over a grid whose cells are a few pixels wider or narrower, and with other random masks and
 names: the mean ATE, its range, and the mean of the logarithms of the runs' ratios to those with
 nothing, as a change. Last the same over all sequences. Standard errors are of both sides' runs.
+``--hand-eye``: the reference is of another body on the camera, as the red kitchen's is.
 """
 
 from __future__ import annotations
@@ -39,14 +40,15 @@ from semantics.labels import LabelSet
 from semantics.segmenter import Image, Segmenter
 from semantics.segmenter_table import SegmenterOptions, make_segmenter
 from slam.configuration import resolve
+from slam.evaluation import evaluate
 from slam.features import FeatureConfig
 from slam.runner import RunOptions, run
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 
 VARIANTS = ("nothing", "geometry", "network", "random", "shuffled")
-Job = tuple[Path, str, int]
-"""Sequence, one of VARIANTS, number of the repeat."""
+Job = tuple[Path, str, int, bool]
+"""Sequence, one of VARIANTS, number of the repeat, whether the reference is of another body."""
 SCORES = (0.5, 0.95)
 MOST, RADII_PX = 8, (20, 120)
 
@@ -103,7 +105,9 @@ def other_keypoints(repeat: int) -> str:
     return f"features.bucket_px={FeatureConfig().bucket_px + (repeat + 1) // 2 * (-1) ** repeat}"
 
 
-def ate_m(sequence: Path, segmenter: Segmenter, settings: list[str]) -> float:
+def ate_m(
+    sequence: Path, segmenter: Segmenter, settings: list[str], with_body: bool = False
+) -> float:
     """The error of a run."""
     config = resolve(SystemConfig, None, settings)
 
@@ -111,13 +115,14 @@ def ate_m(sequence: Path, segmenter: Segmenter, settings: list[str]) -> float:
         return SlamSystem(camera, config, segmenter)
 
     with TemporaryDirectory() as folder:
-        summary = run(RunOptions(sequence, config, out=Path(folder) / "run", quiet=True), make)
-    return {row["name"]: row["value"] for row in summary.rows}["ate_rmse"]
+        out = Path(folder) / "run"
+        run(RunOptions(sequence, config, out=out, quiet=True), make)
+        return evaluate(out, sequence, with_body=with_body).value("ate_rmse")
 
 
 def measured_mm(job: Job) -> float:
     """ATE of one run."""
-    sequence, variant, repeat = job
+    sequence, variant, repeat, with_body = job
     torch.set_num_threads(1)
     kind = "light" if variant in ("network", "random", "shuffled") else "none"
     segmenter = make_segmenter(SegmenterOptions(kind), sequence)
@@ -126,7 +131,7 @@ def measured_mm(job: Job) -> float:
     elif variant == "shuffled":
         segmenter = ShuffledLabels(segmenter, repeat)
     off = ["dynamics.labels=false", "dynamics.geometry=false"] if variant == "nothing" else []
-    return 1e3 * ate_m(sequence, segmenter, [*off, other_keypoints(repeat)])
+    return 1e3 * ate_m(sequence, segmenter, [*off, other_keypoints(repeat)], with_body)
 
 
 def change(ates_mm: Array, base_mm: Array) -> str:
@@ -156,8 +161,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("sequences", type=Path, nargs="+")
     parser.add_argument("--repeats", type=int, default=8)
+    parser.add_argument("--hand-eye", action="store_true")
     arguments = parser.parse_args()
-    jobs = list(itertools.product(arguments.sequences, VARIANTS, range(arguments.repeats)))
+    repeats, bodies = range(arguments.repeats), (arguments.hand_eye,)
+    jobs = list(itertools.product(arguments.sequences, VARIANTS, repeats, bodies))
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         errors_mm = np.array(list(pool.map(measured_mm, jobs)))
     shape = (len(arguments.sequences), len(VARIANTS), arguments.repeats)

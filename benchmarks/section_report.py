@@ -114,6 +114,10 @@ REPORTS = {
             "What the semantics cost where nothing moves",
             "no_harm.py {sequences}/office-300 {sequences}/living_room ../shared/data/redkitchen",
         ),
+        "harm-kitchen": (
+            "The same in the red kitchen, its reference of a point beside the camera",
+            "no_harm.py ../shared/data/redkitchen --hand-eye",
+        ),
         "pairs": ("A real man who walks, by geometry alone", "dynamic_pairs.py"),
         "pairs-labels": (
             "The same with the network's masks",
