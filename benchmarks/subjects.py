@@ -56,8 +56,8 @@ LABELS = (
 )
 MOVING = _of("semantics", "instance_track.py instance_tracks.py movability.py") + _of(
     "slam",
-    "dynamics.py feature_check.py keyframe_masks.py refill.py stance.py static_check.py "
-    "view_memory.py witness.py",
+    "dynamics.py dynamics_config.py feature_check.py keyframe_masks.py refill.py stance.py "
+    "static_check.py suspects.py view_memory.py witness.py",
 )
 DENSE = _of(
     "mapping",

@@ -48,6 +48,7 @@ class Track:
         evidence: of all sightings together, limited.
         sightings: how many.
         missed: how many keyframes in a row showed its place, but not it.
+        stood: it was watched and found to stand, so that its class does not count.
     """
 
     id: int
@@ -60,6 +61,7 @@ class Track:
     evidence: float
     sightings: int
     missed: int = 0
+    stood: bool = False
 
     @property
     def moving(self) -> bool:

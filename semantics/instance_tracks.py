@@ -106,6 +106,15 @@ class InstanceTracks:
         tracks = [replace(t, missed=t.missed + (t.id in unseen)) for t in self.tracks]
         self.tracks = [t for t in tracks if t.missed < self.config.max_missed]
 
+    def acquit(self, track_id: int, prior: float) -> None:
+        """A thing was found to stand: its class does not count, its log odds begin at a prior."""
+        self.tracks = [
+            replace(t, prior=min(t.prior, prior), evidence=min(t.evidence, 0.0), stood=True)
+            if t.id == track_id
+            else t
+            for t in self.tracks
+        ]
+
     def expire(self, time_s: float) -> None:
         """End the tracks that were not seen for long."""
         limit = time_s - self.config.patience_s
@@ -164,6 +173,7 @@ class InstanceTracks:
             "evidence": np.array([t.evidence for t in tracks], float),
             "sightings": np.array([t.sightings for t in tracks], np.int64),
             "missed": np.array([t.missed for t in tracks], np.int64),
+            "stood": np.array([t.stood for t in tracks], bool),
         }
 
     def restore(self, state: Arrays) -> None:
@@ -184,6 +194,7 @@ class InstanceTracks:
                 state["evidence"].tolist(),
                 state["sightings"].tolist(),
                 state["missed"].tolist(),
+                state["stood"].tolist(),
                 strict=True,
             )
         ]
@@ -270,7 +281,7 @@ class InstanceTracks:
             covariance=covariance,
             half_size=np.maximum(sighting.half_size, 0.8 * ahead.half_size),
             distribution=np.float32(0.5) * (ahead.distribution + sighting.distribution),
-            prior=(ahead.prior + sighting.prior) / 2,
+            prior=ahead.prior if ahead.stood else (ahead.prior + sighting.prior) / 2,
             evidence=float(np.clip(ahead.evidence + sighting.evidence, -limit, limit)),
             sightings=ahead.sightings + 1,
             missed=0,

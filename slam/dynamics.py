@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
 from graph.geometry import Array
-from semantics.instance_track import Sighting
-from semantics.instance_tracks import InstanceTracks, TrackConfig
-from semantics.movability import MovabilityConfig, MovabilityFilter, log_odds, read_priors
-from slam.depth_regions import DepthRegionConfig, MovingSpace
+from semantics.instance_track import Sighting, Track
+from semantics.instance_tracks import InstanceTracks
+from semantics.movability import MovabilityFilter, log_odds, read_priors
+from slam.depth_regions import MovingSpace
+from slam.dynamics_config import DynamicsConfig
 from slam.feature_check import FeatureCheck, Judged
 from slam.features import FeatureConfig, Features, select
 from slam.frame import Frame
@@ -26,47 +27,16 @@ from slam.refill import Refill
 from slam.static_check import (
     DepthView,
     StaticCheck,
-    StaticCheckConfig,
     Verdict,
     depth_view,
 )
+from slam.suspects import Suspects
 from slam.tracker import Tracked
 from slam.view_memory import PosedView, ViewMemory
 from slam.witness import Witness
 from slam.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class DynamicsConfig:
-    """Which evidence of motion counts: that of masks by their ``labels``, that of ``geometry``.
-
-    ``priors`` is a YAML file of P(moving) by class, or the name of one in ``data/labels``. With
-    fewer than ``min_static`` keypoints left all are used, and the frame says so. If more than
-    ``doubt_share`` of them seem to move, the pose is looked at again. Masks of moving
-    things are widened by ``mask_border_px``. An instance is judged by at least ``min_judged`` of
-    its pixels.
-    """
-
-    labels: bool = True
-    geometry: bool = True
-    priors: str = "movability"
-    doubt_share: float = 0.5
-    settled_share: float = 0.2
-    min_static: int = 60
-    mask_border_px: int = 5
-    min_judged: int = 20
-    movability: MovabilityConfig = field(default_factory=MovabilityConfig)
-    check: StaticCheckConfig = field(default_factory=StaticCheckConfig)
-    regions: DepthRegionConfig = field(default_factory=DepthRegionConfig)
-    tracks: TrackConfig = field(default_factory=TrackConfig)
-
-    def __post_init__(self) -> None:
-        if self.min_static < 0 or self.mask_border_px < 0 or self.min_judged < 1:
-            raise ValueError(
-                "min_static and mask_border_px must not be negative, min_judged at least 1"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +82,8 @@ class Dynamics:
         self.tracks = InstanceTracks(config.tracks)
         self.memory = ViewMemory(config.check)
         self._check = StaticCheck(camera, features.disparity_sigma_px, config.check)
+        watched = config.min_judged, config.mask_border_px
+        self.suspects = Suspects(self._check, config.suspects, *watched)
         self._features = FeatureCheck(camera, self._check, config.regions)
         self._refill = Refill(camera, features)
         rules = config.movability.step, config.min_judged
@@ -216,21 +188,43 @@ class Dynamics:
             views = self.memory.posed(keyframe.segment, mapper)
         now_s = np.nan if keyframe is None else keyframe.timestamp_s
         sightings = self._witness.sightings(masks, views, now_s)
-        moving = self._tracked(masks, sightings, now_s)
-        self._believe(masks, sightings)
-        still = [s is not None and s.still for s in sightings]
+        moving, tracks = self._tracked(masks, sightings, now_s)
+        still = [
+            s is not None and (s.still or (track is not None and track.stood))
+            for s, track in zip(sightings, tracks, strict=True)
+        ]
+        self._believe(masks, sightings, still)
         standing = np.isin(masks.claims.owner, np.flatnonzero(still))
         self.memory.recall_space(masks.keyframe_id, standing)
         if not moving.any():
             return
-        covered = np.isin(masks.claims.owner, np.flatnonzero(moving))
-        self.memory.forget_space(masks.keyframe_id, covered)
+        moves = np.isin(masks.claims.owner, np.flatnonzero(moving))
+        self.memory.forget_space(masks.keyframe_id, moves)
         pruner = replace(mapper.pruner(), border_px=-self.config.mask_border_px)
-        pruner.prune_mask(masks.keyframe_id, covered)
+        if keyframe is not None and self.config.geometry:
+            self.suspects.add(masks, [t if _by_class(t) else None for t in tracks], keyframe)
+        pruner.prune_mask(masks.keyframe_id, moves)
         self._remove(masks.landmark_ids, mapper)
+
+    def acquit(
+        self, time_s: float, tracked: Tracked, view: DepthView | None, mapper: Mapper
+    ) -> bool:
+        """What was left out for its class alone, and stands, comes back; whether anything did."""
+        if view is None or not self.suspects.watched:
+            return False
+        standing = self.suspects.watch(time_s, view, tracked.T_world_camera, mapper.world)
+        for suspect in standing:
+            logger.info("track %d stands: its class does not count", suspect.track_id)
+            self.tracks.acquit(suspect.track_id, float(log_odds(self.priors.unknown)))
+            for removed in suspect.removed:
+                self.memory.recall_space(removed.keyframe_id, removed.mask)
+                keypoints = self.suspects.without_watched(removed)
+                mapper.take_back(removed.keyframe_id, keypoints)
+        return bool(standing)
 
     def begin_session(self) -> None:
         """Forget what moved in an earlier recording; landmarks stay what they are."""
+        self.suspects.clear()
         self.memory.clear()
         self.tracks.clear()
 
@@ -240,6 +234,7 @@ class Dynamics:
             movability=self.movability.state(),
             tracks=self.tracks.state(),
             memory=self.memory.state(),
+            suspects=self.suspects.state(),
         )
 
     def restore(self, state: Arrays) -> None:
@@ -247,6 +242,7 @@ class Dynamics:
         self.movability.restore(part(state, "movability"))
         self.tracks.restore(part(state, "tracks"))
         self.memory.restore(part(state, "memory"))
+        self.suspects.restore(part(state, "suspects"))
 
     def _judge(
         self, frame: Frame, features: Features, T_world_camera: Array, views: list[PosedView]
@@ -258,32 +254,36 @@ class Dynamics:
 
     def _tracked(
         self, masks: KeyframeMasks, sightings: Sequence[Sighting | None], now_s: float
-    ) -> Mask:
-        """Which of a keyframe's sightings (K,) move, by their tracks, if they have one.
+    ) -> tuple[Mask, list[Track | None]]:
+        """Which of a keyframe's sightings (K,) move, by their tracks, if they have one; these.
 
         A culled keyframe, whose time ``now_s`` is NaN, adds nothing to the tracks.
         """
         moving = np.array([s is not None and s.log_odds > 0 for s in sightings], bool)
+        tracks: list[Track | None] = [None] * len(sightings)
         if np.isnan(now_s):
-            return moving
+            return moving, tracks
         least = log_odds(self.config.tracks.min_prior)
         movable = {k: s for k, s in enumerate(sightings) if s is not None and s.log_odds > least}
         ids = self.tracks.see(now_s, list(movable.values()), masks.T_world_camera[:3, :3])
         ahead = [self.tracks.predicted(track, now_s) for track in self.tracks.tracks]
-        by_id = {track.id: track.moving for track in ahead}
-        if ids:
-            moving[list(movable)] = [by_id[track_id] for track_id in ids]
+        by_id = {track.id: track for track in ahead}
+        for k, track_id in zip(movable, ids, strict=False):
+            tracks[k] = by_id[track_id]
+            moving[k] = by_id[track_id].moving
         self.tracks.miss(now_s, [track for track in ahead if self._witness.shows(masks, track)])
-        return moving
+        return moving, tracks
 
-    def _believe(self, masks: KeyframeMasks, sightings: Sequence[Sighting | None]) -> None:
+    def _believe(
+        self, masks: KeyframeMasks, sightings: Sequence[Sighting | None], standing: Sequence[bool]
+    ) -> None:
         """Landmarks on instances have their classes' priors, and move if views say so of their
         instance; of what stood still for long the class says nothing.
         """
         ids, first = np.unique(masks.landmark_ids, return_index=True)
         priors = masks.label_distributions[first] @ self.priors.of(masks.names)
         instances = masks.instances[first]
-        still = np.array([s is not None and s.still for s in sightings] + [False])
+        still = np.array([*standing, False])
         evidence = np.array([0.0 if s is None else s.evidence for s in sightings] + [0.0])
         priors[still[instances]] = np.minimum(priors[still[instances]], self.priors.unknown)
         self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
@@ -306,3 +306,8 @@ class Dynamics:
         alive = world.landmarks.alive[heirs]
         self.movability.move(gone[alive], heirs[alive])
         self.movability.drop(gone[~alive])
+
+
+def _by_class(track: Track | None) -> bool:
+    """Whether a track moves for all that its class says, and geometry has not seen it do so."""
+    return track is not None and track.moving and track.evidence <= 0

@@ -12,6 +12,7 @@ from graph.geometry import Array
 from semantics.labels import LabelSet
 from semantics.votes import Claims
 from slam.landmarks import Ints
+from slam.static_check import DepthView, thinned_view
 
 _SAMPLES = 400
 """Points of an instance, at most."""
@@ -38,11 +39,19 @@ class KeyframeMasks:
     instances: Ints
     label_distributions: Array
 
+    @property
+    def step(self) -> int:
+        """Every how many pixels there is a depth."""
+        return max(self.claims.owner.shape[0] // max(self.depth_m.shape[0], 1), 1)
+
+    def view(self, window_px: int) -> DepthView:
+        """What the keyframe's depth says about space."""
+        return thinned_view(self.depth_m.copy(), self.step, window_px)
+
 
 def surface_points(camera: Camera, masks: KeyframeMasks, k: int, at_least: int) -> Array | None:
     """Points (N, 3) on an instance's surface, in the camera's frame; None if fewer have depth."""
-    depth_m = masks.depth_m
-    step = max(masks.claims.owner.shape[0] // max(depth_m.shape[0], 1), 1)
+    depth_m, step = masks.depth_m, masks.step
     owner = masks.claims.owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
     rows, columns = np.nonzero((owner == k) & np.isfinite(depth_m))
     z_m = depth_m[rows, columns].astype(float)

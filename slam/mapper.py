@@ -159,6 +159,23 @@ class Mapper:
         """Takes things out of map and graph, such as what a mask covers, at any time."""
         return MapPruner(self.world, self.smoother, self.camera)
 
+    def take_back(self, keyframe_id: int, keypoints: Ints) -> None:
+        """Keypoints (N,) of a keyframe that were masked observe landmarks after all.
+
+        Those that the map has by now, or new ones.
+        """
+        world = self.world
+        keyframe = world.keyframes.get(keyframe_id)
+        if keyframe is None or not len(keypoints):
+            return
+        world.unmask(keyframe, keypoints)
+        _, seen = world.observed(keyframe)
+        known = np.setdiff1d(local_landmarks(world, seen, self._mapping), seen)
+        radius_px = self._mapping.fuse_radius_px
+        fused = fuse_into(world, [keyframe], known, self._tracker, radius_px)
+        self._feed.forget_landmarks(fused)
+        create_landmarks(world, keyframe, self.camera)
+
     def finish(self) -> None:
         """Full bundle adjustment of the graph, then without outliers; the map is then final."""
         if self.world.keyframes:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from graph.camera import Camera
-from graph.geometry import Array, inverse
+from graph.geometry import Array, inverse, transform
 
 Depths = NDArray[np.float32]
 Verdicts = NDArray[np.int8]
@@ -89,11 +89,15 @@ class DepthView:
 
 def depth_view(depth_m: Depths, window_px: int) -> DepthView:
     """The view of a depth image (H, W), NaN where missing, at every second pixel."""
-    filled = depth_m[::2, ::2].copy()
-    cv2.patchNaNs(filled, 0.0)
-    side = 2 * (window_px // 2) + 1
+    return thinned_view(depth_m[::2, ::2].copy(), 2, window_px)
+
+
+def thinned_view(depth_m: Depths, step: int, window_px: int) -> DepthView:
+    """The view of every ``step``-th pixel each way of a depth image; they are overwritten."""
+    cv2.patchNaNs(depth_m, 0.0)
+    side = 2 * (window_px // step) + 1
     window = np.ones((side, side), np.uint8)
-    return DepthView(cv2.erode(filled, window), cv2.dilate(filled, window), 2)
+    return DepthView(cv2.erode(depth_m, window), cv2.dilate(depth_m, window), step)
 
 
 class StaticCheck:
@@ -134,6 +138,26 @@ class StaticCheck:
         verdicts[nearest - z > self._margin_m(nearest)] = Verdict.MOVING
         verdicts *= ahead
         return verdicts
+
+    def offsets(
+        self, points_world: Array, view: DepthView, T_world_camera: Array
+    ) -> tuple[Depths, NDArray[np.bool_]]:
+        """How far behind points (N, 3) the surface is that a frame shows, and which are in view.
+
+        (N,) m, 0 within the window's depths; NaN out of view, where a depth is missing in it, and
+        where the two are not one surface.
+        """
+        x, y, z = transform(inverse(T_world_camera), points_world).astype(np.float32).T
+        ahead = (z > 0.1) & (z < self.config.max_depth_m)
+        u, v = self._pixels(x[None], y[None], np.where(ahead, z, np.float32(1))[None])
+        u, v = u[0] / view.step, v[0] / view.step
+        height, width = view.nearest_m.shape
+        ahead &= (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)
+        rows, columns = (np.rint(np.where(ahead, a, 0)).astype(np.int64) for a in (v, u))
+        nearest, farthest = view.nearest_m[rows, columns], view.farthest_m[rows, columns]
+        off_m = np.clip(z, nearest, farthest) - z
+        off_m[~ahead | (nearest == 0) | (np.abs(off_m) > self._margin_m(z))] = np.nan
+        return off_m, ahead
 
     def agree(self, verdicts: Verdicts) -> Verdicts:
         """What several views (K, N) say together (N,): the majority of those that say anything."""

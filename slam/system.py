@@ -120,7 +120,7 @@ class SlamSystem(SystemResults):
         with clock.stage("tracking"):
             tracked = self._track(sifted.features)
         with clock.stage("moving"):
-            self._watch(tracked, sifted)
+            self._watch(frame.timestamp_s, tracked, sifted)
         with clock.stage("keyframe"):
             reason = self._keyframe_reason(tracked)
             if reason:
@@ -196,11 +196,14 @@ class SlamSystem(SystemResults):
         """With other keypoints in place of those on moving things."""
         return self.dynamics.fill_up(frame, features, sifted, self._segment, self.mapper)
 
-    def _watch(self, tracked: Tracked, sifted: Sifted) -> None:
+    def _watch(self, time_s: float, tracked: Tracked, sifted: Sifted) -> None:
         """Landmarks that are believed to move are not tracked against from now on."""
         if tracked.status is not TrackingStatus.LOST:
             moving = self.dynamics.watch(tracked, sifted.view, self.mapper.world)
             self.localiser.leave_out(moving)
+            back = self.dynamics.acquit(time_s, tracked, sifted.view, self.mapper)
+            if back and self._reference is not None:
+                self.localiser.new_local_map(self.mapper.world, self._reference)
 
     def _keyframe_reason(self, tracked: Tracked) -> str:
         if tracked.status is TrackingStatus.LOST:

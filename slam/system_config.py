@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from graph.smoother_config import SmootherConfig
-from slam.dynamics import DynamicsConfig
+from slam.dynamics_config import DynamicsConfig
 from slam.features import FeatureConfig
 from slam.graph_feed import GraphFeedConfig
 from slam.keyframes import KeyframeConfig

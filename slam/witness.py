@@ -52,8 +52,7 @@ class Witness:
         column, row = distorted(self.camera, centre[None])[0]
         if not (0 <= column < self.camera.width and 0 <= row < self.camera.height):
             return False
-        depth_m, owner = masks.depth_m, masks.claims.owner
-        step = max(owner.shape[0] // max(depth_m.shape[0], 1), 1)
+        depth_m, step = masks.depth_m, masks.step
         height, width = depth_m.shape
         there_m = depth_m[min(int(row / step), height - 1), min(int(column / step), width - 1)]
         return bool(there_m > centre[2] - track.half_size[2] - self.check.config.margin_m)

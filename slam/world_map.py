@@ -123,10 +123,14 @@ class WorldMap:
     def mask(self, keyframe: Keyframe, keypoints: Ints) -> None:
         """Record that keypoints (N,) of a keyframe lie on something that moves.
 
-        They observe nothing any more and never will.
+        They observe nothing any more, unless they are unmasked.
         """
         keyframe.masked[keypoints] = True
         self.detach(keyframe, keypoints)
+
+    def unmask(self, keyframe: Keyframe, keypoints: Ints) -> None:
+        """Keypoints (N,) of a keyframe lie on something that stands after all."""
+        keyframe.masked[keypoints] = False
 
     def detach(self, keyframe: Keyframe, keypoints: Ints) -> None:
         """Record that keypoints (N,) of a keyframe observe nothing after all.

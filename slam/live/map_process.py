@@ -41,6 +41,7 @@ from slam.live.messages import (
     SaveState,
     Sightings,
     StateSaved,
+    TakeBack,
 )
 from slam.live.replica import DeltaMaker
 from slam.mapper import Mapper
@@ -52,7 +53,7 @@ from slam.tracker import Tracked
 
 logger = logging.getLogger(__name__)
 
-STATE_FILE = FileKind("live state", 3)
+STATE_FILE = FileKind("live state", 4)
 NICENESS = 5
 """Tracking goes first where there is a processor too few."""
 
@@ -127,6 +128,9 @@ class MapKeeper:
                 size = message.shape[0] * message.shape[1]
                 mask = np.unpackbits(message.bits, count=size).reshape(message.shape) > 0
                 pruner.prune_mask(message.keyframe_id, mask)
+            case TakeBack():
+                self.system.mapper.take_back(message.keyframe_id, message.keypoints)
+                self.tell(-1, done=False)
             case SaveState():
                 self.save(number, message.path)
             case Finish():

@@ -125,6 +125,14 @@ class PruneMask:
     border_px: int
 
 
+@dataclass(frozen=True, eq=False)
+class TakeBack:
+    """To the map: masked keypoints (N,) of a keyframe lie on what stands after all."""
+
+    keyframe_id: int
+    keypoints: Ints
+
+
 @dataclass(frozen=True)
 class SaveState:
     """To the map: write all that is known to a file."""

@@ -29,6 +29,7 @@ from slam.live.messages import (
     SaveState,
     Sightings,
     StateSaved,
+    TakeBack,
 )
 from slam.live.remote_pruner import RemotePruner
 from slam.live.replica import apply_delta
@@ -147,6 +148,11 @@ class RemoteMapper:
     def pruner(self) -> RemotePruner:
         """Takes things out of the map."""
         return RemotePruner(self.world, self.tell)
+
+    def take_back(self, keyframe_id: int, keypoints: Ints) -> None:
+        """As ``Mapper.take_back``; the map is changed when the answer comes."""
+        if len(keypoints):
+            self.tell(TakeBack(keyframe_id, keypoints))
 
     def tell(self, message: Any) -> None:
         """Send a message, to be sent again to another process if this one dies."""

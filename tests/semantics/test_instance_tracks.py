@@ -164,3 +164,17 @@ def test_an_unseen_track_where_its_like_was_seen_ends() -> None:
     assert tracks.see(0.0, [seen(0.0), seen(0.3), seen(0.1, what=CHAIR), seen(1.0)]) == [0, 1, 2, 3]
     (kept,) = tracks.see(0.2, [seen(0.12)])
     assert [t.id for t in tracks.tracks] == [kept, 2, 3]
+
+
+def test_a_class_does_not_count_any_more_for_a_thing_that_was_found_to_stand() -> None:
+    tracks = InstanceTracks()
+    (mine, other) = tracks.see(0.0, [seen(0.0), seen(2.0)])
+    tracks.acquit(mine, -1.4)
+    tracks.see(0.3, [seen(0.0), seen(2.0)])
+    by_id = {track.id: track for track in tracks.tracks}
+    assert [by_id[k].stood for k in (mine, other)] == [True, False]
+    assert [by_id[k].moving for k in (mine, other)] == [False, True]
+    for k in range(2):  # but what views say does
+        moves = Sighting(np.array([0.1 * k, 0, 3]), SIZE, PERSON, 2.0, evidence=2.2)
+        tracks.see(0.6 + 0.3 * k, [moves, seen(2.0)])
+    assert {track.id: track.moving for track in tracks.tracks}[mine]

@@ -155,6 +155,32 @@ def test_what_is_called_a_person_and_stands_for_long_is_structure_again() -> Non
     assert landmarks_on_card(system) > 50
 
 
+def test_what_is_called_a_person_and_stands_comes_back_within_half_a_second() -> None:
+    frames = standing(20)
+    system = run(frames, label=1, settings=["dynamics.suspects.stands_s=0.3"])
+    counts = np.array(system.counts)
+    assert counts[1:9, 1].sum() > 0.9 * counts[1:9, 0].sum()
+    assert counts[12:, 1].sum() == 0
+    keyframes = system.mapper.world.keyframes.values()
+    assert len(keyframes) > 2
+    assert not any(k.masked.any() for k in keyframes)
+    assert system.dynamics.tracks.tracks[0].stood
+    table = system.mapper.world.landmarks
+    on_card = table.alive & (table.points_world[:, 2] < 1.65)
+    assert (table.observations[on_card] > 1).mean() > 0.5  # keyframes find each other's again
+    unmasked = run(frames, settings=["dynamics.suspects.stands_s=0.3"])
+    assert landmarks_on_card(system) > 0.7 * landmarks_on_card(unmasked) > 50
+
+
+def test_one_who_walks_is_left_out_all_the_time_though_suspects_are_watched(
+    frames: list[Frame],
+) -> None:
+    system = run(frames[8:], label=1, settings=["dynamics.suspects.stands_s=0.3"])
+    inside, found, _, _ = np.array(system.counts[1:]).sum(axis=0)
+    assert found > 0.95 * inside > 0
+    assert landmarks_on_card(system) < 5
+
+
 def test_a_person_whom_only_one_keyframe_shows_is_not_looked_for_any_longer() -> None:
     once = CardSegmenter(1)
     segment = once.segment

@@ -27,6 +27,7 @@ from slam.frame import Frame
 from slam.landmarks import LandmarkTable
 from slam.loop_verification import LoopConstraint
 from slam.semantic_mapping import kept_depth
+from slam.suspects import Removed, Suspect
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 
@@ -90,6 +91,14 @@ def system() -> SlamSystem:
     system.semantics.expect(system.mapper.world.keyframes[first], kept_depth(FRAMES[3].depth_m))
     sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
     system.dynamics.tracks.see(FRAMES[19].timestamp_s, [sighting])
+    removed = [
+        Removed(k, np.arange(k, 4 + 2 * k), np.packbits(FRAMES[k].depth_m > 2), (480, 640))
+        for k in (first, second)
+    ]
+    system.dynamics.suspects.watched = [
+        Suspect(1, first, 0.25, np.ones((4, 3)), tuple(removed), 2, 1),
+        Suspect(2, second, 0.5, np.full((3, 3), 0.5), (removed[1],), 1, 3),
+    ]
     loops.closed = {(first, second): True, (first, second + 1): False}
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
     return system

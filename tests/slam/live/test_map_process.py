@@ -10,7 +10,14 @@ from synthetic_view import CAMERA, render_plane
 from graph.geometry import Array, se3_exp
 from slam.history import ENTRY, NOBODY
 from slam.live.map_process import MapKeeper
-from slam.live.messages import LostKeyframe, MapChanged, NewKeyframe, Sightings
+from slam.live.messages import (
+    LostKeyframe,
+    MapChanged,
+    NewKeyframe,
+    PruneMask,
+    Sightings,
+    TakeBack,
+)
 from slam.system import SlamSystem
 from slam.tracker import untracked
 
@@ -58,3 +65,28 @@ def test_after_the_loss_of_its_first_keyframe_a_segment_begins_anew() -> None:
     assert heirs == {0: NOBODY, 1: NOBODY}
     trajectory = system.trajectory()
     assert trajectory.timestamps_s.tolist() == [2 / 30]  # those of the lost ones have no pose
+
+
+def test_what_was_taken_out_under_a_mask_comes_back() -> None:
+    answers: list[Any] = []
+    system = SlamSystem(CAMERA)
+    keeper = MapKeeper(system, answers.append)
+    keeper.handle(1, keyframe(system, 0, None))
+    keeper.handle(2, keyframe(system, 1, (0, np.eye(4))))
+    one, landmarks = system.mapper.world.keyframes[1], system.mapper.world.landmarks
+    mask = np.zeros((CAMERA.height, CAMERA.width), bool)
+    mask[100:300, 200:400] = True
+    keeper.handle(3, PruneMask(1, np.packbits(mask), mask.shape, 0))
+    under = np.flatnonzero(one.masked)
+    assert len(under) > 20
+    keeper.handle(4, TakeBack(1, under))
+    assert not one.masked.any()
+    back = one.landmark_ids[under]
+    with_depth = np.isfinite(one.features.depth_m[under])
+    assert (back[with_depth] >= 0).all()
+    assert landmarks.alive[back[back >= 0]].all()
+    told = [answer for answer in answers if isinstance(answer, MapChanged)][-1].delta
+    assert np.isin(back[back >= 0], told.ids).all()
+    keeper.handle(5, TakeBack(7, under))  # culled meanwhile
+    keeper.handle(6, keyframe(system, 2, (1, one.T_world_camera)))
+    assert list(system.mapper.world.keyframes) == [0, 1, 2]

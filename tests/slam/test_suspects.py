@@ -1,0 +1,188 @@
+"""Things that are left out for their class alone, and come back once they are seen to stand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA
+
+from graph.array_file import Arrays
+from graph.geometry import Array
+from semantics.instance_track import Track
+from semantics.instances import Instance, certain
+from semantics.labels import label_set
+from semantics.votes import VoteConfig, claim_pixels
+from slam.features import Features
+from slam.keyframe_masks import KeyframeMasks
+from slam.static_check import StaticCheck, StaticCheckConfig, depth_view
+from slam.suspects import SuspectConfig, Suspects
+from slam.world_map import Keyframe, WorldMap
+
+NAMES = label_set(("person",))
+WALL_M, BODY_M = 3.0, 2.0
+TOP, LEFT, SIDE = 120, 200, 160
+CHECK = StaticCheck(CAMERA, 0.08, StaticCheckConfig())
+CONFIG = SuspectConfig(stands_s=0.4)
+
+
+def depth(left: int = LEFT, body_m: float = BODY_M) -> Array:
+    """A body before a wall."""
+    found = np.full((CAMERA.height, CAMERA.width), WALL_M, np.float32)
+    found[TOP : TOP + SIDE, left : left + SIDE] = body_m
+    return found
+
+
+def masks_of(left: int = LEFT, keyframe_id: int = 0) -> KeyframeMasks:
+    mask = depth(left) < WALL_M
+    body = Instance(mask, np.zeros(4), 1, certain(1, 2, 0.9), 0.9, 0.9)
+    thinned = depth(left)[::2, ::2].copy()
+    claims = claim_pixels([body], thinned, mask.shape, VoteConfig())
+    none = np.zeros(0, np.int64)
+    return KeyframeMasks(keyframe_id, NAMES, claims, thinned, np.eye(4), none, none, np.eye(2)[:0])
+
+
+def keyframe(keyframe_id: int = 0) -> Keyframe:
+    """Three keypoints on the body, one on the wall."""
+    pixels = np.array([[210.0, 130.0], [280.0, 200.0], [350.0, 270.0], [600.0, 30.0]])
+    n = len(pixels)
+    features = Features(
+        pixels=pixels,
+        image_pixels=pixels,
+        descriptors=np.zeros((n, 8), np.uint64),
+        scales=np.ones(n),
+        angles_rad=np.zeros(n),
+        depth_m=np.full(n, BODY_M),
+        disparity_px=np.full(n, 10.0),
+        sigmas_px=np.ones((n, 3)),
+        colours=np.zeros((n, 3), np.uint8),
+        gray=np.zeros((0, 0), np.uint8),
+    )
+    ids = np.full(n, -1, np.int64)
+    return Keyframe(keyframe_id, 0, 0.1 * keyframe_id, 0, np.eye(4), features, ids)
+
+
+def track(track_id: int = 7) -> Track:
+    state = np.zeros(6), np.eye(6)
+    return Track(track_id, 0.0, *state, np.full(3, 0.3), certain(1, 2, 0.9), 2.9, 0.0, 1)
+
+
+def watching(config: SuspectConfig = CONFIG) -> tuple[Suspects, WorldMap]:
+    """A body that keyframe 0 saw."""
+    suspects, world = Suspects(CHECK, config, 20, 5), WorldMap()
+    world.add_keyframe(keyframe())
+    suspects.add(masks_of(), [track()], world.keyframes[0])
+    return suspects, world
+
+
+def watched(suspects: Suspects, world: WorldMap, images: list[Array], hz: float = 30) -> list[int]:
+    """In which of some frames something is found to stand."""
+    views = [depth_view(image, CHECK.config.window_px) for image in images]
+    return [
+        k for k, view in enumerate(views) if suspects.watch((k + 1) / hz, view, np.eye(4), world)
+    ]
+
+
+def test_what_stands_is_found_after_a_while_and_watched_no_further() -> None:
+    suspects, world = watching()
+    assert watched(suspects, world, [depth()] * 30) == [13]  # 0.4 s and two frames more
+    assert suspects.watched == []
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        [depth(LEFT + 3 * k) for k in range(30)],
+        [depth(body_m=BODY_M + 0.008 * k) for k in range(30)],
+        [depth(body_m=BODY_M - 0.008 * k) for k in range(30)],
+    ],
+    ids=["sideways", "away", "near"],
+)
+def test_what_walks_a_third_of_a_metre_a_second_is_not(images: list[Array]) -> None:
+    suspects, world = watching()
+    assert watched(suspects, world, images) == []
+
+
+def test_noise_and_lost_depth_do_not_make_it_move() -> None:
+    rng = np.random.default_rng(0)
+    images = []
+    for _ in range(20):
+        image = depth() + rng.normal(0, 0.01, depth().shape).astype(np.float32)
+        image[rng.random(image.shape) < 0.001] = np.nan
+        images.append(image)
+    suspects, world = watching()
+    assert watched(suspects, world, images) == [13]
+
+
+def test_it_tells_what_was_taken_out_for_it_but_not_what_another_still_covers() -> None:
+    suspects, world = watching()
+    (removed,) = suspects.watched[0].removed
+    assert removed.keypoints.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(removed.mask, depth() < WALL_M)
+    np.testing.assert_array_equal(suspects.without_watched(removed), [])
+    view = depth_view(depth(), CHECK.config.window_px)
+    for time_s in (0.5, 0.6):
+        assert not suspects.watch(time_s, view, np.eye(4), world)
+    (found,) = suspects.watch(0.7, view, np.eye(4), world)
+    assert suspects.without_watched(found.removed[0]).tolist() == [0, 1, 2]
+
+
+def test_seen_again_it_is_watched_from_the_first_time_on_unless_it_had_moved() -> None:
+    for moved, since_s, taken in ((False, 0.0, 2), (True, 0.1, 1)):
+        suspects, world = watching()
+        world.add_keyframe(keyframe(1))
+        if moved:
+            watched(suspects, world, [depth(400)] * 15)
+        suspects.add(masks_of(keyframe_id=1), [track()], world.keyframes[1])
+        (one,) = suspects.watched
+        assert (one.time_s, len(one.removed)) == (since_s, taken)
+
+
+def test_what_is_out_of_view_or_whose_keyframe_was_culled_is_given_up() -> None:
+    suspects, world = watching()
+    turned = np.eye(4)
+    turned[:3, :3] = np.diag([-1, 1, -1])
+    view = depth_view(depth(), CHECK.config.window_px)
+    for k in range(80):
+        assert not suspects.watch(0.5 + 0.03 * k, view, turned, world)
+    assert len(suspects.watched) == 1
+    assert not suspects.watch(3.1, view, turned, world)
+    assert suspects.watched == []
+    suspects, _ = watching()
+    assert not suspects.watch(0.5, view, np.eye(4), WorldMap())
+    assert suspects.watched == []
+
+
+def test_a_restored_state_goes_on_as_if_nothing_had_happened() -> None:
+    suspects, world = watching()
+    world.add_keyframe(keyframe(1))
+    suspects.add(masks_of(400, 1), [track(9)], world.keyframes[1])
+    watched(suspects, world, [depth()] * 13)
+    other = Suspects(CHECK, CONFIG, 20, 5)
+    other.restore(suspects.state())
+    same(other.state(), suspects.state())
+    assert [s.track_id for s in other.watched] == [7, 9]
+    assert [s.there for s in other.watched] == [2, 0]
+    view = depth_view(depth(), CHECK.config.window_px)
+    for one in (other, suspects):
+        (found,) = one.watch(14 / 30, view, np.eye(4), world)
+        assert found.removed[0].keypoints.tolist() == [0, 1, 2]
+    empty = Suspects(CHECK, CONFIG, 20, 5)
+    other.restore(empty.state())
+    assert other.watched == []
+
+
+def same(a: Arrays, b: Arrays) -> None:
+    assert a.keys() == b.keys()
+    for key in a:
+        np.testing.assert_array_equal(a[key], b[key], err_msg=key)
+
+
+def test_switched_off_nothing_is_watched() -> None:
+    suspects, _ = watching(SuspectConfig(stands_s=0))
+    assert suspects.watched == []
+
+
+def test_values_without_sense_are_refused() -> None:
+    for wrong in ({"stands_s": -1}, {"share": 0}, {"shift_m": 0}, {"frames": 0}, {"patience_s": 0}):
+        with pytest.raises(ValueError, match="must"):
+            SuspectConfig(**wrong)
