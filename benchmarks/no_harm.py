@@ -1,15 +1,16 @@
 """What the semantics cost where nothing moves, also when the masks are wrong.
 
-    python benchmarks/no_harm.py SEQUENCE [SEQUENCE ...] [--repeats 8] [--hand-eye]
+    python benchmarks/no_harm.py [SEQUENCE ...] [--rooms 20-31] [--repeats 8] [--hand-eye]
 
-Each sequence is static. It is run without semantics and without the check of what moves
-("nothing"), with the check alone ("geometry"), with the network's masks, with masks that are drawn
-at random ("random": up to eight ellipses a keyframe, half of them people), and with the network's
-masks under each other's names ("shuffled": what was a chair is a person to the system). Any change
-of the keypoints moves an ATE by a tenth or more, so each is run several times, with keypoints
-spread over a grid whose cells are a few pixels wider or narrower, and with other random masks and
-names: the mean ATE, its range, and the mean of the logarithms of the runs' ratios to those with
-nothing, as a change. Last the same over all sequences. Standard errors are of both sides' runs.
+Each sequence is static; ``--rooms`` are those of dynamic.py without people, of these seeds. Each is
+run without semantics and without the check of what moves ("nothing"), as usual with the network's
+masks ("network"), with masks that are drawn at random ("random": up to eight ellipses a keyframe,
+half of them people), and with the network's masks under each other's names ("shuffled": what was a
+chair is a person to the system). Any change of the keypoints moves an ATE by a tenth or more, so
+each is run several times, with keypoints spread over a grid whose cells are a few pixels wider or
+narrower, and every run has random masks and names of its own: the mean ATE, its range, and the mean
+of the logarithms of the runs' ratios to that with nothing on the same grid, as a change, with its
+standard error. Last the same over all sequences, each of which counts alike.
 ``--hand-eye``: the reference is of another body on the camera, as the red kitchen's is.
 """
 
@@ -19,9 +20,9 @@ import argparse
 import itertools
 import os
 import sys
-from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from zlib import crc32
@@ -32,6 +33,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.dynamic import rendered
 from benchmarks.report import table
 from graph.camera import Camera
 from graph.geometry import Array
@@ -46,9 +48,9 @@ from slam.runner import RunOptions, run
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 
-VARIANTS = ("nothing", "geometry", "network", "random", "shuffled")
-Job = tuple[Path, str, int, bool]
-"""Sequence, one of VARIANTS, number of the repeat, whether the reference is of another body."""
+VARIANTS = ("nothing", "network", "random", "shuffled")
+SEED = 100
+"""The first of random masks and names; it and those after it were never looked at before."""
 SCORES = (0.5, 0.95)
 MOST, RADII_PX = 8, (20, 120)
 
@@ -120,55 +122,82 @@ def ate_m(
         return evaluate(out, sequence, with_body=with_body).value("ate_rmse")
 
 
+@dataclass(frozen=True)
+class Job:
+    """A run: one of VARIANTS, number of the repeat, seed of random masks and names."""
+
+    sequence: Path
+    variant: str
+    repeat: int
+    seed: int
+    with_body: bool
+
+
 def measured_mm(job: Job) -> float:
     """ATE of one run."""
-    sequence, variant, repeat, with_body = job
     torch.set_num_threads(1)
-    kind = "light" if variant in ("network", "random", "shuffled") else "none"
-    segmenter = make_segmenter(SegmenterOptions(kind), sequence)
-    if variant == "random":
-        segmenter = RandomMasks(segmenter.labels, repeat)
-    elif variant == "shuffled":
-        segmenter = ShuffledLabels(segmenter, repeat)
-    off = ["dynamics.labels=false", "dynamics.geometry=false"] if variant == "nothing" else []
-    return 1e3 * ate_m(sequence, segmenter, [*off, other_keypoints(repeat)], with_body)
+    off = ["dynamics.labels=false", "dynamics.geometry=false"] if job.variant == "nothing" else []
+    kind = "none" if job.variant == "nothing" else "light"
+    segmenter = make_segmenter(SegmenterOptions(kind), job.sequence)
+    if job.variant == "random":
+        segmenter = RandomMasks(segmenter.labels, job.seed)
+    elif job.variant == "shuffled":
+        segmenter = ShuffledLabels(segmenter, job.seed)
+    settings = [*off, other_keypoints(job.repeat)]
+    return 1e3 * ate_m(job.sequence, segmenter, settings, job.with_body)
 
 
 def change(ates_mm: Array, base_mm: Array) -> str:
     """By how much ATEs (sequences, repeats) are larger than others, and its standard error."""
-    logs, base = np.log(ates_mm), np.log(base_mm)
-    variance = (logs.var(axis=1, ddof=1) + base.var(axis=1, ddof=1)) / logs.shape[1]
-    error = np.sqrt(variance.sum()) / len(logs)
-    return f"{100 * np.expm1((logs - base).mean()):+.1f} ± {100 * error:.1f} %"
+    logs = np.log(ates_mm / base_mm)
+    error = np.sqrt(logs.var(axis=1, ddof=1).sum() / logs.shape[1]) / len(logs)
+    return f"{100 * np.expm1(logs.mean()):+.1f} ± {100 * error:.1f} %"
 
 
-def report(names: Sequence[str], ates_mm: Array) -> str:
-    """The table in Markdown, of ATEs (sequences, VARIANTS, repeats)."""
+def report(groups: dict[str, Array]) -> str:
+    """The table in Markdown, of ATEs (sequences, VARIANTS, repeats) by what they are of."""
     rows = []
-    for name, errors_mm in zip(names, ates_mm, strict=True):
-        for variant, of_one in zip(VARIANTS, errors_mm, strict=True):
+    for name, ates_mm in groups.items():
+        for k, variant in enumerate(VARIANTS):
+            of_one = ates_mm[:, k]
             span = f"{of_one.min():.2f} to {of_one.max():.2f}"
-            by = change(of_one[None], errors_mm[:1]) if variant != VARIANTS[0] else ""
+            by = change(of_one, ates_mm[:, 0]) if k else ""
             rows.append((name, variant, f"{of_one.mean():.2f}", span, by))
-    for k, variant in enumerate(VARIANTS[1:], 1):
-        of_all = f"{ates_mm[:, k].size} runs"
-        rows.append(("all", variant, "", of_all, change(ates_mm[:, k], ates_mm[:, 0])))
+    if len(groups) > 1:
+        every = np.concatenate(list(groups.values()))
+        for k, variant in enumerate(VARIANTS[1:], 1):
+            of_all = f"{every[:, k].size} runs"
+            rows.append(("all", variant, "", of_all, change(every[:, k], every[:, 0])))
     return table(("sequence", "with", "ATE mm", "of which", "change"), rows)
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("sequences", type=Path, nargs="+")
+    parser.add_argument("sequences", type=Path, nargs="*")
+    parser.add_argument("--rooms", help="seeds, as 20-31")
+    parser.add_argument("--rendered", type=Path, default=Path("runs/bench"), help="where they lie")
     parser.add_argument("--repeats", type=int, default=8)
     parser.add_argument("--hand-eye", action="store_true")
     arguments = parser.parse_args()
-    repeats, bodies = range(arguments.repeats), (arguments.hand_eye,)
-    jobs = list(itertools.product(arguments.sequences, VARIANTS, repeats, bodies))
+    hand_eye = arguments.hand_eye
+    groups = {path.name: [path] for path in arguments.sequences}
     with ProcessPoolExecutor(os.cpu_count()) as pool:
+        if arguments.rooms:
+            first, last = map(int, arguments.rooms.split("-"))
+            seeds = range(first, last + 1)
+            into = partial(rendered, arguments.rendered, "nobody")
+            groups[f"{len(seeds)} rooms"] = list(pool.map(into, seeds))
+        sequences = [path for paths in groups.values() for path in paths]
+        places = itertools.product(range(len(sequences)), VARIANTS, range(arguments.repeats))
+        jobs = [
+            Job(sequences[k], variant, repeat, SEED + k + repeat * len(sequences), hand_eye)
+            for k, variant, repeat in places
+        ]
         errors_mm = np.array(list(pool.map(measured_mm, jobs)))
-    shape = (len(arguments.sequences), len(VARIANTS), arguments.repeats)
-    print(report([path.name for path in arguments.sequences], errors_mm.reshape(shape)))
+    by_sequence = errors_mm.reshape(len(sequences), len(VARIANTS), arguments.repeats)
+    ends = np.cumsum([len(paths) for paths in groups.values()])[:-1]
+    print(report(dict(zip(groups, np.split(by_sequence, ends), strict=True))))
 
 
 if __name__ == "__main__":

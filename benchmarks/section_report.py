@@ -112,7 +112,8 @@ REPORTS = {
         ),
         "harm": (
             "What the semantics cost where nothing moves",
-            "no_harm.py {sequences}/office-300 {sequences}/living_room ../shared/data/redkitchen",
+            "no_harm.py {sequences}/office-300 {sequences}/living_room --rooms 20-31 "
+            "--rendered {sequences}",
         ),
         "harm-kitchen": (
             "The same in the red kitchen, its reference of a point beside the camera",

@@ -10,6 +10,24 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
+class PackedMask:
+    """A mask of ``shape`` (H, W) with a bit a pixel: ``bits`` (H * W / 8,), rounded up."""
+
+    bits: NDArray[np.uint8]
+    shape: tuple[int, ...]
+
+    @classmethod
+    def of(cls, mask: NDArray[np.bool_]) -> PackedMask:
+        """A mask (H, W)."""
+        return cls(np.packbits(mask), mask.shape)
+
+    def unpacked(self) -> NDArray[np.bool_]:
+        """The mask (H, W)."""
+        size = int(np.prod(self.shape))
+        return np.unpackbits(self.bits, count=size).reshape(self.shape) > 0
+
+
+@dataclass(frozen=True, eq=False)
 class Instance:
     """One object in an image.
 
@@ -33,11 +51,11 @@ class Instance:
     def __reduce__(self) -> tuple[Any, ...]:
         """To other processes and machines with a bit a pixel."""
         rest = (self.box, self.label, self.distribution, self.class_score, self.mask_score)
-        return _from_bits, (np.packbits(self.mask), self.mask.shape, rest)
+        return _with_mask, (PackedMask.of(self.mask), rest)
 
 
-def _from_bits(bits: NDArray[np.uint8], shape: tuple[int, int], rest: tuple) -> Instance:
-    return Instance(np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape) > 0, *rest)
+def _with_mask(packed: PackedMask, rest: tuple) -> Instance:
+    return Instance(packed.unpacked(), *rest)
 
 
 def mask_box(mask: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -217,7 +217,7 @@ class Dynamics:
             logger.info("track %d stands: its class does not count", suspect.track_id)
             self.tracks.acquit(suspect.track_id, float(log_odds(self.priors.unknown)))
             for removed in suspect.removed:
-                self.memory.recall_space(removed.keyframe_id, removed.mask)
+                self.memory.recall_space(removed.keyframe_id, removed.mask.unpacked())
                 keypoints = self.suspects.without_watched(removed)
                 mapper.take_back(removed.keyframe_id, keypoints)
         return bool(standing)

@@ -12,13 +12,15 @@ class KeyframeConfig:
 
     "orb" (ORB-SLAM, section V.E, with ORB-SLAM2's extra rule): mapping is idle or more than
     ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and the shared
-    view is below ``max_shared``; or the close points run out: fewer than ``min_close_tracked`` are
-    tracked while ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three
-    keyframes see; here all points of the reference keyframe count, of which BRISK finds about 60 %
-    again in the next frame, so that half is the equal of it. The reference keyframe is the last
-    one, until a keyframe would be made that another shows more of than the reference does: that
-    one is the reference from then on, and the next frame decides. So a known view needs no new
-    one; with ``max_shared`` of 1 or more no view is known.
+    view is below ``max_shared`` or, ``late_frames`` after the last keyframe, below ``late_shared``;
+    or the close points run out: fewer than ``min_close_tracked`` are tracked while
+    ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three keyframes see;
+    here all points of the reference keyframe count, of which BRISK finds about 60 % again in the
+    next frame, so that half is the equal of it. Before a flat wall a slow camera keeps half of its
+    points for seconds, and what is new alone shows how it moved along it; hence ``late_shared``.
+    The reference keyframe is the last one, until a keyframe would be made that another shows more
+    of than the reference does: that one is the reference from then on, and the next frame decides.
+    So a known view needs no new one; with ``max_shared`` of 1 or more no view is known.
     "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """
@@ -28,6 +30,8 @@ class KeyframeConfig:
     max_interval_frames: int = 20
     min_tracked: int = 50
     max_shared: float = 0.5
+    late_frames: int = 10
+    late_shared: float = 0.6
     min_close_tracked: int = 100
     min_close_new: int = 70
     paper_interval_frames: int = 30
@@ -69,7 +73,9 @@ def keyframe_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:
     if starving:
         return "close points run out"
     ready = evidence.mapping_idle or evidence.frames_since > config.max_interval_frames
-    if ready and evidence.tracked >= config.min_tracked and evidence.shared < config.max_shared:
+    late = evidence.frames_since >= config.late_frames
+    most = max(config.late_shared, config.max_shared) if late else config.max_shared
+    if ready and evidence.tracked >= config.min_tracked and evidence.shared < most:
         return "new view"
     return ""
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from graph.camera import Camera
-from graph.geometry import Array, inverse, transform
+from graph.geometry import Array, inverse
 
 Depths = NDArray[np.float32]
 Verdicts = NDArray[np.int8]
@@ -118,21 +118,7 @@ class StaticCheck:
 
         The views have one size and step.
         """
-        T_camera_world = inverse(np.array([T for _, T in views])).astype(np.float32)
-        to_cameras = T_camera_world[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3)
-        x, y, z = (to_cameras @ points_world.T.astype(np.float32)).reshape(3, len(views), -1)
-        x, y, z = (
-            a + t[:, None] for a, t in zip((x, y, z), T_camera_world[:, :3, 3].T, strict=True)
-        )
-        ahead = (z > 0.1) & (z < self.config.max_depth_m)
-        u, v = self._pixels(x, y, np.where(ahead, z, np.float32(1)))
-        ahead &= (u > 0) & (u < self.camera.width - 1) & (v > 0) & (v < self.camera.height - 1)
-        step = views[0][0].step
-        height, width = views[0][0].nearest_m.shape
-        rows, columns = (np.where(ahead, a, 0) / np.float32(step) for a in (v, u))
-        place = np.minimum(np.rint(rows), height - 1) * np.float32(width)
-        place += np.minimum(np.rint(columns), width - 1)
-        nearest, farthest = _looked_up([view for view, _ in views], place.astype(np.int64))
+        z, ahead, nearest, farthest = self._seen(points_world, views)
         margin = self._margin_m(z)
         verdicts = ((np.abs(nearest - z) < margin) | (np.abs(farthest - z) < margin)).view(np.int8)
         verdicts[nearest - z > self._margin_m(nearest)] = Verdict.MOVING
@@ -147,14 +133,8 @@ class StaticCheck:
         (N,) m, 0 within the window's depths; NaN out of view, where a depth is missing in it, and
         where the two are not one surface.
         """
-        x, y, z = transform(inverse(T_world_camera), points_world).astype(np.float32).T
-        ahead = (z > 0.1) & (z < self.config.max_depth_m)
-        u, v = self._pixels(x[None], y[None], np.where(ahead, z, np.float32(1))[None])
-        u, v = u[0] / view.step, v[0] / view.step
-        height, width = view.nearest_m.shape
-        ahead &= (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)
-        rows, columns = (np.rint(np.where(ahead, a, 0)).astype(np.int64) for a in (v, u))
-        nearest, farthest = view.nearest_m[rows, columns], view.farthest_m[rows, columns]
+        seen = self._seen(points_world, [(view, T_world_camera)])
+        z, ahead, nearest, farthest = (of_views[0] for of_views in seen)
         off_m = np.clip(z, nearest, farthest) - z
         off_m[~ahead | (nearest == 0) | (np.abs(off_m) > self._margin_m(z))] = np.nan
         return off_m, ahead
@@ -197,6 +177,27 @@ class StaticCheck:
         spread = verdicts.copy()
         spread[open_] = np.sign((verdicts[there] * speaks).sum(axis=1))
         return spread
+
+    def _seen(
+        self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
+    ) -> tuple[Depths, NDArray[np.bool_], Depths, Depths]:
+        """Of points (N, 3) in views: depth, whether in view, nearest and farthest there (K, N)."""
+        T_camera_world = inverse(np.array([T for _, T in views])).astype(np.float32)
+        to_cameras = T_camera_world[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3)
+        x, y, z = (to_cameras @ points_world.T.astype(np.float32)).reshape(3, len(views), -1)
+        x, y, z = (
+            a + t[:, None] for a, t in zip((x, y, z), T_camera_world[:, :3, 3].T, strict=True)
+        )
+        ahead = (z > 0.1) & (z < self.config.max_depth_m)
+        u, v = self._pixels(x, y, np.where(ahead, z, np.float32(1)))
+        ahead &= (u > 0) & (u < self.camera.width - 1) & (v > 0) & (v < self.camera.height - 1)
+        step = views[0][0].step
+        height, width = views[0][0].nearest_m.shape
+        rows, columns = (np.where(ahead, a, 0) / np.float32(step) for a in (v, u))
+        place = np.minimum(np.rint(rows), height - 1) * np.float32(width)
+        place += np.minimum(np.rint(columns), width - 1)
+        nearest, farthest = _looked_up([view for view, _ in views], place.astype(np.int64))
+        return z, ahead, nearest, farthest
 
     def _margin_m(self, depth_m: Depths) -> Depths:
         """How far apart two depths as large as these may lie and still be one surface."""

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graph.array_file import Arrays
 from graph.geometry import Array, transform
 from semantics.instance_track import Track
+from semantics.instances import PackedMask
 from slam.keyframe_masks import KeyframeMasks, surface_points
 from slam.landmarks import Ints, Mask
 from slam.map_pruning import covered
@@ -29,11 +29,10 @@ class SuspectConfig:
     A frame says so if ``share`` of its points in view lie on a surface and the median of their
     distances from it along the ray is below ``shift_m``; at least ``frames`` have to, and ``share``
     of those that say anything. Someone who walks has left a third of his own place after 0.3 s. A
-    thing is watched for ``patience_s``; with ``stands_s`` of 0, the default, not at all. 0.4 is a
-    good number.
+    thing is watched for ``patience_s``; with ``stands_s`` of 0 not at all.
     """
 
-    stands_s: float = 0.0
+    stands_s: float = 0.4
     share: float = 0.8
     shift_m: float = 0.03
     frames: int = 3
@@ -53,19 +52,12 @@ class Removed:
     Attributes:
         keyframe_id: its.
         keypoints: (N,) that were masked.
-        bits: a bit a pixel of the thing's mask, of the image's ``shape``.
+        mask: the thing's.
     """
 
     keyframe_id: int
     keypoints: Ints
-    bits: NDArray[np.uint8]
-    shape: tuple[int, int]
-
-    @property
-    def mask(self) -> Mask:
-        """(H, W)."""
-        size = self.shape[0] * self.shape[1]
-        return np.unpackbits(self.bits, count=size).reshape(self.shape) > 0
+    mask: PackedMask
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +164,7 @@ class Suspects:
             "keyframe_ids": np.array([r.keyframe_id for r in removed], np.int64),
             "keypoints": np.concatenate([np.zeros(0, np.int64), *keypoints]),
             "keypoints_each": np.array([len(k) for k in keypoints], np.int64),
-            "bits": np.array([r.bits for r in removed], np.uint8).ravel(),
-            "shape": np.array([r.shape for r in removed[:1]], np.int64).ravel(),
+            "bits": np.array([r.mask.bits for r in removed], np.uint8).ravel(),
         }
 
     def restore(self, state: Arrays) -> None:
@@ -181,9 +172,10 @@ class Suspects:
         points = np.split(state["points"], np.cumsum(state["points_each"])[:-1])
         keypoints = np.split(state["keypoints"], np.cumsum(state["keypoints_each"])[:-1])
         ids = state["keyframe_ids"].tolist()
-        bits = state["bits"].reshape(len(ids), -1) if ids else state["bits"]
-        shape = tuple(state["shape"].tolist())
-        removed = [Removed(*row, shape) for row in zip(ids, keypoints, bits, strict=False)]
+        bits = state["bits"].reshape(max(len(ids), 1), -1)
+        shape = self._check.camera.height, self._check.camera.width
+        masks = [PackedMask(of_one, shape) for of_one in bits]
+        removed = [Removed(*row) for row in zip(ids, keypoints, masks, strict=False)]
         self.watched = []
         rows = zip(state["counts"].tolist(), state["times_s"].tolist(), points, strict=False)
         for (track_id, keyframe_id, there, gone, count), time_s, of_one in rows:
@@ -213,9 +205,8 @@ class Suspects:
 def _about_to_be_removed(mask: Mask, keyframe: Keyframe, border_px: int) -> Removed:
     """What a mask (H, W), widened, covers of a keyframe that is not masked yet."""
     keypoints = covered(mask, keyframe.features.image_pixels, -border_px)
-    height, width = mask.shape
     free = keypoints[~keyframe.masked[keypoints]]
-    return Removed(keyframe.id, free, np.packbits(mask), (height, width))
+    return Removed(keyframe.id, free, PackedMask.of(mask))
 
 
 def _same(a: Removed, b: Removed) -> bool:

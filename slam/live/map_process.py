@@ -125,9 +125,7 @@ class MapKeeper:
                     self.system.mapper.pruner().prune_landmarks(ids)
             case PruneMask():
                 pruner = replace(self.system.mapper.pruner(), border_px=message.border_px)
-                size = message.shape[0] * message.shape[1]
-                mask = np.unpackbits(message.bits, count=size).reshape(message.shape) > 0
-                pruner.prune_mask(message.keyframe_id, mask)
+                pruner.prune_mask(message.keyframe_id, message.mask.unpacked())
             case TakeBack():
                 self.system.mapper.take_back(message.keyframe_id, message.keypoints)
                 self.tell(-1, done=False)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graph.geometry import Array
-from semantics.instances import Instance
+from semantics.instances import Instance, PackedMask
 from slam.history import Entries
 from slam.landmarks import Ints
 from slam.live.replica import WorldDelta
@@ -117,11 +117,10 @@ class PruneLandmarks:
 
 @dataclass(frozen=True, eq=False)
 class PruneMask:
-    """To the map: a mask of ``shape``, a bit a pixel, of what moves in a keyframe's image."""
+    """To the map: a mask of what moves in a keyframe's image."""
 
     keyframe_id: int
-    bits: NDArray[np.uint8]
-    shape: tuple[int, ...]
+    mask: PackedMask
     border_px: int
 
 

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from semantics.instances import PackedMask
 from slam.landmarks import Ints, Mask
 from slam.live.messages import PruneLandmarks, PruneMask
 from slam.world_map import WorldMap
@@ -28,5 +27,4 @@ class RemotePruner:
 
     def prune_mask(self, keyframe_id: int, mask: Mask) -> None:
         """As ``MapPruner.prune_mask``."""
-        bits = np.packbits(mask)
-        self.tell(PruneMask(keyframe_id, bits, mask.shape, self.border_px))
+        self.tell(PruneMask(keyframe_id, PackedMask.of(mask), self.border_px))

@@ -13,6 +13,8 @@ ORB = KeyframeConfig(
     max_interval_frames=20,
     min_tracked=50,
     max_shared=0.7,
+    late_frames=30,
+    late_shared=0.8,
     min_close_tracked=100,
     min_close_new=70,
 )
@@ -35,6 +37,11 @@ PAPER_DUE = KeyframeEvidence(
         ({"tracked": 49}, ""),
         ({"shared": 0.69}, "new view"),
         ({"shared": 0.7}, ""),
+        # after a while without a keyframe, less has to be new
+        ({"frames_since": 29, "shared": 0.79}, ""),
+        ({"frames_since": 30, "shared": 0.79}, "new view"),
+        ({"frames_since": 30, "shared": 0.8}, ""),
+        ({"frames_since": 30, "shared": 0.79, "tracked": 49}, ""),
         ({"mapping_idle": False}, ""),
         ({"mapping_idle": False, "frames_since": 20}, ""),
         ({"mapping_idle": False, "frames_since": 21}, "new view"),
@@ -67,6 +74,12 @@ def test_the_papers_rule_with_the_printed_numbers(change: dict[str, float], is_d
     """At least 30 frames AND idle AND shared view < 90 % AND >= 100 matches; nothing else."""
     reason = keyframe_reason(replace(PAPER_DUE, **change), PAPER)
     assert reason == ("Algorithm 2" if is_due else "")
+
+
+def test_less_need_never_be_new_sooner_than_late() -> None:
+    always = replace(ORB, max_shared=2.0)
+    late = replace(DUE, frames_since=30, shared=1.0)
+    assert keyframe_reason(late, always) == "new view"
 
 
 def test_the_default_rule_is_orb_slams() -> None:

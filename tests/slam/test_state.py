@@ -19,7 +19,7 @@ from graph.shadow import Shadow
 from graph.storage import graph_arrays
 from graph.updates import GraphUpdate, RelativePose
 from semantics.instance_track import Sighting
-from semantics.instances import Instance, certain, mask_box
+from semantics.instances import Instance, PackedMask, certain, mask_box
 from semantics.labels import label_set
 from semantics.segmenter import Image
 from slam.configuration import resolve
@@ -92,7 +92,7 @@ def system() -> SlamSystem:
     sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
     system.dynamics.tracks.see(FRAMES[19].timestamp_s, [sighting])
     removed = [
-        Removed(k, np.arange(k, 4 + 2 * k), np.packbits(FRAMES[k].depth_m > 2), (480, 640))
+        Removed(k, np.arange(k, 4 + 2 * k), PackedMask.of(FRAMES[k].depth_m > 2))
         for k in (first, second)
     ]
     system.dynamics.suspects.watched = [

@@ -117,7 +117,7 @@ def test_it_tells_what_was_taken_out_for_it_but_not_what_another_still_covers() 
     suspects, world = watching()
     (removed,) = suspects.watched[0].removed
     assert removed.keypoints.tolist() == [0, 1, 2]
-    np.testing.assert_array_equal(removed.mask, depth() < WALL_M)
+    np.testing.assert_array_equal(removed.mask.unpacked(), depth() < WALL_M)
     np.testing.assert_array_equal(suspects.without_watched(removed), [])
     view = depth_view(depth(), CHECK.config.window_px)
     for time_s in (0.5, 0.6):

@@ -8,6 +8,7 @@ import numpy as np
 from synthetic_view import CAMERA, render_plane
 
 from graph.geometry import Array, se3_exp
+from semantics.instances import PackedMask
 from slam.history import ENTRY, NOBODY
 from slam.live.map_process import MapKeeper
 from slam.live.messages import (
@@ -76,7 +77,7 @@ def test_what_was_taken_out_under_a_mask_comes_back() -> None:
     one, landmarks = system.mapper.world.keyframes[1], system.mapper.world.landmarks
     mask = np.zeros((CAMERA.height, CAMERA.width), bool)
     mask[100:300, 200:400] = True
-    keeper.handle(3, PruneMask(1, np.packbits(mask), mask.shape, 0))
+    keeper.handle(3, PruneMask(1, PackedMask.of(mask), 0))
     under = np.flatnonzero(one.masked)
     assert len(under) > 20
     keeper.handle(4, TakeBack(1, under))
