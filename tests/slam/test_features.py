@@ -308,7 +308,8 @@ def test_a_reserve_is_what_a_larger_search_would_have_found_besides() -> None:
     rows = np.array([expected.get(tuple(p), -1) for p in both.image_pixels.tolist()])
     for name in ("descriptors", "angles_rad", "depth_m", "sigmas_px", "pixels", "colours"):
         mine, others = getattr(both, name)[rows >= 0], getattr(larger, name)[rows[rows >= 0]]
-        np.testing.assert_array_equal(mine, others, err_msg=name)
+        # sums over a patch are rounded by how many patches some processors take at once
+        np.testing.assert_allclose(mine, others, rtol=1e-5 * (name == "angles_rad"), err_msg=name)
 
 
 def test_with_octaves_there_is_no_reserve() -> None:
