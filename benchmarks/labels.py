@@ -58,7 +58,8 @@ class RecordingStore(LabelStore):
         best = self.__dict__.setdefault("best", {})
         for old, new in zip(from_ids.tolist(), to_ids.tolist(), strict=True):
             both = [best[k] for k in (old, new) if k in best]
-            best[new] = max(both, key=lambda view: view[0])
+            if both:
+                best[new] = max(both, key=lambda view: view[0])
 
 
 @dataclass
