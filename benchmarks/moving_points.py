@@ -148,9 +148,9 @@ class WatchedSystem(SlamSystem):
         self.fill_ms.append(1e3 * (time.thread_time() - begun_s))
         return filled
 
-    def _watch(self, tracked: Tracked, sifted: Sifted) -> None:
+    def _watch(self, time_s: float, tracked: Tracked, sifted: Sifted) -> None:
         begun_s = time.thread_time()
-        super()._watch(tracked, sifted)
+        super()._watch(time_s, tracked, sifted)
         self.check_ms[-1] += 1e3 * (time.thread_time() - begun_s)
 
 
