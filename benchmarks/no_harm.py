@@ -49,7 +49,7 @@ from slam.system import SlamSystem
 from slam.system_config import SystemConfig
 
 VARIANTS = ("nothing", "network", "random", "shuffled")
-SEED = 100
+SEED = 1000
 """The first of random masks and names; it and those after it were never looked at before."""
 SCORES = (0.5, 0.95)
 MOST, RADII_PX = 8, (20, 120)

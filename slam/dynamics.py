@@ -10,7 +10,7 @@ import numpy as np
 
 from graph.array_file import Arrays, nested, part
 from graph.camera import Camera
-from graph.geometry import Array
+from graph.geometry import Array, inverse
 from semantics.instance_track import Sighting, Track
 from semantics.instance_tracks import InstanceTracks
 from semantics.movability import MovabilityFilter, log_odds, read_priors
@@ -19,7 +19,7 @@ from slam.dynamics_config import DynamicsConfig
 from slam.feature_check import FeatureCheck, Judged
 from slam.features import FeatureConfig, Features, select
 from slam.frame import Frame
-from slam.keyframe_masks import KeyframeMasks
+from slam.keyframe_masks import KeyframeMasks, surfaces
 from slam.landmarks import Ints, Mask
 from slam.localiser import Localiser
 from slam.mapper import Mapper
@@ -80,7 +80,8 @@ class Dynamics:
         self.priors = read_priors(config.priors)
         self.movability = MovabilityFilter(self.priors.unknown, config.movability)
         self.tracks = InstanceTracks(config.tracks)
-        self.memory = ViewMemory(config.check)
+        self.memory = ViewMemory(config.check.views, config.check.interval_s)
+        self.recent = ViewMemory(config.suspects.recent, config.suspects.interval_s)
         self._check = StaticCheck(camera, features.disparity_sigma_px, config.check)
         watched = config.min_judged, config.mask_border_px
         self.suspects = Suspects(self._check, config.suspects, *watched)
@@ -184,10 +185,15 @@ class Dynamics:
             return
         keyframe = mapper.world.keyframes.get(masks.keyframe_id)
         views: list[PosedView] = []
+        recent: list[PosedView] = []
         if keyframe is not None and self.config.geometry:
             views = self.memory.posed(keyframe.segment, mapper)
+            recent = self.recent.posed(keyframe.segment, mapper)
         now_s = np.nan if keyframe is None else keyframe.timestamp_s
-        sightings = self._witness.sightings(masks, views, now_s)
+        rules = self.config.check.window_px, self.config.min_judged
+        seen = surfaces(self.camera, masks, *rules)
+        stood = self.suspects.stood(masks, seen, recent, now_s)
+        sightings = self._witness.sightings(masks, seen, stood, views, now_s)
         moving, tracks = self._tracked(masks, sightings, now_s)
         still = [
             s is not None and (s.still or (track is not None and track.stood))
@@ -202,30 +208,36 @@ class Dynamics:
         self.memory.forget_space(masks.keyframe_id, moves)
         pruner = replace(mapper.pruner(), border_px=-self.config.mask_border_px)
         if keyframe is not None and self.config.geometry:
-            self.suspects.add(masks, [t if _by_class(t) else None for t in tracks], keyframe)
+            by_class = [t if _by_class(t) else None for t in tracks]
+            self.suspects.add(masks, seen, by_class, mapper.world)
         pruner.prune_mask(masks.keyframe_id, moves)
         self._remove(masks.landmark_ids, mapper)
 
     def acquit(
-        self, time_s: float, tracked: Tracked, view: DepthView | None, mapper: Mapper
+        self, time_s: float, T_world_camera: Array, view: DepthView, near: Keyframe, mapper: Mapper
     ) -> bool:
-        """What was left out for its class alone, and stands, comes back; whether anything did."""
-        if view is None or not self.suspects.watched:
-            return False
-        standing = self.suspects.watch(time_s, view, tracked.T_world_camera, mapper.world)
+        """What was left out for its class alone, and stands, comes back; whether anything did.
+
+        A tracked frame with this view says so; it is remembered by its pose from a keyframe.
+        """
+        T_keyframe_camera = inverse(near.T_world_camera) @ T_world_camera
+        self.recent.add(near.id, time_s, view, T_keyframe_camera=T_keyframe_camera)
+        standing = self.suspects.watch(time_s, view, T_world_camera, mapper.world)
         for suspect in standing:
             logger.info("track %d stands: its class does not count", suspect.track_id)
             self.tracks.acquit(suspect.track_id, float(log_odds(self.priors.unknown)))
             for removed in suspect.removed:
                 self.memory.recall_space(removed.keyframe_id, removed.mask.unpacked())
-                keypoints = self.suspects.without_watched(removed)
-                mapper.take_back(removed.keyframe_id, keypoints)
+                free = self.suspects.without_watched(removed)
+                back = removed.keypoints[free], removed.patches[free]
+                mapper.take_back(removed.keyframe_id, *back)
         return bool(standing)
 
     def begin_session(self) -> None:
         """Forget what moved in an earlier recording; landmarks stay what they are."""
         self.suspects.clear()
         self.memory.clear()
+        self.recent.clear()
         self.tracks.clear()
 
     def state(self) -> Arrays:
@@ -234,6 +246,7 @@ class Dynamics:
             movability=self.movability.state(),
             tracks=self.tracks.state(),
             memory=self.memory.state(),
+            recent=self.recent.state(),
             suspects=self.suspects.state(),
         )
 
@@ -242,6 +255,7 @@ class Dynamics:
         self.movability.restore(part(state, "movability"))
         self.tracks.restore(part(state, "tracks"))
         self.memory.restore(part(state, "memory"))
+        self.recent.restore(part(state, "recent"))
         self.suspects.restore(part(state, "suspects"))
 
     def _judge(

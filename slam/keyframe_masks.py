@@ -11,8 +11,8 @@ from graph.camera import Camera
 from graph.geometry import Array
 from semantics.labels import LabelSet
 from semantics.votes import Claims
-from slam.landmarks import Ints
-from slam.static_check import DepthView, thinned_view
+from slam.landmarks import Ints, Mask
+from slam.static_check import thinned_view
 
 _SAMPLES = 400
 """Points of an instance, at most."""
@@ -44,13 +44,32 @@ class KeyframeMasks:
         """Every how many pixels there is a depth."""
         return max(self.claims.owner.shape[0] // max(self.depth_m.shape[0], 1), 1)
 
-    def view(self, window_px: int) -> DepthView:
-        """What the keyframe's depth says about space."""
-        return thinned_view(self.depth_m.copy(), self.step, window_px)
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Some points on an instance's surface.
+
+    Attributes:
+        points: (N, 3) m, in the camera's frame.
+        complete: (N,) no depth is missing around it, as other frames ask it to be.
+    """
+
+    points: Array
+    complete: Mask
 
 
-def surface_points(camera: Camera, masks: KeyframeMasks, k: int, at_least: int) -> Array | None:
-    """Points (N, 3) on an instance's surface, in the camera's frame; None if fewer have depth."""
+def surfaces(
+    camera: Camera, masks: KeyframeMasks, window_px: int, at_least: int
+) -> list[Surface | None]:
+    """The surface of each of a keyframe's instances; None where fewer pixels have depth."""
+    view = thinned_view(masks.depth_m.copy(), masks.step, window_px)
+    instances = range(len(masks.claims.instances))
+    return [_surface(camera, masks, k, view.nearest_m > 0, at_least) for k in instances]
+
+
+def _surface(
+    camera: Camera, masks: KeyframeMasks, k: int, complete: Mask, at_least: int
+) -> Surface | None:
     depth_m, step = masks.depth_m, masks.step
     owner = masks.claims.owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
     rows, columns = np.nonzero((owner == k) & np.isfinite(depth_m))
@@ -61,4 +80,5 @@ def surface_points(camera: Camera, masks: KeyframeMasks, k: int, at_least: int) 
     some = np.linspace(0, len(surface) - 1, min(len(surface), _SAMPLES)).astype(np.int64)
     chosen = surface[some]
     pixels = step * np.stack([columns[chosen], rows[chosen]], axis=1).astype(float)
-    return camera.backproject(pixels, z_m[chosen])
+    points = camera.backproject(pixels, z_m[chosen])
+    return Surface(points, complete[rows[chosen], columns[chosen]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,22 @@ class Looks:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
         return np.array(self._rows[self._place], dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """What sub-pixel registration aligns some landmarks with, see LandmarkTable.
+
+    Attributes:
+        images: (N, PATCHES, 17, 17) uint8.
+        views: (N, PATCHES, 3) m, NaN where there is none.
+    """
+
+    images: NDArray[np.uint8]
+    views: Array
+
+    def __getitem__(self, rows: Any) -> Patches:
+        return Patches(self.images[rows], self.views[rows])
 
 
 class LandmarkTable:
@@ -203,6 +220,19 @@ class LandmarkTable:
         there = self.patch_views.pick(ids, nearest)
         zooms = np.linalg.norm(there, axis=1) / np.linalg.norm(views, axis=1)
         return self.patches.pick(ids, nearest), np.nan_to_num(zooms, nan=1.0)
+
+    def patches_of(self, ids: Ints) -> Patches:
+        """All patches of landmarks (N,); of an id of -1 none."""
+        images = np.zeros((len(ids), PATCHES, PATCH_PX, PATCH_PX), np.uint8)
+        views, known = np.full((len(ids), PATCHES, 3), np.nan), ids >= 0
+        images[known], views[known] = self.patches[ids[known]], self.patch_views[ids[known]]
+        return Patches(images, views)
+
+    def give_patches(self, ids: Ints, patches: Patches) -> None:
+        """Those of the landmarks (N,), each once, that have no patch have these now."""
+        without = np.isnan(self.patch_views[ids]).all(axis=(1, 2))
+        self.patches[ids[without]] = patches.images[without]
+        self.patch_views[ids[without]] = patches.views[without]
 
     def put_patches(self, ids: Ints, slots: Ints, patches: NDArray[np.uint8], views: Array) -> None:
         """Give landmarks (N,), each once, patches (N, 17, 17) and their views (N, 3) in slots."""

@@ -19,7 +19,7 @@ from slam.features import Features
 from slam.frame import Frame
 from slam.graph_feed import GraphFeed, GraphFeedConfig, read_back
 from slam.history import FrameHistory
-from slam.landmarks import Ints
+from slam.landmarks import Ints, Patches
 from slam.local_mapping import (
     MappingConfig,
     create_landmarks,
@@ -159,10 +159,11 @@ class Mapper:
         """Takes things out of map and graph, such as what a mask covers, at any time."""
         return MapPruner(self.world, self.smoother, self.camera)
 
-    def take_back(self, keyframe_id: int, keypoints: Ints) -> None:
+    def take_back(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """Keypoints (N,) of a keyframe that were masked observe landmarks after all.
 
-        Those that the map has by now, or new ones.
+        Those that the map has by now, or new ones; either have the patches (N) of what the
+        keypoints observed before, unless they have others.
         """
         world = self.world
         keyframe = world.keyframes.get(keyframe_id)
@@ -175,6 +176,8 @@ class Mapper:
         fused = fuse_into(world, [keyframe], known, self._tracker, radius_px)
         self._feed.forget_landmarks(fused)
         create_landmarks(world, keyframe, self.camera)
+        ids = keyframe.landmark_ids[keypoints]
+        world.landmarks.give_patches(ids[ids >= 0], patches[ids >= 0])
 
     def finish(self) -> None:
         """Full bundle adjustment of the graph, then without outliers; the map is then final."""

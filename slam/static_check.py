@@ -126,15 +126,14 @@ class StaticCheck:
         return verdicts
 
     def offsets(
-        self, points_world: Array, view: DepthView, T_world_camera: Array
+        self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
     ) -> tuple[Depths, NDArray[np.bool_]]:
-        """How far behind points (N, 3) the surface is that a frame shows, and which are in view.
+        """How far behind points (N, 3) the surface is that views, each with T_world_camera, show.
 
-        (N,) m, 0 within the window's depths; NaN out of view, where a depth is missing in it, and
-        where the two are not one surface.
+        (K, N) m, 0 within the window's depths; NaN out of view, where a depth is missing in it, and
+        where the two are not one surface; and which are in view (K, N).
         """
-        seen = self._seen(points_world, [(view, T_world_camera)])
-        z, ahead, nearest, farthest = (of_views[0] for of_views in seen)
+        z, ahead, nearest, farthest = self._seen(points_world, views)
         off_m = np.clip(z, nearest, farthest) - z
         off_m[~ahead | (nearest == 0) | (np.abs(off_m) > self._margin_m(z))] = np.nan
         return off_m, ahead

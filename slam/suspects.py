@@ -15,10 +15,11 @@ from graph.array_file import Arrays
 from graph.geometry import Array, transform
 from semantics.instance_track import Track
 from semantics.instances import PackedMask
-from slam.keyframe_masks import KeyframeMasks, surface_points
-from slam.landmarks import Ints, Mask
+from slam.keyframe_masks import KeyframeMasks, Surface
+from slam.landmarks import Ints, LandmarkTable, Mask, Patches
 from slam.map_pruning import covered
 from slam.static_check import DepthView, StaticCheck
+from slam.view_memory import PosedView
 from slam.world_map import Keyframe, WorldMap
 
 
@@ -29,7 +30,9 @@ class SuspectConfig:
     A frame says so if ``share`` of its points in view lie on a surface and the median of their
     distances from it along the ray is below ``shift_m``; at least ``frames`` have to, and ``share``
     of those that say anything. Someone who walks has left a third of his own place after 0.3 s. A
-    thing is watched for ``patience_s``; with ``stands_s`` of 0 not at all.
+    thing is watched for ``patience_s``. One that was there as long before is not left out at all:
+    so say, by the same rule, ``recent`` frames, remembered ``interval_s`` apart. With ``stands_s``
+    of 0 there is neither: only what stood for ``StaticCheckConfig.still_s`` is structure.
     """
 
     stands_s: float = 0.4
@@ -37,12 +40,20 @@ class SuspectConfig:
     shift_m: float = 0.03
     frames: int = 3
     patience_s: float = 3.0
+    recent: int = 10
+    interval_s: float = 0.1
 
     def __post_init__(self) -> None:
         if self.stands_s < 0 or self.patience_s <= 0 or self.frames < 1:
             raise ValueError("stands_s must not be negative, patience_s positive, frames 1 or more")
         if not 0 < self.share <= 1 or self.shift_m <= 0:
             raise ValueError("share must be in (0, 1], shift_m positive")
+        if self.recent < 1 or self.interval_s <= 0:
+            raise ValueError("recent must be 1 or more, interval_s positive")
+
+    def stands(self, there: int, gone: int) -> bool:
+        """Whether so many frames that found a thing where it was, and that did not, say so."""
+        return there >= max(self.frames, self.share * (there + gone))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +63,13 @@ class Removed:
     Attributes:
         keyframe_id: its.
         keypoints: (N,) that were masked.
+        patches: (N) of the landmarks that they observed.
         mask: the thing's.
     """
 
     keyframe_id: int
     keypoints: Ints
+    patches: Patches
     mask: PackedMask
 
 
@@ -96,33 +109,56 @@ class Suspects:
         self._check = check
         self._at_least, self._border_px = at_least, border_px
 
-    def add(self, masks: KeyframeMasks, tracks: Sequence[Track | None], keyframe: Keyframe) -> None:
+    def add(
+        self,
+        masks: KeyframeMasks,
+        seen: Sequence[Surface | None],
+        tracks: Sequence[Track | None],
+        world: WorldMap,
+    ) -> None:
         """A keyframe's instances (K,) on these tracks are about to be taken out of it.
 
         What is seen again is watched on from the first time, unless it was found to move.
         """
         if self.config.stands_s == 0:
             return
-        view = masks.view(self._check.config.window_px)
-        for k, track in enumerate(tracks):
-            if track is None:
+        keyframe = world.keyframes[masks.keyframe_id]
+        for k, (surface, track) in enumerate(zip(seen, tracks, strict=True)):
+            if surface is None or track is None:
                 continue
-            points = surface_points(self._check.camera, masks, k, self._at_least)
-            if points is None:
-                continue
-            seen, _ = self._check.offsets(points, view, np.eye(4))
-            removed = _about_to_be_removed(masks.claims.owner == k, keyframe, self._border_px)
-            suspect = Suspect(
-                track.id,
-                keyframe.id,
-                keyframe.timestamp_s,
-                points[np.isfinite(seen)],
-                (removed,),
-            )
+            mask = masks.claims.owner == k
+            removed = _about_to_be_removed(mask, keyframe, world.landmarks, self._border_px)
+            points = surface.points[surface.complete]
+            when = keyframe.id, keyframe.timestamp_s
+            suspect = Suspect(track.id, *when, points, (removed,))
             before = [s for s in self.watched if s.track_id == track.id and s.gone <= s.there]
             if before:
                 suspect = replace(before[0], removed=(*before[0].removed, removed))
             self.watched = [s for s in self.watched if s.track_id != track.id] + [suspect]
+
+    def stood(
+        self,
+        masks: KeyframeMasks,
+        seen: Sequence[Surface | None],
+        recent: Sequence[PosedView],
+        now_s: float,
+    ) -> list[bool]:
+        """Which of the things (K,) that a keyframe saw at ``now_s`` stood there for long enough.
+
+        Recent frames say so by the rule for what is watched, those before it as well as those
+        after it, which there are where masks come late.
+        """
+        least_s = self.config.stands_s
+        apart = [v for v in recent if abs(v.timestamp_s - now_s) >= least_s]
+        if least_s == 0 or not apart:
+            return [False] * len(seen)
+        views = [(v.seen, v.T_world_camera) for v in apart]
+        stood = []
+        for surface in seen:
+            points = np.zeros((0, 3)) if surface is None else surface.points[surface.complete]
+            points_world = transform(masks.T_world_camera, points)
+            stood.append(self.config.stands(*self._there_or_gone(points_world, views)))
+        return stood
 
     def watch(
         self, time_s: float, view: DepthView, T_world_camera: Array, world: WorldMap
@@ -137,14 +173,14 @@ class Suspects:
             else s
             for s in kept
         ]
-        stand = [self._stands(s) for s in told]
+        stand = [self.config.stands(s.there, s.gone) for s in told]
         self.watched = [s for s, stands in zip(told, stand, strict=True) if not stands]
         return [s for s, stands in zip(told, stand, strict=True) if stands]
 
-    def without_watched(self, removed: Removed) -> Ints:
-        """Keypoints (N,) of what was taken out that are not under anything else that is watched."""
+    def without_watched(self, removed: Removed) -> Mask:
+        """Which of the keypoints (N,) that were taken out nothing else that is watched covers."""
         others = [r.keypoints for s in self.watched for r in s.removed if _same(r, removed)]
-        return np.setdiff1d(removed.keypoints, np.concatenate([np.zeros(0, np.int64), *others]))
+        return ~np.isin(removed.keypoints, np.concatenate([np.zeros(0, np.int64), *others]))
 
     def clear(self) -> None:
         """Watch nothing: another recording."""
@@ -154,6 +190,7 @@ class Suspects:
         """All that is watched, as named arrays."""
         every = self.watched
         removed = [r for s in every for r in s.removed]
+        no_patches = LandmarkTable().patches_of(np.zeros(0, np.int64))
         points, keypoints = [s.points for s in every], [r.keypoints for r in removed]
         counts = [(s.track_id, s.keyframe_id, s.there, s.gone, len(s.removed)) for s in every]
         return {
@@ -164,18 +201,23 @@ class Suspects:
             "keyframe_ids": np.array([r.keyframe_id for r in removed], np.int64),
             "keypoints": np.concatenate([np.zeros(0, np.int64), *keypoints]),
             "keypoints_each": np.array([len(k) for k in keypoints], np.int64),
+            "patches": np.concatenate([no_patches.images, *(r.patches.images for r in removed)]),
+            "patch_views": np.concatenate([no_patches.views, *(r.patches.views for r in removed)]),
             "bits": np.array([r.mask.bits for r in removed], np.uint8).ravel(),
         }
 
     def restore(self, state: Arrays) -> None:
         """Go on from a state."""
         points = np.split(state["points"], np.cumsum(state["points_each"])[:-1])
-        keypoints = np.split(state["keypoints"], np.cumsum(state["keypoints_each"])[:-1])
+        ends = np.cumsum(state["keypoints_each"])[:-1]
+        keypoints = np.split(state["keypoints"], ends)
+        images, views = np.split(state["patches"], ends), np.split(state["patch_views"], ends)
+        patches = [Patches(*both) for both in zip(images, views, strict=True)]
         ids = state["keyframe_ids"].tolist()
         bits = state["bits"].reshape(max(len(ids), 1), -1)
         shape = self._check.camera.height, self._check.camera.width
         masks = [PackedMask(of_one, shape) for of_one in bits]
-        removed = [Removed(*row) for row in zip(ids, keypoints, masks, strict=False)]
+        removed = [Removed(*row) for row in zip(ids, keypoints, patches, masks, strict=False)]
         self.watched = []
         rows = zip(state["counts"].tolist(), state["times_s"].tolist(), points, strict=False)
         for (track_id, keyframe_id, there, gone, count), time_s, of_one in rows:
@@ -188,25 +230,34 @@ class Suspects:
         """A suspect with what a frame says of it counted."""
         pose = world.keyframes[suspect.keyframe_id].T_world_camera
         points_world = transform(pose, suspect.points)
-        off_m, inside = self._check.offsets(points_world, view, T_world_camera)
-        in_view, there_m = np.count_nonzero(inside), off_m[np.isfinite(off_m)]
-        if in_view < self._at_least:
-            return suspect
-        stays = len(there_m) >= self.config.share * in_view
-        if stays and abs(float(np.median(there_m))) < self.config.shift_m:
-            return replace(suspect, there=suspect.there + 1)
-        return replace(suspect, gone=suspect.gone + 1)
+        now = [(view, T_world_camera)]
+        there, gone = self._there_or_gone(points_world, now)
+        return replace(suspect, there=suspect.there + there, gone=suspect.gone + gone)
 
-    def _stands(self, suspect: Suspect) -> bool:
-        frames = suspect.there + suspect.gone
-        return suspect.there >= max(self.config.frames, self.config.share * frames)
+    def _there_or_gone(
+        self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
+    ) -> tuple[int, int]:
+        """How many views, each with T_world_camera, find a thing at points (N, 3), and do not.
+
+        A view with too few of the points in it says nothing.
+        """
+        off_m, inside = self._check.offsets(points_world, views)
+        in_view, found = inside.sum(axis=1), np.isfinite(off_m)
+        told = in_view >= self._at_least
+        stays = told & (found.sum(axis=1) >= self.config.share * in_view)
+        shift_m = [np.median(off_m[k, found[k]]) for k in np.flatnonzero(stays)]
+        there = int(np.count_nonzero(np.abs(shift_m) < self.config.shift_m))
+        return there, int(np.count_nonzero(told)) - there
 
 
-def _about_to_be_removed(mask: Mask, keyframe: Keyframe, border_px: int) -> Removed:
+def _about_to_be_removed(
+    mask: Mask, keyframe: Keyframe, landmarks: LandmarkTable, border_px: int
+) -> Removed:
     """What a mask (H, W), widened, covers of a keyframe that is not masked yet."""
     keypoints = covered(mask, keyframe.features.image_pixels, -border_px)
     free = keypoints[~keyframe.masked[keypoints]]
-    return Removed(keyframe.id, free, PackedMask.of(mask))
+    patches = landmarks.patches_of(keyframe.landmark_ids[free])
+    return Removed(keyframe.id, free, patches, PackedMask.of(mask))
 
 
 def _same(a: Removed, b: Removed) -> bool:

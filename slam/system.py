@@ -120,9 +120,9 @@ class SlamSystem(SystemResults):
         with clock.stage("tracking"):
             tracked = self._track(sifted.features)
         with clock.stage("moving"):
-            self._watch(frame.timestamp_s, tracked, sifted)
+            came_back = self._watch(frame.timestamp_s, tracked, sifted)
         with clock.stage("keyframe"):
-            reason = self._keyframe_reason(tracked)
+            reason = self._keyframe_reason(tracked) if not came_back else ""
             if reason:
                 tracked, keyframe = self.insert(frame, tracked, self.localiser.local_ids)
         with clock.stage("graph"):
@@ -196,14 +196,24 @@ class SlamSystem(SystemResults):
         """With other keypoints in place of those on moving things."""
         return self.dynamics.fill_up(frame, features, sifted, self._segment, self.mapper)
 
-    def _watch(self, time_s: float, tracked: Tracked, sifted: Sifted) -> None:
-        """Landmarks that are believed to move are not tracked against from now on."""
-        if tracked.status is not TrackingStatus.LOST:
-            moving = self.dynamics.watch(tracked, sifted.view, self.mapper.world)
-            self.localiser.leave_out(moving)
-            back = self.dynamics.acquit(time_s, tracked, sifted.view, self.mapper)
-            if back and self._reference is not None:
-                self.localiser.new_local_map(self.mapper.world, self._reference)
+    def _watch(self, time_s: float, tracked: Tracked, sifted: Sifted) -> bool:
+        """Landmarks that are believed to move are not tracked against from now on.
+
+        Returns whether some came back that stand: this frame was tracked without them, so that it
+        cannot say how much of the map it shows.
+        """
+        if tracked.status is TrackingStatus.LOST:
+            return False
+        moving = self.dynamics.watch(tracked, sifted.view, self.mapper.world)
+        self.localiser.leave_out(moving)
+        near, view = self._reference, sifted.view
+        if near is None or view is None:
+            return False
+        pose = tracked.T_world_camera
+        came_back = self.dynamics.acquit(time_s, pose, view, near, self.mapper)
+        if came_back:
+            self.localiser.new_local_map(self.mapper.world, near)
+        return came_back
 
     def _keyframe_reason(self, tracked: Tracked) -> str:
         if tracked.status is TrackingStatus.LOST:

@@ -1,4 +1,4 @@
-"""What the last keyframes saw of space."""
+"""What the last keyframes, or frames, saw of space."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ from graph.geometry import Array
 from slam.depth_regions import MovingSpace
 from slam.landmarks import Mask
 from slam.mapper import Mapper
-from slam.static_check import DepthView, StaticCheckConfig
+from slam.static_check import DepthView
 
 
 @dataclass(frozen=True, eq=False)
 class RememberedView:
-    """The depth that a keyframe saw, and when; ``view`` is without what moved, ``seen`` with it."""
+    """The depth that a frame saw, and when; ``view`` is without what moved, ``seen`` with it.
+
+    Its pose is ``T_keyframe_camera`` (4, 4) from a keyframe, which is mostly itself.
+    """
 
     keyframe_id: int
     timestamp_s: float
     view: DepthView
     seen: DepthView
+    T_keyframe_camera: Array
 
 
 class PosedView(NamedTuple):
@@ -40,10 +44,10 @@ THINNED = 2
 
 
 class ViewMemory:
-    """The last few keyframes' depth, spread in time."""
+    """The depth of the last ``count`` keyframes, or frames, at least ``interval_s`` apart."""
 
-    def __init__(self, config: StaticCheckConfig) -> None:
-        self.config = config
+    def __init__(self, count: int, interval_s: float) -> None:
+        self.count, self.interval_s = count, interval_s
         self.views: list[RememberedView] = []
 
     def add(
@@ -52,16 +56,21 @@ class ViewMemory:
         timestamp_s: float,
         view: DepthView,
         moving: MovingSpace | None = None,
+        T_keyframe_camera: Array | None = None,
     ) -> None:
-        """Remember what a keyframe saw, unless the last is too recent; of what moved nothing."""
-        if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.config.interval_s:
+        """Remember what a keyframe saw, or a frame at a pose (4, 4) from it; of what moved nothing.
+
+        It is not remembered if the last is too recent.
+        """
+        if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.interval_s:
             return
         seen = view.thinned(THINNED)
         told = seen.thinned(1)
         if moving is not None:
             _forget(told, moving.covers(told.nearest_m, told.step))
-        self.views.append(RememberedView(keyframe_id, timestamp_s, told, seen))
-        del self.views[: -self.config.views]
+        pose = np.eye(4) if T_keyframe_camera is None else T_keyframe_camera
+        self.views.append(RememberedView(keyframe_id, timestamp_s, told, seen, pose))
+        del self.views[: -self.count]
 
     def posed(self, segment: int, mapper: Mapper) -> list[PosedView]:
         """What is remembered of a map segment, with poses as optimised since."""
@@ -70,7 +79,7 @@ class ViewMemory:
             heir_id, T_heir_keyframe = mapper.history.heir(kept.keyframe_id)
             heir = mapper.world.keyframes.get(heir_id)
             if heir is not None and heir.segment == segment:
-                pose = heir.T_world_camera @ T_heir_keyframe
+                pose = heir.T_world_camera @ T_heir_keyframe @ kept.T_keyframe_camera
                 when = kept.keyframe_id, kept.timestamp_s
                 found.append(PosedView(*when, kept.view, kept.seen, pose))
         return found
@@ -99,6 +108,7 @@ class ViewMemory:
         return {
             "keyframe_ids": np.array([v.keyframe_id for v in self.views], np.int64),
             "timestamps_s": np.array([v.timestamp_s for v in self.views], float),
+            "T_keyframe_camera": np.array([v.T_keyframe_camera for v in self.views], float).ravel(),
             "step": np.array([v.view.step for v in self.views], np.int64),
             "shape": np.array([n[0].shape for n in near[:1]], np.int64).ravel(),
             "nearest_m": np.array(near, np.float32).ravel(),
@@ -110,10 +120,11 @@ class ViewMemory:
         ids, shape = state["keyframe_ids"].tolist(), state["shape"].tolist() or [0, 0]
         depths = (state[k].reshape(len(ids), 2, *shape) for k in ("nearest_m", "farthest_m"))
         stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
-        self.views = [
-            RememberedView(i, t, *(DepthView(n[k].copy(), f[k].copy(), s) for k in (0, 1)))
-            for i, t, n, f, s in zip(ids, stamps_s, *depths, steps, strict=True)
-        ]
+        poses = state["T_keyframe_camera"].reshape(len(ids), 4, 4).copy()
+        self.views = []
+        for i, t, n, f, s, T in zip(ids, stamps_s, *depths, steps, poses, strict=True):
+            view, seen = (DepthView(n[k].copy(), f[k].copy(), s) for k in (0, 1))
+            self.views.append(RememberedView(i, t, view, seen, T))
 
     def _of(self, keyframe_id: int) -> list[RememberedView]:
         return [kept for kept in self.views if kept.keyframe_id == keyframe_id]

@@ -12,7 +12,7 @@ from graph.geometry import inverse, transform
 from semantics.instance_track import Sighting, Track
 from semantics.movability import MovabilityPriors, log_odds
 from slam.feature_check import NEAREST_M
-from slam.keyframe_masks import KeyframeMasks, surface_points
+from slam.keyframe_masks import KeyframeMasks, Surface
 from slam.stance import Stance, stance
 from slam.static_check import StaticCheck, distorted
 from slam.view_memory import PosedView
@@ -34,15 +34,29 @@ class Witness:
     min_judged: int
 
     def sightings(
-        self, masks: KeyframeMasks, views: Sequence[PosedView], now_s: float
+        self,
+        masks: KeyframeMasks,
+        seen: Sequence[Surface | None],
+        stood: Sequence[bool],
+        views: Sequence[PosedView],
+        now_s: float,
     ) -> list[Sighting | None]:
-        """A keyframe's instances in space; None for those without depth.
+        """A keyframe's instances (K,) in space; None for those without a surface.
 
-        Of the views the keyframe's own does not count. It was taken at ``now_s``.
+        Of those that ``stood`` that is known. Of the views the keyframe's own does not count. It
+        was taken at ``now_s``.
         """
         others = [v for v in views if v.keyframe_id != masks.keyframe_id]
-        instances = range(len(masks.claims.instances))
-        return [self._sighting(k, masks, others, now_s) for k in instances]
+        found: list[Sighting | None] = []
+        for k, surface in enumerate(seen):
+            if surface is None:
+                found.append(None)
+                continue
+            points_world = transform(masks.T_world_camera, surface.points)
+            rules = self.check, self.min_judged
+            known = Stance.STILL if stood[k] else stance(points_world, now_s, others, *rules)
+            found.append(self._sighting(k, surface, masks, known))
+        return found
 
     def shows(self, masks: KeyframeMasks, track: Track) -> bool:
         """Whether a keyframe shows the place of a track, as predicted, or what is behind it."""
@@ -57,15 +71,8 @@ class Witness:
         there_m = depth_m[min(int(row / step), height - 1), min(int(column / step), width - 1)]
         return bool(there_m > centre[2] - track.half_size[2] - self.check.config.margin_m)
 
-    def _sighting(
-        self, k: int, masks: KeyframeMasks, views: Sequence[PosedView], now_s: float
-    ) -> Sighting | None:
-        points = surface_points(self.camera, masks, k, self.min_judged)
-        if points is None:
-            return None
-        low, centroid, high = np.percentile(points, (4, 50, 96), axis=0)
-        points_world = transform(masks.T_world_camera, points)
-        found = stance(points_world, now_s, views, self.check, self.min_judged)
+    def _sighting(self, k: int, surface: Surface, masks: KeyframeMasks, found: Stance) -> Sighting:
+        low, centroid, high = np.percentile(surface.points, (4, 50, 96), axis=0)
         distribution, still = masks.claims.instances[k].distribution, found is Stance.STILL
         prior = float(distribution @ self.priors.of(masks.names))
         prior = min(prior, self.priors.unknown) if still else prior

@@ -127,7 +127,8 @@ class MapKeeper:
                 pruner = replace(self.system.mapper.pruner(), border_px=message.border_px)
                 pruner.prune_mask(message.keyframe_id, message.mask.unpacked())
             case TakeBack():
-                self.system.mapper.take_back(message.keyframe_id, message.keypoints)
+                back = message.keypoints, message.patches
+                self.system.mapper.take_back(message.keyframe_id, *back)
                 self.tell(-1, done=False)
             case SaveState():
                 self.save(number, message.path)

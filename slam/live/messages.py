@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from graph.geometry import Array
 from semantics.instances import Instance, PackedMask
 from slam.history import Entries
-from slam.landmarks import Ints
+from slam.landmarks import Ints, Patches
 from slam.live.replica import WorldDelta
 from slam.tracker import Tracked
 
@@ -126,10 +126,14 @@ class PruneMask:
 
 @dataclass(frozen=True, eq=False)
 class TakeBack:
-    """To the map: masked keypoints (N,) of a keyframe lie on what stands after all."""
+    """To the map: masked keypoints (N,) of a keyframe lie on what stands after all.
+
+    ``patches`` (N) are those of what they observed before.
+    """
 
     keyframe_id: int
     keypoints: Ints
+    patches: Patches
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from graph.errors import InputError
 from graph.geometry import Array, inverse
 from slam.frame import Frame
 from slam.history import NOBODY, Entries, FrameHistory
-from slam.landmarks import Ints
+from slam.landmarks import Ints, Patches
 from slam.live.messages import (
     Began,
     Finish,
@@ -149,10 +149,10 @@ class RemoteMapper:
         """Takes things out of the map."""
         return RemotePruner(self.world, self.tell)
 
-    def take_back(self, keyframe_id: int, keypoints: Ints) -> None:
+    def take_back(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """As ``Mapper.take_back``; the map is changed when the answer comes."""
         if len(keypoints):
-            self.tell(TakeBack(keyframe_id, keypoints))
+            self.tell(TakeBack(keyframe_id, keypoints, patches))
 
     def tell(self, message: Any) -> None:
         """Send a message, to be sent again to another process if this one dies."""

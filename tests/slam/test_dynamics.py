@@ -168,8 +168,24 @@ def test_what_is_called_a_person_and_stands_comes_back_within_half_a_second() ->
     table = system.mapper.world.landmarks
     on_card = table.alive & (table.points_world[:, 2] < 1.65)
     assert (table.observations[on_card] > 1).mean() > 0.5  # keyframes find each other's again
+    assert np.isfinite(table.patch_views[on_card]).any(axis=(1, 2)).all()
     unmasked = run(frames, settings=["dynamics.suspects.stands_s=0.3"])
     assert landmarks_on_card(system) > 0.7 * landmarks_on_card(unmasked) > 50
+
+
+def test_what_frames_showed_standing_before_it_is_called_a_person_is_not_left_out() -> None:
+    late = CardSegmenter(1)
+    segment = late.segment
+    late.segment = lambda image, name: segment(image, "0") if int(name) > 20 else []  # type: ignore
+    system = WatchedSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), late)
+    system.counts = []
+    for frame in standing(30):
+        system.process(replace(frame, name=str(frame.index)))
+    assert np.array(system.counts)[:, 1].sum() == 0
+    assert max(k.timestamp_s for k in system.mapper.world.keyframes.values()) > 21 / 30
+    assert system.dynamics.tracks.tracks == []  # its class does not count
+    assert landmarks_on_card(system) > 50
+    assert not any(k.masked.any() for k in system.mapper.world.keyframes.values())
 
 
 def test_one_who_walks_is_left_out_all_the_time_though_suspects_are_watched(

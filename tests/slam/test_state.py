@@ -24,9 +24,10 @@ from semantics.labels import label_set
 from semantics.segmenter import Image
 from slam.configuration import resolve
 from slam.frame import Frame
-from slam.landmarks import LandmarkTable
+from slam.landmarks import PATCHES, LandmarkTable, Patches
 from slam.loop_verification import LoopConstraint
 from slam.semantic_mapping import kept_depth
+from slam.subpixel import PATCH_PX
 from slam.suspects import Removed, Suspect
 from slam.system import SlamSystem
 from slam.system_config import SystemConfig
@@ -92,7 +93,9 @@ def system() -> SlamSystem:
     sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
     system.dynamics.tracks.see(FRAMES[19].timestamp_s, [sighting])
     removed = [
-        Removed(k, np.arange(k, 4 + 2 * k), PackedMask.of(FRAMES[k].depth_m > 2))
+        Removed(
+            k, np.arange(k, 4 + 2 * k), some_patches(4 + k), PackedMask.of(FRAMES[k].depth_m > 2)
+        )
         for k in (first, second)
     ]
     system.dynamics.suspects.watched = [
@@ -102,6 +105,12 @@ def system() -> SlamSystem:
     loops.closed = {(first, second): True, (first, second + 1): False}
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
     return system
+
+
+def some_patches(count: int) -> Patches:
+    rng = np.random.default_rng(count)
+    images = rng.integers(0, 255, (count, PATCHES, PATCH_PX, PATCH_PX), np.uint8)
+    return Patches(images, rng.normal(size=(count, PATCHES, 3)))
 
 
 def at_checkpoint() -> SlamSystem:

@@ -122,10 +122,10 @@ def test_a_thing_that_views_show_there_for_long_stood_still(
 
 
 def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
-    config = StaticCheckConfig(views=3, interval_s=0.25)
-    memory, other = ViewMemory(config), ViewMemory(config)
+    memory, other = ViewMemory(3, 0.25), ViewMemory(3, 0.25)
     for k in range(12):
-        memory.add(k, 0.1 * k, depth_view(box_before_wall() + k, 5))
+        pose = se3_exp(np.full(6, 0.1 * k)) if k > 3 else None
+        memory.add(k, 0.1 * k, depth_view(box_before_wall() + k, 5), T_keyframe_camera=pose)
     assert [v.keyframe_id for v in memory.views] == [3, 6, 9]
     memory.forget_space(6, np.ones(box_before_wall().shape, bool))
     other.restore(memory.state())
@@ -135,6 +135,7 @@ def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
             b.timestamp_s,
             b.view.step,
         )
+        np.testing.assert_array_equal(a.T_keyframe_camera, b.T_keyframe_camera)
         for one, two in ((a.view, b.view), (a.seen, b.seen)):
             np.testing.assert_array_equal(one.nearest_m, two.nearest_m)
             np.testing.assert_array_equal(one.farthest_m, two.farthest_m)
@@ -145,7 +146,7 @@ def test_what_moves_is_not_remembered_but_was_seen() -> None:
     depth_m = box_before_wall()
     regions = depth_regions(depth_m, DepthRegionConfig(step_px=8))
     nearer = regions.depth_m < 2.5
-    memory = ViewMemory(StaticCheckConfig())
+    memory = ViewMemory(6, 0.25)
     memory.add(0, 0.0, depth_view(depth_m, 5), regions.space(nearer))
     kept = memory.views[0]
     there = (kept.seen.nearest_m < 2.5) & (kept.seen.nearest_m > 0)

@@ -13,9 +13,10 @@ from semantics.instances import Instance, certain
 from semantics.labels import label_set
 from semantics.votes import VoteConfig, claim_pixels
 from slam.features import Features
-from slam.keyframe_masks import KeyframeMasks
+from slam.keyframe_masks import KeyframeMasks, surfaces
 from slam.static_check import StaticCheck, StaticCheckConfig, depth_view
 from slam.suspects import SuspectConfig, Suspects
+from slam.view_memory import PosedView
 from slam.world_map import Keyframe, WorldMap
 
 NAMES = label_set(("person",))
@@ -70,8 +71,12 @@ def watching(config: SuspectConfig = CONFIG) -> tuple[Suspects, WorldMap]:
     """A body that keyframe 0 saw."""
     suspects, world = Suspects(CHECK, config, 20, 5), WorldMap()
     world.add_keyframe(keyframe())
-    suspects.add(masks_of(), [track()], world.keyframes[0])
+    add(suspects, world, masks_of(), track())
     return suspects, world
+
+
+def add(suspects: Suspects, world: WorldMap, masks: KeyframeMasks, of_track: Track) -> None:
+    suspects.add(masks, surfaces(CAMERA, masks, CHECK.config.window_px, 20), [of_track], world)
 
 
 def watched(suspects: Suspects, world: WorldMap, images: list[Array], hz: float = 30) -> list[int]:
@@ -118,12 +123,12 @@ def test_it_tells_what_was_taken_out_for_it_but_not_what_another_still_covers() 
     (removed,) = suspects.watched[0].removed
     assert removed.keypoints.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(removed.mask.unpacked(), depth() < WALL_M)
-    np.testing.assert_array_equal(suspects.without_watched(removed), [])
+    assert suspects.without_watched(removed).tolist() == [False] * 3
     view = depth_view(depth(), CHECK.config.window_px)
     for time_s in (0.5, 0.6):
         assert not suspects.watch(time_s, view, np.eye(4), world)
     (found,) = suspects.watch(0.7, view, np.eye(4), world)
-    assert suspects.without_watched(found.removed[0]).tolist() == [0, 1, 2]
+    assert suspects.without_watched(found.removed[0]).tolist() == [True] * 3
 
 
 def test_seen_again_it_is_watched_from_the_first_time_on_unless_it_had_moved() -> None:
@@ -132,7 +137,7 @@ def test_seen_again_it_is_watched_from_the_first_time_on_unless_it_had_moved() -
         world.add_keyframe(keyframe(1))
         if moved:
             watched(suspects, world, [depth(400)] * 15)
-        suspects.add(masks_of(keyframe_id=1), [track()], world.keyframes[1])
+        add(suspects, world, masks_of(keyframe_id=1), track())
         (one,) = suspects.watched
         assert (one.time_s, len(one.removed)) == (since_s, taken)
 
@@ -155,7 +160,7 @@ def test_what_is_out_of_view_or_whose_keyframe_was_culled_is_given_up() -> None:
 def test_a_restored_state_goes_on_as_if_nothing_had_happened() -> None:
     suspects, world = watching()
     world.add_keyframe(keyframe(1))
-    suspects.add(masks_of(400, 1), [track(9)], world.keyframes[1])
+    add(suspects, world, masks_of(400, 1), track(9))
     watched(suspects, world, [depth()] * 13)
     other = Suspects(CHECK, CONFIG, 20, 5)
     other.restore(suspects.state())
@@ -171,6 +176,30 @@ def test_a_restored_state_goes_on_as_if_nothing_had_happened() -> None:
     assert other.watched == []
 
 
+@pytest.mark.parametrize(
+    ("left", "body_m", "from_s", "stood"),
+    [
+        (LEFT, BODY_M, -1.0, True),
+        (LEFT, BODY_M, 0.4, True),
+        (LEFT, BODY_M, -0.3, False),
+        (LEFT + 40, BODY_M, -1.0, False),
+        (LEFT, BODY_M + 0.05, -1.0, False),
+        (LEFT, 0.6 * BODY_M, -1.0, False),
+    ],
+    ids=["before", "after", "too-recent", "sideways", "away", "hidden"],
+)
+def test_frames_before_or_after_show_that_it_stood(
+    left: int, body_m: float, from_s: float, stood: bool
+) -> None:
+    suspects, now_s, masks = Suspects(CHECK, CONFIG, 20, 5), 5.0, masks_of()
+    seen = [*surfaces(CAMERA, masks, CHECK.config.window_px, 20), None]
+    view = depth_view(depth(left, body_m), CHECK.config.window_px)
+    views = [PosedView(0, now_s + from_s + 0.1 * k, view, view, np.eye(4)) for k in range(5)]
+    assert suspects.stood(masks, seen, views, now_s) == [stood, False]
+    switched_off = Suspects(CHECK, SuspectConfig(stands_s=0), 20, 5)
+    assert switched_off.stood(masks, seen, views, now_s) == [False, False]
+
+
 def same(a: Arrays, b: Arrays) -> None:
     assert a.keys() == b.keys()
     for key in a:
@@ -183,6 +212,14 @@ def test_switched_off_nothing_is_watched() -> None:
 
 
 def test_values_without_sense_are_refused() -> None:
-    for wrong in ({"stands_s": -1}, {"share": 0}, {"shift_m": 0}, {"frames": 0}, {"patience_s": 0}):
+    for wrong in (
+        {"stands_s": -1},
+        {"share": 0},
+        {"shift_m": 0},
+        {"frames": 0},
+        {"patience_s": 0},
+        {"recent": 0},
+        {"interval_s": 0},
+    ):
         with pytest.raises(ValueError, match="must"):
             SuspectConfig(**wrong)

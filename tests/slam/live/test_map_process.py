@@ -77,17 +77,22 @@ def test_what_was_taken_out_under_a_mask_comes_back() -> None:
     one, landmarks = system.mapper.world.keyframes[1], system.mapper.world.landmarks
     mask = np.zeros((CAMERA.height, CAMERA.width), bool)
     mask[100:300, 200:400] = True
+    all_patches, next_id = landmarks.patches_of(one.landmark_ids), len(landmarks)
     keeper.handle(3, PruneMask(1, PackedMask.of(mask), 0))
     under = np.flatnonzero(one.masked)
     assert len(under) > 20
-    keeper.handle(4, TakeBack(1, under))
+    keeper.handle(4, TakeBack(1, under, all_patches[under]))
     assert not one.masked.any()
     back = one.landmark_ids[under]
     with_depth = np.isfinite(one.features.depth_m[under])
     assert (back[with_depth] >= 0).all()
     assert landmarks.alive[back[back >= 0]].all()
+    made = back >= next_id
+    assert made.any()
+    np.testing.assert_array_equal(landmarks.patches[back[made]], all_patches.images[under[made]])
+    assert np.isfinite(landmarks.patch_views[back[made]][:, 0]).all()
     told = [answer for answer in answers if isinstance(answer, MapChanged)][-1].delta
     assert np.isin(back[back >= 0], told.ids).all()
-    keeper.handle(5, TakeBack(7, under))  # culled meanwhile
+    keeper.handle(5, TakeBack(7, under, all_patches[under]))  # culled meanwhile
     keeper.handle(6, keyframe(system, 2, (1, one.T_world_camera)))
     assert list(system.mapper.world.keyframes) == [0, 1, 2]
