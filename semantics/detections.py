@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from graph.geometry import Array
 from semantics.votes import NOBODY, Claims, Ints
 
+_COARSE = 4
+"""Of masks every so many pixels each way are counted."""
+
 
 @dataclass(frozen=True)
 class DetectionConfig:
@@ -18,7 +21,9 @@ class DetectionConfig:
 
     ``border_px``: nearer to a mask's border depth belongs to this side or the other; not where
     both sides' masks have scores of ``exact_score`` or more. An instance
-    with fewer than ``min_points`` is passed over, of more than ``max_points`` some are taken.
+    with fewer than ``min_points`` is passed over, of more than ``max_points`` some are taken. So is
+    one of which better ones of its class own more than ``double``: it is another outline of them,
+    as one around two desks that stand side by side, and what it is left with is no thing.
 
     The inverse depth of a point is a mean over pixels of its instance in a window of
     ``smooth_px`` to each side, of those whose depth is within three sigmas: at 1 m
@@ -29,6 +34,7 @@ class DetectionConfig:
     border_px: int = 1
     exact_score: float = 0.99
     min_points: int = 12
+    double: float = 0.5
     max_points: int = 300
     smooth_px: int = 4
     depth_sigma_m: float = 0.002
@@ -71,6 +77,7 @@ def detect(
     order = np.argsort(owners[good], kind="stable")
     rows, columns, owners = (a[good][order] for a in (rows, columns, owners))
     sizes = np.bincount(owners, minlength=len(claims.instances))
+    sizes[_doubles(claims, config.double)] = 0
     kept = _evenly(owners, sizes, config.max_points) & (sizes >= config.min_points)[owners]
     rows, columns, owners = rows[kept], columns[kept], owners[kept]
     instances = np.flatnonzero(sizes >= config.min_points)
@@ -79,6 +86,19 @@ def detect(
     z_m = _smoothed((owner, depth_m), rows, columns, config.smooth_px // step, config)
     points = rays[rows, columns] * z_m[:, None]
     return Detections(instances, points, number[owners], number)
+
+
+def _doubles(claims: Claims, share: float) -> list[int]:
+    """Instances of whose masks others of their class own more than a share."""
+    labels = np.array([*(i.label for i in claims.instances), 0])
+    owned = labels[claims.owner[::_COARSE, ::_COARSE]]
+    found = []
+    for k, instance in enumerate(claims.instances):
+        mask = instance.mask[::_COARSE, ::_COARSE]
+        others = (owned[mask] == labels[k]) & (claims.owner[::_COARSE, ::_COARSE][mask] != k)
+        if np.count_nonzero(others) > share * np.count_nonzero(mask):
+            found.append(k)
+    return found
 
 
 def _smoothed(

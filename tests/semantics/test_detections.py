@@ -70,3 +70,25 @@ def test_only_masks_that_may_be_wrong_lose_their_borders() -> None:
         columns[score] = np.unique(np.rint((points[:, 0] * 100 / 2 + 59.5) / 2)).astype(int)
     assert columns[1.0].tolist() == list(range(10, 50))
     assert columns[0.9].tolist() == [*range(11, 30), *range(31, 50)]
+
+
+@pytest.mark.parametrize(
+    ("label", "rows", "alone"),
+    [(1, slice(20, 70), False), (2, slice(20, 70), True), (1, slice(0, 90), True)],
+    ids=["of-them", "other-class", "more-than-them"],
+)
+def test_another_outline_of_things_of_its_class_is_none(
+    label: int, rows: slice, alone: bool
+) -> None:
+    """A mask over two others."""
+    both = (1, slice(20, 70), slice(20, 50), 0.9), (1, slice(20, 70), slice(55, 80), 0.8)
+    instances = []
+    for of_class, its_rows, its_columns, score in (*both, (label, rows, slice(20, 90), 0.5)):
+        mask = np.zeros(SIZE, bool)
+        mask[its_rows, its_columns] = True
+        distribution = certain(of_class, 3)
+        instances.append(Instance(mask, mask_box(mask), of_class, distribution, 1.0, score))
+    depth_m = np.full((45, 60), 3.0, np.float32)
+    claims = claim_pixels(instances, depth_m, SIZE, VoteConfig())
+    number = detect(claims, depth_m, RAYS, ALL).number
+    assert (number[:-1] >= 0).tolist() == [True, True, alone]
