@@ -2,12 +2,14 @@
 
     python benchmarks/labels.py SEQUENCE... [--segmenter truth] [--imperfect] [--out DIR]
 
-Sequences are rendered with --true-depth. A landmark is what the truth shows at its place in most
-keyframes that see it. Objects that at least two keyframes show with enough pixels are to be found
-at a 3-D IoU of 0.25, with their label: against the box of the surface that the keyframes measure,
-by true depth where the sensor gave one that is right within four sigmas (what a camera can know; of
-a side seen at a glancing angle it gives none); against that of the surface that they show to a
-perfect sensor; and against the whole object's.
+Sequences are rendered with `--true-depth`, those of docs/semantics.md by `bmask-slam render office
+--frames 300 --true-depth` and, for 930 and 931, `bmask-slam render room --seed 930 --frames 300
+--true-depth`. A landmark is what the truth shows at its place in most keyframes that see it.
+Objects that at least two keyframes show with enough pixels are to be found at a 3-D IoU of 0.25,
+with their label: against the box of the surface that the keyframes measure, by true depth where the
+sensor gave one that is right within four sigmas (what a camera can know; of a side seen at a
+glancing angle it gives none); against that of the surface that they show to a perfect sensor; and
+against the whole object's.
 """
 
 from __future__ import annotations
