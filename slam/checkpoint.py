@@ -30,7 +30,7 @@ from slam.system_interface import System
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_FILE = FileKind("checkpoint", 5)
+CHECKPOINT_FILE = FileKind("checkpoint", 6)
 
 
 @dataclass(frozen=True)

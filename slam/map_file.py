@@ -10,7 +10,7 @@ from graph.camera import Camera
 from graph.errors import InputError
 from graph.storage import read_camera
 
-MAP_FILE = FileKind("map", 3, compressed=True)
+MAP_FILE = FileKind("map", 4, compressed=True)
 MAP = "map"
 
 

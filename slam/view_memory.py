@@ -101,30 +101,36 @@ class ViewMemory:
         self.views = []
 
     def state(self) -> Arrays:
-        """All views as named arrays."""
-        views = [(v.view, v.seen) for v in self.views]
-        near = [[v.nearest_m, s.nearest_m] for v, s in views]
-        far = [[v.farthest_m, s.farthest_m] for v, s in views]
+        """All views as named arrays; of those without what moved, where they say something."""
+        views = self.views
+        speak = [(v.view.nearest_m != 0) | (v.view.farthest_m != 0) for v in views]
         return {
-            "keyframe_ids": np.array([v.keyframe_id for v in self.views], np.int64),
-            "timestamps_s": np.array([v.timestamp_s for v in self.views], float),
-            "T_keyframe_camera": np.array([v.T_keyframe_camera for v in self.views], float).ravel(),
-            "step": np.array([v.view.step for v in self.views], np.int64),
-            "shape": np.array([n[0].shape for n in near[:1]], np.int64).ravel(),
-            "nearest_m": np.array(near, np.float32).ravel(),
-            "farthest_m": np.array(far, np.float32).ravel(),
+            "keyframe_ids": np.array([v.keyframe_id for v in views], np.int64),
+            "timestamps_s": np.array([v.timestamp_s for v in views], float),
+            "T_keyframe_camera": np.array([v.T_keyframe_camera for v in views], float).ravel(),
+            "step": np.array([v.view.step for v in views], np.int64),
+            "shape": np.array([s.shape for s in speak[:1]], np.int64).ravel(),
+            "speak": np.packbits(np.array(speak, bool)),
+            "nearest_m": np.array([v.seen.nearest_m for v in views], np.float32).ravel(),
+            "farthest_m": np.array([v.seen.farthest_m for v in views], np.float32).ravel(),
         }
 
     def restore(self, state: Arrays) -> None:
         """Become the memory of a state."""
-        ids, shape = state["keyframe_ids"].tolist(), state["shape"].tolist() or [0, 0]
-        depths = (state[k].reshape(len(ids), 2, *shape) for k in ("nearest_m", "farthest_m"))
+        ids = state["keyframe_ids"].tolist()
+        size = len(ids), *(state["shape"].tolist() or [0, 0])
         stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
         poses = state["T_keyframe_camera"].reshape(len(ids), 4, 4).copy()
+        speak = np.unpackbits(state["speak"], count=np.prod(size)).reshape(size).astype(bool)
+        depths = (state[name].reshape(size) for name in ("nearest_m", "farthest_m"))
         self.views = []
-        for i, t, n, f, s, T in zip(ids, stamps_s, *depths, steps, poses, strict=True):
-            view, seen = (DepthView(n[k].copy(), f[k].copy(), s) for k in (0, 1))
-            self.views.append(RememberedView(i, t, view, seen, T))
+        for i, stamp_s, T, step, told, near, far in zip(
+            ids, stamps_s, poses, steps, speak, *depths, strict=True
+        ):
+            seen = DepthView(near.copy(), far.copy(), step)
+            view = seen.thinned(1)
+            _forget(view, ~told)
+            self.views.append(RememberedView(i, stamp_s, view, seen, T))
 
     def _of(self, keyframe_id: int) -> list[RememberedView]:
         return [kept for kept in self.views if kept.keyframe_id == keyframe_id]

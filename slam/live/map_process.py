@@ -53,7 +53,7 @@ from slam.tracker import Tracked
 
 logger = logging.getLogger(__name__)
 
-STATE_FILE = FileKind("live state", 4)
+STATE_FILE = FileKind("live state", 5)
 NICENESS = 5
 """Tracking goes first where there is a processor too few."""
 
