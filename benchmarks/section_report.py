@@ -96,6 +96,7 @@ REPORTS = {
             "labels.py {sequences}/office-300 {sequences}/room-930 {sequences}/room-931 "
             "--segmenter light",
         ),
+        "store": ("Time of the label store", "label_store.py"),
         "dynamic": (
             "People who walk, a carried box and a pulled chair",
             "dynamic.py --sequences {sequences} --segmenter light --seed 6 "
