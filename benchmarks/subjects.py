@@ -83,6 +83,7 @@ SUBJECTS = {
     "dynamic_pairs.py": (*MOVING, "slam/depth_regions.py"),
     "kill_and_resume.py": STATE,
     "kitchen_reference.py": (*CALIBRATION, *METRICS),
+    "label_store.py": ("semantics/label_store.py",),
     "labels.py": RENDERING + LABELS + NETWORK + WEIGHTS,
     "live.py": ODOMETRY + LIVE,
     "live_session.py": LIVE,
