@@ -47,9 +47,9 @@ def make(name: str) -> dict[str, Callable[[], Detected]]:
     """Both networks with the same weights, as functions that detect and paste the masks."""
     import torch  # noqa: PLC0415
 
-    from semantics.network import config  # noqa: PLC0415
-    from semantics.network.model import MaskRCNN  # noqa: PLC0415
-    from semantics.network.paste import paste  # noqa: PLC0415
+    from bmask_slam.semantics.network import config  # noqa: PLC0415
+    from bmask_slam.semantics.network.model import MaskRCNN  # noqa: PLC0415
+    from bmask_slam.semantics.network.paste import paste  # noqa: PLC0415
 
     torch.set_num_threads(2)
     torch.manual_seed(0)

@@ -20,16 +20,16 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.calibration_model import PARAMETERS, parameters_of
-from graph.camera import Camera
-from slam.calibrate import CalibrateOptions, calibrate_run
-from slam.calibration_report import NORMAL_95, Calibrated, format_calibration
-from slam.configuration import resolve
-from slam.evaluation import evaluate
-from slam.rendering.sequence import RenderConfig, render_sequence
-from slam.runner import RunOptions, run
-from slam.sequences import read_camera, write_camera
-from slam.system_config import SystemConfig
+from bmask_slam.calibration.calibrate import CalibrateOptions, calibrate_run
+from bmask_slam.calibration.report import NORMAL_95, Calibrated, format_calibration
+from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation import evaluate
+from bmask_slam.graph.calibration.model import PARAMETERS, parameters_of
+from bmask_slam.graph.camera import Camera
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.sequences import read_camera, write_camera
+from bmask_slam.system_config import SystemConfig
 
 KEYPOINTS = (800, 825, 850, 875, 900)
 KITCHEN = Path(__file__).resolve().parents[1] / "../shared/data/redkitchen"

@@ -23,16 +23,16 @@ from numpy.typing import NDArray
 from report import table
 from scipy.interpolate import CubicSpline
 
-from graph.geometry import Array, inverse, transform
-from graph.trajectory import read_tum
-from slam.configuration import resolve
-from slam.frame import Frame
-from slam.rendering.annotations import FrameMarks, coco, frame_marks
-from slam.rendering.writer import new_folder, stored_depth, write_json, write_lists, write_png
-from slam.runner import RunOptions, run
-from slam.sequences import open_sequence
-from slam.sequences.cameras import write_camera
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.rendering.annotations import FrameMarks, coco, frame_marks
+from bmask_slam.rendering.writer import new_folder, stored_depth, write_json, write_lists, write_png
+from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.cameras import write_camera
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
 
 KITCHEN = PAIRS.parent / "redkitchen"
 LEG_S = 1.5

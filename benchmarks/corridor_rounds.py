@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.trajectory import read_tum
-from slam.configuration import resolve
-from slam.rendering.sequence import RenderConfig, render_sequence
-from slam.runner import RunOptions, run
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.system_config import SystemConfig
 
 TITLES = ("rounds", "frames", "path m", "ATE without", "ATE closed", "ratio", "RPE/s", "RPE/s")
 

@@ -19,12 +19,12 @@ import numpy as np
 from graph_growth import CAMERA, Feeder
 from scipy.stats import chi2
 
-from graph.geometry import Array, adjoint, inverse, se3_log
-from graph.smoother import Smoother, SmootherConfig
-from graph.trajectory import associate_stamps
-from graph.updates import GraphEstimate, GraphUpdate
-from slam.sequences import open_sequence
-from slam.system import SlamSystem
+from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate
+from bmask_slam.graph.geometry import Array, adjoint, inverse, se3_log
+from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
+from bmask_slam.graph.trajectory import associate_stamps
+from bmask_slam.sequences import open_sequence
+from bmask_slam.system import SlamSystem
 
 
 def nees(errors: Array, covariances: Array) -> Array:

@@ -35,15 +35,15 @@ from benchmarks.dense_surface import (
     surface_errors,
 )
 from benchmarks.dense_time import ROUNDS, step_times_ms
-from graph.ply import read_ply
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
-from slam.dense_fusion import dense_config
-from slam.dense_input import MappedRun, open_run
-from slam.dense_options import MapOptions
-from slam.dense_run import map_run
-from slam.rendering.sequence import RenderConfig, render_sequence
-from slam.run_options import RunOptions
-from slam.runner import run
+from bmask_slam.dense.fusion import dense_config
+from bmask_slam.dense.input import MappedRun, open_run
+from bmask_slam.dense.map_run import map_run
+from bmask_slam.dense.options import MapOptions
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.offline.options import RunOptions
+from bmask_slam.offline.runner import run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 ROOMS, FRAMES = "office,living_room", 150
 

@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.dense_surface import Truth
-from graph.geometry import inverse
-from mapping.dense import DenseConfig, DenseKeyframe, neighbours
-from mapping.fusion import Fused, fuse, stated
-from mapping.inverse_depth import InverseDepthMap, from_sensor
-from mapping.regularisation import regularise
-from mapping.warping import View
-from slam.dense_input import MappedRun, load
+from bmask_slam.dense.input import MappedRun, load
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, DenseKeyframe, neighbours
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap, from_sensor
+from bmask_slam.mapping.inverse_depth.fusion import Fused, fuse, stated
+from bmask_slam.mapping.inverse_depth.regularisation import regularise
+from bmask_slam.mapping.inverse_depth.warping import View
 
 OUTLIER_M = 0.05
 PATCHES = 0.2

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from slam.dense_folder import DenseFolder
-from slam.dense_input import load, open_run
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.input import load, open_run
 
 MAX_WIDTH_PX = 1400
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 85]

@@ -24,18 +24,18 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, se3_exp, se3_log, transform
-from mapping.cloud import merged, spill
-from mapping.cloud_files import CloudWriter
-from mapping.dense import DenseKeyframe, DenseMapper, FusedKeyframe
-from mapping.labels import InstanceEvidence, LabelTable
-from mapping.submaps import Submap, make_submap
-from semantics.label_store import LabelStoreConfig
-from slam.dense_folder import DenseFolder
-from slam.dense_input import undistorted
-from slam.memory import peak_rss_mb
-from slam.sequences import Sequence, open_sequence
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.input import undistorted
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DenseMapper, FusedKeyframe
+from bmask_slam.mapping.products.cloud import merged, spill
+from bmask_slam.mapping.products.cloud_files import CloudWriter
+from bmask_slam.mapping.products.submaps import Submap, make_submap
+from bmask_slam.mapping.products.surface_labels import InstanceEvidence, LabelTable
+from bmask_slam.runtime.memory import peak_rss_mb
+from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
+from bmask_slam.sequences import Sequence, open_sequence
 
 VOXEL_M = 0.01
 STRIDE, SHARED = 2, 13

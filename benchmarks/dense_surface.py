@@ -11,14 +11,14 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from graph.geometry import Array, make_pose, transform
-from mapping.backprojection import back_project, surface_normals
-from mapping.dense import DenseKeyframe
-from mapping.inverse_depth import InverseDepthMap
-from mapping.mesh import integrated
-from mapping.submaps import nearest_a_voxel
-from semantics.segmenter import CocoSegmenter
-from slam.dense_input import MappedRun, image_name
+from bmask_slam.dense.input import MappedRun, image_name
+from bmask_slam.graph.geometry import Array, make_pose, transform
+from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.products.mesh import integrated
+from bmask_slam.mapping.products.submaps import nearest_a_voxel
+from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter
 
 F_SCORE_M = 0.01
 VOXEL_M = 0.01

@@ -12,15 +12,15 @@ import torch
 
 from benchmarks.dense_depth import Map, Steps
 from benchmarks.dense_surface import VOXEL_M, open3d_points
-from graph.geometry import inverse
-from mapping.backprojection import back_project, surface_normals
-from mapping.dense import DenseConfig, FusedKeyframe, neighbours
-from mapping.fusion import Fused, fuse, stated
-from mapping.inverse_depth import from_sensor
-from mapping.regularisation import regularise
-from mapping.submaps import make_submap
-from mapping.warping import View
-from slam.dense_input import MappedRun
+from bmask_slam.dense.input import MappedRun
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, FusedKeyframe, neighbours
+from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
+from bmask_slam.mapping.inverse_depth.fusion import Fused, fuse, stated
+from bmask_slam.mapping.inverse_depth.regularisation import regularise
+from bmask_slam.mapping.inverse_depth.warping import View
+from bmask_slam.mapping.products.submaps import make_submap
 
 ROUNDS = 6
 MAX_LOAD = 1.7

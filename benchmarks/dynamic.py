@@ -30,16 +30,16 @@ from moving_points import KINDS, NEAR_PX, MovingTruth, WatchedSystem, strip
 from numpy.typing import NDArray
 from report import table
 
-from graph.camera import Camera
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
-from slam.configuration import resolve
-from slam.dynamics import Sifted
-from slam.features import Features, select
-from slam.frame import Frame
-from slam.refill import Refill
-from slam.rendering.sequence import RenderConfig, render_sequence
-from slam.runner import RunOptions, run
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.features.brisk import Features, select
+from bmask_slam.graph.camera import Camera
+from bmask_slam.moving.feature_replenishment import Refill
+from bmask_slam.moving.moving_object_filter import Sifted
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
 
 ROOM = "crowded_office"
 SCENES = {

@@ -21,14 +21,14 @@ import numpy as np
 from moving_points import Count, Image, Mask, count, picture, strip
 from report import table
 
-from graph.camera import Camera
-from graph.geometry import Array
-from semantics.segmenter import Segmenter
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
-from slam.configuration import resolve
-from slam.frame import Frame
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data" / "dynamic_pairs"

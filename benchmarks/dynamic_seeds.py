@@ -29,8 +29,8 @@ from dynamic import SCENES, VARIANTS, rendered
 from no_harm import ate_m, other_keypoints
 from report import table
 
-from graph.geometry import Array
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 Job = tuple[Path, str, int]
 """Sequence, name of the variant, number of the repeat."""

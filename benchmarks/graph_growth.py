@@ -13,10 +13,10 @@ import dataclasses
 
 import numpy as np
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, make_pose, se3_exp, se3_log, transform
-from graph.smoother import Smoother, SmootherConfig
-from graph.updates import GraphEstimate, GraphUpdate, Observations
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate, Observations
+from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, se3_log, transform
+from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 NOISE_PX = 0.7

@@ -8,8 +8,8 @@ from zlib import crc32
 import cv2
 import numpy as np
 
-from semantics.instances import Instance, mask_box
-from semantics.segmenter import Image, Segmenter
+from bmask_slam.semantics.instances.instances import Instance, mask_box
+from bmask_slam.semantics.segmenters.segmenter import Image, Segmenter
 
 
 @dataclass(frozen=True)

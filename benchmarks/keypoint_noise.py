@@ -5,7 +5,8 @@
 
 A keypoint of one frame, with the noise-free depth there, is a point whose true place in a later
 frame follows from the true poses. Compared with it: the BRISK keypoint that matches it there, and
-that keypoint after registration to the patch around the first one (slam/subpixel.py). Likewise
+that keypoint after registration to the patch around the first one
+(slam/features/patch_alignment.py). Likewise
 the disparity bf/z that the front end reads from the noisy depth, against the true one.
 """
 
@@ -19,14 +20,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, transform
-from graph.trajectory import associate_stamps
-from slam.features import BriskExtractor, FeatureConfig, Features
-from slam.landmarks import Ints
-from slam.matching import MatchConfig, WindowIndex, match_pairs
-from slam.sequences import Sequence, open_sequence
-from slam.subpixel import SubpixelConfig, cut_patches, register_patches
+from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
+from bmask_slam.features.matching import MatchConfig, WindowIndex, match_pairs
+from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches, register_patches
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.trajectory import associate_stamps
+from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.world.landmark_table import Ints
 
 GAPS = (1, 5, 15)
 STEP = 10

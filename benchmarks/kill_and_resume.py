@@ -50,7 +50,7 @@ class Kill:
 def program(*arguments: object) -> subprocess.Popen[bytes]:
     """``bmask-slam run`` with these arguments, quietly."""
     given = [*map(str, arguments), "--segmenter", "none", "--quiet"]
-    command = [sys.executable, "-m", "slam", "run", *given]
+    command = [sys.executable, "-m", "bmask_slam", "run", *given]
     return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL)
 
 

@@ -24,14 +24,14 @@ import numpy as np
 from report import table
 from scipy.optimize import least_squares
 
-from graph.calibration_model import CalibrationViews
-from graph.geometry import Array, inverse, se3_exp, skew
-from graph.trajectory import Trajectory, associate, nearest_indices, read_tum, write_tum
-from mapping.open3d_loader import load_open3d
-from slam.calibrate import CalibrateOptions, make_problem
-from slam.evaluation import evaluate
-from slam.saved_run import read_run
-from slam.sequences import Sequence, open_sequence
+from bmask_slam.calibration.calibrate import CalibrateOptions, make_problem
+from bmask_slam.evaluation import evaluate
+from bmask_slam.graph.calibration.model import CalibrationViews
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, skew
+from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices, read_tum, write_tum
+from bmask_slam.mapping.open3d_loader import load_open3d
+from bmask_slam.run_folder.saved_run import read_run
+from bmask_slam.sequences import Sequence, open_sequence
 
 KITCHEN = Path(__file__).resolve().parents[1] / "../shared/data/redkitchen"
 MAX_DEPTH_M = 8.0

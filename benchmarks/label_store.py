@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from semantics.label_store import LabelStore, LabelStoreConfig
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 
 def update_ms(landmarks: int, classes: int, repeats: int) -> list[float]:

@@ -25,18 +25,18 @@ from imperfect_masks import Errors, ImperfectSegmenter
 from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
-from graph.geometry import Array, inverse, se3_exp, se3_log, transform
-from semantics.boxes3d import OrientedBox, box_around, box_iou
-from semantics.label_store import LabelStore
-from semantics.objects import MapObject, pixel_rays
-from semantics.segmenter_table import make_segmenter
-from slam.configuration import resolve
-from slam.rendering.sensor import depth_sigma_m
-from slam.rendering.true_boxes import OBJECTS_TRUTH
-from slam.sequences import Sequence, open_sequence
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
-from slam.world_map import Keyframe
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.rendering.engine.sensor import depth_sigma_m
+from bmask_slam.rendering.true_boxes import OBJECTS_TRUTH
+from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around, box_iou
+from bmask_slam.semantics.objects.object_map import MapObject, pixel_rays
+from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
+from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.world_map import Keyframe
 
 MIN_PIXELS = 300
 MIN_IOU = 0.25

@@ -35,7 +35,16 @@ COLUMNS = (
 
 def measured(command: list[str], out: Path) -> dict[str, float]:
     """The metrics of one command, run in a process of its own."""
-    line = [sys.executable, "-m", "slam", *command, "--quiet", "--overwrite", "--out", str(out)]
+    line = [
+        sys.executable,
+        "-m",
+        "bmask_slam",
+        *command,
+        "--quiet",
+        "--overwrite",
+        "--out",
+        str(out),
+    ]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{' '.join(line)}\n{done.stderr[-2000:]}")

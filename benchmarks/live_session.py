@@ -20,16 +20,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from graph.trajectory import Trajectory, nearest_indices
-from semantics.segmenter_table import SegmenterOptions
-from slam.evaluation import evaluate_trajectory
-from slam.frame import Frame
-from slam.live.health import Health
-from slam.live.live_slam import LiveOptions, LiveSlam
-from slam.live.play import PlayOptions, play
-from slam.live.sources import SourceCounts
-from slam.sequences import Sequence, open_sequence
-from slam.system_config import SystemConfig
+from bmask_slam.evaluation import evaluate_trajectory
+from bmask_slam.graph.trajectory import Trajectory, nearest_indices
+from bmask_slam.live.health import Health
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.live.play import PlayOptions, play
+from bmask_slam.live.sources import SourceCounts
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
 
 PARTS = 6
 

@@ -24,11 +24,17 @@ from matplotlib.figure import Figure
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.building import CAMERA, landmarks, visible, walk
-from graph.geometry import Array, inverse, se3_exp, transform
-from graph.metrics import align
-from graph.smoother import Smoother
-from graph.updates import GraphEstimate, GraphUpdate, IntArray, Observations, RelativePose
-from slam.graph_feed import GraphFeedConfig
+from bmask_slam.back_end.factor_selection import GraphFeedConfig
+from bmask_slam.graph.factors.graph_update import (
+    GraphEstimate,
+    GraphUpdate,
+    IntArray,
+    Observations,
+    RelativePose,
+)
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.graph.metrics import align
+from bmask_slam.graph.smoother.smoother import Smoother
 
 SIGMAS_PX = np.array([1.0, 1.0, 0.2])
 """Of u, v and disparity: about what the red kitchen's frames ask for (docs/architecture.md)."""
@@ -107,7 +113,7 @@ class FrontEnd:
         return (loop,), ids[~again], z[~again]
 
     def _outside_window(self, in_graph: IntArray) -> IntArray:
-        """As ``slam.graph_feed.GraphFeed`` chooses what retires."""
+        """As ``back_end.factor_selection.GraphFeed`` chooses what retires."""
         mine = np.zeros(len(self.points), bool)
         mine[self.seen[-1]] = True
         shared = np.array([np.count_nonzero(mine[ids]) for ids in self.seen])

@@ -16,16 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.array_file import Arrays
-from graph.geometry import se3_exp
-from slam.configuration import resolve
-from slam.evaluation import evaluate_trajectory
-from slam.loop_closing import LoopCloser
-from slam.loop_verification import LoopConstraint
-from slam.sequences import Sequence, open_sequence
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation import evaluate_trajectory
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.loops.closing import LoopCloser
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 SNAPSHOT_FRAMES = 50
 TURN_RAD, SHIFT_M = 0.5, 2.0  # sigmas of a wrong loop, an axis

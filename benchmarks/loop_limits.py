@@ -21,14 +21,14 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-from graph.bundle_adjustment import AdjustmentConfig, adjust, loop_numbers
-from graph.factors import FactorMaker, make_graph, make_values
-from graph.geometry import Array, inverse, se3_log
-from graph.keys import keyframe_keys, landmark_keys
-from graph.metrics import align
-from graph.trajectory import nearest_indices, read_tum
-from graph.updates import RelativePose
-from slam.saved_run import SavedRun, read_run
+from bmask_slam.graph.batch.bundle_adjustment import AdjustmentConfig, adjust, loop_numbers
+from bmask_slam.graph.factors.graph_update import RelativePose
+from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values
+from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
+from bmask_slam.graph.geometry import Array, inverse, se3_log
+from bmask_slam.graph.metrics import align
+from bmask_slam.graph.trajectory import nearest_indices, read_tum
+from bmask_slam.run_folder.saved_run import SavedRun, read_run
 
 EXACT = 1e-4  # of a loop's covariance
 DRAWS = 60
@@ -104,7 +104,8 @@ def expected_ate_mm(run: SavedRun) -> float:
 
 
 def _draws(linear: gtsam.GaussianFactorGraph) -> Array:
-    """Draws (n, DRAWS) of all tangents, in the order of the keys: see graph/loop_prediction.py."""
+    """Draws (n, DRAWS) of all tangents, in the order of the keys: see
+    graph/pose_graph/loop_prediction.py."""
     i, j, entries = linear.sparseJacobian_()
     i, j = i.astype(np.int64) - 1, j.astype(np.int64) - 1
     left = j < j.max()

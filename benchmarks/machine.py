@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slam import machine
-from slam.machine import versions
-from slam.sequences import open_sequence
+from bmask_slam.runtime import machine
+from bmask_slam.runtime.machine import versions
+from bmask_slam.sequences import open_sequence
 
 PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "open3d", "scipy")
 YARDSTICK_FRAMES = 40

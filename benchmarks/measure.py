@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.geometry import Array, inverse
-from graph.trajectory import associate, read_tum
-from slam.evaluation import Row, evaluate
-from slam.run_folder import STAGES
+from bmask_slam.evaluation import Row, evaluate
+from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.trajectory import associate, read_tum
+from bmask_slam.run_folder.folder import STAGES
 
 logger = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ def render(folder: Path, name: str, options: tuple[str, ...] = ()) -> str:
     command = ["render", name, *options, "--out"]
     if not (folder / "groundtruth.txt").is_file():
         logger.info("rendering %s", folder)
-        call(["-m", "slam", *command, str(folder), "--quiet"])
+        call(["-m", "bmask_slam", *command, str(folder), "--quiet"])
     return f"bmask-slam {' '.join(command)} {shown(folder)}"
 
 
@@ -110,7 +110,7 @@ def measure(job: Job, work: Path) -> Measurement:
     options = job.options
     if "--segmenter" not in options:
         options = (*options, "--segmenter", "none")  # as the systems beside it
-    call(["-m", "slam", "run", *where, *options])
+    call(["-m", "bmask_slam", "run", *where, *options])
     command = " ".join(["bmask-slam run", shown(job.folder), *options])
     return read_run(out, job, command)
 

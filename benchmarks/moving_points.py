@@ -18,18 +18,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.geometry import Array
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
-from slam.configuration import resolve
-from slam.dynamics import Sifted
-from slam.features import Features
-from slam.frame import Frame
-from slam.rendering.classes import CATEGORY_IDS
-from slam.rendering.people import PULLED_S
-from slam.sequences import open_sequence
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
-from slam.tracker import Tracked
+from bmask_slam.config.configuration import resolve
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.geometry import Array
+from bmask_slam.moving.moving_object_filter import Sifted
+from bmask_slam.rendering.classes import CATEGORY_IDS
+from bmask_slam.rendering.things.people import PULLED_S
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.tracker import Tracked
 
 NEAR_PX = 6
 """Keypoints so near to a border count for neither side."""

@@ -35,18 +35,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.dynamic import rendered
 from benchmarks.report import table
-from graph.camera import Camera
-from graph.geometry import Array
-from semantics.instances import Instance, certain, mask_box
-from semantics.labels import LabelSet
-from semantics.segmenter import Image, Segmenter
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
-from slam.configuration import resolve
-from slam.evaluation import evaluate
-from slam.features import FeatureConfig
-from slam.runner import RunOptions, run
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation import evaluate
+from bmask_slam.features.brisk import FeatureConfig
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.segmenters.segmenter import Image, Segmenter
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 
 VARIANTS = ("nothing", "network", "random", "shuffled")
 SEED = 1000

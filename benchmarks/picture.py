@@ -20,16 +20,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, make_pose, transform
-from graph.metrics import absolute_error
-from graph.ply import read_ply
-from graph.trajectory import Trajectory, associate, associate_stamps, read_tum
-from semantics.overlay import draw
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
-from slam.evaluation.plot import draw_top_view
-from slam.frame import Frame
-from slam.sequences import open_sequence
+from bmask_slam.evaluation.plot import draw_top_view
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.geometry import Array, inverse, make_pose, transform
+from bmask_slam.graph.metrics import absolute_error
+from bmask_slam.graph.trajectory import Trajectory, associate, associate_stamps, read_tum
+from bmask_slam.semantics.instances.overlay import draw
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.frame import Frame
 
 Image = NDArray[np.uint8]
 VIEW_SIZE = (960, 720)

@@ -20,19 +20,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, transform
-from graph.trajectory import associate_stamps
-from slam.features import BriskExtractor, FeatureConfig, Features
-from slam.matching import Bits
-from slam.place_recognition import (
+from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
+from bmask_slam.features.matching import Bits
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.trajectory import associate_stamps
+from bmask_slam.loops.place_recognition import (
     BITS,
     DescriptorIndex,
     IndexConfig,
     PlaceConfig,
     PlaceRecogniser,
 )
-from slam.sequences import open_sequence
+from bmask_slam.sequences import open_sequence
 
 SAME_PLACE = 0.3  # of the keypoints seen
 SOME_PLACE = 0.1  # less than this is a wrong place

@@ -12,10 +12,10 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from slam.frame import Frame
-from slam.results import FrameResult
-from slam.runner import RunOptions, run
-from slam.system import SlamSystem
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.tracking.results import FrameResult
 
 COLUMNS = ("frame", "keyframes", "landmarks", "graph_landmarks", "factors", "update_ms", "rss_mb")
 

@@ -9,7 +9,7 @@ from typing import Any
 from anchors import KITCHEN, PUBLISHED_ATE_CM
 from targets import target_rows
 
-from slam.evaluation import format_table
+from bmask_slam.evaluation import format_table
 
 Results = dict[str, Any]
 BEGIN = "<!-- results: written by benchmarks/run.py -->"
@@ -254,7 +254,8 @@ def _noise(results: Results) -> str:
         "## Noise of keypoints and depth, against exact truth\n\nRendered office with sensor "
         "noise, by `benchmarks/keypoint_noise.py`: error along u and v of a matched keypoint "
         "against the true place of the surface point it was matched to, as a robust sigma; before "
-        "and after registration to the landmark's patch (`slam/subpixel.py`). Rendered surfaces "
+        "and after registration to the landmark's patch (`slam/features/patch_alignment.py`). "
+        "Rendered surfaces "
         f"flatter both columns: real images are blurred and shine.\n\n{table(header, keypoints)}"
         "\n\nDisparity bf/z that the front end reads at keypoints, against the true one:\n\n"
         f"{table(header_disparity, disparity)}"

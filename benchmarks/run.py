@@ -143,7 +143,7 @@ def repeats(measurements: list[Measurement]) -> dict[str, bool]:
 def draw_overview(folder: Path, arguments: argparse.Namespace) -> None:
     """The picture at the top of README.md, from the office's run with labels."""
     run = arguments.work / "results" / f"office-{LABELLED}".replace(" ", "-")
-    call(["-m", "slam", "map", str(run), "--quiet"])
+    call(["-m", "bmask_slam", "map", str(run), "--quiet"])
     out = image_path(arguments).with_name("overview.png")
     command = ["benchmarks/picture.py", str(run), str(folder), "--out", str(out)]
     call([*command, "--frame", str(OVERVIEW_FRAME)])
@@ -186,7 +186,7 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     """Measure, write the report, and the README's table if everything was measured."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    logging.getLogger("slam").setLevel(logging.WARNING)
+    logging.getLogger("bmask_slam").setLevel(logging.WARNING)
     arguments = parse()
     arguments.work.mkdir(parents=True, exist_ok=True)
     store = arguments.work / "results.json"

@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks.freshness import PAGES, code_print, sections  # noqa: E402
 from benchmarks.machine import describe_commit, now  # noqa: E402
-from slam.machine import processor  # noqa: E402
+from bmask_slam.runtime.machine import processor  # noqa: E402
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,10 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from semantics.coco_files import CocoFile, read_coco  # noqa: E402
-from semantics.evaluation import SegmentationResult, evaluate_segmenter  # noqa: E402
-from semantics.segmenter_table import SegmenterOptions, make_segmenter  # noqa: E402
-from semantics.training.dataset import split  # noqa: E402
+from bmask_slam.semantics.instances.coco_files import CocoFile, read_coco  # noqa: E402
+from bmask_slam.semantics.segmenters.evaluation import SegmentationResult, evaluate_segmenter  # noqa: E402
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter  # noqa: E402
+from bmask_slam.semantics.training.dataset import split  # noqa: E402
 
 DATA = ROOT.parent / "shared" / "data"
 HELD_OUT = 0.28
@@ -114,8 +114,8 @@ def one(name: str) -> None:
     """Time and memory of one network in this process."""
     import torch  # noqa: PLC0415
 
-    from semantics.network import config  # noqa: PLC0415
-    from semantics.network.model import MaskRCNN  # noqa: PLC0415
+    from bmask_slam.semantics.network import config  # noqa: PLC0415
+    from bmask_slam.semantics.network.model import MaskRCNN  # noqa: PLC0415
 
     torch.set_num_threads(2)
     torch.manual_seed(0)

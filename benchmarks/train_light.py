@@ -24,15 +24,15 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from semantics.checkpoints import find_weights, load_network, save_network  # noqa: E402
-from semantics.coco_files import read_coco  # noqa: E402
-from semantics.training.dataset import Dataset, split  # noqa: E402
-from semantics.training.detected import DetectedConfig, collect, train_maskiou  # noqa: E402
-from semantics.training.loop import WEIGHTS as WEIGHTS_NAME  # noqa: E402
-from semantics.training.run import Source, TrainingRun, run_training  # noqa: E402
-from semantics.yolox import YoloxDetector  # noqa: E402
-from slam.cli import main as slam  # noqa: E402
-from slam.progress import console_log, counting_bar  # noqa: E402
+from bmask_slam.cli import main as slam  # noqa: E402
+from bmask_slam.runtime.progress import console_log, counting_bar  # noqa: E402
+from bmask_slam.semantics.instances.coco_files import read_coco  # noqa: E402
+from bmask_slam.semantics.segmenters.yolox import YoloxDetector  # noqa: E402
+from bmask_slam.semantics.training.dataset import Dataset, split  # noqa: E402
+from bmask_slam.semantics.training.detected import DetectedConfig, collect, train_maskiou  # noqa: E402
+from bmask_slam.semantics.training.loop import WEIGHTS as WEIGHTS_NAME  # noqa: E402
+from bmask_slam.semantics.training.run import Source, TrainingRun, run_training  # noqa: E402
+from bmask_slam.semantics.weights.checkpoints import find_weights, load_network, save_network  # noqa: E402
 
 DATA = ROOT.parent / "shared" / "data"
 WEIGHTS = ROOT / "data" / "weights" / "light.safetensors"

@@ -6,8 +6,8 @@ A recording stands in for a camera here; anything that gives colour and depth wi
 import sys
 from pathlib import Path
 
-from slam.live.live_slam import LiveOptions, LiveSlam
-from slam.sequences import open_sequence
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.sequences import open_sequence
 
 sequence = open_sequence(Path(sys.argv[1]))
 with LiveSlam(sequence.camera, options=LiveOptions(out=Path("runs/live"), overwrite=True)) as slam:

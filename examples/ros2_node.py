@@ -13,12 +13,12 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from graph.errors import InputError
-from graph.geometry import quaternion_from_rotation
-from slam.live.live_slam import LiveOptions, LiveSlam
-from slam.live.sources import ros_images as ros
-from slam.run_folder import free_run_path
-from slam.sequences.images import depth_in_metres
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import quaternion_from_rotation
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.live.sources import ros_images as ros
+from bmask_slam.run_folder.folder import free_run_path
+from bmask_slam.sequences.images import depth_in_metres
 
 
 class Bridge:

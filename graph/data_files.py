@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from graph.errors import InputError
+from bmask_slam.graph.errors import InputError
 
 
 def data_path(*parts: str) -> Path:
@@ -13,10 +13,9 @@ def data_path(*parts: str) -> Path:
     Raises:
         InputError: there is no such file; the message lists what is there.
     """
-    top = Path(__file__).resolve().parents[1]
-    root = next((p for p in (top / "slam" / "data", top / "data") if p.is_dir()), None)
-    if root is None:
-        raise InputError(f"{top}: the project's data folder is missing; install it again")
+    root = Path(__file__).resolve().parents[1] / "data"
+    if not root.is_dir():
+        raise InputError(f"{root}: the project's data folder is missing; install it again")
     path = root.joinpath(*parts)
     if not path.exists():
         there = sorted(p.stem for p in path.parent.glob(f"*{path.suffix}"))

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from graph.errors import InputError
-from graph.geometry import Array, inverse, make_pose, se3_exp, so3_log
-from graph.metrics import time_pairs
-from graph.trajectory import Trajectory
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, so3_log
+from bmask_slam.graph.metrics import time_pairs
+from bmask_slam.graph.trajectory import Trajectory
 
 MIN_TURN_RAD = 0.05
 ARM_M = 1.0

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graph.geometry import Array, inverse, so3_log
-from graph.trajectory import Indices, Trajectory, nearest_indices
+from bmask_slam.graph.geometry import Array, inverse, so3_log
+from bmask_slam.graph.trajectory import Indices, Trajectory, nearest_indices
 
 RELATIVE_DELTA_TOLERANCE = 0.1
 

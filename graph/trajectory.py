@@ -10,8 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.errors import InputError, finite_number
-from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
+from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.geometry import (
+    Array,
+    make_pose,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 
 MAX_TIME_DIFFERENCE_S = 0.02
 MAX_TYPICAL_STEP_S = 5.0

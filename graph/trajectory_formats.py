@@ -11,10 +11,15 @@ from typing import Literal
 
 import numpy as np
 
-from graph.errors import InputError, finite_number
-from graph.geometry import Array, make_pose, quaternion_from_rotation, rotation_from_quaternion
-from graph.trajectory import Trajectory, read_tum
-from graph.whole_file import whole_file
+from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.geometry import (
+    Array,
+    make_pose,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
+from bmask_slam.graph.trajectory import Trajectory, read_tum
+from bmask_slam.graph.whole_file import whole_file
 
 EUROC_HEADER = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"

@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 
-from semantics.http_file import WebFile, download
+from bmask_slam.semantics.http_file import WebFile, download
 
 
 def cache_folder() -> Path:

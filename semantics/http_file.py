@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from graph.errors import InputError
+from bmask_slam.graph.errors import InputError
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_S = 30.0

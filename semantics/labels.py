@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from graph.data_files import data_path
-from graph.errors import InputError
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
 
 BACKGROUND = "background"
 UNKNOWN = "unknown"

@@ -2,7 +2,7 @@
 
 import sys
 
-from slam.cli import main
+from bmask_slam.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

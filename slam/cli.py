@@ -15,21 +15,21 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TypeAlias
 
-from graph.errors import InputError
-from slam import __version__
-from slam.commands.calibrate import add_calibrate
-from slam.commands.compare import add_compare
-from slam.commands.download import add_download
-from slam.commands.evaluate_segmentation import add_evaluate_segmentation
-from slam.commands.export import add_export
-from slam.commands.live import add_live
-from slam.commands.map import add_map
-from slam.commands.optimise import add_optimise
-from slam.commands.query import add_query
-from slam.commands.run import add_run
-from slam.commands.segment import add_segment
-from slam.commands.train import add_train
-from slam.commands.view import add_view
+from bmask_slam import __version__
+from bmask_slam.commands.calibrate import add_calibrate
+from bmask_slam.commands.compare import add_compare
+from bmask_slam.commands.download import add_download
+from bmask_slam.commands.evaluate_segmentation import add_evaluate_segmentation
+from bmask_slam.commands.export import add_export
+from bmask_slam.commands.live import add_live
+from bmask_slam.commands.map import add_map
+from bmask_slam.commands.optimise import add_optimise
+from bmask_slam.commands.query import add_query
+from bmask_slam.commands.run import add_run
+from bmask_slam.commands.segment import add_segment
+from bmask_slam.commands.train import add_train
+from bmask_slam.commands.view import add_view
+from bmask_slam.graph.errors import InputError
 
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
 EPILOG = """\
@@ -119,8 +119,8 @@ def _add_evaluate(commands: _Commands) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from slam.evaluation import evaluate, format_json, format_table
-    from slam.progress import console_log
+    from bmask_slam.evaluation import evaluate, format_json, format_table
+    from bmask_slam.runtime.progress import console_log
 
     with console_log():
         result = evaluate(
@@ -170,8 +170,8 @@ def _add_render(commands: _Commands) -> None:
 
 
 def _render(arguments: argparse.Namespace) -> int:
-    from slam.progress import console_log, counting_bar
-    from slam.rendering.sequence import RenderConfig, render_sequence
+    from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+    from bmask_slam.runtime.progress import console_log, counting_bar
 
     names = (f.name for f in fields(RenderConfig) if f.name != "noise")
     given = {name: getattr(arguments, name) for name in names}
@@ -193,9 +193,9 @@ def _add_info(commands: _Commands) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from slam.live.sources.bags import format_topics, is_bag, open_bag
-    from slam.progress import console_log
-    from slam.sequences import format_info, open_sequence, sequence_info
+    from bmask_slam.live.sources.bags import format_topics, is_bag, open_bag
+    from bmask_slam.runtime.progress import console_log
+    from bmask_slam.sequences import format_info, open_sequence, sequence_info
 
     if is_bag(arguments.sequence):
         with open_bag(arguments.sequence) as bag:

@@ -7,24 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.array_file import Arrays, check_like, nested, part
-from graph.camera import Camera
-from graph.geometry import Array
-from semantics.segmenter import Segmenter
-from slam.dynamics import Dynamics, Sifted
-from slam.features import BriskExtractor, Features
-from slam.frame import Frame
-from slam.keyframes import KeyframeEvidence, keyframe_reason
-from slam.landmarks import Ints
-from slam.localiser import Localiser
-from slam.mapper import Mapper
-from slam.results import FrameResult, TrackingStatus
-from slam.semantic_mapping import SemanticMapper
-from slam.stage_clock import StageClock
-from slam.system_config import SystemConfig
-from slam.system_results import SystemResults, largest
-from slam.tracker import Tracked, Tracker, lost, untracked
-from slam.world_map import Keyframe
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.features.brisk import BriskExtractor, Features
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import Arrays, check_like, nested, part
+from bmask_slam.graph.geometry import Array
+from bmask_slam.labelling.semantic_mapper import SemanticMapper
+from bmask_slam.moving.moving_object_filter import Dynamics, Sifted
+from bmask_slam.runtime.stage_clock import StageClock
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.system_results import SystemResults, largest
+from bmask_slam.tracking.camera_tracker import Localiser
+from bmask_slam.tracking.keyframe_decision import KeyframeEvidence, keyframe_reason
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
+from bmask_slam.tracking.tracker import Tracked, Tracker, lost, untracked
+from bmask_slam.world.landmark_table import Ints
+from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from graph.smoother_config import SmootherConfig
-from slam.dynamics_config import DynamicsConfig
-from slam.features import FeatureConfig
-from slam.graph_feed import GraphFeedConfig
-from slam.keyframes import KeyframeConfig
-from slam.local_mapping import MappingConfig
-from slam.loop_closing import LoopClosingConfig
-from slam.relocalisation import RelocalisationConfig
-from slam.semantic_mapping import SemanticsConfig
-from slam.tracker import TrackingConfig
+from bmask_slam.back_end.factor_selection import GraphFeedConfig
+from bmask_slam.back_end.landmark_management import MappingConfig
+from bmask_slam.features.brisk import FeatureConfig
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.labelling.semantic_mapper import SemanticsConfig
+from bmask_slam.loops.closing import LoopClosingConfig
+from bmask_slam.moving.config import DynamicsConfig
+from bmask_slam.tracking.keyframe_decision import KeyframeConfig
+from bmask_slam.tracking.relocalisation import RelocalisationConfig
+from bmask_slam.tracking.tracker import TrackingConfig
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from graph.array_file import Arrays
-from graph.trajectory import Trajectory
-from slam.frame import Frame
-from slam.landmark_cloud import LandmarkCloud
-from slam.results import FrameResult
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.results import FrameResult
 
 
 class System(Protocol):
-    """What a run asks of a SLAM system; ``slam.system.SlamSystem`` is the real one."""
+    """What a run asks of a SLAM system; ``system.SlamSystem`` is the real one."""
 
     def prepare(self, frame: Frame) -> Any: ...
     def process(self, frame: Frame, features: Any = None) -> FrameResult: ...

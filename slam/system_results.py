@@ -8,22 +8,22 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.array_file import Arrays
-from graph.camera import Camera
-from graph.trajectory import Trajectory
-from slam.covariances import (
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.labelling.results import MapObjects
+from bmask_slam.labelling.semantic_mapper import SemanticMapper
+from bmask_slam.run_folder.covariance_file import (
     COVARIANCES,
     KeyframeCovariances,
     find_covariances,
     write_covariances,
 )
-from slam.landmark_cloud import LandmarkCloud
-from slam.map_file import MAP, write_map
-from slam.mapper import Mapper
-from slam.semantic_files import semantic_writers
-from slam.semantic_mapping import SemanticMapper
-from slam.semantic_results import MapObjects
-from slam.system_config import SystemConfig
+from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.run_folder.map_file import MAP, write_map
+from bmask_slam.run_folder.semantic_files import semantic_writers
+from bmask_slam.system_config import SystemConfig
 
 
 class SystemResults(ABC):

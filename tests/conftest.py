@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from slam import semantic_mapping
+from bmask_slam.labelling import semantic_mapper as semantic_mapping
 
 
 def pytest_configure() -> None:

@@ -16,8 +16,8 @@ from recorded_bags import image
 from scipy.spatial.transform import Rotation
 from synthetic_view import CAMERA, render_plane
 
-from graph.geometry import inverse, se3_exp
-from slam.cli import main
+from bmask_slam.cli import main
+from bmask_slam.graph.geometry import inverse, se3_exp
 
 ROOT = Path(__file__).resolve().parents[1]
 

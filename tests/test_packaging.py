@@ -74,7 +74,7 @@ def test_the_licence_and_the_command_are_in_the_wheel(installed: Path) -> None:
     assert "License-Expression: BSD-3-Clause" in (information / "METADATA").read_text()
     points = configparser.ConfigParser()
     points.read(information / "entry_points.txt")
-    assert points["console_scripts"]["bmask-slam"] == "slam.cli:main"
+    assert points["console_scripts"]["bmask-slam"] == "bmask_slam.cli:main"
 
 
 def test_the_wheel_works_outside_the_checkout(installed: Path) -> None:
@@ -82,14 +82,16 @@ def test_the_wheel_works_outside_the_checkout(installed: Path) -> None:
         installed, "-c", "import slam, graph; print(slam.__file__, graph.__file__)"
     )
     assert found.split() == [str(installed / f"{k}/__init__.py") for k in ("slam", "graph")]
-    assert "usage: bmask-slam" in run_installed(installed, "-m", "slam", "--help")
+    assert "usage: bmask-slam" in run_installed(installed, "-m", "bmask_slam", "--help")
 
 
 def test_every_shipped_configuration_is_found_in_the_wheel(installed: Path) -> None:
-    code = "from graph.data_files import data_path; print(data_path('configs'))"
+    code = "from bmask_slam.graph.data_files import data_path; print(data_path('configs'))"
     assert run_installed(installed, "-c", code).strip() == str(installed / "slam/data/configs")
     for path in (ROOT / "data/configs").glob("*.yaml"):
-        run_installed(installed, "-m", "slam", "run", "-", "--config", path.stem, "--print-config")
+        run_installed(
+            installed, "-m", "bmask_slam", "run", "-", "--config", path.stem, "--print-config"
+        )
 
 
 def _constraints() -> dict[str, str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from slam.cli import make_parser
+from bmask_slam.cli import make_parser
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -104,8 +104,8 @@ def test_make_targets_exist():
 
 
 def test_configuration_keys_exist():
-    from slam.configuration import resolve
-    from slam.system_config import SystemConfig
+    from bmask_slam.config.configuration import resolve
+    from bmask_slam.system_config import SystemConfig
 
     given = [
         words[i + 1]

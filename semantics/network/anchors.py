@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from semantics.network.config import AnchorConfig
+from bmask_slam.semantics.network.config import AnchorConfig
 
 
 def cell_anchors(

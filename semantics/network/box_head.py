@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semantics.network import boxes as box_ops
-from semantics.network.config import DetectionConfig, NetworkConfig
-from semantics.network.layers import NormKind, conv_stack
-from semantics.network.nms import grouped_nms
+from bmask_slam.semantics.network import boxes as box_ops
+from bmask_slam.semantics.network.backbone.layers import NormKind, conv_stack
+from bmask_slam.semantics.network.config import DetectionConfig, NetworkConfig
+from bmask_slam.semantics.network.nms import grouped_nms
 
 BINS = 7
 MIN_SIZE_PX = 1e-2

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semantics.network.config import ImageConfig
+from bmask_slam.semantics.network.config import ImageConfig
 
 MULTIPLE_PX = 32
 """Both sides of a batch are padded to multiples of this, the coarsest stride of the body."""

@@ -8,8 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from semantics.network.config import NetworkConfig
-from semantics.network.layers import ConvBlock, NormKind, conv_stack, keep_variance
+from bmask_slam.semantics.network.backbone.layers import (
+    ConvBlock,
+    NormKind,
+    conv_stack,
+    keep_variance,
+)
+from bmask_slam.semantics.network.config import NetworkConfig
 
 BINS = 14
 """RoIAlign bins of both heads; masks have twice as many."""

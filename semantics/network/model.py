@@ -8,15 +8,25 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from semantics.network import box_head, mask_heads
-from semantics.network.box_head import BoxPredictor, ClassifiedBoxes, classify, make_box_head
-from semantics.network.boxes import enlarged, rescale
-from semantics.network.config import NetworkConfig
-from semantics.network.images import ImageBatch, prepare
-from semantics.network.mask_heads import MaskIoUHead, MaskPredictor, make_mask_head, of_class
-from semantics.network.pyramid import BackboneWithPyramid
-from semantics.network.roi_align import FeatureTable, feature_table, roi_align
-from semantics.network.rpn import RegionProposalNetwork
+from bmask_slam.semantics.network import box_head, mask_heads
+from bmask_slam.semantics.network.backbone.pyramid import BackboneWithPyramid
+from bmask_slam.semantics.network.box_head import (
+    BoxPredictor,
+    ClassifiedBoxes,
+    classify,
+    make_box_head,
+)
+from bmask_slam.semantics.network.boxes import enlarged, rescale
+from bmask_slam.semantics.network.config import NetworkConfig
+from bmask_slam.semantics.network.images import ImageBatch, prepare
+from bmask_slam.semantics.network.mask_heads import (
+    MaskIoUHead,
+    MaskPredictor,
+    make_mask_head,
+    of_class,
+)
+from bmask_slam.semantics.network.roi_align import FeatureTable, feature_table, roi_align
+from bmask_slam.semantics.network.rpn import RegionProposalNetwork
 
 ROI_LEVELS = 4
 """The coarsest pyramid level serves the RPN alone."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from semantics.network.boxes import iou
+from bmask_slam.semantics.network.boxes import iou
 
 
 def nms(boxes: Tensor, scores: Tensor, max_iou: float) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semantics.network.boxes import area
+from bmask_slam.semantics.network.boxes import area
 
 SAMPLES = 2
 """Bilinear samples of a bin along each axis."""

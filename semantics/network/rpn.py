@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from semantics.network import boxes as box_ops
-from semantics.network.anchors import make_anchors
-from semantics.network.config import NetworkConfig, ProposalConfig
-from semantics.network.images import ImageBatch
-from semantics.network.layers import conv_stack
-from semantics.network.nms import grouped_nms
+from bmask_slam.semantics.network import boxes as box_ops
+from bmask_slam.semantics.network.anchors import make_anchors
+from bmask_slam.semantics.network.backbone.layers import conv_stack
+from bmask_slam.semantics.network.config import NetworkConfig, ProposalConfig
+from bmask_slam.semantics.network.images import ImageBatch
+from bmask_slam.semantics.network.nms import grouped_nms
 
 MIN_SIZE_PX = 1e-3
 

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from graph.errors import InputError
-from semantics.coco_files import CocoFile, CocoImage, CocoObject
-from semantics.image_files import read_colour
-from semantics.instances import mask_box
-from semantics.labels import LabelSet
-from semantics.training.targets import Target
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import CocoFile, CocoImage, CocoObject
+from bmask_slam.semantics.instances.image_files import read_colour
+from bmask_slam.semantics.instances.instances import mask_box
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.training.targets import Target
 
 MIN_OBJECT_PX = 16
 """Objects with fewer pixels, after augmentation, are no examples."""

@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from semantics.network import mask_heads
-from semantics.network.box_head import ClassifiedBoxes
-from semantics.network.boxes import enlarged, iou, mirrored, rescale
-from semantics.network.images import prepare
-from semantics.network.mask_heads import MaskIoUHead, expected_iou, of_class
-from semantics.network.model import ROI_LEVELS, MaskRCNN
-from semantics.network.paste import paste
-from semantics.network.roi_align import feature_table, roi_align
-from semantics.segmenter import Image
-from semantics.training.dataset import Dataset, as_tensors
-from semantics.training.targets import Target
+from bmask_slam.semantics.network import mask_heads
+from bmask_slam.semantics.network.box_head import ClassifiedBoxes
+from bmask_slam.semantics.network.boxes import enlarged, iou, mirrored, rescale
+from bmask_slam.semantics.network.images import prepare
+from bmask_slam.semantics.network.mask_heads import MaskIoUHead, expected_iou, of_class
+from bmask_slam.semantics.network.model import ROI_LEVELS, MaskRCNN
+from bmask_slam.semantics.network.paste import paste
+from bmask_slam.semantics.network.roi_align import feature_table, roi_align
+from bmask_slam.semantics.segmenters.segmenter import Image
+from bmask_slam.semantics.training.dataset import Dataset, as_tensors
+from bmask_slam.semantics.training.targets import Target
 
 MASK_THRESHOLD = 0.5
 MATCH_IOU = 0.5

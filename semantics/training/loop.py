@@ -15,17 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from graph.errors import InputError
-from semantics.checkpoints import TrainedNetwork, save_network
-from semantics.training.dataset import (
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.training.dataset import (
     AugmentConfig,
     Dataset,
     JoinedDatasets,
     as_tensors,
     augmented,
 )
-from semantics.training.losses import Losses, MaskRois, Only, network_losses
-from semantics.training.targets import Target
+from bmask_slam.semantics.training.losses import Losses, MaskRois, Only, network_losses
+from bmask_slam.semantics.training.targets import Target
+from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, save_network
 
 STATE = "training.pt"
 CURVES = "losses.csv"

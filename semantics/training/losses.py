@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semantics.network import boxes as box_ops
-from semantics.network import mask_heads
-from semantics.network.anchors import make_anchors
-from semantics.network.images import ImageBatch, prepare
-from semantics.network.mask_heads import of_class
-from semantics.network.model import ROI_LEVELS, MaskRCNN
-from semantics.network.roi_align import FeatureTable, feature_table, roi_align
-from semantics.network.rpn import select_proposals
-from semantics.training.targets import (
+from bmask_slam.semantics.network import boxes as box_ops
+from bmask_slam.semantics.network import mask_heads
+from bmask_slam.semantics.network.anchors import make_anchors
+from bmask_slam.semantics.network.images import ImageBatch, prepare
+from bmask_slam.semantics.network.mask_heads import of_class
+from bmask_slam.semantics.network.model import ROI_LEVELS, MaskRCNN
+from bmask_slam.semantics.network.roi_align import FeatureTable, feature_table, roi_align
+from bmask_slam.semantics.network.rpn import select_proposals
+from bmask_slam.semantics.training.targets import (
     BOX_RULE,
     RPN_RULE,
     Target,

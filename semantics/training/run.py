@@ -13,15 +13,20 @@ import matplotlib.figure
 import numpy as np
 import torch
 
-from graph.errors import InputError
-from semantics.checkpoints import TrainedNetwork, find_weights, load_mobilenet, load_network
-from semantics.coco_files import read_coco
-from semantics.labels import LabelSet, read_label_set
-from semantics.network.config import LIGHT
-from semantics.network.model import MaskRCNN
-from semantics.training.dataset import Dataset, JoinedDatasets, split
-from semantics.training.loop import CURVES, TrainingConfig, train
-from semantics.training.transfer import transferred
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import read_coco
+from bmask_slam.semantics.labels import LabelSet, read_label_set
+from bmask_slam.semantics.network.config import LIGHT
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.training.dataset import Dataset, JoinedDatasets, split
+from bmask_slam.semantics.training.loop import CURVES, TrainingConfig, train
+from bmask_slam.semantics.training.transfer import transferred
+from bmask_slam.semantics.weights.checkpoints import (
+    TrainedNetwork,
+    find_weights,
+    load_mobilenet,
+    load_network,
+)
 
 SMOOTHING_STEPS = 25
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from semantics.network.boxes import iou
+from bmask_slam.semantics.network.boxes import iou
 
 IGNORED = -2
 NOTHING = -1

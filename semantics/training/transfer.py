@@ -7,10 +7,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from semantics.checkpoints import TrainedNetwork
-from semantics.labels import LabelSet
-from semantics.network.config import NetworkConfig
-from semantics.network.model import MaskRCNN
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.network.config import NetworkConfig
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.weights.checkpoints import TrainedNetwork
 
 PER_CLASS = {
     "roi_heads.box_predictor.cls_score": 1,

@@ -62,10 +62,10 @@ def add_calibrate(commands: _Commands) -> None:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from slam.calibrate import CalibrateOptions, CalibrationPriors
-    from slam.calibration_report import format_calibration
-    from slam.calibration_rounds import calibrate_in_rounds
-    from slam.progress import console_log
+    from bmask_slam.calibration.calibrate import CalibrateOptions, CalibrationPriors
+    from bmask_slam.calibration.report import format_calibration
+    from bmask_slam.offline.calibration_rounds import calibrate_in_rounds
+    from bmask_slam.runtime.progress import console_log
 
     known = arguments.known_distance
     options = CalibrateOptions(

@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from graph.errors import InputError
+from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
-    from slam.comparison.options import CompareOptions
+    from bmask_slam.comparison.experiment.options import CompareOptions
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -59,11 +59,11 @@ def add_compare(commands: _Commands) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> int:
-    from slam.comparison.comparing import compare
-    from slam.comparison.experiment_file import find_experiment
-    from slam.comparison.result import CellStatus
-    from slam.comparison.text import format_comparison
-    from slam.progress import console_log
+    from bmask_slam.comparison.comparing import compare
+    from bmask_slam.comparison.experiment.experiment_file import find_experiment
+    from bmask_slam.comparison.experiment.result import CellStatus
+    from bmask_slam.comparison.text import format_comparison
+    from bmask_slam.runtime.progress import console_log
 
     name = find_experiment(arguments.experiment).stem
     out = arguments.out or Path("runs") / f"compare-{name}"
@@ -75,8 +75,8 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 
 def _options(arguments: argparse.Namespace) -> CompareOptions:
-    from slam.comparison.external import parse_trajectory
-    from slam.comparison.options import CompareOptions
+    from bmask_slam.comparison.experiment.options import CompareOptions
+    from bmask_slam.comparison.jobs.external import parse_trajectory
 
     return CompareOptions(
         data=tuple(arguments.data),

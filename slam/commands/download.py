@@ -29,10 +29,10 @@ def add_download(commands: _Commands) -> None:
 
 
 def _download(arguments: argparse.Namespace) -> int:
-    from graph.errors import InputError
-    from slam.datasets import obtain, read_catalogue
-    from slam.datasets.catalogue import find, format_catalogue
-    from slam.progress import byte_bars, console_log
+    from bmask_slam.datasets import obtain, read_catalogue
+    from bmask_slam.datasets.catalogue import find, format_catalogue
+    from bmask_slam.graph.errors import InputError
+    from bmask_slam.runtime.progress import byte_bars, console_log
 
     catalogue = read_catalogue(arguments.catalogue)
     if arguments.list:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TypeAlias
 
-from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -34,16 +34,16 @@ def add_evaluate_segmentation(commands: _Commands) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from semantics.coco_files import read_coco
-    from semantics.evaluation import (
+    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.semantics.instances.coco_files import read_coco
+    from bmask_slam.semantics.segmenters.evaluation import (
         draw_precision_recall,
         evaluate_segmenter,
         format_segmentation,
         write_curves,
     )
-    from semantics.segmenter_table import SegmenterOptions, make_segmenter
-    from semantics.training.dataset import split
-    from slam.progress import console_log, counting_bar
+    from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+    from bmask_slam.semantics.training.dataset import split
 
     options = segmenter_options(arguments, SegmenterOptions(min_score=0.0))
     with console_log(), counting_bar(arguments.quiet) as progress:

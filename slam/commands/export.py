@@ -30,8 +30,8 @@ def add_export(commands: _Commands) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from slam.export import export
-    from slam.progress import console_log
+    from bmask_slam.run_folder.export import export
+    from bmask_slam.runtime.progress import console_log
 
     with console_log():
         exported = export(arguments.input, arguments.format, arguments.out, arguments.times)

@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from slam.commands.run import CONFIG_HELP, SET_HELP
-from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
-from slam.commands.view import add_view_arguments, view_options
+from bmask_slam.commands.run import CONFIG_HELP, SET_HELP
+from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.view import add_view_arguments, view_options
 
 if TYPE_CHECKING:
-    from slam.live.sources.opening import SourceOptions
+    from bmask_slam.live.sources.opening import SourceOptions
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -70,8 +70,8 @@ def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
     """How the source is to be read."""
-    from slam.live.sources.bag_source import BagTopics
-    from slam.live.sources.opening import SourceOptions
+    from bmask_slam.live.sources.bag_source import BagTopics
+    from bmask_slam.live.sources.opening import SourceOptions
 
     names = ("rgb", "depth", "camera_info")
     topics = {name: getattr(arguments, f"{name}_topic") for name in names}
@@ -86,15 +86,15 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
 
 
 def _live(arguments: argparse.Namespace) -> int:
-    from slam.configuration import find_config, resolve
-    from slam.evaluation import format_table
-    from slam.live.live_slam import LiveOptions, LiveSlam
-    from slam.live.play import PlayOptions, play
-    from slam.live.sources.bags import is_bag
-    from slam.live.sources.opening import open_source
-    from slam.progress import console_log
-    from slam.run_folder import free_run_path
-    from slam.system_config import SystemConfig
+    from bmask_slam.config.configuration import find_config, resolve
+    from bmask_slam.evaluation import format_table
+    from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+    from bmask_slam.live.play import PlayOptions, play
+    from bmask_slam.live.sources.bags import is_bag
+    from bmask_slam.live.sources.opening import open_source
+    from bmask_slam.run_folder.folder import free_run_path
+    from bmask_slam.runtime.progress import console_log
+    from bmask_slam.system_config import SystemConfig
 
     file = find_config(arguments.config) if arguments.config else None
     plain = resolve(SystemConfig, file, arguments.set)

@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
 
 if TYPE_CHECKING:
-    from semantics.segmenter_table import SegmenterOptions
+    from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -51,9 +51,9 @@ def add_map(commands: _Commands) -> None:
 
 
 def _map(arguments: argparse.Namespace) -> int:
-    from slam.dense_options import MapOptions
-    from slam.dense_run import format_summary, map_run
-    from slam.progress import console_log, counting_bar
+    from bmask_slam.dense.map_run import format_summary, map_run
+    from bmask_slam.dense.options import MapOptions
+    from bmask_slam.runtime.progress import console_log, counting_bar
 
     without = arguments.without
     options = MapOptions(
@@ -76,7 +76,7 @@ def _map(arguments: argparse.Namespace) -> int:
 
 def _masks(arguments: argparse.Namespace) -> SegmenterOptions | None:
     """What was asked for; None if nothing was."""
-    from semantics.segmenter_table import SegmenterOptions
+    from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
     if arguments.segmenter is None:
         if arguments.masks is None and arguments.weights is None:

@@ -6,11 +6,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from graph.errors import InputError
+from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
-    from graph.iteration import Progress
-    from graph.pose_graph_optimisation import Method
+    from bmask_slam.graph.batch.iteration import Progress
+    from bmask_slam.graph.pose_graph.optimisation import Method
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -52,7 +52,7 @@ def add_optimise(commands: _Commands) -> None:
 
 
 def _optimise(arguments: argparse.Namespace) -> int:
-    from slam.progress import console_log, iteration_bar
+    from bmask_slam.runtime.progress import console_log, iteration_bar
 
     work = _run_folder if arguments.input.is_dir() else _file
     with console_log(), iteration_bar(arguments.quiet) as progress:
@@ -62,7 +62,7 @@ def _optimise(arguments: argparse.Namespace) -> int:
 
 
 def _run_folder(arguments: argparse.Namespace, progress: Progress) -> str:
-    from slam.run_adjustment import AdjustOptions, adjust_run, format_run_adjustment
+    from bmask_slam.refinement.adjustment import AdjustOptions, adjust_run, format_run_adjustment
 
     _refuse_method(arguments, "a run folder")
     names = ("out", "overwrite", "reference", "plot")
@@ -75,9 +75,9 @@ def _run_folder(arguments: argparse.Namespace, progress: Progress) -> str:
 
 
 def _file(arguments: argparse.Namespace, progress: Progress) -> str:
-    from graph.g2o_landmarks import has_landmarks
-    from slam.adjustment_report import format_adjustment
-    from slam.optimise import adjust_file, format_result, optimise_file
+    from bmask_slam.graph.g2o.landmark_graphs import has_landmarks
+    from bmask_slam.refinement.adjustment_report import format_adjustment
+    from bmask_slam.refinement.optimise import adjust_file, format_result, optimise_file
 
     for option in ("reference", "overwrite"):
         if getattr(arguments, option):

@@ -24,7 +24,7 @@ def add_query(commands: _Commands) -> None:
 
 
 def _query(arguments: argparse.Namespace) -> int:
-    from slam.query import format_answer, query
+    from bmask_slam.run_folder.query import format_answer, query
 
     print(format_answer(query(arguments.run, arguments.label)))
     return 0

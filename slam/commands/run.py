@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from graph.errors import InputError
-from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
-    from slam.runner import RunSummary
+    from bmask_slam.offline.runner import RunSummary
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -85,10 +85,10 @@ def add_run(commands: _Commands) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from slam.configuration import dump, find_config, resolve
-    from slam.progress import console_log
-    from slam.runner import RunOptions, resume, run
-    from slam.system_config import SystemConfig
+    from bmask_slam.config.configuration import dump, find_config, resolve
+    from bmask_slam.offline.runner import RunOptions, resume, run
+    from bmask_slam.runtime.progress import console_log
+    from bmask_slam.system_config import SystemConfig
 
     file = find_config(arguments.config) if arguments.config else None
     plain = resolve(SystemConfig, file, arguments.set)
@@ -122,7 +122,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _print_summary(summary: RunSummary, quiet: bool) -> None:
-    from slam.evaluation import format_table
+    from bmask_slam.evaluation import format_table
 
     if quiet:
         print(summary.folder)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TypeAlias
 
-from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -32,9 +32,9 @@ def add_segment(commands: _Commands) -> None:
 
 
 def _segment(arguments: argparse.Namespace) -> int:
-    from semantics.segmenter_table import SegmenterOptions
-    from slam.progress import console_log, counting_bar
-    from slam.segmentation import segment_folder
+    from bmask_slam.offline.segment_folder import segment_folder
+    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
     options = segmenter_options(arguments, SegmenterOptions(min_score=arguments.min_score))
     with console_log(), counting_bar(arguments.quiet) as progress:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from semantics.segmenter_table import SegmenterOptions
+    from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
 SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth or none"
 
@@ -36,7 +36,7 @@ def segmenter_options(arguments: argparse.Namespace, base: SegmenterOptions) -> 
     on labels: a detector of photographs is too often wrong there. In the red kitchen its weak books
     became the table.
     """
-    from slam.semantic_mapping import SemanticsConfig
+    from bmask_slam.labelling.semantic_mapper import SemanticsConfig
 
     given = {name: getattr(arguments, name) for name in ("weights", "labels", "ray")}
     given["name"] = arguments.segmenter

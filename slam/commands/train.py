@@ -57,9 +57,9 @@ def add_train(commands: _Commands) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from graph.errors import InputError
-    from semantics.training.run import Source, TrainingRun, run_training
-    from slam.progress import console_log, counting_bar
+    from bmask_slam.graph.errors import InputError
+    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.semantics.training.run import Source, TrainingRun, run_training
 
     if len(arguments.data) != len(arguments.images):
         raise InputError(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
-    from slam.viewer.scene import ViewOptions
+    from bmask_slam.viewer.scene import ViewOptions
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
@@ -43,15 +43,15 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
 
 def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
     """What was asked for; ``window``: Rerun's own window, if nothing else was."""
-    from slam.viewer.scene import ViewOptions
+    from bmask_slam.viewer.scene import ViewOptions
 
     elsewhere = arguments.record is not None or arguments.serve > 0
     return ViewOptions(arguments.record, arguments.serve, window and not elsewhere)
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from slam.viewer.replay import replay
-    from slam.viewer.scene import Scene
+    from bmask_slam.viewer.replay import replay
+    from bmask_slam.viewer.scene import Scene
 
     scene = Scene(arguments.run.name, view_options(arguments, window=True))
     count = replay(arguments.run, scene)

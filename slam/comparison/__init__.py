@@ -1,6 +1,6 @@
 """Research comparisons: sequences x methods x seeds, run, measured, tabulated, drawn.
 
-    from slam.comparison import compare
+    from bmask_slam.comparison import compare
     comparison = compare("rendered", "runs/rendered")
     comparison.to_pandas()
 
@@ -13,10 +13,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from slam.comparison.comparing import compare
-    from slam.comparison.options import CompareOptions
-    from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method, read_results
-    from slam.comparison.statistics import Summary, Verdict, summarise, verdicts
+    from bmask_slam.comparison.comparing import compare
+    from bmask_slam.comparison.experiment.options import CompareOptions
+    from bmask_slam.comparison.experiment.result import (
+        Cell,
+        CellStatus,
+        Comparison,
+        Kind,
+        Method,
+        read_results,
+    )
+    from bmask_slam.comparison.statistics import Summary, Verdict, summarise, verdicts
 
 _MODULES = {
     "comparing": ("compare",),

@@ -11,21 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from graph.errors import InputError
-from slam.comparison.bar import JobBar
-from slam.comparison.cells import Key
-from slam.comparison.errors import Rules, run_figures, trajectory_errors
-from slam.comparison.experiment import Configuration, Experiment
-from slam.comparison.experiment_file import read_experiment
-from slam.comparison.external import other_methods, published_cells, trajectory_cells
-from slam.comparison.job import Job, Outcome, finished
-from slam.comparison.options import CompareOptions, chosen
-from slam.comparison.plan import Plan, make_plan
-from slam.comparison.pool import LocalPool, Pool
-from slam.comparison.provenance import provenance
-from slam.comparison.ray_pool import RayPool
-from slam.comparison.report import write_report
-from slam.comparison.result import (
+from bmask_slam.comparison.experiment.experiment import Configuration, Experiment
+from bmask_slam.comparison.experiment.experiment_file import read_experiment
+from bmask_slam.comparison.experiment.options import CompareOptions, chosen
+from bmask_slam.comparison.experiment.plan import Plan, make_plan
+from bmask_slam.comparison.experiment.provenance import provenance
+from bmask_slam.comparison.experiment.result import (
     RESULTS,
     Cell,
     CellStatus,
@@ -34,6 +25,15 @@ from slam.comparison.result import (
     Method,
     write_results,
 )
+from bmask_slam.comparison.jobs.bar import JobBar
+from bmask_slam.comparison.jobs.cells import Key
+from bmask_slam.comparison.jobs.errors import Rules, run_figures, trajectory_errors
+from bmask_slam.comparison.jobs.external import other_methods, published_cells, trajectory_cells
+from bmask_slam.comparison.jobs.job import Job, Outcome, finished
+from bmask_slam.comparison.jobs.pool import LocalPool, Pool
+from bmask_slam.comparison.jobs.ray_pool import RayPool
+from bmask_slam.comparison.report import write_report
+from bmask_slam.graph.errors import InputError
 
 logger = logging.getLogger(__name__)
 

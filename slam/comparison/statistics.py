@@ -14,10 +14,10 @@ from statistics import fmean, median
 
 import numpy as np
 
-from graph.geometry import Array
-from slam.comparison.experiment import VERDICT_METRICS
-from slam.comparison.metric_table import BY_NAME
-from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.comparison.experiment.experiment import VERDICT_METRICS
+from bmask_slam.comparison.experiment.metric_table import BY_NAME
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.graph.geometry import Array
 
 LEVEL = 0.05
 RESAMPLES = 10_000

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from slam.comparison.metric_table import BY_NAME
-from slam.comparison.report.table import TableRow, cell_name, metric_table
-from slam.comparison.result import CellStatus, Comparison
-from slam.comparison.statistics import Verdict, verdicts
+from bmask_slam.comparison.experiment.metric_table import BY_NAME
+from bmask_slam.comparison.experiment.result import CellStatus, Comparison
+from bmask_slam.comparison.report.table import TableRow, cell_name, metric_table
+from bmask_slam.comparison.statistics import Verdict, verdicts
 
 MAIN_METRIC = "ate_rmse"
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from graph.data_files import data_path
-from graph.errors import InputError
-from slam.yaml_text import read_yaml
+from bmask_slam.config.yaml import read_yaml
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
 
 CATALOGUE = "sequences.yaml"
 SHOWN = 5

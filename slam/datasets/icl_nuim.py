@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.errors import InputError
-from graph.trajectory import Trajectory, read_tum, write_tum
-from slam.sequences.lists import read_associations
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
+from bmask_slam.sequences.lists import read_associations
 
 FPS = 30.0
 FIRST_POSE = 1

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from graph.errors import InputError
+from bmask_slam.graph.errors import InputError
 
 Progress = Callable[[int, int], None]
 """Called with the bytes of the archive that are read and all of them."""

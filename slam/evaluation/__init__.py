@@ -1,6 +1,6 @@
 """Trajectory evaluation: errors, tables and the picture of a run."""
 
-from slam.evaluation.evaluation import (
+from bmask_slam.evaluation.ate_rpe import (
     EvaluationResult,
     Row,
     evaluate,

@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from graph.errors import InputError
-from graph.geometry import Array
-from graph.metrics import AbsoluteError, absolute_error
-from graph.trajectory import Trajectory, associate
-from graph.whole_file import whole_file
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.metrics import AbsoluteError, absolute_error
+from bmask_slam.graph.trajectory import Trajectory, associate
+from bmask_slam.graph.whole_file import whole_file
 
 ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#9a9a96", "#d6302a"
 GAP_STEPS = 5

@@ -19,7 +19,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
-from slam.live.shared_memory import Ring
+from bmask_slam.live.shared_memory import Ring
 
 LARGE = 1 << 15
 """Bytes from which an array goes through shared memory."""

@@ -7,13 +7,13 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.geometry import Array
-from slam.live.health import Health
-from slam.live.remote_dense import RemoteDenseMapper
-from slam.live.system import LiveSystem
-from slam.results import FrameResult
-from slam.viewer.scene import Scene
-from slam.world_map import WorldMap
+from bmask_slam.graph.geometry import Array
+from bmask_slam.live.health import Health
+from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
+from bmask_slam.live.system import LiveSystem
+from bmask_slam.tracking.results import FrameResult
+from bmask_slam.viewer.scene import Scene
+from bmask_slam.world.world_map import WorldMap
 
 IMAGE_EVERY = 3
 """Frames from one image to the next."""

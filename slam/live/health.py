@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from slam.results import FrameResult, TrackingStatus
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 WINDOW = 120
 """Frames over which rates and delays are taken."""

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from graph.camera import Camera
-from graph.errors import InputError
-from slam.frame import Frame
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.frame import Frame
 
 
 def checked(frame: Frame, camera: Camera, last_s: float) -> Frame:

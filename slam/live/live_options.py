@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from graph.trajectory import Trajectory
-from slam.viewer.scene import ViewOptions
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.viewer.scene import ViewOptions
 
 
 @dataclass(frozen=True)

@@ -13,29 +13,29 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.trajectory import Trajectory
-from slam import __version__
-from slam.configuration import dump
-from slam.evaluation import Row
-from slam.features import Features
-from slam.frame import Frame
-from slam.landmark_cloud import LandmarkCloud
-from slam.live.dense_messages import MapWritten
-from slam.live.display import Display
-from slam.live.health import WINDOW, FrameMeter, Health
-from slam.live.incoming import checked
-from slam.live.live_options import LiveOptions
-from slam.live.recorder import Recorder, rescued
-from slam.live.sources.counts import SourceCounts
-from slam.live.system import LiveSystem
-from slam.live.workers import start_system
-from slam.results import FrameResult
-from slam.run_folder import DISK_ERRORS, HEALTH, RunFolder
-from slam.run_results import Tally, measure, row, save
-from slam.system_config import SystemConfig
-from slam.viewer.scene import Scene
+from bmask_slam import __version__
+from bmask_slam.config.configuration import dump
+from bmask_slam.evaluation import Row
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.display import Display
+from bmask_slam.live.health import WINDOW, FrameMeter, Health
+from bmask_slam.live.incoming import checked
+from bmask_slam.live.live_options import LiveOptions
+from bmask_slam.live.processes.dense_messages import MapWritten
+from bmask_slam.live.processes.start import start_system
+from bmask_slam.live.recorder import Recorder, rescued
+from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.live.system import LiveSystem
+from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
+from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.run_folder.metrics import Tally, measure, row, save
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import FrameResult
+from bmask_slam.viewer.scene import Scene
 
 __all__ = ["LiveOptions", "LiveSlam", "Prepared"]
 logger = logging.getLogger(__name__)

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.geometry import Array
-from semantics.instances import Instance, PackedMask
-from slam.history import Entries
-from slam.landmarks import Ints, Patches
-from slam.live.replica import WorldDelta
-from slam.tracker import Tracked
+from bmask_slam.graph.geometry import Array
+from bmask_slam.live.replica import WorldDelta
+from bmask_slam.semantics.instances.instances import Instance, PackedMask
+from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.world.frame_history import Entries
+from bmask_slam.world.landmark_table import Ints, Patches
 
 Image = NDArray[np.uint8]
 Depth = NDArray[np.float32]

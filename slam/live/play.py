@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from graph.errors import InputError
-from slam.frame import Frame
-from slam.live.live_slam import LiveSlam, Prepared
-from slam.live.sources import Newest, Source
-from slam.progress import make_bar
-from slam.sequences.prefetch import prefetched
-from slam.stop import StopRequest
+from bmask_slam.graph.errors import InputError
+from bmask_slam.live.live_slam import LiveSlam, Prepared
+from bmask_slam.live.sources import Newest, Source
+from bmask_slam.runtime.progress import make_bar
+from bmask_slam.runtime.stop_request import StopRequest
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.prefetch import prefetched
 
 logger = logging.getLogger(__name__)
 

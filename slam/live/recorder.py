@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.trajectory import Trajectory, write_tum
-from slam.live.health import Health
-from slam.results import FrameResult
-from slam.run_folder import DISK_ERRORS, HEALTH, RunFolder
+from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.live.health import Health
+from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
+from bmask_slam.tracking.results import FrameResult
 
 logger = logging.getLogger(__name__)
 

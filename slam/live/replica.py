@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.geometry import Array, carried_along
-from slam.features import Features
-from slam.history import FrameHistory
-from slam.landmarks import Ints, Mask
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.geometry import Array, carried_along
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.landmark_table import Ints, Mask
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 COLUMNS = (
     *("descriptors", "directions", "extent", "angles_rad", "patches", "patch_views"),

@@ -10,28 +10,28 @@ from pathlib import Path
 import faiss
 import numpy as np
 
-from graph.array_file import nested, read_arrays
-from graph.camera import Camera
-from graph.geometry import Array
-from semantics.segmenter import NoSegmenter
-from slam.features import Features
-from slam.frame import Frame
-from slam.history import NOBODY
-from slam.landmarks import Ints
-from slam.live.map_process import STATE_FILE, LabelledNothing
-from slam.live.messages import ImageToSegment
-from slam.live.remote_dense import RemoteDenseMapper
-from slam.live.remote_mapper import RemoteMapper
-from slam.live.segmentation import RemoteSegmenter
-from slam.live.supervision import Patience
-from slam.mapper import Mapper
-from slam.results import FrameResult
-from slam.semantic_mapping import SemanticMapper
-from slam.semantic_results import LandmarkLabels
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
-from slam.tracker import Tracked, Tracker
-from slam.world_map import Keyframe
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import nested, read_arrays
+from bmask_slam.graph.geometry import Array
+from bmask_slam.labelling.results import LandmarkLabels
+from bmask_slam.labelling.semantic_mapper import SemanticMapper
+from bmask_slam.live.messages import ImageToSegment
+from bmask_slam.live.processes.map_process import STATE_FILE, LabelledNothing
+from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
+from bmask_slam.live.processes.remote_mapper import RemoteMapper
+from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.processes.supervision import Patience
+from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import FrameResult
+from bmask_slam.tracking.tracker import Tracked, Tracker
+from bmask_slam.world.frame_history import NOBODY
+from bmask_slam.world.landmark_table import Ints
+from bmask_slam.world.world_map import Keyframe
 
 MAX_PENDING = 3
 """Keyframes that wait for the map; with so many no further one is promised."""

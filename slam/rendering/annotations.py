@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from slam.rendering.builder import UNLABELLED
-from slam.rendering.classes import CATEGORY_IDS
-from slam.rendering.scene import Scene
+from bmask_slam.graph.camera import Camera
+from bmask_slam.rendering.classes import CATEGORY_IDS
+from bmask_slam.rendering.engine.builder import UNLABELLED
+from bmask_slam.rendering.engine.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from semantics.labels import read_label_set
+from bmask_slam.semantics.labels import read_label_set
 
 CLASSES: tuple[str, ...] = read_label_set("paper").names[1:]
 """A category's id in the annotations is its place here, from 1."""

@@ -11,27 +11,27 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.geometry import Array, inverse
-from slam.rendering.annotations import FrameMarks, coco, frame_marks
-from slam.rendering.builder import Image, SceneBuilder
-from slam.rendering.lighting import Lighting
-from slam.rendering.path import CameraPath, camera_poses
-from slam.rendering.people import Cast, Role, hire
-from slam.rendering.random_room import draw_room
-from slam.rendering.raycast import Renderer, View, to_image
-from slam.rendering.scene import Scene, build_scene
-from slam.rendering.sensor import blur, exposure_gain, measure_depth, optical_flow
-from slam.rendering.true_boxes import OBJECTS_TRUTH, true_boxes
-from slam.rendering.writer import (
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.rendering.annotations import FrameMarks, coco, frame_marks
+from bmask_slam.rendering.engine.builder import Image, SceneBuilder
+from bmask_slam.rendering.engine.lighting import Lighting
+from bmask_slam.rendering.engine.path import CameraPath, camera_poses
+from bmask_slam.rendering.engine.raycast import Renderer, View, to_image
+from bmask_slam.rendering.engine.scene import Scene, build_scene
+from bmask_slam.rendering.engine.sensor import blur, exposure_gain, measure_depth, optical_flow
+from bmask_slam.rendering.rooms.random_room import draw_room
+from bmask_slam.rendering.things.people import Cast, Role, hire
+from bmask_slam.rendering.true_boxes import OBJECTS_TRUTH, true_boxes
+from bmask_slam.rendering.writer import (
     new_folder,
     stored_depth,
     write_json,
     write_lists,
     write_png,
 )
-from slam.sequences.cameras import write_camera
+from bmask_slam.sequences.cameras import write_camera
 
 SCENES: dict[str, str] = {
     "office": "an office for three with desks, computers and bookcases; one round through it",
@@ -181,7 +181,7 @@ def _plan(config: RenderConfig) -> _Plan:
     if config.name == "room":
         room = draw_room(config.seed)
         return _Plan(room.path, room.roles, room.lighting, room.furnish)
-    module = importlib.import_module(f"slam.rendering.{config.name}")
+    module = importlib.import_module(f"bmask_slam.rendering.rooms.{config.name}")
     path = module.path(config.rounds) if config.name in CLOSED else module.PATH
     return _Plan(path, module.ROLES, module.LIGHTING, module.furnish)
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from graph.geometry import inverse, transform
-from slam.rendering.builder import SceneBuilder
+from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.rendering.engine.builder import SceneBuilder
 
 OBJECTS_TRUTH = "objects_truth.json"
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.errors import InputError
-from graph.geometry import Array, quaternion_from_rotation
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, quaternion_from_rotation
 
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 

@@ -1,8 +1,8 @@
 """Reading RGB-D sequences in TUM layout."""
 
-from slam.sequences.cameras import read_camera, write_camera
-from slam.sequences.info import SequenceInfo, format_info, sequence_info
-from slam.sequences.sequence import Sequence, SequenceConfig, open_sequence
+from bmask_slam.sequences.cameras import read_camera, write_camera
+from bmask_slam.sequences.info import SequenceInfo, format_info, sequence_info
+from bmask_slam.sequences.sequence import Sequence, SequenceConfig, open_sequence
 
 __all__ = [
     "Sequence",

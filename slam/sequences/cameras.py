@@ -9,9 +9,9 @@ from pathlib import Path
 
 import yaml
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.whole_file import whole_file
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.errors import InputError
-from semantics.image_files import decode_image, read_colour
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.image_files import decode_image, read_colour
 
 SURFACE_STEP = 0.05
 """A pixel whose depth changes by more from one depth image to the next shows another surface."""

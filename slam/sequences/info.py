@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.geometry import Array
-from graph.trajectory import associate_stamps
-from slam.sequences.sequence import Sequence
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.trajectory import associate_stamps
+from bmask_slam.sequences.sequence import Sequence
 
 GAP_STEPS = 3
 DEPTH_PERCENTILES = (5, 50, 95)

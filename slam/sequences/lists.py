@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.errors import InputError
-from graph.geometry import Array
-from graph.trajectory import Indices, associate_stamps, check_seconds
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.trajectory import Indices, associate_stamps, check_seconds
 
 logger = logging.getLogger(__name__)
 

@@ -12,15 +12,15 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.geometry import Array
-from graph.trajectory import Trajectory, read_tum
-from slam.frame import Frame
-from slam.sequences.cameras import find_camera
-from slam.sequences.images import depth_between, read_depth, read_rgb
-from slam.sequences.lists import ImagePairs, image_name, read_pairs
-from slam.sequences.prefetch import prefetched
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.trajectory import Trajectory, read_tum
+from bmask_slam.sequences.cameras import find_camera
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.images import depth_between, read_depth, read_rgb
+from bmask_slam.sequences.lists import ImagePairs, image_name, read_pairs
+from bmask_slam.sequences.prefetch import prefetched
 
 logger = logging.getLogger(__name__)
 

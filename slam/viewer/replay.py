@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.errors import InputError
-from graph.geometry import Array
-from graph.ply import read_ply
-from graph.trajectory import Trajectory
-from graph.updates import RelativePose
-from semantics.overlay import class_colour
-from slam.results import FrameResult, TrackingStatus
-from slam.run_folder import STAGES
-from slam.saved_run import SavedRun, read_run
-from slam.semantic_files import OBJECTS, read_objects
-from slam.viewer.scene import Box, Scene
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.graph_update import RelativePose
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.run_folder.folder import STAGES
+from bmask_slam.run_folder.saved_run import SavedRun, read_run
+from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
+from bmask_slam.semantics.instances.overlay import class_colour
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
+from bmask_slam.viewer.scene import Box, Scene
 
 MAX_DENSE_POINTS = 300_000
 MAX_STAMP_ERROR_S = 1e-5

@@ -23,11 +23,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.geometry import Array
-from semantics.boxes3d import OrientedBox
-from slam.results import FrameResult, TrackingStatus
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.objects.boxes3d import OrientedBox
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 TIMELINE = "time"
 IMAGE_STEP = 2

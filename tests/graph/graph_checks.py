@@ -5,10 +5,15 @@ from __future__ import annotations
 import numpy as np
 from synthetic_room import CAMERA, Room
 
-from graph.geometry import inverse, se3_log
-from graph.keys import keyframe_keys, landmark_keys
-from graph.smoother import Smoother
-from graph.updates import GraphEstimate, GraphUpdate, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import (
+    GraphEstimate,
+    GraphUpdate,
+    PosePrior,
+    RelativePose,
+)
+from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
+from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.smoother.smoother import Smoother
 
 
 def filled(room: Room) -> Smoother:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from graph.geometry import inverse, make_pose, se3_exp, so3_exp
-from graph.pose_graph import PoseGraph, planar_poses
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_poses
 
 PER_LAP = 12
 

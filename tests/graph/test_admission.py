@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 from synthetic_room import CAMERA, make_room
 
-from graph.geometry import make_pose
-from graph.smoother import Smoother
-from graph.support import constrained_landmarks
-from graph.updates import (
+from bmask_slam.graph.factors.graph_update import (
     NO_LANDMARK,
     GraphUpdate,
     Observations,
@@ -18,6 +15,9 @@ from graph.updates import (
     RefusalReason,
     RelativePose,
 )
+from bmask_slam.graph.factors.observability import constrained_landmarks
+from bmask_slam.graph.geometry import make_pose
+from bmask_slam.graph.smoother.smoother import Smoother
 
 ROOM = make_room(keyframes=4)
 NEXT = ROOM.update_of(3)

@@ -8,8 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph.array_file import FileKind, check_like, nested, part, read_arrays, write_arrays
-from graph.errors import InputError
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import (
+    FileKind,
+    check_like,
+    nested,
+    part,
+    read_arrays,
+    write_arrays,
+)
 
 KIND = FileKind("shoebox", 3)
 ARRAYS = {

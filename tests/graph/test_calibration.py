@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from calibration_scene import PRIORS, TRUTH, make_problem
 
-from graph.calibration import calibrate
-from graph.calibration_covariance import _clustered_variance
-from graph.calibration_equations import normal_equations
-from graph.calibration_model import FACTOR, OFFSET, PARAMETERS, SHUTTER, TIME, linearise
-from graph.calibration_problem import (
+from bmask_slam.graph.calibration.calibration import calibrate
+from bmask_slam.graph.calibration.covariance import _clustered_variance
+from bmask_slam.graph.calibration.equations import normal_equations
+from bmask_slam.graph.calibration.model import FACTOR, OFFSET, PARAMETERS, SHUTTER, TIME, linearise
+from bmask_slam.graph.calibration.problem import (
     Anchors,
     CalibrationProblem,
     CalibrationState,
     anchor_terms,
 )
-from graph.geometry import Array, se3_exp
+from bmask_slam.graph.geometry import Array, se3_exp
 
 START = TRUTH + np.array(
     [15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010, 0.005]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from graph.camera import Camera
+from bmask_slam.graph.camera import Camera
 
 CAMERA = Camera(640, 480, fx=525.0, fy=510.0, cx=318.5, cy=241.5, stereo_bf_px_m=40.0)
 RNG = np.random.default_rng(5)

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from synthetic_room import CAMERA, make_room, noisy
 
-from graph.factors import FactorMaker, make_graph, make_values, read_values
-from graph.gates import reprojection
-from graph.geometry import inverse, se3_exp, se3_log, transform
-from graph.keys import keyframe_keys, landmark_keys, variable_named_in
-from graph.smoother_config import SmootherConfig
-from graph.updates import Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.checks import reprojection
+from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
+from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys, variable_named_in
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 
 RNG = np.random.default_rng(3)
 T_WORLD_CAMERA = se3_exp(np.array([0.3, -0.2, 0.5, 1.0, -2.0, 0.7]))

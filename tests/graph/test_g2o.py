@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from pose_graph_rings import ring
 
-from graph.errors import InputError
-from graph.g2o import read_g2o, write_g2o
-from graph.geometry import make_pose, rotation_from_quaternion
-from graph.pose_graph_factors import pose_graph_cost
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.g2o.pose_graphs import read_g2o, write_g2o
+from bmask_slam.graph.geometry import make_pose, rotation_from_quaternion
+from bmask_slam.graph.pose_graph.factors import pose_graph_cost
 
 EDGE_2D = "EDGE_SE2 3 7 1 2 0.5 11 12 13 22 23 33\n"
 VERTICES_2D = "VERTEX_SE2 7 4 5 -0.5\nVERTEX_SE2 3 1 2 3\n"

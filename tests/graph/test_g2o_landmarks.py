@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from synthetic_room import CAMERA, make_room
 
-from graph.bundle_adjustment import adjust
-from graph.errors import InputError
-from graph.g2o_landmarks import has_landmarks, write_landmark_graph
-from graph.g2o_landmarks_reader import read_landmark_graph
-from graph.gates import reprojection
-from graph.geometry import inverse, rotation_from_quaternion, se3_exp
-from graph.shadow import Shadow
-from graph.updates import PosePrior, RelativePose
+from bmask_slam.graph.batch.bundle_adjustment import adjust
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.checks import reprojection
+from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.graph_update import PosePrior, RelativePose
+from bmask_slam.graph.g2o.landmark_graphs import has_landmarks, write_landmark_graph
+from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
+from bmask_slam.graph.geometry import inverse, rotation_from_quaternion, se3_exp
 
 
 def room_graph() -> Shadow:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from graph.geometry import (
+from bmask_slam.graph.geometry import (
     carried_along,
     inverse,
     make_pose,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from synthetic_room import CAMERA, make_room
 
-from graph.errors import InputError
-from graph.geometry import inverse
-from graph.smoother import Smoother
-from graph.updates import GraphUpdate, RelativePose
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.smoother.smoother import Smoother
 
 ROOM = make_room(keyframes=8, noise_px=0.4, mono_share=0.2)
 

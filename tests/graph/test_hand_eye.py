@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp
-from graph.hand_eye import body_trajectory, hand_eye
-from graph.trajectory import Trajectory
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp
+from bmask_slam.graph.hand_eye import body_trajectory, hand_eye
+from bmask_slam.graph.trajectory import Trajectory
 
 T_CAMERA_IMU = make_pose(so3_exp(np.array([1.2, -1.1, 1.3])), np.array([0.05, 0.16, -0.11]))
 """Axes as different as those of a camera and an IMU usually are."""

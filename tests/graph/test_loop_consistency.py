@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from graph.geometry import inverse, se3_exp
-from graph.loop_consistency import cycle_chi2
+from bmask_slam.graph.geometry import inverse, se3_exp
+from bmask_slam.graph.pose_graph.loop_consistency import cycle_chi2
 
 
 def test_chi_square_of_true_loops_has_six_degrees_of_freedom() -> None:

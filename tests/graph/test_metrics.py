@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graph.geometry import inverse, make_pose, se3_exp, so3_exp
-from graph.metrics import (
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
+from bmask_slam.graph.metrics import (
     ErrorStatistics,
     absolute_error,
     align,
@@ -18,7 +18,7 @@ from graph.metrics import (
     relative_error,
     time_pairs,
 )
-from graph.trajectory import Trajectory, associate, read_tum
+from bmask_slam.graph.trajectory import Trajectory, associate, read_tum
 
 SHARED = Path(__file__).resolve().parents[2] / "../shared/data/trajectories"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data/trajectories here")

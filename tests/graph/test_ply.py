@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from graph.ply import read_ply, write_ply
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.ply import read_ply, write_ply
 
 TYPES = [np.float32, np.float64, np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32]
 

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from pose_graph_rings import PER_LAP, ring
 
-from graph.g2o import read_g2o
-from graph.geometry import inverse, se3_exp, se3_log
-from graph.graduation import truncated_weights
-from graph.loop_consistency import loop_support
-from graph.loop_prediction import predicted_chi2
-from graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
-from graph.pose_graph_factors import chordal_poses, pose_graph_cost
-from graph.pose_graph_optimisation import (
+from bmask_slam.graph.factors.gnc import truncated_weights
+from bmask_slam.graph.g2o.pose_graphs import read_g2o
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.pose_graph.factors import chordal_poses, pose_graph_cost
+from bmask_slam.graph.pose_graph.loop_consistency import loop_support
+from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
+from bmask_slam.graph.pose_graph.optimisation import (
     PoseGraphConfig,
     optimise_pose_graph,
 )
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
 
 FOLDER = Path(__file__).resolve().parents[2] / "../shared/data/posegraphs"
 BOTH = pytest.mark.parametrize("planar", [True, False], ids=["2-D", "3-D"])

@@ -10,10 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_room import Room, make_room
 
-from graph.geometry import inverse, se3_log
-from graph.holding import loose_in
-from graph.smoother import Smoother
-from graph.updates import NO_KEYFRAME, NO_LANDMARK, GraphEstimate, GraphUpdate, RemovalPolicy
+from bmask_slam.graph.factors.graph_update import (
+    NO_KEYFRAME,
+    NO_LANDMARK,
+    GraphEstimate,
+    GraphUpdate,
+    RemovalPolicy,
+)
+from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.smoother.anchoring import loose_in
+from bmask_slam.graph.smoother.smoother import Smoother
 
 FEW = settings(max_examples=20, deadline=None, derandomize=True)
 SEEDS = st.integers(0, 10_000)

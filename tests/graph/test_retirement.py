@@ -8,11 +8,16 @@ import pytest
 from synthetic_room import CAMERA, Room, make_room
 from test_smoother_removal import assert_isam_matches_shadow
 
-from graph.geometry import Array, inverse, se3_exp, se3_log
-from graph.marginalisation import linearise, marginalise
-from graph.smoother import Smoother, SmootherConfig
-from graph.sparsification import adjoint
-from graph.updates import GraphEstimate, GraphUpdate, Observations, RefusalReason
+from bmask_slam.graph.factors.graph_update import (
+    GraphEstimate,
+    GraphUpdate,
+    Observations,
+    RefusalReason,
+)
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.marginals.point_elimination import linearise, marginalise
+from bmask_slam.graph.marginals.sparsification import adjoint
+from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 
 ROOM = make_room(keyframes=10, points=150, noise_px=0.5, seed=3)
 

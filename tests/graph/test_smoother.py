@@ -8,11 +8,7 @@ import pytest
 from scipy.stats import chi2
 from synthetic_room import CAMERA, Room, make_room
 
-from graph.geometry import Array, inverse, se3_exp, se3_log, transform
-from graph.keys import keyframe_keys, landmark_keys
-from graph.smoother import Smoother, SmootherConfig
-from graph.solver import poses_last
-from graph.updates import (
+from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
     Observations,
@@ -20,6 +16,10 @@ from graph.updates import (
     RefusalReason,
     RelativePose,
 )
+from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.smoother.isam2 import poses_last
+from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 
 T_NEW_OLD = se3_exp(np.array([0.4, -1.1, 0.7, 3.0, -5.0, 2.0]))
 

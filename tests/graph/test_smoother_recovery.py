@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from synthetic_room import CAMERA, make_room
 
-import graph.smoother
-from graph.admission import Admitted
-from graph.camera import Camera
-from graph.geometry import Array, inverse, se3_exp, se3_log, transform
-from graph.recovery import Repair
-from graph.shadow import Shadow
-from graph.smoother import Smoother, SmootherConfig
-from graph.solver import SolverError
-from graph.updates import (
+import bmask_slam.graph.smoother.smoother
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
     Observations,
     RefusalReason,
     Refusals,
 )
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.smoother.isam2 import SolverError
+from bmask_slam.graph.smoother.repair import Repair
+from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
+from bmask_slam.graph.smoother.validation import Admitted
 
 ROOM = make_room(keyframes=6, noise_px=0.3)
 
@@ -47,7 +47,7 @@ def smoother(monkeypatch: pytest.MonkeyPatch) -> Smoother:
     smoother = Smoother(CAMERA)
     for update in ROOM.updates()[:5]:
         smoother.update(update)
-    monkeypatch.setattr(graph.smoother, "admit", admit_everything)
+    monkeypatch.setattr(bmask_slam.graph.smoother.smoother, "admit", admit_everything)
     return smoother
 
 
@@ -185,7 +185,9 @@ def test_an_update_that_cannot_be_repaired_is_taken_out_whole(
     smoother: Smoother, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     none = np.zeros(0, np.int64)
-    monkeypatch.setattr(graph.smoother, "repair", lambda *_: Repair(none, none, none))
+    monkeypatch.setattr(
+        bmask_slam.graph.smoother.smoother, "repair", lambda *_: Repair(none, none, none)
+    )
     before = smoother.estimate()
     known = int(before.landmark_ids[3])
     estimate = smoother.update(

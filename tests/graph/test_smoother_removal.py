@@ -5,15 +5,15 @@ import pytest
 from graph_checks import assert_isam_matches_shadow, assert_same_optimum, filled
 from synthetic_room import CAMERA, Room, make_room
 
-from graph.geometry import inverse, se3_exp, se3_log
-from graph.smoother import Smoother
-from graph.updates import (
+from bmask_slam.graph.factors.graph_update import (
     GraphUpdate,
     Observations,
     RefusalReason,
     RelativePose,
     RemovalPolicy,
 )
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.smoother.smoother import Smoother
 
 ROOM = make_room(keyframes=8, points=80, noise_px=0.3)
 

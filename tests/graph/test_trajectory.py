@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from graph.trajectory import Trajectory, associate, associate_stamps, read_tum, write_tum
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.trajectory import Trajectory, associate, associate_stamps, read_tum, write_tum
 
 SHARED = Path(__file__).resolve().parents[2] / "../shared/data/trajectories"
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from graph.trajectory import Trajectory, write_tum
-from graph.trajectory_formats import (
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.graph.trajectory_formats import (
     read_euroc,
     read_kitti,
     read_times,

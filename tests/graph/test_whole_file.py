@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from graph.whole_file import whole_file
+from bmask_slam.graph.whole_file import whole_file
 
 
 def test_the_file_appears_at_the_end_of_the_block(tmp_path):

@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 import torch
 
-from graph.camera import Camera
-from graph.geometry import inverse, make_pose, se3_exp
-from mapping.inverse_depth import InverseDepthMap
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 
 CAMERA = Camera(40, 30, fx=38.0, fy=39.0, cx=19.2, cy=14.7, stereo_bf_px_m=3.0)
 

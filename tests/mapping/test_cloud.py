@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.geometry import make_pose, se3_exp
-from graph.ply import read_ply
-from mapping.cloud import BLOCK_VOXELS, _fused_labels, merged, spill
-from mapping.cloud_files import CloudWriter
-from mapping.labels import LabelTable, keyframe_labels
-from mapping.open3d_loader import load_open3d
-from mapping.pictures import palette
-from mapping.submaps import Submap
-from semantics.instances import Instance, certain, mask_box
-from semantics.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.geometry import make_pose, se3_exp
+from bmask_slam.mapping.open3d_loader import load_open3d
+from bmask_slam.mapping.products.cloud import BLOCK_VOXELS, _fused_labels, merged, spill
+from bmask_slam.mapping.products.cloud_files import CloudWriter
+from bmask_slam.mapping.products.pictures import palette
+from bmask_slam.mapping.products.submaps import Submap
+from bmask_slam.mapping.products.surface_labels import LabelTable, keyframe_labels
+from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 
 RNG = np.random.default_rng(0)
 VOXEL_M = 0.1

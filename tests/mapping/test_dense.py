@@ -7,8 +7,14 @@ from dataclasses import replace
 import numpy as np
 from surface_scene import CAMERA, noisy_map, poses
 
-from graph.geometry import Array, se3_exp
-from mapping.dense import WINDOW, DenseKeyframe, DenseMapper, FusedKeyframe, neighbours
+from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.mapping.inverse_depth.dense_mapper import (
+    WINDOW,
+    DenseKeyframe,
+    DenseMapper,
+    FusedKeyframe,
+    neighbours,
+)
 
 RGB = np.full((30, 40, 3), 100, np.uint8)
 

@@ -10,18 +10,23 @@ import pytest
 import torch
 from surface_scene import plane_rho
 
-from graph.camera import Camera
-from graph.geometry import inverse, se3_exp
-from mapping.inverse_depth import InverseDepthMap
-from mapping.matching_cost import (
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import inverse, se3_exp
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.inverse_depth.matching_cost import (
     GuidedFilter,
     MatchingConfig,
     matching_cost,
     support_weighted,
     winner,
 )
-from mapping.plane_sweep import SweepConfig, completed, shrunk_camera, sweep
-from mapping.stereo import checked, match_stereo
+from bmask_slam.mapping.inverse_depth.plane_sweep import (
+    SweepConfig,
+    completed,
+    shrunk_camera,
+    sweep,
+)
+from bmask_slam.mapping.inverse_depth.stereo import checked, match_stereo
 
 RNG = np.random.default_rng(8)
 CAMERA = Camera(96, 72, fx=90.0, fy=91.0, cx=47.0, cy=36.5, stereo_bf_px_m=9.0)

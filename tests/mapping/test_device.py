@@ -17,9 +17,15 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from graph.camera import Camera
-from mapping.dense import DenseConfig, DenseKeyframe, DenseMapper, DepthSource, FusedKeyframe
-from mapping.submaps import make_submap
+from bmask_slam.graph.camera import Camera
+from bmask_slam.mapping.inverse_depth.dense_mapper import (
+    DenseConfig,
+    DenseKeyframe,
+    DenseMapper,
+    DepthSource,
+    FusedKeyframe,
+)
+from bmask_slam.mapping.products.submaps import make_submap
 
 AWAY = "meta"
 """The one device that torch can name wherever it runs; nothing would be computed on it."""

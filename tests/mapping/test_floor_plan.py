@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graph.camera import Camera
-from graph.geometry import make_pose, so3_exp
-from mapping.cloud import Cloud
-from mapping.floor_plan import FloorPlan, floor_height, plan_frame, up_direction
-from mapping.pictures import EMPTY, Picture, palette, with_legend
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import make_pose, so3_exp
+from bmask_slam.mapping.products.cloud import Cloud
+from bmask_slam.mapping.products.floor_plan import FloorPlan, floor_height, plan_frame, up_direction
+from bmask_slam.mapping.products.pictures import EMPTY, Picture, palette, with_legend
 
 RNG = np.random.default_rng(4)
 

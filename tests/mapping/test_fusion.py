@@ -16,8 +16,9 @@ from surface_scene import (
     weighted,
 )
 
-from graph.geometry import inverse, make_pose, se3_exp, transform
-from mapping.fusion import (
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap, squared_gradient
+from bmask_slam.mapping.inverse_depth.fusion import (
     BLUR_PX,
     WRONG_SIDE,
     Fused,
@@ -27,9 +28,14 @@ from mapping.fusion import (
     stated,
     variance_factor,
 )
-from mapping.inverse_depth import InverseDepthMap, squared_gradient
-from mapping.regularisation import regularise
-from mapping.warping import JUMP_SIGMAS, MAX_APART_PX, View, hypothesis, project
+from bmask_slam.mapping.inverse_depth.regularisation import regularise
+from bmask_slam.mapping.inverse_depth.warping import (
+    JUMP_SIGMAS,
+    MAX_APART_PX,
+    View,
+    hypothesis,
+    project,
+)
 
 
 def read(given: InverseDepthMap, u: float, v: float, inner: bool):

@@ -6,12 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.geometry import se3_exp
-from graph.ply import read_ply
-from mapping.cloud import Cloud
-from mapping.labels import ASTRAY, MIN_LANDMARKS, OTHER_SHARE, InstanceEvidence, widened
-from mapping.object_clouds import MARGIN_M, ObjectClouds, ObjectRegion, owners
-from semantics.boxes3d import OrientedBox
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.mapping.products.cloud import Cloud
+from bmask_slam.mapping.products.object_clouds import MARGIN_M, ObjectClouds, ObjectRegion, owners
+from bmask_slam.mapping.products.surface_labels import (
+    ASTRAY,
+    MIN_LANDMARKS,
+    OTHER_SHARE,
+    InstanceEvidence,
+    widened,
+)
+from bmask_slam.semantics.objects.boxes3d import OrientedBox
 
 PRIOR = np.array([0.5, 1 / 6, 1 / 6, 1 / 6])
 

@@ -7,8 +7,13 @@ import pytest
 import torch
 from surface_scene import CAMERA
 
-from mapping.inverse_depth import COMPATIBLE, DepthNoise, agreement, from_sensor
-from mapping.pixelwise import gate, windowed
+from bmask_slam.mapping.inverse_depth.depth_map import (
+    COMPATIBLE,
+    DepthNoise,
+    agreement,
+    from_sensor,
+)
+from bmask_slam.mapping.inverse_depth.pixelwise import gate, windowed
 
 
 def test_a_gate_lets_through_what_is_not_negative() -> None:

@@ -7,8 +7,8 @@ import pytest
 import torch
 from surface_scene import as_map, compatible, largest_set, noisy_map, weighted
 
-from mapping.inverse_depth import InverseDepthMap
-from mapping.regularisation import OFFSETS, regularise, set_order
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.inverse_depth.regularisation import OFFSETS, regularise, set_order
 
 RNG = np.random.default_rng(3)
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from surface_scene import CAMERA, as_map, plane_rho, poses
 
-from graph.errors import InputError
-from graph.geometry import make_pose, se3_exp, transform
-from mapping.backprojection import back_project, surface_normals
-from mapping.dense import DenseKeyframe, FusedKeyframe
-from mapping.submaps import (
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import make_pose, se3_exp, transform
+from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, FusedKeyframe
+from bmask_slam.mapping.products.submaps import (
     make_submap,
     nearest_a_voxel,
     read_submap,

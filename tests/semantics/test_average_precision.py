@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from semantics.coco_files import CocoFile, read_coco
-from semantics.evaluation import (
+from bmask_slam.cli import main
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import CocoFile, read_coco
+from bmask_slam.semantics.instances.instances import Instance, as_annotation, certain, mask_box
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.segmenters.evaluation import (
     draw_precision_recall,
     evaluate_segmenter,
     format_segmentation,
 )
-from semantics.instances import Instance, as_annotation, certain, mask_box
-from semantics.labels import label_set
-from semantics.segmenter import CocoSegmenter, Image
-from slam.cli import main
+from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter, Image
 
 LABELS = label_set(["cup", "mouse"])
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graph.camera import Camera
-from graph.geometry import Array, se3_exp, transform
-from semantics.boxes3d import (
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, se3_exp, transform
+from bmask_slam.semantics.objects.boxes3d import (
     EDGES,
     OrientedBox,
     box_around,
@@ -16,8 +16,8 @@ from semantics.boxes3d import (
     upright_axes,
     without_noise,
 )
-from semantics.objects import pixel_rays
-from semantics.upright import Upright, sample_normals, up_direction
+from bmask_slam.semantics.objects.gravity import Upright, sample_normals, up_direction
+from bmask_slam.semantics.objects.object_map import pixel_rays
 
 T_B_A = se3_exp(np.array([0.7, -0.4, 1.9, 1.0, -2.0, 3.0]))
 UP = np.array([0.0, 0.0, 1.0])

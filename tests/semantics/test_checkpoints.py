@@ -17,8 +17,12 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from graph.errors import InputError
-from semantics.checkpoints import (
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.downloads import expected_sha256, fetch
+from bmask_slam.semantics.labels import label_set, read_label_set
+from bmask_slam.semantics.network.config import RESNET50, RESNET50_V2, NetworkConfig
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.weights.checkpoints import (
     PUBLISHED,
     TrainedNetwork,
     find_weights,
@@ -26,10 +30,6 @@ from semantics.checkpoints import (
     read_state,
     save_network,
 )
-from semantics.downloads import expected_sha256, fetch
-from semantics.labels import label_set, read_label_set
-from semantics.network.config import RESNET50, RESNET50_V2, NetworkConfig
-from semantics.network.model import MaskRCNN
 
 State = dict[str, Tensor]
 

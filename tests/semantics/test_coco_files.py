@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from semantics.coco_files import read_coco
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import read_coco
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 SQUARE = [2.0, 3.0, 6.0, 3.0, 6.0, 9.0, 2.0, 9.0]

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from semantics.network.box_head import ClassifiedBoxes
-from semantics.network.config import ImageConfig, NetworkConfig
-from semantics.network.mask_heads import expected_iou
-from semantics.network.model import MaskRCNN
-from semantics.network.paste import paste
-from semantics.network_segmenter import segment_both_ways
-from semantics.training.detected import (
+from bmask_slam.semantics.network.box_head import ClassifiedBoxes
+from bmask_slam.semantics.network.config import ImageConfig, NetworkConfig
+from bmask_slam.semantics.network.mask_heads import expected_iou
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.network.paste import paste
+from bmask_slam.semantics.segmenters.network_segmenter import segment_both_ways
+from bmask_slam.semantics.training.detected import (
     DetectedConfig,
     Examples,
     _judged,
@@ -22,7 +22,7 @@ from semantics.training.detected import (
     mask_iou,
     train_maskiou,
 )
-from semantics.training.targets import Target
+from bmask_slam.semantics.training.targets import Target
 
 TINY = NetworkConfig(
     classes=3, backbone="mobilenet_v2", norm="none", channels=8, box_hidden=8, mask_channels=8,

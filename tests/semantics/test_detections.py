@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graph.camera import Camera
-from semantics.detections import DetectionConfig, Detections, detect
-from semantics.instances import Instance, certain, mask_box
-from semantics.objects import pixel_rays
-from semantics.votes import VoteConfig, claim_pixels
+from bmask_slam.graph.camera import Camera
+from bmask_slam.semantics.beliefs.votes import VoteConfig, claim_pixels
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.objects.detections import DetectionConfig, Detections, detect
+from bmask_slam.semantics.objects.object_map import pixel_rays
 
 CAMERA = Camera(width=120, height=90, fx=100.0, fy=100.0, cx=59.5, cy=44.5)
 SIZE = (90, 120)

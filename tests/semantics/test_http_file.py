@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from range_server import Served, serve
 
-from graph.errors import InputError
-from semantics import http_file
-from semantics.http_file import WebFile, download
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics import http_file
+from bmask_slam.semantics.http_file import WebFile, download
 
 CONTENT = bytes(range(256)) * 4000
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.geometry import so3_exp
-from semantics.instance_track import Sighting
-from semantics.instance_tracks import InstanceTracks, TrackConfig
+from bmask_slam.graph.geometry import so3_exp
+from bmask_slam.semantics.tracks.instance_track import Sighting
+from bmask_slam.semantics.tracks.instance_tracks import InstanceTracks, TrackConfig
 
 SIZE = np.array([0.25, 0.9, 0.2])
 PERSON, CHAIR = np.eye(3, dtype=np.float32)[1:]

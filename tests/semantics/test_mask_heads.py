@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import torch
 
-from semantics.network.config import NetworkConfig
-from semantics.network.mask_heads import MaskIoUHead, expected_iou
-from semantics.network.model import RoIHeads
-from semantics.network.roi_align import feature_table
+from bmask_slam.semantics.network.config import NetworkConfig
+from bmask_slam.semantics.network.mask_heads import MaskIoUHead, expected_iou
+from bmask_slam.semantics.network.model import RoIHeads
+from bmask_slam.semantics.network.roi_align import feature_table
 
 CONFIG = NetworkConfig(
     classes=3, channels=6, box_hidden=8, mask_channels=5, maskiou_channels=4, maskiou_hidden=8

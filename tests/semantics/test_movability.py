@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from semantics.labels import label_set
-from semantics.movability import MovabilityConfig, MovabilityFilter, read_priors
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.beliefs.movability import MovabilityConfig, MovabilityFilter, read_priors
+from bmask_slam.semantics.labels import label_set
 
 IDS = np.array([3, 2000])
 

@@ -7,14 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from graph.array_file import Arrays
-from graph.camera import Camera
-from graph.geometry import Array, se3_exp, transform
-from semantics.instances import Instance, certain, mask_box
-from semantics.label_store import LabelStoreConfig
-from semantics.object_association import AssociationConfig, Evidence, Overlap, assign
-from semantics.objects import KeyframeView, MapObject, ObjectConfig, ObjectMap, pixel_rays
-from semantics.votes import VoteConfig, claim_pixels
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array, se3_exp, transform
+from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
+from bmask_slam.semantics.beliefs.votes import VoteConfig, claim_pixels
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.objects.association import AssociationConfig, Evidence, Overlap, assign
+from bmask_slam.semantics.objects.object_map import (
+    KeyframeView,
+    MapObject,
+    ObjectConfig,
+    ObjectMap,
+    pixel_rays,
+)
 
 CAMERA = Camera(320, 240, fx=260.0, fy=262.0, cx=160.5, cy=119.0)
 SIZE = (240, 320)

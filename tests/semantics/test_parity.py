@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from random_weights import picture, random_boxes, random_state
 
-from semantics.network import boxes as box_ops
-from semantics.network.anchors import make_anchors
-from semantics.network.config import (
+from bmask_slam.semantics.network import boxes as box_ops
+from bmask_slam.semantics.network.anchors import make_anchors
+from bmask_slam.semantics.network.config import (
     RESNET50,
     RESNET50_V2,
     RESNET101,
@@ -24,11 +24,11 @@ from semantics.network.config import (
     NetworkConfig,
     ProposalConfig,
 )
-from semantics.network.images import prepare
-from semantics.network.model import MaskRCNN
-from semantics.network.nms import grouped_nms, nms
-from semantics.network.paste import paste
-from semantics.network.roi_align import assign_levels, feature_table, roi_align
+from bmask_slam.semantics.network.images import prepare
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.network.nms import grouped_nms, nms
+from bmask_slam.semantics.network.paste import paste
+from bmask_slam.semantics.network.roi_align import assign_levels, feature_table, roi_align
 
 TOLERANCE = 1e-4
 GOLDEN: Mapping[str, NDArray] = dict(np.load(Path(__file__).parent / "golden.npz"))

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from semantics.instances import Instance, certain, mask_box
-from semantics.ray_segmenter import RaySegmenter
-from semantics.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.segmenters.ray_segmenter import RaySegmenter
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 ray = pytest.importorskip("ray", reason="needs Ray: pip install 'bmask-slam[ray]'")
 

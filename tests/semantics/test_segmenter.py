@@ -11,17 +11,20 @@ import numpy as np
 import pytest
 import torch
 
-from graph.errors import InputError
-from semantics.checkpoints import TrainedNetwork, save_network
-from semantics.instances import Instance, as_annotation, certain, mask_box
-from semantics.labels import label_set
-from semantics.mask_cache import ANNOTATIONS, CacheOptions, cache_masks
-from semantics.network.box_head import ClassifiedBoxes
-from semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
-from semantics.network.model import Detections, MaskRCNN
-from semantics.network_segmenter import NetworkSegmenter, as_instances, segment_both_ways
-from semantics.overlay import draw
-from semantics.segmenter import (
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.instances import Instance, as_annotation, certain, mask_box
+from bmask_slam.semantics.instances.overlay import draw
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.network.box_head import ClassifiedBoxes
+from bmask_slam.semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
+from bmask_slam.semantics.network.model import Detections, MaskRCNN
+from bmask_slam.semantics.segmenters.mask_cache import ANNOTATIONS, CacheOptions, cache_masks
+from bmask_slam.semantics.segmenters.network_segmenter import (
+    NetworkSegmenter,
+    as_instances,
+    segment_both_ways,
+)
+from bmask_slam.semantics.segmenters.segmenter import (
     CocoSegmenter,
     Image,
     LabelImageSegmenter,
@@ -29,7 +32,8 @@ from semantics.segmenter import (
     Segmenter,
     check_image,
 )
-from semantics.segmenter_table import NAMES, SegmenterOptions, make_segmenter
+from bmask_slam.semantics.segmenters.segmenter_table import NAMES, SegmenterOptions, make_segmenter
+from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, save_network
 
 LABELS = label_set(["cup", "mouse"])
 TINY = NetworkConfig(

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from semantics.checkpoints import TrainedNetwork, load_network
-from semantics.labels import label_set, read_label_set
-from semantics.network.config import LIGHT, AnchorConfig
-from semantics.network.model import MaskRCNN
-from semantics.training.transfer import transferred
-from slam.cli import main
+from bmask_slam.cli import main
+from bmask_slam.semantics.labels import label_set, read_label_set
+from bmask_slam.semantics.network.config import LIGHT, AnchorConfig
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.training.transfer import transferred
+from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, load_network
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from semantics.checkpoints import load_mobilenet
-from semantics.network.box_head import ClassifiedBoxes
-from semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
-from semantics.network.model import MaskRCNN
-from semantics.network.paste import paste
-from semantics.training.losses import Only, dice_loss, network_losses
-from semantics.training.targets import (
+from bmask_slam.semantics.network.box_head import ClassifiedBoxes
+from bmask_slam.semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.network.paste import paste
+from bmask_slam.semantics.training.losses import Only, dice_loss, network_losses
+from bmask_slam.semantics.training.targets import (
     BOX_RULE,
     IGNORED,
     NOTHING,
@@ -28,6 +27,7 @@ from semantics.training.targets import (
     mask_targets,
     match,
 )
+from bmask_slam.semantics.weights.checkpoints import load_mobilenet
 
 WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "data" / "weights"
 TINY = NetworkConfig(

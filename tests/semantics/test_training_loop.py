@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from graph.errors import InputError
-from semantics.checkpoints import TrainedNetwork, load_mobilenet, load_network
-from semantics.coco_files import CocoFile, read_coco
-from semantics.instances import Instance, as_annotation, certain, mask_box
-from semantics.labels import label_set, read_label_set
-from semantics.network.config import ImageConfig, NetworkConfig
-from semantics.network.model import MaskRCNN
-from semantics.training.dataset import (
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import CocoFile, read_coco
+from bmask_slam.semantics.instances.instances import Instance, as_annotation, certain, mask_box
+from bmask_slam.semantics.labels import label_set, read_label_set
+from bmask_slam.semantics.network.config import ImageConfig, NetworkConfig
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.training.dataset import (
     AugmentConfig,
     Dataset,
     JoinedDatasets,
@@ -32,7 +31,7 @@ from semantics.training.dataset import (
     scaled,
     split,
 )
-from semantics.training.loop import (
+from bmask_slam.semantics.training.loop import (
     CURVES,
     STATE,
     Only,
@@ -41,6 +40,7 @@ from semantics.training.loop import (
     train,
     trainable,
 )
+from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, load_mobilenet, load_network
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 LABELS = label_set(["cup", "mouse"])

@@ -7,10 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from semantics.instances import Instance, certain, mask_box
-from semantics.labels import label_set
-from semantics.votes import VoteConfig, check_instances, claim_pixels, grouped_median, vote
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.beliefs.votes import (
+    VoteConfig,
+    check_instances,
+    claim_pixels,
+    grouped_median,
+    vote,
+)
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.labels import label_set
 
 SIZE = (120, 160)
 LABELS = label_set(("chair", "desk", "cup"))

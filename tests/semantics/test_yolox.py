@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from graph.errors import InputError
-from semantics.coco_files import read_coco
-from semantics.image_files import read_colour
-from semantics.labels import label_set, read_label_set
-from semantics.network.boxes import iou
-from semantics.yolox import STRIDES, YoloxConfig, YoloxDetector, decode, letterbox, voted
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import read_coco
+from bmask_slam.semantics.instances.image_files import read_colour
+from bmask_slam.semantics.labels import label_set, read_label_set
+from bmask_slam.semantics.network.boxes import iou
+from bmask_slam.semantics.segmenters.yolox import (
+    STRIDES,
+    YoloxConfig,
+    YoloxDetector,
+    decode,
+    letterbox,
+    voted,
+)
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 ONNX = SHARED / "weights" / "yolox_nano.onnx"

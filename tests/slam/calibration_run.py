@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp, transform
-from graph.ply import write_ply
-from graph.shadow import Shadow
-from graph.storage import write_graph
-from graph.trajectory import Trajectory, write_tum
-from graph.updates import Observations
-from slam.rendering.writer import stored_depth, write_lists, write_png
-from slam.rolling_shutter import share_of_rows
-from slam.sequences import write_camera
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.graph_update import Observations
+from bmask_slam.graph.files.ply import write_ply
+from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp, transform
+from bmask_slam.graph.smoother.storage import write_graph
+from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.rendering.writer import stored_depth, write_lists, write_png
+from bmask_slam.sequences import write_camera
+from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 HALF_ROOM_M = np.array([1.6, 1.3, 1.7])
 STEP_S, KEYFRAME_STEP_S = 1 / 30, 0.2

@@ -10,13 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from graph.array_file import Arrays
-from graph.camera import Camera
-from graph.trajectory import Trajectory, write_tum
-from slam.frame import Frame
-from slam.landmark_cloud import LandmarkCloud
-from slam.results import FrameResult, TrackingStatus
-from slam.system_config import SystemConfig
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 CAMERA = "{width: 32, height: 24, fx: 30, fy: 31, cx: 15, cy: 12, depth_scale: 1000, fps: 10}\n"
 FPS_HZ = 10.0

@@ -15,8 +15,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from synthetic_view import CAMERA, render_plane
 
-from graph.geometry import se3_exp
-from slam.frame import Frame
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.sequences.frame import Frame
 
 STEP_S = 1 / 30
 BEGIN_S = 1305031102.0

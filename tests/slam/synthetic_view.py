@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, se3_exp, transform
-from slam.features import Features
-from slam.frame import Frame
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 CAMERA = Camera(640, 480, fx=525.0, fy=520.0, cx=318.5, cy=241.5)
 T_NEW_OLD = se3_exp(np.array([0.4, -1.1, 0.7, 3.0, -5.0, 2.0]))

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from calibration_run import camera_path, make_run, room_depth
 
-from graph.calibration_model import TIME
-from graph.camera import Camera
-from graph.errors import InputError
-from slam import cli
-from slam.calibrate import CalibrateOptions, calibrate_run, sequence_of
-from slam.calibration_report import format_calibration
-from slam.calibration_views import raw_pixels, smooth_value
-from slam.features import undistort
-from slam.rendering.sequence import RenderConfig, render_sequence
-from slam.sequences import open_sequence, read_camera, write_camera
+from bmask_slam import cli
+from bmask_slam.calibration.calibrate import CalibrateOptions, calibrate_run, sequence_of
+from bmask_slam.calibration.report import format_calibration
+from bmask_slam.calibration.views import raw_pixels, smooth_value
+from bmask_slam.features.brisk import undistort
+from bmask_slam.graph.calibration.model import TIME
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.sequences import open_sequence, read_camera, write_camera
 
 TRUTH = Camera(320, 240, 262.0, 260.0, 158.0, 121.0, depth_scale=5000.0, depth_offset_m=0.015)
 WRONG = dataclasses.replace(

@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence, signal_at
 
-from graph.errors import InputError
-from slam import run_results
-from slam.run_folder import CHECKPOINT, FILES, RunFolder
-from slam.runner import RunOptions, resume, run
-from slam.system_config import SystemConfig
-from slam.tracker import TrackingConfig
+from bmask_slam.graph.errors import InputError
+from bmask_slam.offline.runner import RunOptions, resume, run
+from bmask_slam.run_folder import metrics as run_results
+from bmask_slam.run_folder.folder import CHECKPOINT, FILES, RunFolder
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.tracker import TrackingConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 KITCHEN = ROOT.parent / "shared/data/redkitchen"
@@ -281,7 +281,9 @@ def test_a_run_without_checkpoints_cannot_be_resumed(sequence: Path, tmp_path: P
 def kill_after_lines(command: list[str], frames: Path, lines: int, delay_s: float) -> None:
     """Start the program and kill it soon after frames.csv has so many lines."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-m", "slam", *command], env=environment) as process:
+    with subprocess.Popen(
+        [sys.executable, "-m", "bmask_slam", *command], env=environment
+    ) as process:
         while process.poll() is None:
             if frames.exists() and frames.read_bytes().count(b"\n") >= lines:
                 time.sleep(delay_s)

@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 from fake_run import make_sequence, true_trajectory
 
-import slam.rendering.sequence
-from graph.data_files import data_path
-from graph.errors import InputError
-from graph.trajectory import write_tum
-from slam import cli
-from slam.configuration import resolve
-from slam.rendering.sequence import SCENES, RenderConfig
-from slam.runner import RunSummary
-from slam.system_config import SystemConfig
+import bmask_slam.rendering.sequence
+from bmask_slam import cli
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import write_tum
+from bmask_slam.offline.runner import RunSummary
+from bmask_slam.rendering.sequence import SCENES, RenderConfig
+from bmask_slam.system_config import SystemConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = ("run", "evaluate", "render", "info", "optimise", "export", "calibrate")
@@ -44,7 +44,7 @@ def sequence(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("arguments", [["--help"], *([c, "--help"] for c in COMMANDS)])
 def test_help_answers_in_half_a_second_without_heavy_imports(arguments: list[str]) -> None:
     code = (
-        "import sys; from slam.cli import main\n"
+        "import sys; from bmask_slam.cli import main\n"
         f"try: main({arguments!r})\n"
         "finally: print({'numpy', 'cv2', 'gtsam', 'open3d', 'yaml'} & set(sys.modules))"
     )
@@ -62,13 +62,13 @@ def test_help_answers_in_half_a_second_without_heavy_imports(arguments: list[str
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(capsys, "--version") == (0, f"bmask-slam {slam.__version__}\n", "")
+    assert call(capsys, "--version") == (0, f"bmask-slam {bmask_slam.__version__}\n", "")
 
 
 def test_python_m_slam() -> None:
-    command = [sys.executable, "-m", "slam", "--version"]
+    command = [sys.executable, "-m", "bmask_slam", "--version"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout == f"bmask-slam {slam.__version__}\n"
+    assert done.stdout == f"bmask-slam {bmask_slam.__version__}\n"
 
 
 def test_no_command_and_a_wrong_one(capsys: pytest.CaptureFixture[str]) -> None:
@@ -192,7 +192,7 @@ def test_render_options_reach_the_renderer(capsys, monkeypatch, tmp_path: Path) 
         progress(2, 2)
         return out
 
-    monkeypatch.setattr(slam.rendering.sequence, "render_sequence", render)
+    monkeypatch.setattr(bmask_slam.rendering.sequence, "render_sequence", render)
     options = [
         "--frames",
         "2",
@@ -244,10 +244,10 @@ def test_unknown_errors_keep_their_traceback(monkeypatch) -> None:
 def test_a_stopped_run_says_so(capsys, monkeypatch, sequence: Path) -> None:
     import signal
 
-    import slam.runner
+    import bmask_slam.offline.runner
 
     summary = RunSummary(Path("r"), [], 7, 2, signal.SIGTERM)
-    monkeypatch.setattr(slam.runner, "run", lambda options: summary)
+    monkeypatch.setattr(bmask_slam.offline.runner, "run", lambda options: summary)
     status, output, _ = call(capsys, "run", sequence)
     assert status == 143
     assert "Stopped by SIGTERM after 7 frames; all is saved" in output
@@ -255,7 +255,7 @@ def test_a_stopped_run_says_so(capsys, monkeypatch, sequence: Path) -> None:
 
 
 def test_a_reader_that_goes_away_is_no_error(sequence: Path) -> None:
-    command = f"{sys.executable} -m slam info {sequence} | true; exit ${{PIPESTATUS[0]}}"
+    command = f"{sys.executable} -m bmask_slam info {sequence} | true; exit ${{PIPESTATUS[0]}}"
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         ["bash", "-c", command], env=environment, capture_output=True, text=True, check=False

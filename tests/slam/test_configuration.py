@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graph.data_files import data_path
-from graph.errors import InputError
-from slam.configuration import dump, find_config, resolve
+from bmask_slam.config.configuration import dump, find_config, resolve
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
 
 
 class Kernel(Enum):

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from slam.covariances import KeyframeCovariances, read_covariances, write_covariances
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.run_folder.covariance_file import (
+    KeyframeCovariances,
+    read_covariances,
+    write_covariances,
+)
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 
 
 def example(count: int = 4) -> KeyframeCovariances:

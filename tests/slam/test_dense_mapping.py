@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from true_run import FRAMES, make_run
 
-from graph.array_file import nested
-from graph.errors import InputError
-from graph.geometry import inverse, transform
-from graph.ply import read_ply
-from semantics.label_store import LabelStore
-from semantics.segmenter import CocoSegmenter
-from slam.cli import main
-from slam.dense_folder import DenseFolder
-from slam.dense_input import MappedRun, load, open_run
-from slam.map_file import read_map, write_map
-from slam.rendering.sequence import RenderConfig, render_sequence
-from slam.sequences import open_sequence
+from bmask_slam.cli import main
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.input import MappedRun, load, open_run
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import nested
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.run_folder.map_file import read_map, write_map
+from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter
+from bmask_slam.sequences import open_sequence
 
 
 def shares_of(run: Path) -> dict[str, float]:
@@ -194,7 +194,7 @@ def test_a_full_disk_stops_with_what_was_written(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = make_run(tmp_path / "run", open_sequence(room))
-    import slam.dense_folder as module
+    import bmask_slam.dense.folder as module
 
     write, count = module.write_submap, 0
 

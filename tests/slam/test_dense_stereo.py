@@ -15,24 +15,24 @@ import yaml
 from numpy.typing import NDArray
 from true_run import make_run
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.geometry import Array, make_pose
-from semantics.instances import Instance, certain, mask_box
-from semantics.labels import label_set
-from slam.cli import main
-from slam.dense_folder import DenseFolder
-from slam.dense_input import open_run
-from slam.dense_mapping import assembled, fuse_run
-from slam.dense_options import MapOptions
-from slam.rendering import office
-from slam.rendering.builder import SceneBuilder
-from slam.rendering.path import camera_poses
-from slam.rendering.raycast import Renderer, to_image
-from slam.rendering.scene import build_scene
-from slam.rendering.writer import stored_depth, write_lists, write_png
-from slam.right_images import read_right_images
-from slam.sequences import open_sequence, write_camera
+from bmask_slam.cli import main
+from bmask_slam.dense.assembly import assembled, fuse_run
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.input import open_run
+from bmask_slam.dense.options import MapOptions
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, make_pose
+from bmask_slam.rendering.engine.builder import SceneBuilder
+from bmask_slam.rendering.engine.path import camera_poses
+from bmask_slam.rendering.engine.raycast import Renderer, to_image
+from bmask_slam.rendering.engine.scene import build_scene
+from bmask_slam.rendering.rooms import office
+from bmask_slam.rendering.writer import stored_depth, write_lists, write_png
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.sequences import open_sequence, write_camera
+from bmask_slam.sequences.right_images import read_right_images
 
 CAMERA = Camera(240, 180, fx=197.0, fy=197.0, cx=119.5, cy=89.5, stereo_bf_px_m=25.0)
 COUNT = 5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.depth_regions import DepthRegionConfig, depth_regions
+from bmask_slam.moving.depth_segments import DepthRegionConfig, depth_regions
 
 CONFIG = DepthRegionConfig(step_px=8, least=3, share=0.2)
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from synthetic_view import render_plane
 
-from graph.geometry import se3_exp
-from slam.description import FixedSizeBrisk, box_kernel
-from slam.matching import hamming
+from bmask_slam.features.fixed_size_descriptor import FixedSizeBrisk, box_kernel
+from bmask_slam.features.matching import hamming
+from bmask_slam.graph.geometry import se3_exp
 
 SIZES_PX = (12.0, 18.0)
 NOISE = np.random.default_rng(2).integers(0, 256, (480, 640)).astype(np.uint8)

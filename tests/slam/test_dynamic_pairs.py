@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.frame import Frame
-from slam.system_config import SystemConfig
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))

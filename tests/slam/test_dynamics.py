@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, TEXTURE, render_plane
 
-from graph.geometry import Array, inverse, se3_exp, transform
-from semantics.instance_track import Sighting
-from semantics.instances import Instance, certain, mask_box
-from semantics.labels import label_set
-from semantics.segmenter import Image
-from slam.configuration import resolve
-from slam.dynamics import Sifted
-from slam.features import Features
-from slam.frame import Frame
-from slam.results import TrackingStatus
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.moving.moving_object_filter import Sifted
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.segmenters.segmenter import Image
+from bmask_slam.semantics.tracks.instance_track import Sighting
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import TrackingStatus
 
 CARD_Z_M = 1.3
 FRAMES = 36

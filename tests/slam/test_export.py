@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph.camera import Camera
-from graph.g2o_landmarks_reader import read_landmark_graph
-from graph.geometry import inverse, se3_exp, transform
-from graph.ply import read_ply, write_ply
-from graph.shadow import Shadow
-from graph.storage import write_graph
-from graph.trajectory import Trajectory, write_tum
-from graph.trajectory_formats import read_times, read_trajectory
-from graph.updates import Observations
-from slam import cli
+from bmask_slam import cli
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.graph_update import Observations
+from bmask_slam.graph.files.ply import read_ply, write_ply
+from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.graph.smoother.storage import write_graph
+from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.graph.trajectory_formats import read_times, read_trajectory
 
 CAMERA = Camera(640, 480, 520.0, 525.0, 320.0, 240.0)
 STAMPS_S = np.arange(6) / 10

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, se3_exp, transform
-from slam.depth_regions import DepthRegionConfig
-from slam.feature_check import FeatureCheck
-from slam.features import Features
-from slam.frame import Frame
-from slam.static_check import DepthView, StaticCheck, StaticCheckConfig, depth_view
-from slam.view_memory import PosedView
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.moving.depth_segments import DepthRegionConfig
+from bmask_slam.moving.depth_view_buffer import PosedView
+from bmask_slam.moving.feature_motion import FeatureCheck
+from bmask_slam.moving.free_space_check import DepthView, StaticCheck, StaticCheckConfig, depth_view
+from bmask_slam.sequences.frame import Frame
 
 CAMERA = Camera(640, 480, fx=525.0, fy=480.0, cx=319.5, cy=239.5, fps=30.0, stereo_bf_px_m=40.0)
 

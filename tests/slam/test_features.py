@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, PLANE_Z_M, render_plane
 
-from graph.camera import Camera
-from graph.geometry import make_pose, se3_exp, so3_exp
-from slam.features import (
+from bmask_slam.features.brisk import (
     BriskExtractor,
     FeatureConfig,
     Features,
@@ -18,8 +16,10 @@ from slam.features import (
     spread_order,
     undistort,
 )
-from slam.frame import Frame
-from slam.matching import hamming
+from bmask_slam.features.matching import hamming
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import make_pose, se3_exp, so3_exp
+from bmask_slam.sequences.frame import Frame
 
 RNG = np.random.default_rng(4)
 CONFIG = FeatureConfig()

@@ -12,10 +12,7 @@ from synthetic_view import (
     random_descriptors,
 )
 
-from graph.geometry import Array, inverse, se3_exp, se3_log, transform
-from graph.smoother import Smoother
-from graph.updates import GraphEstimate, GraphUpdate
-from slam.graph_feed import (
+from bmask_slam.back_end.factor_selection import (
     GraphFeed,
     GraphFeedConfig,
     observations_of,
@@ -23,7 +20,10 @@ from slam.graph_feed import (
     read_back,
     stereo_measurements,
 )
-from slam.world_map import WorldMap
+from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.world.world_map import WorldMap
 
 RNG = np.random.default_rng(21)
 COUNT = 60

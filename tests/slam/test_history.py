@@ -3,9 +3,9 @@
 import numpy as np
 from synthetic_view import add_keyframe, make_features
 
-from graph.geometry import Array, inverse, se3_exp
-from slam.history import FrameHistory
-from slam.world_map import WorldMap
+from bmask_slam.graph.geometry import Array, inverse, se3_exp
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.world_map import WorldMap
 
 RNG = np.random.default_rng(6)
 NO_FEATURES = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))

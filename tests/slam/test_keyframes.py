@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from slam.keyframes import KeyframeConfig, KeyframeEvidence, keyframe_reason
+from bmask_slam.tracking.keyframe_decision import KeyframeConfig, KeyframeEvidence, keyframe_reason
 
 # Numbers of their own, so that the tables do not follow the defaults about.
 ORB = KeyframeConfig(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from test_semantic_mapping import FRAMES, MANY_KEYFRAMES, Sides, estimates, right_share, run
 
-from slam import label_votes
+from bmask_slam.labelling import landmark_votes as label_votes
 
 
 def test_keyframes_vote_on_what_is_made_after_them(monkeypatch: pytest.MonkeyPatch) -> None:

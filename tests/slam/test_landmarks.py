@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from graph.geometry import inverse, se3_exp, transform
-from slam.landmarks import LandmarkTable
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.world.landmark_table import LandmarkTable
 
 RNG = np.random.default_rng(8)
 

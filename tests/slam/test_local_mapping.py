@@ -13,8 +13,7 @@ from synthetic_view import (
     random_descriptors,
 )
 
-from graph.geometry import Array, se3_exp
-from slam.local_mapping import (
+from bmask_slam.back_end.landmark_management import (
     MappingConfig,
     create_landmarks,
     cull_landmarks,
@@ -22,8 +21,9 @@ from slam.local_mapping import (
     local_landmarks,
     redundant_keyframe,
 )
-from slam.tracker import Tracker, TrackingConfig
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 CONFIG = MappingConfig()
 TRACKER = Tracker(CAMERA, TrackingConfig())

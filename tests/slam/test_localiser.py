@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from synthetic_view import T_NEW_OLD, add_keyframe, make_features
 
-from graph.geometry import Array, se3_exp, se3_log
-from slam.features import Features
-from slam.local_mapping import MappingConfig
-from slam.localiser import Localiser
-from slam.place_recognition import DescriptorIndex
-from slam.relocalisation import RelocalisationConfig
-from slam.results import TrackingStatus
-from slam.rolling_shutter import PreviousPose
-from slam.tracker import Tracked, lost, untracked
-from slam.world_map import WorldMap
+from bmask_slam.back_end.landmark_management import MappingConfig
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.geometry import Array, se3_exp, se3_log
+from bmask_slam.loops.place_recognition import DescriptorIndex
+from bmask_slam.tracking.camera_tracker import Localiser
+from bmask_slam.tracking.relocalisation import RelocalisationConfig
+from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.tracking.rolling_shutter import PreviousPose
+from bmask_slam.tracking.tracker import Tracked, lost, untracked
+from bmask_slam.world.world_map import WorldMap
 
 STEP = se3_exp(np.array([0.05, -0.1, 0.2, 0.3, 0.1, -0.2]))
 NO_IDS = np.zeros(0, np.int64)

@@ -8,17 +8,25 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, add_keyframe, make_features, random_descriptors
 
-import slam.mapper
-from graph.geometry import Array, inverse, make_pose, se3_exp, se3_log, so3_exp, transform
-from graph.smoother_config import SmootherConfig
-from graph.updates import RelativePoseErrors
-from slam.graph_feed import GraphFeedConfig
-from slam.local_mapping import MappingConfig
-from slam.loop_closing import LoopCloser, LoopClosingConfig
-from slam.loop_verification import LoopConstraint
-from slam.mapper import Mapper
-from slam.tracker import Tracker, TrackingConfig
-from slam.world_map import Keyframe, WorldMap
+import bmask_slam.back_end.mapper
+from bmask_slam.back_end.factor_selection import GraphFeedConfig
+from bmask_slam.back_end.landmark_management import MappingConfig
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.factors.graph_update import RelativePoseErrors
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.geometry import (
+    Array,
+    inverse,
+    make_pose,
+    se3_exp,
+    se3_log,
+    so3_exp,
+    transform,
+)
+from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 STEP_RAD = np.deg2rad(10.0)
 ONCE_ROUND = 36
@@ -280,7 +288,7 @@ def test_keyframes_at_the_ends_of_loops_are_never_culled(monkeypatch: pytest.Mon
     def remember(_: WorldMap, candidates: list[Keyframe], __: MappingConfig) -> None:
         offered.extend(k.id for k in candidates)
 
-    monkeypatch.setattr(slam.mapper, "redundant_keyframe", remember)
+    monkeypatch.setattr(bmask_slam.back_end.mapper, "redundant_keyframe", remember)
     newest, _ = ring.step()
     world = ring.mapper.world
     ends = {end for loop in loops for end in loop.ends}

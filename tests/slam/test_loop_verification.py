@@ -16,8 +16,8 @@ from synthetic_view import (
     random_descriptors,
 )
 
-from graph.geometry import Array, inverse, se3_exp, se3_log, transform
-from slam.loop_verification import (
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.loops.verification import (
     LoopConfig,
     LoopConstraint,
     LoopView,
@@ -27,7 +27,7 @@ from slam.loop_verification import (
     loop_view,
     verify_loop,
 )
-from slam.world_map import WorldMap
+from bmask_slam.world.world_map import WorldMap
 
 T_WORLD_A = se3_exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, -0.5]))
 T_A_B = se3_exp(np.array([0.06, -0.09, 0.25, 0.15, -0.1, 0.2]))

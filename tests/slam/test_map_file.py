@@ -11,16 +11,16 @@ import pytest
 from fake_run import FakeSystem, make_sequence
 from synthetic_view import CAMERA, render_plane
 
-from graph.array_file import Arrays, read_arrays, write_arrays
-from graph.errors import InputError
-from graph.geometry import Array, inverse, se3_exp, se3_log
-from graph.trajectory import read_tum
-from slam.map_file import MAP_FILE, read_map, write_map
-from slam.map_localisation import MapLocalisation
-from slam.results import FrameResult, TrackingStatus
-from slam.run_folder import FILES
-from slam.runner import RunOptions, run
-from slam.system import SlamSystem
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import Arrays, read_arrays, write_arrays
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.offline.map_localisation import MapLocalisation
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.run_folder.folder import FILES
+from bmask_slam.run_folder.map_file import MAP_FILE, read_map, write_map
+from bmask_slam.system import SlamSystem
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/redkitchen"
 

@@ -17,17 +17,17 @@ from synthetic_view import (
     render_plane,
 )
 
-from graph.geometry import Array, se3_exp
-from graph.smoother import Smoother
-from graph.updates import GraphUpdate, RelativePose, RemovalPolicy
-from slam.configuration import resolve
-from slam.graph_feed import GraphFeed, GraphFeedConfig, read_back
-from slam.map_pruning import KeptReason, MapPruner, MaskScope, covered
-from slam.map_state import world_of, world_state
-from slam.results import TrackingStatus
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.back_end.factor_selection import GraphFeed, GraphFeedConfig, read_back
+from bmask_slam.back_end.pruning import KeptReason, MapPruner, MaskScope, covered
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose, RemovalPolicy
+from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.world.map_state import world_of, world_state
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 COUNT = 60
 VIEW, LANDMARKS = MaskScope.VIEW, MaskScope.LANDMARKS

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 from synthetic_view import CAMERA, add_keyframe, make_features, points_before, random_descriptors
 
-from graph.geometry import se3_exp
-from graph.smoother_config import SmootherConfig
-from slam.graph_feed import GraphFeedConfig
-from slam.local_mapping import MappingConfig
-from slam.loop_closing import LoopClosingConfig
-from slam.mapper import Mapper
-from slam.tracker import Tracker, TrackingConfig
+from bmask_slam.back_end.factor_selection import GraphFeedConfig
+from bmask_slam.back_end.landmark_management import MappingConfig
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.loops.closing import LoopClosingConfig
+from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 
 ALONE = 3
 """Points that each keyframe sees alone."""

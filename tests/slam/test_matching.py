@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slam.matching import (
+from bmask_slam.features.matching import (
     MatchConfig,
     Matches,
     WindowIndex,

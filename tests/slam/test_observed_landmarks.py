@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from synthetic_view import CAMERA
 
-from graph.geometry import inverse, se3_exp, transform
-from slam.observed_landmarks import Located
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.labelling.landmark_visibility import Located
 
 POSE = se3_exp(np.array([0.1, -0.3, 0.05, 0.4, -0.2, 0.3]))
 

@@ -6,8 +6,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from graph.g2o import read_g2o
-from slam import cli
+from bmask_slam import cli
+from bmask_slam.graph.g2o.pose_graphs import read_g2o
 
 SIDE = 8
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from synthetic_view import random_descriptors
 
-from slam.matching import Bits, hamming
-from slam.place_recognition import (
+from bmask_slam.features.matching import Bits, hamming
+from bmask_slam.loops.place_recognition import (
     DescriptorIndex,
     IndexConfig,
     PlaceConfig,

@@ -5,14 +5,14 @@ import pytest
 from scipy.stats import chi2
 from synthetic_view import CAMERA, T_NEW_OLD, points_before
 
-from graph.geometry import Array, inverse, se3_exp, se3_log, transform
-from slam.pose_optimisation import (
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.tracking.pose_optimisation import (
     PoseOptimisationConfig,
     jacobian,
     optimise_pose,
     residuals,
 )
-from slam.reprojection import Reprojection, moved
+from bmask_slam.tracking.reprojection import Reprojection, moved
 
 T_WORLD_CAMERA = se3_exp(np.array([0.2, -0.5, 0.1, 1.0, -2.0, 0.5]))
 SIGMAS_PX = np.array([0.7, 0.7, 0.12])

@@ -8,15 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from graph.geometry import Array, se3_exp
-from semantics.boxes3d import OrientedBox
-from semantics.labels import label_set
-from semantics.objects import MapObject
-from slam.cli import main
-from slam.query import format_answer, query
-from slam.semantic_files import BOXES, OBJECTS, read_objects, write_boxes, write_objects
-from slam.semantic_results import MapObjects
+from bmask_slam.cli import main
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.labelling.results import MapObjects
+from bmask_slam.run_folder.query import format_answer, query
+from bmask_slam.run_folder.semantic_files import (
+    BOXES,
+    OBJECTS,
+    read_objects,
+    write_boxes,
+    write_objects,
+)
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.objects.boxes3d import OrientedBox
+from bmask_slam.semantics.objects.object_map import MapObject
 
 NAMES = label_set(("chair", "desk", "cup"))
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from synthetic_view import CAMERA, render_plane
 
-from slam.features import BriskExtractor, FeatureConfig, Features
-from slam.landmarks import Mask
-from slam.refill import Refill
+from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
+from bmask_slam.moving.feature_replenishment import Refill
+from bmask_slam.world.landmark_table import Mask
 
 CONFIG = FeatureConfig(max_keypoints=300)
 FRAME = render_plane(np.eye(4))

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
 
-from graph.geometry import Array, inverse, se3_exp, se3_log
-from slam.features import BriskExtractor, FeatureConfig
-from slam.local_mapping import MappingConfig, create_landmarks
-from slam.place_recognition import DescriptorIndex
-from slam.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
-from slam.tracker import Tracked, Tracker, TrackingConfig
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.back_end.landmark_management import MappingConfig, create_landmarks
+from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.loops.place_recognition import DescriptorIndex
+from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
+from bmask_slam.tracking.tracker import Tracked, Tracker, TrackingConfig
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 EXTRACTOR = BriskExtractor(CAMERA, FeatureConfig())
 TRACKER = Tracker(CAMERA, TrackingConfig())

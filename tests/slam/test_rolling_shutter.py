@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 from synthetic_view import CAMERA, make_features, points_before, random_descriptors, render_plane
 
-from graph.geometry import Array, inverse, se3_exp, transform
-from graph.metrics import align
-from slam.features import Features
-from slam.pose_optimisation import optimise_pose
-from slam.rolling_shutter import (
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.graph.metrics import align
+from bmask_slam.system import SlamSystem
+from bmask_slam.tracking.pose_optimisation import optimise_pose
+from bmask_slam.tracking.rolling_shutter import (
     Motion,
     PreviousPose,
     at_one_moment,
@@ -20,7 +21,6 @@ from slam.rolling_shutter import (
     share_of_rows,
     velocities,
 )
-from slam.system import SlamSystem
 
 ROLLING = replace(CAMERA, rolling_shutter_s=0.025)
 TWIST = np.array([0.5, -0.6, 0.4, 0.3, 0.2, -0.3])

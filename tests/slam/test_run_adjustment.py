@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph.array_file import part
-from graph.errors import InputError
-from graph.g2o_landmarks_reader import read_landmark_graph
-from graph.geometry import inverse, make_pose, se3_exp, so3_exp
-from graph.ply import read_ply
-from graph.storage import read_graph, write_graph
-from graph.trajectory import Trajectory, read_tum, write_tum
-from slam import cli
-from slam.map_file import read_map
-from slam.map_state import world_of
-from slam.run_adjustment import carry_along
-from slam.runner import RunOptions, run
-from slam.saved_run import read_run
-from slam.system_config import SystemConfig
+from bmask_slam import cli
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import part
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
+from bmask_slam.graph.smoother.storage import read_graph, write_graph
+from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.refinement.adjustment import carry_along
+from bmask_slam.run_folder.map_file import read_map
+from bmask_slam.run_folder.saved_run import read_run
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.map_state import world_of
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/redkitchen"
 

@@ -19,14 +19,14 @@ import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence, signal_at, true_trajectory
 
-from graph.errors import InputError
-from graph.ply import read_ply
-from graph.trajectory import Trajectory, read_tum, write_tum
-from slam.configuration import resolve
-from slam.run_folder import FILES
-from slam.runner import RunOptions, RunSummary, run
-from slam.system_config import SystemConfig
-from slam.tracker import TrackingConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
+from bmask_slam.offline.runner import RunOptions, RunSummary, run
+from bmask_slam.run_folder.folder import FILES
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.tracker import TrackingConfig
 
 METRICS = [
     "tracked_share",
@@ -215,7 +215,8 @@ def test_a_killed_run_leaves_what_it_had(tmp_path: Path, out: Path) -> None:
     sequence = make_sequence(tmp_path / "seq", 50)
     code = (
         "import sys; from functools import partial; from pathlib import Path; import signal\n"
-        "from fake_run import FakeSystem, signal_at; from slam.runner import RunOptions, run\n"
+        "from fake_run import FakeSystem, signal_at; "
+        "from bmask_slam.offline.runner import RunOptions, run\n"
         "options = RunOptions(Path(sys.argv[1]), out=Path(sys.argv[2]), quiet=True)\n"
         "run(options, partial(FakeSystem, on_frame=signal_at(40, signal.SIGKILL)))\n"
     )
@@ -257,12 +258,12 @@ def test_a_bug_is_in_the_log_with_its_traceback(sequence: Path, out: Path) -> No
         if k == 3:
             raise ZeroDivisionError("planted")
 
-    level = logging.getLogger("slam").level
+    level = logging.getLogger("bmask_slam").level
     with pytest.raises(ZeroDivisionError):
         run(RunOptions(sequence, out=out, quiet=True), partial(FakeSystem, on_frame=fail))
     assert "Traceback" in (out / "log.txt").read_text()
-    assert logging.getLogger("slam").level == level
-    assert logging.getLogger("slam").handlers == []
+    assert logging.getLogger("bmask_slam").level == level
+    assert logging.getLogger("bmask_slam").handlers == []
 
 
 def test_a_full_disk_is_said_and_keeps_what_was_written(sequence: Path, out: Path) -> None:

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.camera import Camera
-from slam.cli import main
-from slam.rendering.annotations import coco, frame_marks
-from slam.rendering.classes import CLASSES
+from bmask_slam.cli import main
+from bmask_slam.graph.camera import Camera
+from bmask_slam.rendering.annotations import coco, frame_marks
+from bmask_slam.rendering.classes import CLASSES
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from semantics.segmenter_table import SegmenterOptions
-from slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
-from slam.semantic_mapping import SemanticsConfig
+from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.labelling.semantic_mapper import SemanticsConfig
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
 BASE = SemanticsConfig().segmenter
 

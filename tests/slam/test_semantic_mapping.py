@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from semantics.instances import Instance, certain, mask_box
-from semantics.label_store import LabelEstimates
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.run_folder.landmark_file import write_landmarks
+from bmask_slam.run_folder.semantic_files import read_labels, write_labels
+from bmask_slam.semantics.beliefs.label_store import LabelEstimates
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.segmenters.segmenter import Image
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 from semantics.labels import LabelSet, label_set
-from semantics.segmenter import Image
-from slam.configuration import resolve
-from slam.frame import Frame
-from slam.landmark_cloud import write_landmarks
-from slam.semantic_files import read_labels, write_labels
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
 
 FILE = Path("run/checkpoint")
 EDGE_M = 0.1  # world x: left of it on the plane is one thing, right of it another
@@ -165,7 +165,11 @@ def test_fused_and_culled_landmarks_are_followed(at_once: SlamSystem) -> None:
     world.replace_landmarks(np.array([a]), np.array([b]))
     landmarks.remove(np.array([gone]))
     semantics.follow(at_once.mapper)
-    assert semantics.labels.estimates(np.array([a, b, gone])).views.tolist() == [0, both, 0]
+    assert semantics.labels.estimates(np.array([a, b, gone])).views.tolist() == [
+        0,
+        both,
+        0,
+    ]
 
 
 def test_the_estimate_is_the_same_with_and_without_masks(at_once: SlamSystem) -> None:
@@ -260,7 +264,7 @@ def test_late_masks_make_the_same_objects(at_once: SlamSystem) -> None:
 
 
 def test_files(at_once: SlamSystem, tmp_path: Path) -> None:
-    from graph.ply import read_ply
+    from bmask_slam.graph.files.ply import read_ply
 
     cloud = at_once.landmarks()
     write_labels(tmp_path / "labels.csv", cloud)

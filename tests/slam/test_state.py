@@ -12,25 +12,25 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
 
-from graph.array_file import Arrays
-from graph.errors import InputError
-from graph.geometry import Array, se3_exp
-from graph.shadow import Shadow
-from graph.storage import graph_arrays
-from graph.updates import GraphUpdate, RelativePose
-from semantics.instance_track import Sighting
-from semantics.instances import Instance, PackedMask, certain, mask_box
-from semantics.labels import label_set
-from semantics.segmenter import Image
-from slam.configuration import resolve
-from slam.frame import Frame
-from slam.landmarks import PATCHES, LandmarkTable, Patches
-from slam.loop_verification import LoopConstraint
-from slam.semantic_mapping import kept_depth
-from slam.subpixel import PATCH_PX
-from slam.suspects import Removed, Suspect
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.features.patch_alignment import PATCH_PX
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.smoother.storage import graph_arrays
+from bmask_slam.labelling.semantic_mapper import kept_depth
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.moving.static_verification import Removed, Suspect
+from bmask_slam.semantics.instances.instances import Instance, PackedMask, certain, mask_box
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.segmenters.segmenter import Image
+from bmask_slam.semantics.tracks.instance_track import Sighting
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.landmark_table import PATCHES, LandmarkTable, Patches
 
 FILE = Path("run/checkpoint")
 SCRATCH = {"elapsed_s"}  # means nothing between two frames

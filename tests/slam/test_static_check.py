@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graph.camera import Camera
-from graph.geometry import Array, inverse, se3_exp, transform
-from slam.depth_regions import DepthRegionConfig, depth_regions
-from slam.static_check import StaticCheck, StaticCheckConfig, Verdict, depth_view
-from slam.view_memory import ViewMemory
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.moving.depth_segments import DepthRegionConfig, depth_regions
+from bmask_slam.moving.depth_view_buffer import ViewMemory
+from bmask_slam.moving.free_space_check import StaticCheck, StaticCheckConfig, Verdict, depth_view
 
 CAMERA = Camera(160, 120, fx=130.0, fy=130.0, cx=79.5, cy=59.5)
 CHECK = StaticCheck(CAMERA, 0.08, StaticCheckConfig())

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.subpixel import PATCH_PX, cut_patches, register_patches
+from bmask_slam.features.patch_alignment import PATCH_PX, cut_patches, register_patches
 
 RNG = np.random.default_rng(3)
 HALF = PATCH_PX // 2

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA
 
-from graph.array_file import Arrays
-from graph.geometry import Array
-from semantics.instance_track import Track
-from semantics.instances import Instance, certain
-from semantics.labels import label_set
-from semantics.votes import VoteConfig, claim_pixels
-from slam.features import Features
-from slam.keyframe_masks import KeyframeMasks, surfaces
-from slam.static_check import StaticCheck, StaticCheckConfig, depth_view
-from slam.suspects import SuspectConfig, Suspects
-from slam.view_memory import PosedView
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array
+from bmask_slam.moving.depth_view_buffer import PosedView
+from bmask_slam.moving.free_space_check import StaticCheck, StaticCheckConfig, depth_view
+from bmask_slam.moving.keyframe_masks import KeyframeMasks, surfaces
+from bmask_slam.moving.static_verification import SuspectConfig, Suspects
+from bmask_slam.semantics.beliefs.votes import VoteConfig, claim_pixels
+from bmask_slam.semantics.instances.instances import Instance, certain
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.tracks.instance_track import Track
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 NAMES = label_set(("person",))
 WALL_M, BODY_M = 3.0, 2.0

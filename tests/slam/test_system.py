@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
 
-from graph.geometry import Array, inverse, se3_exp, se3_log
-from slam.configuration import resolve
-from slam.frame import Frame
-from slam.results import FrameResult, TrackingStatus
-from slam.sequences import open_sequence
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/redkitchen"
 
@@ -168,7 +168,7 @@ def test_every_option_still_tracks(override: str) -> None:
 
 
 def test_graph_is_saved_with_every_keyframe(tmp_path: Path) -> None:
-    from graph.smoother import Smoother
+    from bmask_slam.graph.smoother.smoother import Smoother
 
     system = SlamSystem(CAMERA)
     feed(system, path(15))
@@ -181,7 +181,7 @@ def test_graph_is_saved_with_every_keyframe(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not KITCHEN.exists(), reason="needs ../shared/data/redkitchen")
 def test_real_kitchen_start_is_tracked() -> None:
-    from slam.evaluation import evaluate_trajectory
+    from bmask_slam.evaluation import evaluate_trajectory
 
     sequence = open_sequence(KITCHEN)
     system = SlamSystem(sequence.camera)

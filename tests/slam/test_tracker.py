@@ -14,13 +14,13 @@ from synthetic_view import (
     render_plane,
 )
 
-from graph.geometry import Array, inverse, se3_exp, se3_log, transform
-from slam.features import BriskExtractor, FeatureConfig, Features
-from slam.matching import WindowIndex, hamming
-from slam.results import TrackingStatus
-from slam.subpixel import SubpixelConfig
-from slam.tracker import Tracker, TrackingConfig, lost, untracked
-from slam.world_map import WorldMap
+from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
+from bmask_slam.features.matching import WindowIndex, hamming
+from bmask_slam.features.patch_alignment import SubpixelConfig
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.tracking.tracker import Tracker, TrackingConfig, lost, untracked
+from bmask_slam.world.world_map import WorldMap
 
 PLAIN = TrackingConfig(subpixel=SubpixelConfig(enabled=False))
 T_WORLD_CAMERA = se3_exp(np.array([0.02, -0.03, 0.01, 0.06, -0.04, 0.05]))

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, T_NEW_OLD, add_keyframe, make_features, random_descriptors
 
-from graph.geometry import inverse, se3_exp, transform
-from slam.triangulation import TriangulationConfig, triangulate, triangulate_landmarks
-from slam.world_map import WorldMap
+from bmask_slam.back_end.triangulation import (
+    TriangulationConfig,
+    triangulate,
+    triangulate_landmarks,
+)
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.world.world_map import WorldMap
 
 T_FIRST = np.eye(4)
 T_SECOND = se3_exp(np.array([0.02, -0.05, 0.01, 0.3, 0.05, 0.02]))

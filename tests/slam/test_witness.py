@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.geometry import Array, se3_exp, transform
-from semantics.instance_track import Track
-from semantics.labels import label_set
-from semantics.movability import read_priors
-from semantics.votes import VoteConfig, claim_pixels
-from slam.keyframe_masks import KeyframeMasks
-from slam.static_check import StaticCheck, StaticCheckConfig
-from slam.witness import Witness
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, se3_exp, transform
+from bmask_slam.moving.free_space_check import StaticCheck, StaticCheckConfig
+from bmask_slam.moving.instance_motion import Witness
+from bmask_slam.moving.keyframe_masks import KeyframeMasks
+from bmask_slam.semantics.beliefs.movability import read_priors
+from bmask_slam.semantics.beliefs.votes import VoteConfig, claim_pixels
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.tracks.instance_track import Track
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 NAMES = label_set(("person",))

@@ -12,11 +12,11 @@ from synthetic_view import (
     render_plane,
 )
 
-from graph.geometry import Array, inverse, se3_exp, transform
-from slam.features import BriskExtractor, FeatureConfig
-from slam.landmarks import PATCHES
-from slam.subpixel import PATCH_PX, SubpixelConfig, cut_patches
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
+from bmask_slam.features.patch_alignment import PATCH_PX, SubpixelConfig, cut_patches
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.world.landmark_table import PATCHES
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 RNG = np.random.default_rng(12)
 COUNT = 30

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from slam.yaml_text import format_yaml, parse_yaml
+from bmask_slam.config.yaml import format_yaml, parse_yaml
 
 
 @pytest.mark.parametrize("flow", [False, True])

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.array_file import nested
-from graph.geometry import Array, inverse, transform
-from slam.features import BriskExtractor, FeatureConfig
-from slam.map_file import write_map
-from slam.map_state import world_state
-from slam.sequences import Sequence
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
+from bmask_slam.graph.files.array_file import nested
+from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.run_folder.map_file import write_map
+from bmask_slam.sequences import Sequence
+from bmask_slam.world.map_state import world_state
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 FRAMES = tuple(range(0, 40, 4))
 

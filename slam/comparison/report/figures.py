@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from graph.errors import InputError
-from graph.metrics import AbsoluteError, RelativeError
-from graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate
-from graph.trajectory_formats import read_trajectory
-from slam.comparison.errors import Rules
-from slam.comparison.report.drawing import as_picture, figure
-from slam.comparison.report.section import Picture
-from slam.comparison.report.table import ATE, values
-from slam.comparison.result import Cell, CellStatus, Comparison, Method
-from slam.evaluation import evaluate_trajectory, read_reference
-from slam.evaluation.plot import draw_top_view
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Method
+from bmask_slam.comparison.jobs.errors import Rules
+from bmask_slam.comparison.report.drawing import as_picture, figure
+from bmask_slam.comparison.report.section import Picture
+from bmask_slam.comparison.report.table import ATE, values
+from bmask_slam.evaluation import evaluate_trajectory, read_reference
+from bmask_slam.evaluation.plot import draw_top_view
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.metrics import AbsoluteError, RelativeError
+from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate
+from bmask_slam.graph.trajectory_formats import read_trajectory
 
 MAX_DIFFERENCES = 300
 VISIBLE_SHARE = 0.04  # of the path's extent, for an RMSE

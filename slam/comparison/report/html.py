@@ -7,7 +7,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup
 
-from slam.comparison.report.section import Section
+from bmask_slam.comparison.report.section import Section
 
 TEMPLATES = Path(__file__).parent
 

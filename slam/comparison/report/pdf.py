@@ -29,8 +29,8 @@ from reportlab.platypus import (
     Spacer,
 )  # fmt: skip
 
-from slam.comparison.report.section import Listing, Picture, Section
-from slam.comparison.report.table import Entry, Table, TableRow
+from bmask_slam.comparison.report.section import Listing, Picture, Section
+from bmask_slam.comparison.report.table import Entry, Table, TableRow
 
 MARGIN = 16 * mm
 WIDTH = A4[0] - 2 * MARGIN

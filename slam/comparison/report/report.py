@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from graph.whole_file import whole_file
-from slam.comparison.report.html import html_text
-from slam.comparison.report.pdf import pdf_bytes
-from slam.comparison.report.section import Section, slug
-from slam.comparison.report.sections import make_sections, summary
-from slam.comparison.report.table import metric_tables
-from slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
-from slam.comparison.report.verdict_tables import ablation_table, verdict_tables
-from slam.comparison.result import Comparison
+from bmask_slam.comparison.experiment.result import Comparison
+from bmask_slam.comparison.report.html import html_text
+from bmask_slam.comparison.report.pdf import pdf_bytes
+from bmask_slam.comparison.report.section import Section, slug
+from bmask_slam.comparison.report.sections import make_sections, summary
+from bmask_slam.comparison.report.table import metric_tables
+from bmask_slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
+from bmask_slam.comparison.report.verdict_tables import ablation_table, verdict_tables
+from bmask_slam.graph.whole_file import whole_file
 
 PAGE = "report.html"
 FIGURES = "figures"

@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slam.comparison.report.section import Picture
-from slam.comparison.report.table import EMPTY, Entry, Table, TableRow
-from slam.comparison.result import Cell, CellStatus, Comparison, Kind
-from slam.run_folder import STAGES
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind
+from bmask_slam.comparison.report.section import Picture
+from bmask_slam.comparison.report.table import EMPTY, Entry, Table, TableRow
+from bmask_slam.run_folder.folder import STAGES
 
 KEYFRAME_STAGES = ("keyframe", "graph", "loops", "semantics")
 PICTURE_WIDTH_PX = 900

@@ -6,7 +6,7 @@ import base64
 import re
 from dataclasses import dataclass
 
-from slam.comparison.report.table import Table
+from bmask_slam.comparison.report.table import Table
 
 
 @dataclass(frozen=True)

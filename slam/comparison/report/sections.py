@@ -9,11 +9,12 @@ from typing import Any
 
 import yaml
 
-from slam.comparison.report.curves import network_pictures
-from slam.comparison.report.figures import error_pictures
-from slam.comparison.report.run_files import map_pictures, stage_table
-from slam.comparison.report.section import Listing, Section
-from slam.comparison.report.table import (
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison
+from bmask_slam.comparison.report.curves import network_pictures
+from bmask_slam.comparison.report.figures import error_pictures
+from bmask_slam.comparison.report.run_files import map_pictures, stage_table
+from bmask_slam.comparison.report.section import Listing, Section
+from bmask_slam.comparison.report.table import (
     ATE,
     Table,
     cell_name,
@@ -21,13 +22,12 @@ from slam.comparison.report.table import (
     metric_table,
     metric_tables,
 )
-from slam.comparison.report.verdict_tables import (
+from bmask_slam.comparison.report.verdict_tables import (
     RULE,
     ablation_table,
     verdict_sentences,
     verdict_tables,
 )
-from slam.comparison.result import Cell, CellStatus, Comparison
 
 LOG_LINES = 15
 LINE_CHARACTERS = 400

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from math import isfinite
 from statistics import median
 
-from slam.comparison.metric_table import METRICS, Metric
-from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.comparison.experiment.metric_table import METRICS, Metric
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
 
 EMPTY = "–"
 FAILED = "failed"

@@ -6,10 +6,10 @@ import csv
 import io
 import re
 
-from slam.comparison.metric_table import BY_NAME
-from slam.comparison.report.section import slug
-from slam.comparison.report.table import RANGE, Entry, Table, TableRow
-from slam.comparison.result import Comparison
+from bmask_slam.comparison.experiment.metric_table import BY_NAME
+from bmask_slam.comparison.experiment.result import Comparison
+from bmask_slam.comparison.report.section import slug
+from bmask_slam.comparison.report.table import RANGE, Entry, Table, TableRow
 
 CSV_COLUMNS = ("sequence", "method", "kind", "with_scale", "seed", "status", "metric", "value",
                "unit", "error", "source")  # fmt: skip

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from slam.comparison.metric_table import BY_NAME, Metric
-from slam.comparison.report.table import ATE, EMPTY, Entry, Table, TableRow
-from slam.comparison.result import CellStatus, Comparison, Kind
-from slam.comparison.statistics import (
+from bmask_slam.comparison.experiment.metric_table import BY_NAME, Metric
+from bmask_slam.comparison.experiment.result import CellStatus, Comparison, Kind
+from bmask_slam.comparison.report.table import ATE, EMPTY, Entry, Table, TableRow
+from bmask_slam.comparison.statistics import (
     BETTER,
     LEVEL,
     NOTHING,

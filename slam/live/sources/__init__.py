@@ -1,6 +1,6 @@
 """Where live frames come from."""
 
-from slam.live.sources.counts import SourceCounts
-from slam.live.sources.source import Newest, RecordedSource, Source
+from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.live.sources.source import Newest, RecordedSource, Source
 
 __all__ = ["Newest", "RecordedSource", "Source", "SourceCounts"]

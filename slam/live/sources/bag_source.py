@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.trajectory import Trajectory
-from slam.frame import Frame
-from slam.live.sources.bags import IMAGE_TYPES, INFO_TYPE, Bag, open_bag
-from slam.live.sources.checks import check_depth_scale, check_sizes
-from slam.live.sources.counts import SourceCounts
-from slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
-from slam.live.sources.ros_images import (
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.sources.bags import IMAGE_TYPES, INFO_TYPE, Bag, open_bag
+from bmask_slam.live.sources.checks import check_depth_scale, check_sizes
+from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
+from bmask_slam.live.sources.ros_images import (
     DEPTH_SCALES,
     camera_of,
     colour_image,
@@ -24,9 +23,10 @@ from slam.live.sources.ros_images import (
     depth_image,
     stamp_s,
 )
-from slam.live.sources.source import paced
-from slam.sequences import read_camera
-from slam.sequences.images import depth_in_metres
+from bmask_slam.live.sources.source import paced
+from bmask_slam.sequences import read_camera
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.images import depth_in_metres
 
 logger = logging.getLogger(__name__)
 

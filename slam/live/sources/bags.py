@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from graph.errors import InputError
-from slam.live.sources.optional import import_optional
+from bmask_slam.graph.errors import InputError
+from bmask_slam.live.sources.optional import import_optional
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _CURE = (

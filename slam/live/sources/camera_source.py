@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.trajectory import Trajectory
-from slam.frame import Frame
-from slam.live.sources.counts import SourceCounts
-from slam.live.sources.pairing import RGB, GapMeter, StreamClock
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.live.sources.pairing import RGB, GapMeter, StreamClock
+from bmask_slam.sequences.frame import Frame
 
 RETRY_S = 0.01
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.errors import InputError
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 
 SCALE_TOLERANCE = 0.1
 """A calibrated depth scale differs from the nominal one by less."""

@@ -14,15 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.trajectory import Trajectory, check_seconds
-from slam.frame import Frame
-from slam.live.sources.counts import SourceCounts
-from slam.live.sources.pairing import DEPTH, RGB, Pairer
-from slam.sequences.cameras import find_camera
-from slam.sequences.images import read_depth, read_rgb
-from slam.sequences.lists import image_name
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory, check_seconds
+from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.live.sources.pairing import DEPTH, RGB, Pairer
+from bmask_slam.sequences.cameras import find_camera
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.images import read_depth, read_rgb
+from bmask_slam.sequences.lists import image_name
 
 logger = logging.getLogger(__name__)
 

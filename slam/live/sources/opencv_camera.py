@@ -8,11 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from graph.errors import InputError
-from slam.live.sources.camera_source import CameraSource, Shot
-from slam.live.sources.checks import check_depth_scale, check_sizes
-from slam.sequences import read_camera
-from slam.sequences.images import depth_in_metres
+from bmask_slam.graph.errors import InputError
+from bmask_slam.live.sources.camera_source import CameraSource, Shot
+from bmask_slam.live.sources.checks import check_depth_scale, check_sizes
+from bmask_slam.sequences import read_camera
+from bmask_slam.sequences.images import depth_in_metres
 
 DEPTH_SCALE = 1000.0
 """OpenNI's depth is in millimetres."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from graph.errors import InputError
-from slam.live.sources.bag_source import BagSource, BagTopics
-from slam.live.sources.bags import is_bag
-from slam.live.sources.growing_folder import FollowOptions, GrowingFolder
-from slam.live.sources.opencv_camera import OpenCvSource
-from slam.live.sources.realsense_camera import RealSenseSource
-from slam.live.sources.source import Limited, RecordedSource, Source
-from slam.sequences import open_sequence
+from bmask_slam.graph.errors import InputError
+from bmask_slam.live.sources.bag_source import BagSource, BagTopics
+from bmask_slam.live.sources.bags import is_bag
+from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
+from bmask_slam.live.sources.opencv_camera import OpenCvSource
+from bmask_slam.live.sources.realsense_camera import RealSenseSource
+from bmask_slam.live.sources.source import Limited, RecordedSource, Source
+from bmask_slam.sequences import open_sequence
 
 REALSENSE, OPENCV = "realsense:", "opencv:"
 

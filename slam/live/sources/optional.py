@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-from graph.errors import InputError
+from bmask_slam.graph.errors import InputError
 
 
 def import_optional(name: str, extra: str, source: str) -> ModuleType:

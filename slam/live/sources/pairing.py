@@ -8,8 +8,8 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from graph.trajectory import associate_stamps, nearest_indices
-from slam.live.sources.counts import SourceCounts
+from bmask_slam.graph.trajectory import associate_stamps, nearest_indices
+from bmask_slam.live.sources.counts import SourceCounts
 
 logger = logging.getLogger(__name__)
 

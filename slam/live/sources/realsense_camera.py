@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.geometry import Array
-from slam.live.sources.camera_source import CameraSource, Shot
-from slam.live.sources.checks import check_depth_scale
-from slam.live.sources.optional import import_optional
-from slam.live.sources.pairing import MAX_DIFFERENCE_S
-from slam.sequences import read_camera
-from slam.sequences.images import depth_in_metres
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.live.sources.camera_source import CameraSource, Shot
+from bmask_slam.live.sources.checks import check_depth_scale
+from bmask_slam.live.sources.optional import import_optional
+from bmask_slam.live.sources.pairing import MAX_DIFFERENCE_S
+from bmask_slam.sequences import read_camera
+from bmask_slam.sequences.images import depth_in_metres
 
 SIZE = (640, 480)
 FPS = 30

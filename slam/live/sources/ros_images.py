@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from graph.camera import Camera
-from graph.errors import InputError
-from semantics.image_files import decode_bytes
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.image_files import decode_bytes
 
 _RAW: dict[str, tuple[str, int]] = {
     "rgb8": ("u1", 3), "bgr8": ("u1", 3), "8UC3": ("u1", 3),

@@ -9,11 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
-from graph.camera import Camera
-from graph.trajectory import Trajectory
-from slam.frame import Frame
-from slam.live.sources.counts import SourceCounts
-from slam.sequences import Sequence
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.sequences import Sequence
+from bmask_slam.sequences.frame import Frame
 
 T = TypeVar("T")
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from graph.trajectory import Trajectory, write_tum
-from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.graph.trajectory import Trajectory, write_tum
 
 HOSTILE = "<script>alert('x')</script> & 50%_{\\input{a}} `|#~^"
 FAILED_LOG = "first line\n" + "noise\n" * 100 + "Killed <b>here</b> & there"

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from graph.trajectory import read_tum, write_tum
-from slam.cli import main
-from slam.comparison import CellStatus, CompareOptions, Comparison, compare, read_results
-from slam.comparison.job import environment
-from slam.comparison.text import format_comparison
-from slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.cli import main
+from bmask_slam.comparison import CellStatus, CompareOptions, Comparison, compare, read_results
+from bmask_slam.comparison.jobs.job import environment
+from bmask_slam.comparison.text import format_comparison
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.trajectory import read_tum, write_tum
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 
 ROOT = Path(__file__).resolve().parents[3]
 EXPERIMENT = """\
@@ -106,7 +106,7 @@ def test_a_sequence_that_cannot_be_rendered_fails_its_cells_alone(data, tmp_path
 def start(data: Path, out: Path) -> subprocess.Popen:
     words = ["compare", str(data / "seeds.yaml"), "--out", str(out), "--jobs", "1"]
     return subprocess.Popen(
-        [sys.executable, "-m", "slam", *words],
+        [sys.executable, "-m", "bmask_slam", *words],
         cwd=ROOT,
         env=environment(1),
         stdout=subprocess.DEVNULL,

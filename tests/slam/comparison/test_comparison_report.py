@@ -16,15 +16,15 @@ import pytest
 from pypdf import PdfReader
 from small_comparison import HOSTILE, WAVE_M, make_comparison
 
-from graph.trajectory import Trajectory, read_tum, write_tum
-from slam.comparison.errors import Rules, trajectory_errors
-from slam.comparison.metric_table import BY_NAME
-from slam.comparison.report import write_report
-from slam.comparison.report.figures import common_scales, read_errors
-from slam.comparison.report.sections import make_sections, summary
-from slam.comparison.report.table import ATE, metric_table
-from slam.comparison.report.verdict_tables import ablation_table
-from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.comparison.experiment.metric_table import BY_NAME
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
+from bmask_slam.comparison.report import write_report
+from bmask_slam.comparison.report.figures import common_scales, read_errors
+from bmask_slam.comparison.report.sections import make_sections, summary
+from bmask_slam.comparison.report.table import ATE, metric_table
+from bmask_slam.comparison.report.verdict_tables import ablation_table
+from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 
 RULES = Rules(0.02)
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from graph.errors import InputError
-from slam.comparison.result import (
+from bmask_slam.comparison.experiment.result import (
     RESULTS,
     Cell,
     CellStatus,
@@ -16,6 +15,7 @@ from slam.comparison.result import (
     read_results,
     write_results,
 )
+from bmask_slam.graph.errors import InputError
 
 COMPARISON = Comparison(
     name="small",

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from slam.comparison.result import Cell, CellStatus, Comparison, Kind, Method
-from slam.comparison.statistics import (
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
+from bmask_slam.comparison.statistics import (
     BETTER,
     NOTHING,
     WORSE,
@@ -20,7 +20,7 @@ from slam.comparison.statistics import (
     summarise,
     verdicts,
 )
-from slam.comparison.text import format_verdicts
+from bmask_slam.comparison.text import format_verdicts
 
 SEQUENCES = ("a", "b", "c", "d", "e", "f")
 METHODS = (Method("default", Kind.RUN), Method("other", Kind.RUN))

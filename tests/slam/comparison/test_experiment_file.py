@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from graph.data_files import data_path
-from graph.errors import InputError
-from slam.comparison.experiment import Configuration
-from slam.comparison.experiment_file import find_experiment, read_experiment
+from bmask_slam.comparison.experiment.experiment import Configuration
+from bmask_slam.comparison.experiment.experiment_file import find_experiment, read_experiment
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
 
 WHOLE = """\
 title: All keys

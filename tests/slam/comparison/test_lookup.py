@@ -7,20 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from graph.trajectory import Trajectory, write_tum
-from slam.comparison.bar import JobBar
-from slam.comparison.cells import drawn_place, run_jobs
-from slam.comparison.data_folders import data_folders, find_site
-from slam.comparison.errors import Rules, trajectory_errors
-from slam.comparison.experiment import Configuration, Experiment, Quotation, SequenceSource
-from slam.comparison.external import parse_trajectory, published_cells, with_files
-from slam.comparison.job import Job, Outcome
-from slam.comparison.options import CompareOptions
-from slam.comparison.plan import make_plan
-from slam.comparison.result import CellStatus
-from slam.rendering.sequence import RenderConfig
+from bmask_slam.comparison.experiment.data_folders import data_folders, find_site
+from bmask_slam.comparison.experiment.experiment import (
+    Configuration,
+    Experiment,
+    Quotation,
+    SequenceSource,
+)
+from bmask_slam.comparison.experiment.options import CompareOptions
+from bmask_slam.comparison.experiment.plan import make_plan
+from bmask_slam.comparison.experiment.result import CellStatus
+from bmask_slam.comparison.jobs.bar import JobBar
+from bmask_slam.comparison.jobs.cells import drawn_place, run_jobs
+from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
+from bmask_slam.comparison.jobs.external import parse_trajectory, published_cells, with_files
+from bmask_slam.comparison.jobs.job import Job, Outcome
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.rendering.sequence import RenderConfig
 
 XYZ = SequenceSource("xyz", "tum/freiburg1_xyz")
 OFFICE = SequenceSource("office", render=RenderConfig("office", 5))

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from graph.errors import InputError
-from slam.comparison.job import Job, Outcome, environment, finished, read_record, run_job
-from slam.comparison.pool import LocalPool
-from slam.comparison.result import CellStatus
+from bmask_slam.comparison.experiment.result import CellStatus
+from bmask_slam.comparison.jobs.job import Job, Outcome, environment, finished, read_record, run_job
+from bmask_slam.comparison.jobs.pool import LocalPool
+from bmask_slam.graph.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[3]
 POSES = "".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(5))
@@ -112,7 +112,7 @@ def test_a_pool_that_is_closed_ends_what_runs(tmp_path):
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
 def test_a_job_ends_when_the_process_that_started_it_is_killed(tmp_path):
     code = (
-        "import json, sys; from slam.comparison.job import Job, run_job\n"
+        "import json, sys; from bmask_slam.comparison.jobs.job import Job, run_job\n"
         "run_job(Job(**json.loads(sys.argv[1])), started=lambda p: print(p.pid, flush=True))"
     )
     import json
@@ -129,7 +129,7 @@ def test_a_job_ends_when_the_process_that_started_it_is_killed(tmp_path):
 
 def test_jobs_on_a_local_ray(tmp_path):
     pytest.importorskip("ray")
-    from slam.comparison.ray_pool import RayPool
+    from bmask_slam.comparison.jobs.ray_pool import RayPool
 
     with RayPool("local") as pool:
         assert pool.workers == 1
@@ -141,7 +141,7 @@ def test_jobs_on_a_local_ray(tmp_path):
 
 def test_an_address_without_a_cluster_is_refused():
     pytest.importorskip("ray")
-    from slam.comparison.ray_pool import RayPool
+    from bmask_slam.comparison.jobs.ray_pool import RayPool
 
     with pytest.raises(InputError, match="nothing answers there"):
         RayPool("127.0.0.1:1")

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from small_comparison import make_comparison
 
-from semantics.evaluation import ApCurve, SegmentationResult, write_curves
-from slam.comparison.report import write_report
-from slam.comparison.report.curves import network_pictures, read_losses, read_precision
-from slam.comparison.report.run_files import map_pictures, stage_table
-from slam.comparison.result import Comparison
-from slam.run_folder import COLUMNS, STAGES
+from bmask_slam.comparison.experiment.result import Comparison
+from bmask_slam.comparison.report import write_report
+from bmask_slam.comparison.report.curves import network_pictures, read_losses, read_precision
+from bmask_slam.comparison.report.run_files import map_pictures, stage_table
+from bmask_slam.run_folder.folder import COLUMNS, STAGES
+from bmask_slam.semantics.segmenters.evaluation import ApCurve, SegmentationResult, write_curves
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from chromium import EXECUTABLE, Browser, chromium
 from small_comparison import make_comparison
 
-from slam.comparison.report import write_report
+from bmask_slam.comparison.report import write_report
 
 pytestmark = pytest.mark.skipif(
     EXECUTABLE is None, reason="no Chromium: apt-get install chromium (.ci/run does)"

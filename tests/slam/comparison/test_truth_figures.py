@@ -9,12 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.geometry import inverse, se3_exp, transform
-from graph.ply import write_ply
-from graph.trajectory import write_tum
-from mapping.inverse_depth import InverseDepthMap
-from semantics.labels import label_set
-from slam.comparison.truth_figures import (
+from bmask_slam.comparison.jobs.truth_figures import (
     depth_ratio,
     label_accuracy,
     true_classes,
@@ -22,9 +17,14 @@ from slam.comparison.truth_figures import (
     truth_from_world,
     visible,
 )
-from slam.rendering.classes import CLASSES
-from slam.rendering.sequence import RenderConfig, render_sequence
-from slam.sequences import open_sequence
+from bmask_slam.graph.files.ply import write_ply
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.graph.trajectory import write_tum
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.rendering.classes import CLASSES
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.sequences import open_sequence
 
 T_WORLD_TRUTH = se3_exp([0.4, -1.1, 0.3, 2.0, -3.0, 1.0])
 NAMES = label_set(CLASSES)
@@ -130,5 +130,7 @@ def test_depth_against_the_sensor(run, folder, monkeypatch):
         def depth_m(self):
             return self.given
 
-    monkeypatch.setattr("slam.comparison.truth_figures.DenseFolder.opened", lambda run: Dense())
+    monkeypatch.setattr(
+        "bmask_slam.comparison.jobs.truth_figures.DenseFolder.opened", lambda run: Dense()
+    )
     assert depth_ratio(run, sequence) == pytest.approx(0.5, rel=1e-6)

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from range_server import Served, serve
 
-from graph.data_files import data_path
-from graph.errors import InputError
-from graph.trajectory import read_tum
-from semantics import http_file
-from slam.cli import main
-from slam.comparison.experiment_file import read_experiment
-from slam.datasets.catalogue import Recording, find, read_catalogue
-from slam.datasets.obtain import SUMS, obtain, read_sums
-from slam.sequences import open_sequence
+from bmask_slam.cli import main
+from bmask_slam.comparison.experiment.experiment_file import read_experiment
+from bmask_slam.datasets.catalogue import Recording, find, read_catalogue
+from bmask_slam.datasets.obtain import SUMS, obtain, read_sums
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.semantics import http_file
+from bmask_slam.sequences import open_sequence
 
 CAMERA = {"width": 640, "height": 480, "fx": 50.0, "fy": 50.0, "cx": 31.5, "cy": 23.5,
           "depth_scale": 5000}  # fmt: skip

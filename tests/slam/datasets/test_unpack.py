@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from graph.errors import InputError
-from slam.datasets.unpack import unpack
+from bmask_slam.datasets.unpack import unpack
+from bmask_slam.graph.errors import InputError
 
 FILES = {"seq/rgb.txt": b"0.1 rgb/0.png\n", "seq/rgb/0.png": b"\x89PNG" * 1000}
 

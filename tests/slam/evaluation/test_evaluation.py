@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from graph.geometry import make_pose, se3_exp, so3_exp
-from graph.trajectory import Trajectory, write_tum
-from slam.evaluation import evaluate, evaluate_trajectory, format_json, format_table
-from slam.evaluation.plot import plot_trajectory, view_plane
+from bmask_slam.evaluation import evaluate, evaluate_trajectory, format_json, format_table
+from bmask_slam.evaluation.plot import plot_trajectory, view_plane
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import make_pose, se3_exp, so3_exp
+from bmask_slam.graph.trajectory import Trajectory, write_tum
 
 SHARED = Path(__file__).resolve().parents[3] / "../shared/data/trajectories"
 

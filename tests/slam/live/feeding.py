@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-from slam.frame import Frame
-from slam.live.live_slam import LiveSlam
-from slam.results import TrackingStatus
+from bmask_slam.live.live_slam import LiveSlam
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.results import TrackingStatus
 
 PATIENCE_S = 2
 

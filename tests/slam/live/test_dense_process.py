@@ -10,15 +10,22 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, PLANE_Z_M, render_plane
 
-from graph.geometry import Array, se3_exp
-from semantics.instances import Instance, certain, mask_box
-from semantics.segmenter_table import SegmenterOptions
-from slam.configuration import dump
-from slam.dense_folder import DenseFolder
-from slam.dense_view import SeenKeyframe
-from slam.live.dense_messages import DenseOrder, Forget, KeyframeToMap, LateMasks, Mapped, NotMapped
-from slam.live.dense_process import DenseKeeper
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import dump
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.keyframe_view import SeenKeyframe
+from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.live.processes.dense_messages import (
+    DenseOrder,
+    Forget,
+    KeyframeToMap,
+    LateMasks,
+    Mapped,
+    NotMapped,
+)
+from bmask_slam.live.processes.dense_process import DenseKeeper
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.system_config import SystemConfig
 
 LABELS = ("background", "person", "chair")
 POSES = {k: se3_exp(np.array([0, 0.01 * k, 0, 0.03 * k, 0, 0])) for k in range(8)}

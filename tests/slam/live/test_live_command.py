@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from graph.ply import read_ply
-from graph.trajectory import read_tum
-from slam.cli import main
-from slam.live.worker import ROOT
+from bmask_slam.cli import main
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.live.processes.worker import ROOT
 
 FRAMES = 24
 
@@ -31,7 +31,16 @@ def recording(tmp_path_factory) -> Path:
 
 
 def start(recording: Path, out: Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "slam", "live", str(recording), "--out", str(out), *options]
+    command = [
+        sys.executable,
+        "-m",
+        "bmask_slam",
+        "live",
+        str(recording),
+        "--out",
+        str(out),
+        *options,
+    ]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -15,19 +15,19 @@ from feeding import feed
 from synthetic_view import CAMERA, render_plane
 from test_live_faults import fill, running
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from graph.ply import read_ply
-from graph.trajectory import read_tum
-from slam.configuration import resolve
-from slam.dense_folder import DenseFolder
-from slam.dense_input import read_saved_map
-from slam.live import workers
-from slam.live.live_slam import LiveOptions, LiveSlam
-from slam.live.remote_dense import LATE, RemoteDenseMapper
-from slam.live.supervision import Patience
-from slam.results import TrackingStatus
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.input import read_saved_map
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.live.processes import start as workers
+from bmask_slam.live.processes.remote_dense import LATE, RemoteDenseMapper
+from bmask_slam.live.processes.supervision import Patience
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import TrackingStatus
 
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=1.1"]
 SETTINGS += ["mapping.redundant_share=1.0"]  # the same plane again and again

@@ -15,21 +15,21 @@ import pytest
 from feeding import feed
 from synthetic_view import CAMERA, render_plane
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from graph.trajectory import read_tum
-from semantics.segmenter_table import SegmenterOptions
-from slam.configuration import resolve
-from slam.frame import Frame
-from slam.live.live_slam import LiveOptions, LiveSlam
-from slam.live.messages import ImageToSegment
-from slam.live.play import PlayOptions, play
-from slam.live.recorder import HEALTH_S
-from slam.live.segmentation import RemoteSegmenter
-from slam.live.sources.counts import SourceCounts
-from slam.live.supervision import Patience
-from slam.results import TrackingStatus
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.live.messages import ImageToSegment
+from bmask_slam.live.play import PlayOptions, play
+from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.processes.supervision import Patience
+from bmask_slam.live.recorder import HEALTH_S
+from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import TrackingStatus
 
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
@@ -174,7 +174,7 @@ def test_a_segmenter_that_hangs_is_started_again(tmp_path) -> None:
 
 def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:
     rerun = pytest.importorskip("rerun", reason="needs Rerun: pip install 'bmask-slam[view]'")
-    from slam.viewer.scene import ViewOptions
+    from bmask_slam.viewer.scene import ViewOptions
 
     viewers: list[subprocess.Popen[bytes]] = []
 

@@ -14,20 +14,20 @@ import pytest
 from feeding import feed
 from synthetic_view import CAMERA, render_plane
 
-from graph.errors import InputError
-from graph.geometry import Array, inverse, se3_exp
-from graph.trajectory import read_tum
-from semantics.segmenter_table import SegmenterOptions
-from slam.configuration import resolve
-from slam.landmark_cloud import LandmarkCloud
-from slam.live.live_slam import LiveOptions, LiveSlam
-from slam.live.messages import NewKeyframe
-from slam.live.segmentation import RemoteSegmenter
-from slam.live.supervision import Patience
-from slam.results import TrackingStatus
-from slam.run_folder import HEALTH
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, inverse, se3_exp
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.live.messages import NewKeyframe
+from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.processes.supervision import Patience
+from bmask_slam.run_folder.folder import HEALTH
+from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import TrackingStatus
 
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
 CONFIG = resolve(SystemConfig, None, SETTINGS)

@@ -7,11 +7,8 @@ from typing import Any
 import numpy as np
 from synthetic_view import CAMERA, render_plane
 
-from graph.geometry import Array, se3_exp
-from semantics.instances import PackedMask
-from slam.history import ENTRY, NOBODY
-from slam.live.map_process import MapKeeper
-from slam.live.messages import (
+from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.live.messages import (
     LostKeyframe,
     MapChanged,
     NewKeyframe,
@@ -19,8 +16,11 @@ from slam.live.messages import (
     Sightings,
     TakeBack,
 )
-from slam.system import SlamSystem
-from slam.tracker import untracked
+from bmask_slam.live.processes.map_process import MapKeeper
+from bmask_slam.semantics.instances.instances import PackedMask
+from bmask_slam.system import SlamSystem
+from bmask_slam.tracking.tracker import untracked
+from bmask_slam.world.frame_history import ENTRY, NOBODY
 
 NO_IDS = np.zeros(0, np.int64)
 

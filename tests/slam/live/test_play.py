@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from slam.configuration import resolve
-from slam.frame import Frame
-from slam.live.live_slam import LiveSlam
-from slam.live.play import WAITING, PlayOptions, play
-from slam.live.sources import Newest
-from slam.live.sources.source import paced
-from slam.results import FrameResult
-from slam.system_config import SystemConfig
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.live.live_slam import LiveSlam
+from bmask_slam.live.play import WAITING, PlayOptions, play
+from bmask_slam.live.sources import Newest
+from bmask_slam.live.sources.source import paced
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import FrameResult
 
 POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(10)]
 FRAMES = [render_plane(pose, index) for index, pose in enumerate(POSES)]

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from graph.trajectory import Trajectory
-from slam.live import recorder
-from slam.live.health import Health
-from slam.live.recorder import SNAPSHOT_S, SNAPSHOT_SHARE, Recorder
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live import recorder
+from bmask_slam.live.health import Health
+from bmask_slam.live.recorder import SNAPSHOT_S, SNAPSHOT_SHARE, Recorder
 
 NOTHING = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, PLANE_Z_M, add_keyframe, make_features, random_descriptors
 
-from graph.geometry import make_pose
-from semantics.segmenter_table import SegmenterOptions
-from slam.frame import Frame
-from slam.live import remote_dense
-from slam.live.dense_messages import (
+from bmask_slam.graph.geometry import make_pose
+from bmask_slam.live.messages import Masks
+from bmask_slam.live.processes import remote_dense
+from bmask_slam.live.processes.dense_messages import (
     DenseOrder,
     FinishMap,
     Forget,
@@ -26,9 +25,10 @@ from slam.live.dense_messages import (
     Preview,
     Taken,
 )
-from slam.live.messages import Masks
-from slam.live.remote_dense import CROWDED, MAX_WAITING, RemoteDenseMapper
-from slam.world_map import WorldMap
+from bmask_slam.live.processes.remote_dense import CROWDED, MAX_WAITING, RemoteDenseMapper
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.world_map import WorldMap
 
 ORDER = DenseOrder(Path("run"), CAMERA, SegmenterOptions(), ("background",))
 

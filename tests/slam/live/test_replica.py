@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
 
-from graph.geometry import se3_exp
-from slam.configuration import resolve
-from slam.history import FrameHistory
-from slam.live.replica import COLUMNS, DeltaMaker, apply_delta
-from slam.system import SlamSystem
-from slam.system_config import SystemConfig
-from slam.world_map import Keyframe, WorldMap
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.live.replica import COLUMNS, DeltaMaker, apply_delta
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),

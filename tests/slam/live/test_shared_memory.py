@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from slam.live.shared_memory import Ring, nameless_file
+from bmask_slam.live.shared_memory import Ring, nameless_file
 
 
 def ends(size: int) -> tuple[Ring, Ring]:

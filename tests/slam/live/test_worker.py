@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.live.channel import Channel
-from slam.live.worker import ROOT, Failure, Worker
+from bmask_slam.live.channel import Channel
+from bmask_slam.live.processes.worker import ROOT, Failure, Worker
 
 HERE = f"{__name__}"
 
@@ -138,7 +138,7 @@ def test_ctrl_c_in_the_terminal_does_not_reach_it() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_it_ends_with_its_owner_however_that_ends() -> None:
     script = (
-        "from slam.live.worker import Worker; import time\n"
+        "from bmask_slam.live.processes.worker import Worker; import time\n"
         f"w = Worker('echo', '{HERE}:echo', 'a'); w.send(1); w.receive(20)\n"
         "print(w.pid, flush=True); time.sleep(600)"
     )

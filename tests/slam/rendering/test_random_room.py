@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.rendering.builder import Image, Painter, SceneBuilder
-from slam.rendering.classes import CLASSES
-from slam.rendering.meshes import pose
-from slam.rendering.path import camera_poses
-from slam.rendering.people import Person, hire
-from slam.rendering.random_furniture import add_piece
-from slam.rendering.random_layout import distance_m, moved_rect, overlap, wall_poses
-from slam.rendering.random_room import RandomRoom, draw_room
-from slam.rendering.room import Room
-from slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.classes import CLASSES
+from bmask_slam.rendering.engine.builder import Image, Painter, SceneBuilder
+from bmask_slam.rendering.engine.meshes import pose
+from bmask_slam.rendering.engine.path import camera_poses
+from bmask_slam.rendering.rooms.random_furniture import add_piece
+from bmask_slam.rendering.rooms.random_layout import distance_m, moved_rect, overlap, wall_poses
+from bmask_slam.rendering.rooms.random_room import RandomRoom, draw_room
+from bmask_slam.rendering.rooms.room import Room
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.things.people import Person, hire
 
 
 @pytest.fixture(scope="module")

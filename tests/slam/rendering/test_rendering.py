@@ -14,19 +14,19 @@ import numpy as np
 import pytest
 import yaml
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.geometry import inverse, rotation_from_quaternion, so3_exp, so3_log, transform
-from slam.rendering import corridor, living_room, office
-from slam.rendering.annotations import run_lengths
-from slam.rendering.atlas import build_atlas
-from slam.rendering.classes import CATEGORY_IDS
-from slam.rendering.meshes import quad
-from slam.rendering.path import CameraPath, camera_poses, look_at
-from slam.rendering.people import PULLED_S, Person, Role
-from slam.rendering.raycast import Renderer, build_geometry
-from slam.rendering.sensor import blur, depth_sigma_m, measure_depth, optical_flow
-from slam.rendering.sequence import SCENES, RenderConfig, kinect_camera, render_sequence
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import inverse, rotation_from_quaternion, so3_exp, so3_log, transform
+from bmask_slam.rendering.annotations import run_lengths
+from bmask_slam.rendering.classes import CATEGORY_IDS
+from bmask_slam.rendering.engine.atlas import build_atlas
+from bmask_slam.rendering.engine.meshes import quad
+from bmask_slam.rendering.engine.path import CameraPath, camera_poses, look_at
+from bmask_slam.rendering.engine.raycast import Renderer, build_geometry
+from bmask_slam.rendering.engine.sensor import blur, depth_sigma_m, measure_depth, optical_flow
+from bmask_slam.rendering.rooms import corridor, living_room, office
+from bmask_slam.rendering.sequence import SCENES, RenderConfig, kinect_camera, render_sequence
+from bmask_slam.rendering.things.people import PULLED_S, Person, Role
 
 PERSON = CATEGORY_IDS["person"]
 CAMERA = Camera(160, 120, fx=131.25, fy=131.25, cx=79.5, cy=59.5, stereo_bf_px_m=10.0)
@@ -375,6 +375,6 @@ def test_scenes_are_listed_without_open3d() -> None:
         "corridor",
         "room",
     }
-    code = "import sys, slam.rendering.sequence; assert 'open3d' not in sys.modules"
+    code = "import sys, bmask_slam.rendering.sequence; assert 'open3d' not in sys.modules"
     root = Path(__file__).resolve().parents[3]
     subprocess.run([sys.executable, "-c", code], cwd=root, check=True)

@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from graph.geometry import transform
-from graph.trajectory import read_tum
-from semantics.boxes3d import OrientedBox
-from semantics.objects import pixel_rays
-from slam.rendering.sequence import RenderConfig, kinect_camera, render_sequence
-from slam.rendering.true_boxes import OBJECTS_TRUTH
+from bmask_slam.graph.geometry import transform
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.rendering.sequence import RenderConfig, kinect_camera, render_sequence
+from bmask_slam.rendering.true_boxes import OBJECTS_TRUTH
+from bmask_slam.semantics.objects.boxes3d import OrientedBox
+from bmask_slam.semantics.objects.object_map import pixel_rays
 
 
 def test_boxes_hold_the_pixels_of_their_objects_tightly(tmp_path: Path) -> None:

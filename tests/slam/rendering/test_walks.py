@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from graph.geometry import inverse
-from slam.rendering import crowded_office
-from slam.rendering.path import duration_s, steady_poses
-from slam.rendering.walks import Escort
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.rendering.engine.path import duration_s, steady_poses
+from bmask_slam.rendering.rooms import crowded_office
+from bmask_slam.rendering.things.walks import Escort
 
 
 def test_escorts_keep_their_places_before_the_camera_and_look_where_they_walk() -> None:

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from slam.sequences import SequenceConfig, open_sequence
+from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences import SequenceConfig, open_sequence
 
 
 def break_missing(folder, k):

@@ -4,9 +4,9 @@ import logging
 
 import pytest
 
-from graph.camera import Camera
-from graph.errors import InputError
-from slam.sequences.cameras import CAMERA_EXAMPLE, find_camera, read_camera
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.cameras import CAMERA_EXAMPLE, find_camera, read_camera
 
 LINES = {
     "width": "640",

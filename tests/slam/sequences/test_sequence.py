@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from slam.sequences import format_info, open_sequence, sequence_info
+from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences import format_info, open_sequence, sequence_info
 
 KITCHEN = Path(__file__).resolve().parents[3] / "../shared/data/redkitchen"
 

@@ -11,14 +11,14 @@ import pytest
 from numpy.typing import NDArray
 from synthetic_view import CAMERA, make_features, render_plane
 
-from graph.errors import InputError
-from graph.geometry import se3_exp
-from slam.cli import main
-from slam.live.dense_messages import Preview
-from slam.live.display import Display
-from slam.live.live_slam import LiveOptions, LiveSlam
-from slam.viewer.scene import Scene, ViewOptions
-from slam.world_map import WorldMap
+from bmask_slam.cli import main
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.live.display import Display
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.live.processes.dense_messages import Preview
+from bmask_slam.viewer.scene import Scene, ViewOptions
+from bmask_slam.world.world_map import WorldMap
 
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(12)]

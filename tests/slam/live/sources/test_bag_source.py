@@ -22,12 +22,12 @@ from recorded_bags import (
     write_bag,
 )
 
-from graph.camera import Camera
-from graph.errors import InputError
-from slam.frame import Frame
-from slam.live.sources.bag_source import BagSource, BagTopics
-from slam.live.sources.bags import format_topics, is_bag, open_bag
-from slam.sequences import write_camera
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.live.sources.bag_source import BagSource, BagTopics
+from bmask_slam.live.sources.bags import format_topics, is_bag, open_bag
+from bmask_slam.sequences import write_camera
+from bmask_slam.sequences.frame import Frame
 
 FORMS = [("a.bag", ""), ("a.mcap", ""), ("folder", "sqlite3"), ("folder", "mcap")]
 

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.camera import Camera
-from graph.errors import InputError
-from graph.geometry import Array
-from slam.live.sources.opencv_camera import OpenCvSource
-from slam.live.sources.realsense_camera import RealSenseSource, fit_distortion
-from slam.sequences import write_camera
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.live.sources.opencv_camera import OpenCvSource
+from bmask_slam.live.sources.realsense_camera import RealSenseSource, fit_distortion
+from bmask_slam.sequences import write_camera
 
 SILENCE_S = 0.3
 UNPLUGGED = object()

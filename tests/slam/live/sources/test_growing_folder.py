@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from graph.errors import InputError
-from slam.frame import Frame
-from slam.live.sources.growing_folder import FINISHED, FollowOptions, GrowingFolder
-from slam.sequences import open_sequence
+from bmask_slam.graph.errors import InputError
+from bmask_slam.live.sources.growing_folder import FINISHED, FollowOptions, GrowingFolder
+from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.frame import Frame
 
 CAMERA = "{width: 32, height: 24, fx: 30, fy: 31, cx: 15, cy: 12, depth_scale: 1000}\n"
 QUICK = FollowOptions(silence_s=1.0, patience_s=0.3, poll_s=0.002)

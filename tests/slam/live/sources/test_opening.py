@@ -12,16 +12,16 @@ import pytest
 from recorded_bags import DEPTH, INFO, RGB, BagMaker, camera_info, image, write_bag
 from synthetic_view import CAMERA, render_plane
 
-from graph.errors import InputError
-from graph.geometry import inverse, se3_exp
-from graph.trajectory import read_tum
-from slam.cli import main, make_parser
-from slam.commands import live as live_command
-from slam.live.sources import RecordedSource, Source
-from slam.live.sources.bag_source import BagSource, BagTopics
-from slam.live.sources.growing_folder import GrowingFolder
-from slam.live.sources.opening import SourceOptions, open_source
-from slam.sequences import Sequence, open_sequence, write_camera
+from bmask_slam.cli import main, make_parser
+from bmask_slam.commands import live as live_command
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import inverse, se3_exp
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.live.sources import RecordedSource, Source
+from bmask_slam.live.sources.bag_source import BagSource, BagTopics
+from bmask_slam.live.sources.growing_folder import GrowingFolder
+from bmask_slam.live.sources.opening import SourceOptions, open_source
+from bmask_slam.sequences import Sequence, open_sequence, write_camera
 
 FRAMES = 8
 

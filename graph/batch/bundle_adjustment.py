@@ -1,0 +1,263 @@
+"""Full bundle adjustment of a saved graph: robustly, then the loops by GNC, then without outliers.
+
+Three stages, each from where the one before ended:
+
+1. **robust**: Levenberg-Marquardt on everything, with the kernels of the run.
+2. **loops**: graduated non-convexity decides which loop edges are right. Observations and all other
+   relative poses are known inliers (the former keep their kernel). Wrong loops leave the graph.
+3. **inliers**: observations whose chi-square without a kernel is beyond the bound leave, with the
+   landmarks that nothing holds then; the rest is optimised again.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2
+
+from bmask_slam.graph.batch.iteration import Progress, iterate
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.checks import OBSERVATION_PROBABILITY, wrong_observations
+from bmask_slam.graph.factors.factor_tables import Shadow, ids_array
+from bmask_slam.graph.factors.gnc import first_mu, graduate
+from bmask_slam.graph.factors.graph_update import GraphUpdate, IntArray, RelativePose
+from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.smoother.removal import remove
+
+LOOP = "loop"
+
+
+@dataclass(frozen=True)
+class AdjustmentConfig:
+    """How long to iterate, and what counts as an outlier.
+
+    Attributes:
+        loop_probability, observation_probability: the share of right ones that the chi-square
+            tests keep. Observations meet the bounds of tracking, 7.815 with depth and 5.991
+            without: there are many of them. Of loops there are few.
+        gnc_step, gnc_inner_iterations: growth of mu, and solver steps at each.
+        drop_observations: whether there is a third stage.
+    """
+
+    max_iterations: int = 100
+    relative_tolerance: float = 1e-7
+    loop_probability: float = 0.999
+    observation_probability: float = OBSERVATION_PROBABILITY
+    gnc_step: float = 2.0
+    gnc_inner_iterations: int = 2
+    drop_observations: bool = True
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One optimisation of it all: its factors, its cost before and after, its solver steps."""
+
+    name: str
+    factors: int
+    cost_before: float
+    cost_after: float
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """What a bundle adjustment did.
+
+    Attributes:
+        stages: in their order; costs are half the sum of squared whitened errors, with kernels.
+        loops: number of loop edges there were.
+        wrong_loops: (N, 2) keyframe ids of the loop edges that were taken out.
+        observations: number of observations there were.
+        wrong_observations: (N, 2) keyframe id, landmark id of those that were taken out.
+        dropped_landmarks: (N,) ids of the landmarks that this left without a hold.
+        duration_ms: wall time.
+    """
+
+    stages: tuple[Stage, ...]
+    loops: int
+    wrong_loops: IntArray
+    observations: int
+    wrong_observations: IntArray
+    dropped_landmarks: IntArray
+    duration_ms: float
+
+    @property
+    def initial_cost(self) -> float:
+        """Where the first stage began."""
+        return self.stages[0].cost_before
+
+    @property
+    def final_cost(self) -> float:
+        """Where the last stage ended, without what was taken out."""
+        return self.stages[-1].cost_after
+
+    @property
+    def iterations(self) -> int:
+        """Solver steps altogether."""
+        return sum(stage.iterations for stage in self.stages)
+
+
+def adjust(
+    shadow: Shadow,
+    camera: Camera,
+    smoother_config: SmootherConfig | None = None,
+    config: AdjustmentConfig | None = None,
+    progress: Progress = lambda iteration, cost: None,
+) -> Adjustment:
+    """Adjust a graph in place: its values move, its outliers leave.
+
+    Raises:
+        InputError: the graph is empty or cannot be solved, with GTSAM's reason.
+    """
+    begin_s = time.perf_counter()
+    if not len(shadow.keyframes.ids):
+        raise InputError("the graph holds no keyframe; nothing to optimise")
+    observations = len(shadow.observations)
+    adjuster = _Adjuster(shadow, camera, smoother_config or SmootherConfig(), config, progress)
+    try:
+        adjuster.optimise("robust")
+        loops = loop_numbers(shadow)
+        wrong_loops = adjuster.drop_wrong_loops() if loops else np.zeros((0, 2), np.int64)
+        wrong, dropped = adjuster.drop_wrong_observations()
+    except RuntimeError as error:  # GTSAM's exceptions all arrive as this
+        reason = str(error).strip().split("\n\n")[0]
+        raise InputError(f"the graph cannot be solved: {reason}") from error
+    return Adjustment(
+        tuple(adjuster.stages),
+        len(loops),
+        wrong_loops,
+        observations,
+        wrong,
+        dropped,
+        1e3 * (time.perf_counter() - begin_s),
+    )
+
+
+def loop_edges(shadow: Shadow) -> IntArray:
+    """Keyframe ids (N, 2) of the loop edges."""
+    edges = [shadow.pose_factors[number].keyframes for number in loop_numbers(shadow)]
+    return np.array(edges, np.int64).reshape(-1, 2)
+
+
+def loop_numbers(shadow: Shadow) -> list[int]:
+    """Numbers of the loop edges."""
+    factors = shadow.pose_factors
+    return sorted(n for n in factors if getattr(factors[n].factor, "kind", "") == LOOP)
+
+
+class _Adjuster:
+    """A shadow, the factors made of it, and the stages so far."""
+
+    def __init__(
+        self,
+        shadow: Shadow,
+        camera: Camera,
+        smoother_config: SmootherConfig,
+        config: AdjustmentConfig | None,
+        progress: Progress,
+    ) -> None:
+        self._shadow, self._camera = shadow, camera
+        self._smoother_config, self._config = smoother_config, config or AdjustmentConfig()
+        self._progress = progress
+        self._maker = FactorMaker(camera, smoother_config)
+        self._done = 0
+        self.stages: list[Stage] = []
+
+    def optimise(self, name: str) -> None:
+        """A stage: every factor that is in the shadow, to convergence."""
+        graph = self._graph(sorted(self._shadow.pose_factors))
+        before = float(graph.error(self._values()))
+        done = self._done
+        after = self._run(graph, self._config.max_iterations)
+        self.stages.append(Stage(name, graph.size(), before, after, self._done - done))
+
+    def drop_wrong_loops(self) -> IntArray:
+        """Decide on the loop edges by GNC; keyframes (N, 2) of those that left.
+
+        The right ones stay without a kernel until the end of this stage, so that the solution
+        follows them whole.
+        """
+        numbers = loop_numbers(self._shadow)
+        loops = [self._loop(number) for number in numbers]
+        plain = make_graph([self._maker.pose_factor(loop) for loop in loops])
+        others = self._graph(sorted(set(self._shadow.pose_factors) - set(numbers)))
+        limit = float(chi2.ppf(self._config.loop_probability, 6))
+
+        def chi_squares() -> Array:
+            values = self._values()
+            return 2 * np.array([plain.at(k).error(values) for k in range(plain.size())])
+
+        def solve(weights: Array) -> Array:
+            graph = gtsam.NonlinearFactorGraph(others)
+            for loop, weight in zip(loops, weights.tolist(), strict=True):
+                if weight > 0:
+                    weighted = replace(loop, covariance=loop.covariance / weight)
+                    graph.add(self._maker.pose_factor(weighted))
+            self._run(graph, self._config.gnc_inner_iterations)
+            return chi_squares()
+
+        now = chi_squares()
+        if not (now > limit).any():
+            return np.zeros((0, 2), np.int64)
+        steps, done = self._config.max_iterations, self._done
+        before = self.stages[-1].cost_after
+        weights, _ = graduate(now, limit, first_mu(now, limit), self._config.gnc_step, steps, solve)
+        wrong = [number for number, weight in zip(numbers, weights, strict=True) if weight < 0.5]
+        edges = np.array([self._shadow.pose_factors[n].keyframes for n in wrong], np.int64)
+        self._shadow.remove_pose_factors(wrong)
+        graph = self._graph(sorted(self._shadow.pose_factors))
+        after = self._run(graph, steps)
+        self.stages.append(Stage("loops", graph.size(), before, after, self._done - done))
+        return edges.reshape(-1, 2)
+
+    def drop_wrong_observations(self) -> tuple[IntArray, IntArray]:
+        """Pairs (N, 2) of the observations that left, and the landmarks (N,) with them."""
+        probability = self._config.observation_probability
+        pairs = wrong_observations(self._shadow, self._camera, probability)
+        if not (len(pairs) and self._config.drop_observations):
+            return np.zeros((0, 2), np.int64), ids_array([])
+        update = GraphUpdate(remove_observations=pairs)
+        removal = remove(update, self._shadow, self._smoother_config)
+        self.optimise("inliers")
+        return pairs, removal.dropped_landmarks
+
+    def _loop(self, number: int) -> RelativePose:
+        """A loop edge without its kernel."""
+        factor = self._shadow.pose_factors[number].factor
+        assert isinstance(factor, RelativePose)
+        return replace(factor, robust=None)
+
+    def _graph(self, numbers: list[int]) -> gtsam.NonlinearFactorGraph:
+        """All observations, and the pose factors of these numbers."""
+        table = self._shadow.observations
+        factors = self._maker.observations(table.select(table.all_rows()))
+        chosen = [self._shadow.pose_factors[number].factor for number in numbers]
+        return make_graph(factors + [self._maker.pose_factor(factor) for factor in chosen])
+
+    def _values(self) -> gtsam.Values:
+        keyframes, landmarks = self._shadow.keyframes, self._shadow.landmarks
+        return make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
+
+    def _run(self, graph: gtsam.NonlinearFactorGraph, max_iterations: int) -> float:
+        """Iterate, write the values into the shadow; the cost that was reached."""
+        parameters = gtsam.LevenbergMarquardtParams()
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, self._values(), parameters)
+        done = self._done
+        cost, steps = iterate(
+            optimiser,
+            max_iterations,
+            self._config.relative_tolerance,
+            lambda step, cost: self._progress(done + step, cost),
+        )
+        if not np.isfinite(cost):
+            raise RuntimeError(f"the cost is {cost}")
+        self._done += steps
+        poses, points = read_values(optimiser.values())
+        self._shadow.keyframes.values, self._shadow.landmarks.values = poses, points
+        return cost

@@ -1,0 +1,177 @@
+"""Self-calibration: bundle adjustment of poses, landmarks and the camera's calibration.
+
+Landmarks are eliminated (Schur complement), poses and calibration solved together by
+Levenberg-Marquardt. Cauchy's kernel keeps wrong matches out; the noise of pixels and depths is
+estimated along with the rest, since the sigmas that a run works with are only nominal, and the
+covariance is stated in that estimated noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from bmask_slam.graph.calibration.covariance import covariance_of
+from bmask_slam.graph.calibration.equations import (
+    CAUCHY,
+    normal_equations,
+    squared,
+    with_points,
+)
+from bmask_slam.graph.calibration.model import linearise
+from bmask_slam.graph.calibration.problem import (
+    CalibrationProblem,
+    CalibrationState,
+    anchor_rms,
+    anchor_terms,
+    body_arm,
+    prior_residuals,
+)
+from bmask_slam.graph.geometry import Array, se3_exp
+
+MIN_NOISE_SCALE = 0.02
+MEDIAN_CHI2_1DOF, MEDIAN_CHI2_2DOF = 0.455, 1.386
+MIN_LEFT = 0.1
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """How the solver goes about it: rounds of noise estimation, steps a round, and when to end."""
+
+    rounds: int = 10
+    steps: int = 15
+    tolerance: float = 1e-6
+    max_damping: float = 1e6
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """Where the solver ended.
+
+    Attributes:
+        calibration: (13,), and its covariance (13, 13), zero in fixed parameters.
+        poses_world_camera: (K, 4, 4); points_world: (L, 3).
+        noise_scales: (2,) how many times the nominal sigmas of pixels and of depths the
+            residuals are.
+        body_arm_m: (3,) where in the camera's frame the body of the anchors' positions sits.
+        anchor_rms_m: RMS of what anchors and result differ by, NaN without any.
+        inlier_share: of the views' measurements within 3 of those sigmas.
+        converged: whether the last step was negligible.
+    """
+
+    calibration: Array
+    covariance: Array
+    poses_world_camera: Array
+    points_world: Array
+    noise_scales: Array
+    body_arm_m: Array
+    anchor_rms_m: float
+    inlier_share: float
+    converged: bool
+
+
+def calibrate(
+    problem: CalibrationProblem, config: CalibrationConfig | None = None
+) -> CalibrationResult:
+    """The most probable poses, points and calibration, and the covariance of the last."""
+    config = config or CalibrationConfig()
+    state = CalibrationState(problem.poses_world_camera, problem.points_world, problem.calibration)
+    scales = np.ones(2)
+    for _ in range(config.rounds):
+        before = state
+        scales = _noise_scales(problem, state, scales)
+        state = _descend(problem, state, scales, config)
+        change = (state.calibration - before.calibration) / np.maximum(problem.prior_sigmas, 1e-12)
+        converged = bool(np.abs(change).max() < 1e-3)
+        if converged:
+            break
+    covariance = covariance_of(problem, state, scales)
+    lin = linearise(problem.views, *state.values)
+    e2 = squared(lin.residuals, scales)
+    return CalibrationResult(
+        calibration=state.calibration,
+        covariance=covariance,
+        poses_world_camera=state.poses,
+        points_world=state.points,
+        noise_scales=scales,
+        body_arm_m=body_arm(problem.anchors, state.poses) if problem.anchors else np.zeros(3),
+        anchor_rms_m=anchor_rms(problem, state),
+        inlier_share=float((e2[lin.valid[:, 1:]] < 9).mean()),
+        converged=converged,
+    )
+
+
+def _descend(
+    problem: CalibrationProblem, state: CalibrationState, scales: Array, config: CalibrationConfig
+) -> CalibrationState:
+    """Levenberg-Marquardt at this noise; steps that raise the cost are taken back."""
+    damping, cost = 1e-6, _cost(problem, state, scales)
+    for _ in range(config.steps):
+        step = _step(problem, state, scales, damping)
+        while True:
+            moved = _moved(state, *step) if step else state
+            new_cost = _cost(problem, moved, scales)
+            if step and new_cost <= cost:
+                break
+            damping = max(10 * damping, 1e-6)
+            if damping > config.max_damping:
+                return state
+            step = _step(problem, state, scales, damping)
+        drop, cost, state, damping = cost - new_cost, new_cost, moved, damping / 10
+        if drop <= config.tolerance * cost:
+            break
+    return state
+
+
+def _step(
+    problem: CalibrationProblem, state: CalibrationState, scales: Array, damping: float
+) -> tuple[Array, Array, Array] | None:
+    """Step of poses (K, 6), points (L, 3) and calibration (13,); None: not positive definite."""
+    reduced = normal_equations(problem, state, scales, damping)
+    try:
+        x = -cho_solve(cho_factor(reduced.S), reduced.b)
+    except LinAlgError:
+        return None
+    poses, points, calibration = with_points(problem.views, reduced, x[:, None])
+    points -= reduced.landmark_inverse @ reduced.landmark_gradient[..., None]
+    return poses[..., 0], points[..., 0], calibration[:, 0]
+
+
+def _moved(
+    state: CalibrationState, poses: Array, points: Array, calibration: Array
+) -> CalibrationState:
+    return CalibrationState(
+        state.poses @ se3_exp(poses), state.points + points, state.calibration + calibration
+    )
+
+
+def _cost(problem: CalibrationProblem, state: CalibrationState, scales: Array) -> float:
+    e2 = squared(linearise(problem.views, *state.values).residuals, scales)
+    cost = 0.5 * CAUCHY**2 * np.log1p(e2 / CAUCHY**2).sum()
+    pose, calibration = prior_residuals(problem, state)
+    anchors, _ = anchor_terms(problem, state)
+    return float(cost + 0.5 * (pose @ pose + calibration @ calibration + anchors @ anchors))
+
+
+def _noise_scales(problem: CalibrationProblem, state: CalibrationState, scales: Array) -> Array:
+    """How many times the nominal sigmas of pixels and depths the noise is, (2,).
+
+    From medians, which wrong matches do not move, of residuals over the root of what the landmark
+    left of them: 1 - h, with h the diagonal of its hat matrix J (J^T J)^-1 J^T.
+    """
+    views = problem.views
+    lin = linearise(views, *state.values)
+    J = lin.point / scales[[0, 0, 1], None]
+    H = np.zeros((len(state.points), 3, 3)) + 1e-9 * np.eye(3)
+    np.add.at(H, views.landmarks, J.swapaxes(1, 2) @ J)
+    left = 1 - np.einsum("mri,mij,mrj->mr", J, np.linalg.inv(H)[views.landmarks], J)
+    chi2 = lin.residuals**2 / np.maximum(left, MIN_LEFT)
+    told = lin.valid & (left > MIN_LEFT)
+    pixel, depth = told[:, 0] & told[:, 1], told[:, 2]
+    medians = [
+        np.median(chi2[pixel, :2].sum(axis=1)) / MEDIAN_CHI2_2DOF if pixel.any() else 1.0,
+        np.median(chi2[depth, 2]) / MEDIAN_CHI2_1DOF if depth.any() else 1.0,
+    ]
+    return np.maximum(np.sqrt(medians), MIN_NOISE_SCALE)

@@ -1,0 +1,109 @@
+"""Normal equations of self-calibration, with the landmarks eliminated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import bsr_array
+
+from bmask_slam.graph.calibration.model import CalibrationViews, linearise
+from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState, N, add_priors
+from bmask_slam.graph.geometry import Array
+
+CAUCHY = 2.385  # 95 % efficiency on Gaussian noise
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """Normal equations of poses and calibration, with what is needed to find the points again."""
+
+    S: Array
+    b: Array
+    landmark_inverse: Array
+    landmark_gradient: Array
+    cross_pose: Array
+    cross_calibration: Array
+
+
+def normal_equations(
+    problem: CalibrationProblem, state: CalibrationState, scales: Array, damping: float
+) -> Reduced:
+    """Schur complement of the weighted normal equations on poses (first) and calibration."""
+    views, K, L = problem.views, len(state.poses), len(state.points)
+    lin = linearise(views, *state.values)
+    root = root_weights(lin.residuals, scales)
+    r, J_c, J_l, J_k = (
+        lin.residuals * root[..., 0], lin.pose * root, lin.point * root, lin.calibration * root,
+    )  # fmt: skip
+    H_ll, g_l = np.zeros((L, 3, 3)), np.zeros((L, 3))
+    np.add.at(H_ll, views.landmarks, J_l.swapaxes(1, 2) @ J_l)
+    np.add.at(g_l, views.landmarks, np.einsum("mri,mr->mi", J_l, r))
+    H_ll = _damped(H_ll, damping) + 1e-9 * np.eye(3)
+    inverse_ll: Array = np.linalg.inv(H_ll).astype(float)
+    cross_c, cross_k = J_c.swapaxes(1, 2) @ J_l, np.zeros((L, N, 3))
+    np.add.at(cross_k, views.landmarks, J_k.swapaxes(1, 2) @ J_l)
+
+    H_c, g_c, H_ck = np.zeros((K, 6, 6)), np.zeros((K, 6)), np.zeros((K, 6, N))
+    shrunk = cross_c @ inverse_ll[views.landmarks]
+    np.add.at(H_c, views.keyframes, J_c.swapaxes(1, 2) @ J_c)
+    np.add.at(g_c, views.keyframes, np.einsum("mri,mr->mi", J_c, r))
+    S_ck = J_c.swapaxes(1, 2) @ J_k - shrunk @ cross_k[views.landmarks].swapaxes(1, 2)
+    np.add.at(H_ck, views.keyframes, S_ck)
+    b_c = g_c.copy()
+    np.add.at(b_c, views.keyframes, -np.einsum("mij,mj->mi", shrunk, g_l[views.landmarks]))
+    shrunk_k = cross_k @ inverse_ll
+    H_k = _damped(np.einsum("mri,mrj->ij", J_k, J_k), damping)
+    S: Array = np.zeros((6 * K + N, 6 * K + N))
+    S[:-N, :-N] = _block_diagonal(_damped(H_c, damping)) - _product(views, shrunk, cross_c, K, L)
+    S[:-N, -N:] = H_ck.reshape(6 * K, N)
+    S[-N:, :-N] = S[:-N, -N:].T
+    S[-N:, -N:] = H_k - np.einsum("lik,ljk->ij", shrunk_k, cross_k)
+    b_k = np.einsum("mri,mr->i", J_k, r) - np.einsum("lij,lj->i", shrunk_k, g_l)
+    b = np.concatenate([b_c.ravel(), b_k])
+    add_priors(problem, state, S, b)
+    return Reduced(S, b, inverse_ll, g_l, cross_c, cross_k)
+
+
+def _damped(H: Array, damping: float) -> Array:
+    return H + damping * H * np.eye(H.shape[-1])
+
+
+def _block_diagonal(blocks: Array) -> Array:
+    count, size = blocks.shape[:2]
+    whole = np.zeros((count, size, count, size))
+    whole[np.arange(count), :, np.arange(count), :] = blocks
+    return whole.reshape(count * size, count * size)
+
+
+def _product(views: CalibrationViews, left: Array, right: Array, K: int, L: int) -> Array:
+    """Dense (6K, 6K) product of two sparse matrices with a (6, 3) block for each view."""
+    order = np.lexsort((views.landmarks, views.keyframes))
+    columns = views.landmarks[order]
+    starts = np.searchsorted(views.keyframes[order], np.arange(K + 1))
+    a, b = (bsr_array((m[order], columns, starts), shape=(6 * K, 3 * L)) for m in (left, right))
+    return np.asarray((a @ b.T).todense())
+
+
+def with_points(views: CalibrationViews, reduced: Reduced, x: Array) -> tuple[Array, Array, Array]:
+    """Columns (6K + 13, n) of poses and calibration with what they make of the points.
+
+    Returns (K, 6, n), (L, 3, n) and (13, n).
+    """
+    poses, calibration = x[:-N].reshape(-1, 6, x.shape[1]), x[-N:]
+    right = reduced.cross_calibration.swapaxes(1, 2) @ calibration
+    from_poses = reduced.cross_pose.swapaxes(1, 2) @ poses[views.keyframes]
+    np.add.at(right, views.landmarks, from_poses)
+    return poses, -reduced.landmark_inverse @ right, calibration
+
+
+def squared(residuals: Array, scales: Array) -> Array:
+    """Squared errors (M, 2) of pixel and depth in units of the estimated noise."""
+    pixel = (residuals[:, :2] ** 2).sum(axis=1) / scales[0] ** 2
+    return np.stack([pixel, residuals[:, 2] ** 2 / scales[1] ** 2], axis=1)
+
+
+def root_weights(residuals: Array, scales: Array) -> Array:
+    """Roots (M, 3, 1) of Cauchy's weights over the estimated noise."""
+    root = np.sqrt(1 / (1 + squared(residuals, scales) / CAUCHY**2)) / scales
+    return root[:, [0, 0, 1], None]

@@ -1,0 +1,191 @@
+"""What an RGB-D camera measures of a point, as a function of its calibration, with derivatives.
+
+A landmark is measured by the raw (distorted) pixel where the colour image shows it, and by the
+inverse of the raw depth that the depth image holds at that pixel:
+
+    pixel          (u, v) = (fx, fy) * distort(x / z, y / z) + (cx, cy)
+    metric depth   z = factor * raw + offset
+
+The depth image may have been taken tau = lag + time_offset later than the colour image; by then
+another point of the surface is seen at the pixel. To first order
+
+    1 / raw = factor / (z - offset) + tau * rate
+
+with the rate of change of 1 / raw at the fixed pixel, which is measured: the depth images before
+and after differ by it. (The alternative, rate = -(z' + slope . flow) / z^2 from the camera's
+velocity and the surface's slope, needs that slope from one noisy image, whose error biases tau
+toward zero.)
+
+The rows of a rolling shutter are exposed one after the other: a point with the velocity p' in the
+camera's frame is seen at p + (row / rows - 1/2) rolling_shutter p'. The depth image is taken to
+roll along.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, skew
+
+PARAMETERS = (
+    *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
+    *("depth_factor", "depth_offset_m", "time_offset_s", "rolling_shutter_s"),
+)
+"""The calibration as a vector (13,): pixels, OpenCV's distortion, metres a raw depth unit,
+metres, seconds, seconds."""
+F, C, K, P = slice(0, 2), slice(2, 4), [4, 5, 8], slice(6, 8)
+FACTOR, OFFSET, TIME, SHUTTER = 9, 10, 11, 12
+MIN_DEPTH_M = 0.05
+
+
+@dataclass(frozen=True)
+class CalibrationViews:
+    """M views of L landmarks in K keyframes, as columns.
+
+    Attributes:
+        keyframes, landmarks: (M,) positions in the tables of poses and points, from 0.
+        pixels: (M, 2) raw pixels, distorted as the image is.
+        inverse_depth: (M,) of the raw depth, NaN without one.
+        inverse_depth_rate: (M,) its rate of change at that pixel, in 1/s; NaN where unknown.
+        lag_s: (M,) what the depth image's stamp says it was taken later than the colour image.
+        sigma_px: (M,) standard deviation of u and of v.
+        sigma_inverse: (M,) standard deviation of ``inverse_depth``.
+        shutter_velocity: (M, 3) the point's velocity in the camera's frame in m/s, times the share
+            of the image, from -1/2 to 1/2, by which its row lies below the middle.
+    """
+
+    keyframes: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    pixels: Array
+    inverse_depth: Array
+    inverse_depth_rate: Array
+    lag_s: Array
+    sigma_px: Array
+    sigma_inverse: Array
+    shutter_velocity: Array
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Residuals (M, 3), predicted - measured over sigma, and their derivatives.
+
+    ``pose`` (M, 3, 6) is by the tangent of T_world_camera, ``point`` (M, 3, 3) by the point in
+    the world, ``calibration`` (M, 3, 13) by the vector of PARAMETERS. Rows are u, v and inverse
+    depth; ``valid`` (M, 3) is False, and the row zero, for a missing depth or one whose rate is not
+    known, and for a point behind the camera.
+    """
+
+    residuals: Array
+    pose: Array
+    point: Array
+    calibration: Array
+    valid: NDArray[np.bool_]
+
+
+def parameters_of(camera: Camera, raw_scale: float) -> Array:
+    """The vector (13,) of a camera whose raw depth is stored values over ``raw_scale``."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    return np.array(
+        [
+            *(camera.fx, camera.fy, camera.cx, camera.cy, k1, k2, p1, p2, k3),
+            *(raw_scale / camera.depth_scale, camera.depth_offset_m),
+            *(camera.depth_time_offset_s, camera.rolling_shutter_s),
+        ]
+    )
+
+
+def distort(normalised: Array, calibration: Array) -> Array:
+    """OpenCV's distortion of normalised coordinates (..., 2)."""
+    x, y = np.moveaxis(normalised, -1, 0)
+    (k1, k2, k3), (p1, p2) = calibration[K], calibration[P]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def linearise(
+    views: CalibrationViews, poses: Array, points_world: Array, calibration: Array
+) -> Linearised:
+    """Residuals and derivatives at poses (K, 4, 4), points (L, 3) and a calibration (13,)."""
+    T_camera_world = inverse(poses)[views.keyframes]
+    R = T_camera_world[:, :3, :3]
+    p = np.einsum("mij,mj->mi", R, points_world[views.landmarks]) + T_camera_world[:, :3, 3]
+    in_front = p[:, 2] > MIN_DEPTH_M
+    p = np.where(in_front[:, None], p, [0.0, 0.0, 1.0])
+    p_row = p + calibration[SHUTTER] * views.shutter_velocity
+    pixels, by_point, by_calibration = _pixel(p_row, calibration)
+    inverse_depth, depth_by_point, depth_by_calibration = _inverse_depth(views, p_row, calibration)
+    by_point = np.concatenate([by_point, depth_by_point[:, None]], axis=1)
+    by_calibration = np.concatenate([by_calibration, depth_by_calibration[:, None]], axis=1)
+    by_calibration[..., SHUTTER] = (by_point @ views.shutter_velocity[..., None])[..., 0]
+    predicted = np.column_stack([pixels, inverse_depth])
+    measured = np.column_stack([views.pixels, views.inverse_depth])
+    weight = 1 / np.column_stack([views.sigma_px, views.sigma_px, views.sigma_inverse])
+    valid = np.isfinite((predicted - measured) * weight) & in_front[:, None]
+    weight = np.where(valid, weight, 0.0)
+    residuals = np.where(valid, predicted - measured, 0.0) * weight
+    by_point *= weight[..., None]
+    p_by_tangent = np.concatenate([skew(p), np.broadcast_to(-np.eye(3), (len(p), 3, 3))], axis=2)
+    return Linearised(
+        residuals,
+        by_point @ p_by_tangent,
+        by_point @ R,
+        by_calibration * weight[..., None],
+        valid,
+    )
+
+
+def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
+    """Pixels (M, 2), and their derivatives (M, 2, 3) by p (M, 3) and (M, 2, 13)."""
+    inv_z = 1 / p[:, 2]
+    normalised = p[:, :2] * inv_z[:, None]
+    x, y = normalised.T
+    focal, (k1, k2, k3), (p1, p2) = calibration[F], calibration[K], calibration[P]
+    distorted = distort(normalised, calibration)
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d(radial)/d(r2), twice
+    cross = x * y * slope + 2 * (p1 * x + p2 * y)
+    by_normalised = np.empty((len(p), 2, 2))
+    by_normalised[:, 0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    by_normalised[:, 0, 1] = by_normalised[:, 1, 0] = cross
+    by_normalised[:, 1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    normalised_by_p = np.zeros((len(p), 2, 3))
+    normalised_by_p[:, 0, 0] = normalised_by_p[:, 1, 1] = inv_z
+    normalised_by_p[:, :, 2] = -normalised * inv_z[:, None]
+    by_calibration = np.zeros((len(p), 2, len(PARAMETERS)))
+    by_calibration[:, [0, 1], [0, 1]] = distorted
+    by_calibration[:, [0, 1], [2, 3]] = 1.0
+    powers = np.stack([r2, r2**2, r2**3], axis=1)
+    by_calibration[:, :, K] = focal[:, None] * normalised[:, :, None] * powers[:, None]
+    tangential = np.empty((len(p), 2, 2))
+    tangential[:, 0, 0] = tangential[:, 1, 1] = 2 * x * y
+    tangential[:, 0, 1], tangential[:, 1, 0] = r2 + 2 * x * x, r2 + 2 * y * y
+    by_calibration[:, :, P] = focal[:, None] * tangential
+    pixels = focal * distorted + calibration[C]
+    return pixels, focal[:, None] * (by_normalised @ normalised_by_p), by_calibration
+
+
+def _inverse_depth(
+    views: CalibrationViews, p: Array, calibration: Array
+) -> tuple[Array, Array, Array]:
+    """Raw inverse depth (M,) in the depth image, and its derivatives (M, 3) by p and (M, 13)."""
+    tau_s = views.lag_s + calibration[TIME]
+    factor, z = calibration[FACTOR], np.maximum(p[:, 2] - calibration[OFFSET], MIN_DEPTH_M)
+    by_p = np.zeros_like(p)
+    by_p[:, 2] = -factor / z**2
+    by_calibration = np.zeros((len(p), len(PARAMETERS)))
+    by_calibration[:, FACTOR] = 1 / z
+    by_calibration[:, OFFSET] = factor / z**2
+    by_calibration[:, TIME] = np.nan_to_num(views.inverse_depth_rate)
+    return factor / z + tau_s * views.inverse_depth_rate, by_p, by_calibration

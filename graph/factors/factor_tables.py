@@ -1,0 +1,240 @@
+"""The graph in numpy: every factor by id, the current values, and each factor's place in ISAM2.
+
+ISAM2 is corrupt after a failure and cannot be saved; this can always be read, saved and made
+into a new ISAM2. It holds facts only; what may enter is decided in `graph.smoother.validation`,
+what
+must leave in `graph.smoother.removal`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.marginalised_landmarks import Archive
+from bmask_slam.graph.geometry import Array
+
+NO_SLOT = -1
+
+
+def ids_array(ids: Iterable[int]) -> IntArray:
+    """Sorted distinct ids as an int64 array."""
+    return np.array(sorted(set(ids)), np.int64)
+
+
+class ValueTable:
+    """Sorted ids with one array value each: a pose (4, 4) or a point (3,)."""
+
+    def __init__(self, *shape: int) -> None:
+        self.ids: IntArray = np.zeros(0, np.int64)
+        self.values: Array = np.zeros((0, *shape))
+
+    def contains(self, ids: IntArray) -> np.ndarray:
+        """Mask (N,) of the ids that are here."""
+        if not len(self.ids):
+            return np.zeros(len(ids), bool)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return self.ids[at] == ids
+
+    def get(self, ids: IntArray) -> Array:
+        """Values (N, ...) of ids that must be here."""
+        return self.values[np.searchsorted(self.ids, ids)]
+
+    def insert(self, ids: IntArray, values: Array) -> None:
+        """Add ids that must not be here yet."""
+        merged = np.concatenate([self.ids, np.asarray(ids, np.int64)])
+        order = np.argsort(merged, kind="stable")
+        self.ids = merged[order]
+        self.values = np.concatenate([self.values, values])[order]
+
+    def remove(self, ids: IntArray) -> None:
+        """Take ids out; those that are not here are passed over."""
+        keep = ~np.isin(self.ids, ids)
+        self.ids, self.values = self.ids[keep], self.values[keep]
+
+
+class ObservationTable:
+    """Observations in growing columns; a row number stays with its observation for life.
+
+    ``of_keyframe[k]`` maps landmark id to row and ``of_landmark[l]`` keyframe id to row, so
+    that every removal touches only its own rows. Freed rows are used again.
+    """
+
+    def __init__(self) -> None:
+        self.of_keyframe: dict[int, dict[int, int]] = {}
+        self.of_landmark: dict[int, dict[int, int]] = {}
+        self._free: list[int] = []
+        self._columns = Observations()
+        self._slots: IntArray = np.zeros(0, np.int64)
+        self._used = 0
+
+    def __len__(self) -> int:
+        return self._used - len(self._free)
+
+    def add(self, observations: Observations) -> IntArray:
+        """Put observations in; their rows (M,)."""
+        rows = self._take_rows(len(observations))
+        self._columns.keyframe_ids[rows] = observations.keyframe_ids
+        self._columns.landmark_ids[rows] = observations.landmark_ids
+        self._columns.measurements[rows] = observations.measurements
+        self._columns.sigmas_px[rows] = observations.sigmas_px
+        self._slots[rows] = NO_SLOT
+        pairs = zip(
+            observations.keyframe_ids.tolist(),
+            observations.landmark_ids.tolist(),
+            rows.tolist(),
+            strict=True,
+        )
+        for keyframe, landmark, row in pairs:
+            self.of_keyframe.setdefault(keyframe, {})[landmark] = row
+            self.of_landmark.setdefault(landmark, {})[keyframe] = row
+        return rows
+
+    def remove(self, rows: IntArray) -> None:
+        """Take rows out; each must be in use."""
+        pairs = zip(
+            self._columns.keyframe_ids[rows].tolist(),
+            self._columns.landmark_ids[rows].tolist(),
+            strict=True,
+        )
+        for keyframe, landmark in pairs:
+            _discard(self.of_keyframe, keyframe, landmark)
+            _discard(self.of_landmark, landmark, keyframe)
+        self._free.extend(rows.tolist())
+
+    def row(self, keyframe: int, landmark: int) -> int | None:
+        """The row of this observation, or None."""
+        return self.of_keyframe.get(keyframe, {}).get(landmark)
+
+    def rows_of_keyframes(self, ids: Iterable[int]) -> IntArray:
+        """All rows of these keyframes."""
+        return _rows_of(self.of_keyframe, ids)
+
+    def rows_of_landmarks(self, ids: Iterable[int]) -> IntArray:
+        """All rows of these landmarks."""
+        return _rows_of(self.of_landmark, ids)
+
+    def select(self, rows: IntArray) -> Observations:
+        """The observations in these rows."""
+        return self._columns.select(rows)
+
+    def slots(self, rows: IntArray) -> IntArray:
+        """Places of these rows' factors in ISAM2, NO_SLOT where there is none."""
+        return self._slots[rows]
+
+    def set_slots(self, rows: IntArray, slots: IntArray) -> None:
+        """Remember the places of these rows' factors in ISAM2."""
+        self._slots[rows] = slots
+
+    def used_rows(self) -> IntArray:
+        """Every row in use, in no order that means anything."""
+        used = np.ones(self._used, bool)
+        used[self._free] = False
+        return np.flatnonzero(used)
+
+    def all_rows(self) -> IntArray:
+        """Every row in use, ordered by keyframe, then landmark: the same for equal contents."""
+        rows = self.used_rows()
+        columns = self._columns.select(rows)
+        return rows[np.lexsort((columns.landmark_ids, columns.keyframe_ids))]
+
+    def _take_rows(self, count: int) -> IntArray:
+        again = [self._free.pop() for _ in range(min(count, len(self._free)))]
+        fresh = range(self._used, self._used + count - len(again))
+        self._used += len(fresh)
+        if self._used > len(self._slots):
+            self._grow(max(1024, 2 * self._used))
+        return np.array([*again, *fresh], np.int64)
+
+    def _grow(self, capacity: int) -> None:
+        more = capacity - len(self._slots)
+        old = self._columns
+        self._columns = Observations(
+            np.concatenate([old.keyframe_ids, np.zeros(more, np.int64)]),
+            np.concatenate([old.landmark_ids, np.zeros(more, np.int64)]),
+            np.concatenate([old.measurements, np.zeros((more, 3))]),
+            np.concatenate([old.sigmas_px, np.zeros((more, 3))]),
+        )
+        self._slots = np.concatenate([self._slots, np.full(more, NO_SLOT, np.int64)])
+
+
+@dataclass
+class PoseFactor:
+    """A relative pose or a prior with its place in ISAM2."""
+
+    factor: RelativePose | PosePrior
+    slot: int = NO_SLOT
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Ids of the keyframes it touches."""
+        if isinstance(self.factor, PosePrior):
+            return (self.factor.keyframe_id,)
+        return (self.factor.keyframe_a, self.factor.keyframe_b)
+
+    @property
+    def is_prior(self) -> bool:
+        """Whether it fixes a keyframe in the world."""
+        return isinstance(self.factor, PosePrior)
+
+
+class Shadow:
+    """Values, observations and pose factors (relative poses and priors, by running number).
+
+    Observations of retired landmarks are in the archive; the pose factors stand for them.
+    """
+
+    def __init__(self) -> None:
+        self.keyframes = ValueTable(4, 4)
+        self.landmarks = ValueTable(3)
+        self.observations = ObservationTable()
+        self.pose_factors: dict[int, PoseFactor] = {}
+        self.pose_factors_of: dict[int, set[int]] = {}
+        self.archive = Archive()
+        self._next_number = 0
+
+    def __len__(self) -> int:
+        """Number of factors."""
+        return len(self.observations) + len(self.pose_factors)
+
+    def add_pose_factors(self, factors: Iterable[RelativePose | PosePrior]) -> list[int]:
+        """Put relative poses and priors in; their numbers."""
+        numbers = []
+        for factor in factors:
+            number = self._next_number
+            self._next_number += 1
+            self.pose_factors[number] = PoseFactor(factor)
+            for keyframe in self.pose_factors[number].keyframes:
+                self.pose_factors_of.setdefault(keyframe, set()).add(number)
+            numbers.append(number)
+        return numbers
+
+    def remove_pose_factors(self, numbers: Iterable[int]) -> None:
+        """Take relative poses and priors out."""
+        for number in numbers:
+            for keyframe in self.pose_factors.pop(number).keyframes:
+                others = self.pose_factors_of[keyframe]
+                others.discard(number)
+                if not others:
+                    del self.pose_factors_of[keyframe]
+
+    def numbers_of_keyframes(self, ids: Iterable[int]) -> list[int]:
+        """Numbers of the pose factors that touch these keyframes, ascending."""
+        return sorted(set().union(*(self.pose_factors_of.get(k, set()) for k in ids)))
+
+
+def _discard(index: dict[int, dict[int, int]], first: int, second: int) -> None:
+    inner = index[first]
+    del inner[second]
+    if not inner:
+        del index[first]
+
+
+def _rows_of(index: dict[int, dict[int, int]], ids: Iterable[int]) -> IntArray:
+    rows: set[int] = set()
+    for i in ids:
+        rows.update(index.get(i, {}).values())
+    return np.array(sorted(rows), np.int64)

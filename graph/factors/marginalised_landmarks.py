@@ -1,0 +1,122 @@
+"""What retired landmarks leave behind: their observations, and what stands for them meanwhile.
+
+A chunk is a set of observations that left the graph together, and the relative poses (kind
+"marginal") that stand for them. A landmark that is out has a summary: one observation in one
+keyframe that says all that is known of it while the poses are held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.factors.graph_update import IntArray, Observations
+from bmask_slam.graph.geometry import Array
+
+MARGINAL = "marginal"
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Observations that left together.
+
+    Attributes:
+        observations: as they were in the graph.
+        is_summary: (M,) those that were themselves summaries of earlier chunks.
+        numbers: of the pose factors in the shadow that stand for them.
+    """
+
+    observations: Observations
+    is_summary: NDArray[np.bool_]
+    numbers: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One observation ``(u_left, v, u_right)`` with sigmas of u, v and disparity in pixels."""
+
+    keyframe_id: int
+    measurement: Array
+    sigmas_px: Array
+
+
+@dataclass
+class Archive:
+    """Chunks by number, and the summary of every landmark that is out or came back.
+
+    Attributes:
+        summaries: of landmarks that are out of the graph.
+        returned: of landmarks that came back with it as an observation.
+        bases: keyframes that the relative poses of others go to (`graph.marginals.sparsification`).
+        observers: keyframes of each landmark's archived observations, summaries not counted.
+    """
+
+    chunks: dict[int, Chunk] = field(default_factory=dict)
+    summaries: dict[int, Summary] = field(default_factory=dict)
+    returned: dict[int, Summary] = field(default_factory=dict)
+    bases: set[int] = field(default_factory=set)
+    observers: dict[int, set[int]] = field(default_factory=dict)
+    next_number: int = 0
+    _of_landmark: dict[int, set[int]] = field(default_factory=dict)
+    _of_keyframe: dict[int, set[int]] = field(default_factory=dict)
+
+    def put(self, chunk: Chunk, number: int) -> None:
+        """Take a chunk in, under ``next_number`` or the number that it had."""
+        self.next_number = max(self.next_number, number + 1)
+        self.chunks[number], seen = chunk, chunk.observations
+        for landmark in np.unique(seen.landmark_ids).tolist():
+            self._of_landmark.setdefault(landmark, set()).add(number)
+        for keyframe in np.unique(seen.keyframe_ids).tolist():
+            self._of_keyframe.setdefault(keyframe, set()).add(number)
+        for keyframe, landmark in _pairs(chunk):
+            self.observers.setdefault(landmark, set()).add(keyframe)
+
+    def take(self, number: int) -> Chunk:
+        """Take a chunk out."""
+        chunk = self.chunks.pop(number)
+        for landmark in np.unique(chunk.observations.landmark_ids).tolist():
+            self._of_landmark[landmark].discard(number)
+        for keyframe in np.unique(chunk.observations.keyframe_ids).tolist():
+            self._of_keyframe[keyframe].discard(number)
+        for keyframe, landmark in _pairs(chunk):
+            self.observers[landmark].discard(keyframe)
+        return chunk
+
+    def chunks_with(self, keyframes: Iterable[int], landmarks: Iterable[int]) -> list[int]:
+        """Numbers of the chunks with any of these, ascending."""
+        nothing: set[int] = set()
+        return sorted(
+            nothing.union(
+                *(self._of_keyframe.get(k, nothing) for k in keyframes),
+                *(self._of_landmark.get(j, nothing) for j in landmarks),
+            )
+        )
+
+    def newest_with(self, landmark: int) -> int:
+        """Number of the last chunk that holds observations of a landmark; -1 for none."""
+        return max(self._of_landmark.get(landmark, ()), default=-1)
+
+    def holds(self, keyframe: int, landmark: int) -> bool:
+        """Whether this observation is archived; it must not enter the graph a second time.
+
+        Not said of the keyframe of the landmark's summary, where that observation enters.
+        """
+        summary = self.summaries.get(landmark)
+        if summary is not None and summary.keyframe_id == keyframe:
+            return False
+        return keyframe in self.observers.get(landmark, ())
+
+    def are_summaries(self, keyframes: IntArray, landmarks: IntArray) -> NDArray[np.bool_]:
+        """Mask (M,) of the pairs that are the summary with which a landmark came back."""
+        hosts = [
+            -1 if (s := self.returned.get(j)) is None else s.keyframe_id for j in landmarks.tolist()
+        ]
+        return np.array(hosts, np.int64) == keyframes
+
+
+def _pairs(chunk: Chunk) -> list[tuple[int, int]]:
+    seen = chunk.observations.select(~chunk.is_summary)
+    return list(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))

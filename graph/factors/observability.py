@@ -1,0 +1,130 @@
+"""What holds a variable: a landmark by its views, a keyframe by a chain of landmarks to a prior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+
+from bmask_slam.graph.factors.graph_update import IntArray, Observations
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.geometry import Array
+
+Edges = Sequence[tuple[int, ...]]
+"""Keyframes of pose factors: one id for a prior, two for a relative pose."""
+
+
+def constrained_landmarks(
+    observations: Observations,
+    poses_world_camera: Array,
+    points_world: Array,
+    min_parallax_deg: float,
+) -> IntArray:
+    """Sorted ids of the landmarks that these observations alone constrain.
+
+    ``poses_world_camera`` (M, 4, 4) and ``points_world`` (M, 3) belong to the observations row
+    by row, in any order. The parallax is the angle between the ray from a landmark's first
+    keyframe and any other: at least half of the largest angle between any two.
+    """
+    stereo = np.isfinite(observations.measurements[:, 2])
+    by_stereo = np.unique(observations.landmark_ids[stereo])
+    rows = np.flatnonzero(~np.isin(observations.landmark_ids, by_stereo))
+    if not len(rows):
+        return by_stereo
+    rows = rows[np.lexsort((observations.keyframe_ids[rows], observations.landmark_ids[rows]))]
+    ids, first, group = np.unique(
+        observations.landmark_ids[rows], return_index=True, return_inverse=True
+    )
+    rays = points_world[rows] - poses_world_camera[rows, :3, 3]
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    between = np.linalg.norm(np.cross(rays, rays[first][group]), axis=1)
+    angle_rad = np.arctan2(between, np.sum(rays * rays[first][group], axis=1))
+    widest_rad = np.maximum.reduceat(angle_rad, first)
+    return np.union1d(by_stereo, ids[widest_rad >= np.radians(min_parallax_deg)])
+
+
+def loose_keyframes(
+    ids: IntArray,
+    observations: Observations,
+    values: tuple[Array, Array],
+    edges: Edges,
+    config: SmootherConfig,
+) -> IntArray:
+    """Those of the sorted ids (K,) that nothing ties firmly to a prior.
+
+    Grown from the priors: a keyframe joins by a relative pose to a firm one, or by
+    ``min_shared_observations`` landmarks that the firm ones see. A landmark counts if they
+    know its place, or if the keyframe itself measures its depth: one that is monocular in all
+    views would leave the scale open. ``values`` are the poses (M, 4, 4) and points (M, 3) of
+    the observations, row by row.
+    """
+    keyframe = np.searchsorted(ids, observations.keyframe_ids)
+    names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
+    stereo = np.isfinite(observations.measurements[:, 2])
+    places = [np.searchsorted(ids, edge) for edge in edges]
+    pairs = np.array([place for place in places if len(place) == 2], np.int64).reshape(-1, 2)
+    firm = np.zeros(len(ids), bool)
+    firm[[place[0] for place in places if len(place) == 1]] = True
+    while True:
+        inside = firm[keyframe]
+        seen, known = np.zeros(len(names), bool), np.zeros(len(names), bool)
+        seen[landmark[inside]] = True
+        known[landmark[inside & stereo]] = True
+        rest = np.flatnonzero(inside & ~known[landmark])
+        by_rays = constrained_landmarks(
+            observations.select(rest), values[0][rest], values[1][rest], config.min_parallax_deg
+        )
+        known[np.searchsorted(names, by_rays)] = True
+        counts = known[landmark] | (stereo & seen[landmark])
+        shared = np.bincount(keyframe[counts], minlength=len(ids))
+        now = firm | (shared >= config.min_shared_observations)
+        now[pairs[now[pairs].any(axis=1)].ravel()] = True
+        if (now == firm).all():
+            return ids[~firm]
+        firm = now
+
+
+def firm_parts(ids: IntArray, observations: Observations, edges: Edges, minimum: int) -> IntArray:
+    """The number (K,) of the part of the sorted ids that each is in, by firm links alone.
+
+    A link is a relative pose between two of them, or ``minimum`` landmarks that both see and
+    whose depth one of them measures.
+    """
+    stereo = np.isfinite(observations.measurements[:, 2])
+    blind = observations.select(~stereo)
+    shared = shared_landmarks(ids, observations)
+    if len(blind):
+        shared = shared - shared_landmarks(ids, blind)
+    row, column = (shared >= minimum).nonzero()
+    pairs = [edge for edge in edges if len(edge) == 2 and np.isin(edge, ids).all()]
+    ends = np.searchsorted(ids, np.array(pairs, np.int64).reshape(-1, 2))
+    starts, stops = np.concatenate([row, ends[:, 0]]), np.concatenate([column, ends[:, 1]])
+    links = coo_array((np.ones(len(starts), np.int8), (starts, stops)), (len(ids), len(ids)))
+    return connected_components(links, directed=False)[1].astype(np.int64)
+
+
+def component_labels(ids: IntArray, observations: Observations, edges: Edges) -> IntArray:
+    """The number (K,) of the connected part that each of the sorted ids is in."""
+    names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
+    pairs = np.array([edge for edge in edges if len(edge) == 2], np.int64).reshape(-1, 2)
+    starts = np.searchsorted(ids, np.concatenate([observations.keyframe_ids, pairs[:, 0]]))
+    ends = np.concatenate([len(ids) + landmark, np.searchsorted(ids, pairs[:, 1])])
+    size = len(ids) + len(names)
+    links = coo_array((np.ones(len(starts), np.int8), (starts, ends)), (size, size))
+    return connected_components(links, directed=False)[1][: len(ids)].astype(np.int64)
+
+
+def shared_landmarks(ids: IntArray, observations: Observations) -> csr_array:
+    """How many landmarks each two of the sorted ids (K,) share: (K, K), sparse."""
+    names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
+    rows = np.searchsorted(ids, observations.keyframe_ids)
+    ones = np.ones(len(rows), np.int64)
+    sees = coo_array((ones, (rows, landmark)), (len(ids), len(names))).tocsr()
+    return (sees @ sees.T).tocsr()
+
+
+def diagonal_covariance(sigma_rotation_rad: float, sigma_translation_m: float) -> Array:
+    """A (6, 6) covariance with equal sigmas for the three rotations and the three shifts."""
+    return np.diag([sigma_rotation_rad**2] * 3 + [sigma_translation_m**2] * 3)

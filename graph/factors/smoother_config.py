@@ -1,0 +1,61 @@
+"""The smoother's settings, apart from the class so that the numpy-only modules can read them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SmootherConfig:
+    """Settings of `graph.smoother.smoother.Smoother`.
+
+    Attributes:
+        relinearize_threshold: change of a variable (rad, m) above which ISAM2 linearises anew.
+        relinearize_skip: ISAM2 looks for such variables every so many updates.
+        extra_iterations: further ISAM2 updates without new factors after each update.
+        robust: Huber's kernel on observations; off, factors are plain Gaussian.
+        huber_stereo, huber_mono: where the kernel starts, in standard deviations: the square
+            roots of the 95 % chi-square bounds with 3 and 2 degrees of freedom.
+        robust_pose_k: the same for a relative pose that asks for a kernel (6 degrees).
+        gate_sigmas: an observation whose reprojection error at the initial values is larger
+            is refused. Generous: a landmark seen once has a depth sigma of z^2/bf pixels of
+            disparity noise, which from 30 degrees aside is tens of pixels; Huber does the rest.
+        max_disparity_ratio: a stereo observation of a new landmark whose disparity is more
+            than so many times that of the initial values is refused: at 2 a Gauss-Newton step
+            throws the landmark behind the camera, z (2 - d_measured / d).
+        min_depth_m, max_range_m: z-depth at which an observed landmark may be.
+        min_parallax_deg: angle between two viewing rays that a landmark without any stereo
+            observation needs.
+        min_shared_observations: landmarks known to the graph that a keyframe without a prior
+            or relative pose must observe.
+        prior_sigma_rotation_rad, prior_sigma_translation_m: of the prior on the first pose.
+        bridge_sigma_rotation_rad, bridge_sigma_translation_m: of the loose relative pose that
+            holds a keyframe when a removal took its support.
+        marginal_keyframes: landmarks that retire in one update are split into groups that so
+            many keyframes see; each group becomes relative poses of its own.
+        base_share: a keyframe that shares a smaller part of its retired landmarks with any
+            base becomes one (`graph.marginals.sparsification`).
+        max_recoveries: attempts to rebuild after failures before the update is given up.
+    """
+
+    relinearize_threshold: float = 0.003
+    relinearize_skip: int = 1
+    extra_iterations: int = 0
+    robust: bool = True
+    huber_stereo: float = math.sqrt(7.815)
+    huber_mono: float = math.sqrt(5.991)
+    robust_pose_k: float = math.sqrt(12.592)
+    gate_sigmas: float = 100.0
+    max_disparity_ratio: float = 1.7
+    min_depth_m: float = 0.05
+    max_range_m: float = 60.0
+    min_parallax_deg: float = 1.0
+    min_shared_observations: int = 6
+    prior_sigma_rotation_rad: float = 1e-4
+    prior_sigma_translation_m: float = 1e-4
+    bridge_sigma_rotation_rad: float = 0.05
+    bridge_sigma_translation_m: float = 0.1
+    marginal_keyframes: int = 24
+    base_share: float = 0.25
+    max_recoveries: int = 10

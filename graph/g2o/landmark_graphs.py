@@ -1,0 +1,129 @@
+"""The g2o text format of graphs with landmarks: keyframe poses, points and what was seen of them.
+
+All in g2o's own types, of its library slam3d:
+
+==========================  ===================================================================
+PARAMS_CAMERACALIB 0        pose of the camera in its vertex (none: the two are the same), then
+                            fx fy cx cy in pixels
+PARAMS_STEREOCAMERACALIB 1  the same and the baseline in metres; no edge refers to it
+PARAMS_SE3OFFSET 2          the pose in its vertex that a prior is about (the vertex itself)
+VERTEX_SE3:QUAT             id, T_world_camera
+VERTEX_TRACKXYZ             id, point in the world in metres
+EDGE_PROJECT_DISPARITY      keyframe, point, 0; u v in pixels and 1/z in 1/m; upper triangle of
+                            the information of these three
+EDGE_SE3:QUAT               keyframe a, keyframe b; T_a_b; information
+EDGE_SE3_PRIOR              keyframe, 2; T_world_camera; information
+FIX                         keyframes that stand still (read, never written)
+==========================  ===================================================================
+
+**Exact:** a view with depth. g2o's disparity is normalised, 1/z = d / bf, so sigma_d becomes
+sigma_d / bf; u, v and d err independently here as there. A view without depth is the same edge
+with no information on 1/z, which g2o adds like any other: the two equations of a monocular view
+remain. (Its monocular edges belong to its library sba, with another pose vertex and one focal
+length for both axes.) Poses and information: as ``graph.g2o.lines`` says.
+
+**In comments**, since g2o has no words for it: image size, bf and distortion; which ids are
+landmarks' (g2o's vertices share one range); kind and kernel of the next relative pose. Kernels of
+views are left to whoever optimises.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
+from bmask_slam.graph.g2o.lines import (
+    Tag,
+    information_columns,
+    numbers_text,
+    pose_columns,
+    write_lines,
+)
+from bmask_slam.graph.geometry import Array
+
+VIEW = "EDGE_PROJECT_DISPARITY"
+CAMERA, STEREO, OFFSET = "PARAMS_CAMERACALIB", "PARAMS_STEREOCAMERACALIB", "PARAMS_SE3OFFSET"
+POSE, POINT = "VERTEX_SE3:QUAT", "VERTEX_TRACKXYZ"
+RELATIVE, PRIOR = "EDGE_SE3:QUAT", "EDGE_SE3_PRIOR"
+TAGS = {
+    CAMERA: Tag(1, 7 + 4, 3),
+    STEREO: Tag(1, 7 + 5, 3),
+    OFFSET: Tag(1, 7, 3),
+    POSE: Tag(1, 7, 3),
+    POINT: Tag(1, 3),
+    VIEW: Tag(3, 3 + 6),
+    RELATIVE: Tag(2, 7 + 21, 3),
+    PRIOR: Tag(2, 7 + 21, 3),
+}
+MARK = "# bmask-slam"
+_NO_OFFSET = np.array([0, 0, 0, 0, 0, 0, 1.0])
+_ABOUT = """\
+# Graph of bmask-slam: keyframes T_world_camera, landmarks, observations. Metres, radians, pixels.
+# EDGE_PROJECT_DISPARITY: keyframe, landmark, camera, u, v, 1/z; no information on 1/z: no depth.
+# Rotational information of EDGE_SE3:QUAT and EDGE_SE3_PRIOR is per radian, as GTSAM has it; g2o
+# itself takes it per quaternion component, half an angle.
+# Not in here: the robust kernels of observations (bmask-slam: Huber)."""
+
+
+def has_landmarks(path: Path) -> bool:
+    """Whether a g2o file holds observations of landmarks."""
+    if not path.is_file():
+        return False
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        return any(line.split(maxsplit=1)[:1] == [VIEW] for line in file)
+
+
+def write_landmark_graph(path: Path, shadow: Shadow, camera: Camera) -> None:
+    """Write a graph as ``read_landmark_graph`` reads it; it appears whole or not at all."""
+    offset = 1 + int(shadow.keyframes.ids.max(initial=-1))
+    intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
+    rest = [camera.width, camera.height, camera.stereo_bf_px_m, camera.depth_scale, camera.fps]
+    lines = [
+        _ABOUT,
+        f"{MARK} camera {numbers_text(np.array([*rest, *camera.distortion]))}",
+        f"{MARK} landmarks {offset}",
+        f"{CAMERA} 0 {numbers_text(np.array([*_NO_OFFSET, *intrinsics]))}",
+        f"{STEREO} 1 {numbers_text(np.array([*_NO_OFFSET, *intrinsics, camera.baseline_m]))}",
+        f"{OFFSET} 2 {numbers_text(_NO_OFFSET)}",
+    ]
+    keyframes, landmarks = shadow.keyframes, shadow.landmarks
+    lines += _lines(POSE, keyframes.ids, pose_columns(keyframes.values))
+    lines += _lines(POINT, offset + landmarks.ids, landmarks.values)
+    for number in sorted(shadow.pose_factors):
+        lines += _pose_factor_lines(shadow.pose_factors[number].factor)
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    names = np.stack([seen.keyframe_ids, offset + seen.landmark_ids, 0 * seen.keyframe_ids], axis=1)
+    write_lines(path, [*lines, *_lines(VIEW, names, _view_columns(seen, camera))])
+
+
+def _lines(tag: str, names: IntArray, numbers: Array) -> list[str]:
+    rows = zip(names.reshape(len(numbers), -1).tolist(), numbers, strict=True)
+    return [f"{tag} {' '.join(map(str, ids))} {numbers_text(row)}" for ids, row in rows]
+
+
+def _pose_factor_lines(factor: RelativePose | PosePrior) -> list[str]:
+    inverse: Array = np.asarray(np.linalg.inv(factor.covariance), float)
+    information = information_columns(inverse[None])
+    if isinstance(factor, PosePrior):
+        numbers = np.hstack([pose_columns(factor.T_world_camera[None]), information])
+        return _lines(PRIOR, np.array([[factor.keyframe_id, 2]]), numbers)
+    numbers = np.hstack([pose_columns(factor.T_a_b[None]), information])
+    edge = np.array([[factor.keyframe_a, factor.keyframe_b]])
+    note = f"{MARK} edge {factor.kind} {factor.robust or 'none'}"
+    return [note, *_lines(RELATIVE, edge, numbers)]
+
+
+def _view_columns(seen: Observations, camera: Camera) -> Array:
+    """(M, 9) of u, v, 1/z and the upper triangle of their information."""
+    u, v, u_right = seen.measurements.T
+    stereo = np.isfinite(u_right)
+    inverse_depth = np.where(stereo, u - u_right, 0.0) / camera.stereo_bf_px_m
+    information = 1 / seen.sigmas_px**2
+    information[:, 2] = np.where(stereo, information[:, 2] * camera.stereo_bf_px_m**2, 0.0)
+    nothing = np.zeros(len(u))
+    i_u, i_v, i_z = information.T
+    return np.stack([u, v, inverse_depth, i_u, nothing, nothing, i_v, nothing, i_z], axis=1)

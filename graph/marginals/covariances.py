@@ -1,0 +1,57 @@
+"""Marginal covariances of many variables from one factorisation of the graph.
+
+ISAM2 can be asked too, but walks its tree anew for each variable and is linearised where each
+variable last was; here everything is linearised at the current values. A robust kernel enters by
+its weight at these values, so an observation that the kernel holds for an outlier says little:
+the covariance is that of the weighted least-squares problem at the optimum. It knows only the
+noise that the factors state, no errors of calibration and no wrong matches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from bmask_slam.graph.factors.graph_update import IntArray
+from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
+from bmask_slam.graph.geometry import Array
+
+
+@dataclass(frozen=True)
+class Marginals:
+    """Covariances of keyframes and landmarks, each for itself.
+
+    Attributes:
+        keyframe_ids: (K,) int64.
+        keyframes: (K, 6, 6) of ``[rotation rad, translation m]`` on the right side: the true
+            pose is about ``T_world_camera @ se3_exp(xi)``, xi ~ N(0, covariance). The world is
+            where the prior holds it (the first keyframe of each part of the graph), so these
+            grow with the path from there.
+        landmark_ids: (L,) int64.
+        landmarks: (L, 3, 3) of points_world in metres.
+    """
+
+    keyframe_ids: IntArray
+    keyframes: Array
+    landmark_ids: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    landmarks: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+
+
+def marginals_of(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    keyframe_ids: IntArray,
+    landmark_ids: IntArray,
+) -> Marginals:
+    """The covariances of some variables. Raises RuntimeError where the graph is singular."""
+    source = gtsam.Marginals(graph, values)
+    poses = [source.marginalCovariance(key) for key in keyframe_keys(keyframe_ids)]
+    points = [source.marginalCovariance(key) for key in landmark_keys(landmark_ids)]
+    return Marginals(
+        keyframe_ids,
+        np.array(poses).reshape(-1, 6, 6),
+        landmark_ids,
+        np.array(points).reshape(-1, 3, 3),
+    )

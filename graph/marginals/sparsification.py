@@ -1,0 +1,146 @@
+"""Dense information on poses, replaced by a tree of relative poses: nonlinear factor recovery.
+
+Mazuran, Burgard and Tipaldi, "Nonlinear factor recovery for long-term SLAM", IJRR 2016: of all
+graphs of relative poses with a given topology, the one nearest to the dense Gaussian in
+Kullback-Leibler divergence. On a tree the solution is closed: each edge's covariance is the
+dense one's marginal of that relative pose, and the divergence grows with the sum of their log
+det, by which the tree is chosen (Chow and Liu 1968).
+
+Which trees are allowed decides what a long session costs. The best tree is a chain from
+keyframe to keyframe, and chains of many visits make a wide graph, in which errors add up over
+every link. Here a few keyframes are **bases**: between them the best tree, and every other
+keyframe hangs on one base. So the graph's core grows with the space that was seen, not with
+time, and long ways have few links. A keyframe becomes a base when it shares too few of its
+landmarks with any; one that comes back to a known place needs no new one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from bmask_slam.graph.factors.graph_update import IntArray, RelativePose
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, skew
+from bmask_slam.graph.marginals.point_elimination import PoseInformation
+
+Mask = NDArray[np.bool_]
+_KNOWN_SIGMAS = np.array([0.05] * 3 + [0.1] * 3)
+"""How well (rad, m) the poses are known to each other without what is made sparse. Some poses
+hang on one or two of the landmarks; taken alone these would allow any pose, far from where the
+linearisation holds. So what the observations add to this is made sparse, and this is taken off
+again."""
+_FAR = 3.0
+"""In those sigmas: how far from its present value a relative pose may be measured; farther, the
+linearisation means nothing, and part of the gradient is given up."""
+_LEAST = 1.0
+"""Information (rad^-2, m^-2) that makes every covariance finite; an edge with less is left out."""
+
+
+def recover(information: PoseInformation, edges: IntArray, kind: str) -> list[RelativePose]:
+    """Relative poses on a tree (E, 2) of rows that stand for the dense information.
+
+    Their gradient at the linearisation is that of the dense cost, so that a graph at its optimum
+    stays there when these replace the observations; but no relative pose is measured farther
+    from its present value than ``_FAR`` times how well poses are known anyway.
+    """
+    count, poses = len(information.keyframe_ids), information.poses_world_camera
+    anchor, covariance = _anchored(information)
+    a, b = edges.T
+    X = np.linalg.inv(_relative(covariance, poses, a, b))
+    X -= np.linalg.inv(_relative(_known(count, anchor), poses, a, b))
+    X = (X + np.swapaxes(X, 1, 2)) / 2 + _LEAST * np.eye(6)
+    blocks = np.zeros((len(edges), 6, count, 6))
+    blocks[np.arange(len(edges)), :, a] = _jacobians(poses, a, b)
+    blocks[np.arange(len(edges)), :, b] = np.eye(6)
+    J = np.delete(blocks, anchor, axis=2).reshape(len(edges), 6, 6 * (count - 1))
+    H = np.einsum("eik,eij,ejl->kl", J, X, J, optimize=True)
+    H += np.diag(np.tile(_KNOWN_SIGMAS**-2, count - 1))
+    xi = -np.linalg.solve(H, np.delete(information.g, anchor, axis=0).ravel())
+    moves = J @ xi
+    moves /= np.maximum(1.0, np.linalg.norm(moves / _KNOWN_SIGMAS, axis=1) / _FAR)[:, None]
+    T_a_b = inverse(poses[a]) @ poses[b] @ se3_exp(moves)
+    covariances = np.linalg.inv(X)
+    covariances = (covariances + np.swapaxes(covariances, 1, 2)) / 2
+    ends = information.keyframe_ids[edges].tolist()
+    useful = np.linalg.eigvalsh(X)[:, -1] > 2 * _LEAST
+    return [
+        RelativePose(ends[e][0], ends[e][1], T_a_b[e], covariances[e], kind=kind)
+        for e in np.flatnonzero(useful).tolist()
+    ]
+
+
+def spanning_tree(information: PoseInformation, is_base: Mask) -> IntArray:
+    """Pairs of rows (K - 1, 2): the best tree between bases, all others on their best base."""
+    count = len(is_base)
+    _, covariance = _anchored(information)
+    a, b = np.triu_indices(count, 1)
+    cost = np.linalg.slogdet(_relative(covariance, information.poses_world_camera, a, b))[1]
+    costs = np.zeros((count, count))
+    costs[a, b] = costs[b, a] = cost - cost.min() + 1.0  # positive: zero would mean no edge
+    bases, leaves = np.flatnonzero(is_base), np.flatnonzero(~is_base)
+    tree = minimum_spanning_tree(costs[np.ix_(bases, bases)]).tocoo()
+    trunk = np.stack([bases[tree.row], bases[tree.col]], axis=1)
+    hanging = np.stack([bases[np.argmin(costs[np.ix_(leaves, bases)], axis=1)], leaves], axis=1)
+    return np.sort(np.concatenate([trunk, hanging]).astype(np.int64), axis=1)
+
+
+def with_new_bases(shared: IntArray, is_base: Mask, share: float) -> Mask:
+    """Bases (K,) bool such that each pose shares enough of its landmarks with one.
+
+    ``shared`` (K, K) counts common landmarks. Of those left over, the one that covers most of
+    them comes next.
+    """
+    is_base = is_base.copy()
+    enough = shared >= share * np.diag(shared)[:, None]
+    while not (covered := is_base | enough[:, is_base].any(axis=1)).all():
+        serves = (enough & ~covered[:, None]).sum(axis=0)
+        is_base[np.argmax(np.where(covered, -1, serves))] = True
+    return is_base
+
+
+def adjoint(T: Array) -> Array:
+    """Adjoints (..., 6, 6): ``T se3_exp(xi) T^-1 = se3_exp(adjoint(T) xi)``, xi [rad, m]."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    Ad = np.zeros((*T.shape[:-2], 6, 6))
+    Ad[..., :3, :3] = Ad[..., 3:, 3:] = R
+    Ad[..., 3:, :3] = skew(t) @ R
+    return Ad
+
+
+def _anchored(information: PoseInformation) -> tuple[int, Array]:
+    """The best known pose, and the covariance (K, 6, K, 6) of all while it is held.
+
+    Exact for everything relative, since moving all poses together costs nothing.
+    """
+    count = len(information.keyframe_ids)
+    anchor = int(np.argmax(np.einsum("kiki->k", information.H)))
+    others = np.delete(np.arange(count), anchor)
+    size = 6 * (count - 1)
+    H = information.H[others][:, :, others].reshape(size, size)
+    H = H + np.diag(np.tile(_KNOWN_SIGMAS**-2, count - 1))
+    covariance = np.zeros((count, 6, count, 6))
+    held = np.linalg.inv(H).reshape(count - 1, 6, count - 1, 6)
+    covariance[others[:, None], :, others] = np.swapaxes(held, 1, 2)
+    return anchor, covariance
+
+
+def _known(count: int, anchor: int) -> Array:
+    """The same covariance without any observation."""
+    covariance = np.zeros((count, 6, count, 6))
+    others = np.delete(np.arange(count), anchor)
+    covariance[others, :, others] = np.diag(_KNOWN_SIGMAS**2)
+    return covariance
+
+
+def _jacobians(poses: Array, a: IntArray, b: IntArray) -> Array:
+    """d tangent of T_a^-1 T_b (right side) / d tangent of T_a, (E, 6, 6); by T_b it is 1."""
+    return -adjoint(inverse(poses[b]) @ poses[a])
+
+
+def _relative(covariance: Array, poses: Array, a: IntArray, b: IntArray) -> Array:
+    """Covariances (E, 6, 6) of the tangents of T_a^-1 T_b, on its right side."""
+    J = _jacobians(poses, a, b)
+    across = J @ covariance[a, :, b]
+    J_T = np.swapaxes(J, 1, 2)
+    return J @ covariance[a, :, a] @ J_T + covariance[b, :, b] + across + np.swapaxes(across, 1, 2)

@@ -1,0 +1,131 @@
+"""Wrong loops of a pose graph: graduated non-convexity on the edges that can be right."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.stats import chi2
+
+from bmask_slam.graph.factors.gnc import first_mu, graduate
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.pose_graph.loop_consistency import LoopSupport
+from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
+from bmask_slam.graph.pose_graph.pose_graph import Mask, PoseGraph, is_connected
+from bmask_slam.graph.pose_graph.solver import PoseGraphConfig, PoseGraphSolver
+
+LEAST_WEIGHT = 1e-6  # where odometry does not connect: what one edge alone holds stays solvable
+MAX_ROUNDS = 20
+
+
+def find_wrong_loops(
+    graph: PoseGraph, solver: PoseGraphSolver, config: PoseGraphConfig, support: LoopSupport
+) -> Mask:
+    """(M,) the wrong edges, those without which a truncated least-squares cost is least.
+
+    From the solution of odometry and the loops that others confirm, those loops are let in that it
+    does not refute, its own uncertainty counted: a random edge is not among them, a right one that
+    closes a long drift is. GNC (Yang et al., RA-L 2020) then decides among what was let in. What it
+    keeps may allow others, so that this is repeated while the cost falls. Random edges would fill
+    the factorisation and are left out of it from the start.
+
+    Odometry edges keep weight 1. Where they leave gaps, or no loop confirms another, GNC starts
+    with all loops. The solver is left at the solution of the right edges.
+    """
+    search = _Search(graph, solver, config, support.noise_scale)
+    known = search.known
+    if not is_connected(graph.with_edges(known)):
+        solver.run(config.gnc_inner_iterations)
+        is_right = search.graduated(~known, LEAST_WEIGHT)
+        return ~is_right & ~_needed(graph, np.where(is_right, 1e-3, solver.chi_squares()))
+    right = known | support.supported
+    if not support.supported.any():
+        solver.run(config.gnc_inner_iterations)
+        right = search.graduated(~known)
+    cost = search.settle(right)
+    for _ in range(MAX_ROUNDS):
+        poses = solver.poses
+        allowed = right | search.allowed(right)
+        if (allowed > right).any():
+            search.settle(allowed)
+        tried = search.graduated(allowed & ~known)
+        if (tried == right).all():
+            break
+        new_cost = search.settle(tried)
+        if new_cost >= cost * (1 - config.relative_tolerance):
+            solver.start_from(poses)
+            break
+        right, cost = tried, new_cost
+    return ~right
+
+
+class _Search:
+    """Solutions of one graph with different loops left out."""
+
+    def __init__(
+        self,
+        graph: PoseGraph,
+        solver: PoseGraphSolver,
+        config: PoseGraphConfig,
+        noise_scale: float,
+    ) -> None:
+        self._graph, self._solver, self._config = graph, solver, config
+        degrees = graph.information.shape[-1]
+        self.limit = noise_scale * float(chi2.ppf(config.inlier_probability, degrees))
+        self.known = graph.is_odometry
+
+    def settle(self, right: Mask) -> float:
+        """Solve with these edges (M,); the truncated cost with the others at their bound."""
+        self._solver.weigh(right.astype(float))
+        self._solver.run(self._config.max_iterations)
+        c = self._solver.chi_squares()
+        loops = np.minimum(c[~self.known], self.limit).sum()
+        return 0.5 * float(c[self.known].sum() + loops)
+
+    def allowed(self, used: Mask) -> Mask:
+        """(M,) the edges beyond ``used`` that its solution, the solver's, does not refute."""
+        asked = np.flatnonzero(~used)
+        allowed = np.zeros(len(used), bool)
+        if len(asked):
+            predicted = predicted_chi2(self._graph.with_poses(self._solver.poses), used, asked)
+            allowed[asked[predicted <= self.limit]] = True
+        return allowed
+
+    def graduated(self, loops: Mask, least: float = 0.0) -> Mask:
+        """(M,) the right edges, by GNC on these loops (M,) from where the solver stands.
+
+        mu starts where the cost is convex and grows until every weight is 0 or 1.
+        """
+        solver, config, weights = self._solver, self._config, np.ones(len(loops))
+        weights[~loops & ~self.known] = 0.0
+        chi_squares = solver.chi_squares()[loops]
+        if not (chi_squares > self.limit).any():
+            return weights > 0.5
+
+        def solve(of_loops: Array) -> Array:
+            weights[loops] = np.maximum(of_loops, least)
+            solver.weigh(weights)
+            solver.run(config.gnc_inner_iterations)
+            return solver.chi_squares()[loops]
+
+        mu = first_mu(chi_squares, self.limit)
+        of_loops, _ = graduate(
+            chi_squares, self.limit, mu, config.gnc_step, config.max_iterations, solve
+        )
+        weights[loops] = of_loops
+        return weights > 0.5
+
+
+def _needed(graph: PoseGraph, costs: Array) -> Mask:
+    """(M,) edges of the cheapest tree: without them a vertex would hang loose."""
+    size = len(graph.ids)
+    low, high = np.sort(graph.edges, axis=1).T
+    order = np.lexsort((costs, high, low))
+    pairs = np.stack([low, high])[:, order]
+    cheapest = order[np.r_[True, (np.diff(pairs) != 0).any(axis=0)]]  # of edges of the same pair
+    weights = coo_array((costs[cheapest], (low[cheapest], high[cheapest])), shape=(size, size))
+    tree = minimum_spanning_tree(weights.tocsr()).tocoo()
+    in_tree = np.isin(low * size + high, tree.row.astype(np.int64) * size + tree.col)
+    needed = np.zeros(len(costs), bool)
+    needed[cheapest] = in_tree[cheapest]
+    return needed

@@ -1,0 +1,115 @@
+"""Optimising a pose graph offline: Levenberg-Marquardt, dogleg, or robustly with GNC.
+
+The cost is GTSAM's: half the sum of ``r^T Omega r``, with r the tangent of ``inverse(measurement) @
+inverse(T_world_i) @ T_world_j``.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.graph.batch.iteration import Progress
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.pose_graph.factors import chordal_poses, pose_graph_cost
+from bmask_slam.graph.pose_graph.gnc import find_wrong_loops
+from bmask_slam.graph.pose_graph.loop_consistency import loop_support
+from bmask_slam.graph.pose_graph.pose_graph import Mask, PoseGraph, spanning_tree_poses
+from bmask_slam.graph.pose_graph.solver import Method, PoseGraphConfig, PoseGraphSolver
+
+__all__ = ["Method", "PoseGraphConfig", "PoseGraphResult", "optimise_pose_graph"]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraphResult:
+    """An optimised graph and how it came about.
+
+    Attributes:
+        graph: the input with the optimised poses, all edges still in it.
+        given: where the poses before come from: file, or odometry where the file has none.
+        given_poses: (N, 4, 4) those, and given_cost their cost.
+        start: the initial value that was taken: file, odometry or chordal.
+        initial_cost, final_cost: from there to the end, the latter without the outliers.
+        iterations: solver steps altogether.
+        is_outlier: (M,) bool, edges that GNC found wrong; never an odometry edge.
+        duration_ms: wall time without reading and writing.
+    """
+
+    graph: PoseGraph
+    method: Method
+    given: str
+    given_poses: Array
+    given_cost: float
+    start: str
+    initial_cost: float
+    final_cost: float
+    iterations: int
+    is_outlier: Mask
+    duration_ms: float
+
+
+def optimise_pose_graph(
+    graph: PoseGraph,
+    config: PoseGraphConfig | None = None,
+    progress: Progress = lambda iteration, cost: None,
+) -> PoseGraphResult:
+    """Optimise a connected pose graph from the best initial value that is at hand.
+
+    The gauge is held by the fixed vertices, or by the first if none is fixed.
+
+    Raises:
+        InputError: the graph cannot be solved, whatever the reason is that GTSAM gives.
+    """
+    config = config or PoseGraphConfig()
+    begin_s = time.perf_counter()
+    solver = PoseGraphSolver(graph, config, progress)
+    try:
+        is_outlier = np.zeros(len(graph.edges), bool)
+        support, trusted = None, ~is_outlier
+        if config.method == "gnc":
+            support = loop_support(graph)
+            trusted = support.supported | graph.is_odometry
+            trusted = trusted if support.supported.any() else ~is_outlier
+        given = "file" if graph.has_poses else "odometry"
+        given_poses = graph.poses if graph.has_poses else spanning_tree_poses(graph)
+        start, poses = _best_start(graph, {given: given_poses}, trusted)
+        solver.start_from(poses)
+        if support is not None:
+            is_outlier = find_wrong_loops(graph, solver, config, support)
+        solver.weigh(np.where(is_outlier, 0.0, 1.0))
+        final_cost = solver.run(config.max_iterations)
+    except RuntimeError as error:  # GTSAM's exceptions all arrive as this
+        raise InputError(f"the pose graph cannot be solved: {error}") from error
+    return PoseGraphResult(
+        graph=graph.with_poses(solver.poses),
+        method=config.method,
+        given=given,
+        given_poses=given_poses,
+        given_cost=solver.cost(given_poses),
+        start=start,
+        initial_cost=solver.cost(poses),
+        final_cost=final_cost,
+        iterations=solver.iterations,
+        is_outlier=is_outlier,
+        duration_ms=1e3 * (time.perf_counter() - begin_s),
+    )
+
+
+# --- initial value -------------------------------------------------------------------------------
+
+
+def _best_start(graph: PoseGraph, given: dict[str, Array], trusted: Mask) -> tuple[str, Array]:
+    """Name and poses of the cheapest initial value, judged by the trusted edges (M,) alone.
+
+    Where several vertices are fixed, the given poses: the chordal solution knows of one anchor.
+    """
+    if graph.fixed.sum() > 1:
+        return next(iter(given.items()))
+    judged = graph.with_edges(trusted)
+    candidates = {**given, "chordal": chordal_poses(judged)}
+    costs = {name: pose_graph_cost(judged.with_poses(T)) for name, T in candidates.items()}
+    name = min(costs, key=lambda key: costs[key])
+    return name, candidates[name]

@@ -1,0 +1,234 @@
+"""ISAM2 behind a numpy border: the one place where its failures are translated."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.graph_update import IntArray
+from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
+from bmask_slam.graph.factors.keys import (
+    KEYFRAME_BASE,
+    keyframe_keys,
+    landmark_keys,
+    variable_named_in,
+)
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
+
+Variable = tuple[str, int]
+"""("keyframe" or "landmark", id)."""
+
+
+class SolverError(Exception):
+    """ISAM2 could not solve; it is thrown away and must be rebuilt from the shadow."""
+
+    def __init__(self, message: str, variable: Variable | None) -> None:
+        super().__init__(message)
+        self.variable = variable
+
+
+def _no_ids() -> IntArray:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class Change:
+    """What to pass to ISAM2: rows and numbers of new factors in the shadow, ids of new
+    variables, the slots of factors that left, and how many further steps may follow."""
+
+    rows: IntArray = field(default_factory=_no_ids)
+    numbers: list[int] = field(default_factory=list)
+    keyframe_ids: IntArray = field(default_factory=_no_ids)
+    landmark_ids: IntArray = field(default_factory=_no_ids)
+    removed_slots: list[int] = field(default_factory=list)
+    max_iterations: int = 0
+
+
+class Solver:
+    """An ISAM2 that follows a shadow. Without one (at first, after a failure) it builds one."""
+
+    def __init__(self, camera: Camera, config: SmootherConfig) -> None:
+        self._config = config
+        self._maker = FactorMaker(camera, config)
+        self._isam: gtsam.ISAM2 | None = None
+        self.elapsed_s = 0.0
+        """Time spent inside GTSAM's update and read-back since this was last set to zero."""
+
+    def reset(self) -> None:
+        """Throw ISAM2 away; the next update builds it from the shadow."""
+        self._isam = None
+
+    def update(self, shadow: Shadow, change: Change) -> None:
+        """Apply a change that the shadow already has, and read all values back into it.
+
+        Raises SolverError; the shadow's values are then those of before.
+        """
+        if self._isam is None:
+            self.rebuild(shadow)
+            return
+        self._apply(shadow, change)
+
+    def rebuild(self, shadow: Shadow) -> None:
+        """A new ISAM2 of the whole shadow, linearised at its current values."""
+        self._isam = None
+        if not len(shadow.keyframes.ids):
+            return
+        self._isam = gtsam.ISAM2(_parameters(self._config))
+        everything = Change(
+            shadow.observations.all_rows(),
+            sorted(shadow.pose_factors),
+            shadow.keyframes.ids,
+            shadow.landmarks.ids,
+        )
+        self._apply(shadow, everything)
+
+    def optimise_batch(self, shadow: Shadow, max_iterations: int) -> tuple[float, float]:
+        """Levenberg-Marquardt on everything; the cost before and after.
+
+        Raises SolverError; the shadow's values are then those of before.
+        """
+        self._isam = None
+        graph, values = self._everything(shadow)
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(max_iterations)
+        parameters.setRelativeErrorTol(1e-7)
+        started_s = time.perf_counter()
+        try:
+            before = graph.error(values)
+            values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+            after = graph.error(values)
+        except RuntimeError as error:
+            raise self._failure(error) from error
+        if not np.isfinite(after):
+            raise SolverError(f"the cost is {after}", None)
+        poses, points = read_values(values)
+        self.elapsed_s += time.perf_counter() - started_s
+        self._check_finite(shadow, poses, points)
+        shadow.keyframes.values, shadow.landmarks.values = poses, points
+        return before, after
+
+    def marginal_covariance(
+        self, shadow: Shadow, keyframes: IntArray, landmarks: IntArray
+    ) -> Array:
+        """Joint covariance of keyframes (6 each, ``[rad, m]``), then landmarks (3 each, m).
+
+        From ISAM2, or from the shadow at its current values when there is none.
+        """
+        keys = keyframe_keys(keyframes) + landmark_keys(landmarks)
+        try:
+            source = self._isam or gtsam.Marginals(*self._everything(shadow))
+            if len(keys) == 1:
+                return np.asarray(source.marginalCovariance(keys[0]))
+            joint = source.jointMarginalCovariance(keys)
+            return np.block([[joint.at(a, b) for b in keys] for a in keys])
+        except RuntimeError as error:
+            raise self._failure(error) from error
+
+    def marginals(self, shadow: Shadow, landmarks: IntArray) -> Marginals:
+        """Covariances of every keyframe and of some landmarks at the shadow's current values."""
+        if not len(shadow.keyframes.ids):
+            return Marginals(shadow.keyframes.ids, np.zeros((0, 6, 6)))
+        try:
+            return marginals_of(*self._everything(shadow), shadow.keyframes.ids, landmarks)
+        except RuntimeError as error:
+            raise SolverError(str(error).strip(), variable_named_in(str(error))) from error
+
+    def _everything(self, shadow: Shadow) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """All factors and values, in an order that depends on the shadow's contents alone."""
+        numbers = sorted(shadow.pose_factors)
+        graph = make_graph(self._factors(shadow, shadow.observations.all_rows(), numbers))
+        keyframes, landmarks = shadow.keyframes, shadow.landmarks
+        return graph, make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
+
+    def _factors(self, shadow: Shadow, rows: IntArray, numbers: list[int]) -> list:
+        factors = self._maker.observations(shadow.observations.select(rows))
+        return factors + [
+            self._maker.pose_factor(shadow.pose_factors[number].factor) for number in numbers
+        ]
+
+    def _apply(self, shadow: Shadow, change: Change) -> None:
+        graph = make_graph(self._factors(shadow, change.rows, change.numbers))
+        values = make_values(
+            change.keyframe_ids,
+            shadow.keyframes.get(change.keyframe_ids),
+            change.landmark_ids,
+            shadow.landmarks.get(change.landmark_ids),
+        )
+        slots, poses, points = self._run(graph, values, change)
+        if len(poses) != len(shadow.keyframes.ids) or len(points) != len(shadow.landmarks.ids):
+            self._isam = None
+            raise SolverError("ISAM2 and the shadow hold different variables", None)
+        self._check_finite(shadow, poses, points)
+        shadow.observations.set_slots(change.rows, np.array(slots[: len(change.rows)], np.int64))
+        for number, slot in zip(change.numbers, slots[len(change.rows) :], strict=True):
+            shadow.pose_factors[number].slot = slot
+        shadow.keyframes.values, shadow.landmarks.values = poses, points
+
+    def _run(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, change: Change
+    ) -> tuple[list[int], Array, Array]:
+        assert self._isam is not None
+        removed, started_s = change.removed_slots, time.perf_counter()
+        try:
+            keys = values.keys() if removed else []
+            if any(self._isam.valueExists(key) for key in keys):
+                self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), removed)
+                removed = []  # an id that left comes again: it must be gone before
+            result = self._isam.update(graph, values, removed, poses_last(graph))
+            slots = result.getNewFactorsIndices()
+            for _ in range(self._config.extra_iterations):
+                self._isam.update()
+            for _ in range(change.max_iterations):
+                if self._isam.update().getVariablesRelinearized() == 0:
+                    break
+            return slots, *read_values(self._isam.calculateEstimate())
+        except RuntimeError as error:
+            raise self._failure(error) from error
+        finally:
+            self.elapsed_s += time.perf_counter() - started_s
+
+    def _failure(self, error: RuntimeError) -> SolverError:
+        self._isam = None
+        first_line = str(error).strip().split("\n\n")[0].replace("\n", " ")
+        return SolverError(first_line, variable_named_in(str(error)))
+
+    def _check_finite(self, shadow: Shadow, poses: Array, points: Array) -> None:
+        for name, ids, values in (
+            ("landmark", shadow.landmarks.ids, points),
+            ("keyframe", shadow.keyframes.ids, poses),
+        ):
+            bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+            if bad.any():
+                self._isam = None
+                raise SolverError("a value is not finite", (name, int(ids[bad][0])))
+
+
+def poses_last(graph: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
+    """The order in which ISAM2 eliminates: the poses that new factors touch at the end.
+
+    By itself it puts all that a change touches to the end, and a keyframe that leaves touches
+    hundreds of landmarks. A pose that is eliminated before them ties all that it sees to each
+    other: where a place is walked again that takes four times the time and the memory.
+    """
+    groups = gtsam.KeyGroupMap()
+    for key in graph.keyVector():
+        if key >= KEYFRAME_BASE:
+            groups.insert2(key, 1)
+    return groups
+
+
+def _parameters(config: SmootherConfig) -> gtsam.ISAM2Params:
+    parameters = gtsam.ISAM2Params()
+    parameters.setRelinearizeThreshold(config.relinearize_threshold)
+    parameters.relinearizeSkip = config.relinearize_skip
+    parameters.findUnusedFactorSlots = True
+    parameters.evaluateNonlinearError = False
+    parameters.setFactorization("CHOLESKY")
+    return parameters

@@ -1,0 +1,119 @@
+"""What to take out of the graph after ISAM2 failed.
+
+GTSAM names a variable near the place where elimination broke down, which need not be the
+cause: a new pose on one point is reported as that point. So the causes that can be seen are
+looked for first, and the named variable is dropped only when there is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.checks import reprojection
+from bmask_slam.graph.factors.factor_tables import Shadow, ids_array
+from bmask_slam.graph.factors.graph_update import GraphUpdate, IntArray
+from bmask_slam.graph.factors.observability import constrained_landmarks
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.smoother.anchoring import (
+    anchor_components,
+    bridge,
+    keyframes_held_by,
+    loose_in,
+)
+from bmask_slam.graph.smoother.isam2 import Variable
+from bmask_slam.graph.smoother.removal import remove
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What a repair took out of the shadow, and whom it tied loosely."""
+
+    dropped_landmarks: IntArray
+    dropped_keyframes: IntArray
+    bridged_keyframes: IntArray
+
+    @property
+    def changed(self) -> bool:
+        """Whether it did anything; if not, trying again would fail again."""
+        return bool(
+            len(self.dropped_landmarks)
+            or len(self.dropped_keyframes)
+            or len(self.bridged_keyframes)
+        )
+
+
+def repair(
+    named: Variable | None,
+    new_keyframes: IntArray,
+    shadow: Shadow,
+    camera: Camera,
+    config: SmootherConfig,
+) -> Repair:
+    """Take out what makes the system singular; ``new_keyframes`` go rather than be bridged."""
+    held = keyframes_held_by(anchor_components(shadow, config), shadow)
+    pairs = _broken_observations(shadow, camera)
+    broken = remove(GraphUpdate(remove_observations=pairs), shadow, config)
+    landmarks = _loose_landmarks(shadow, camera, config)
+    keyframes = loose_in(shadow, config)
+    if named is not None and not (len(held) or broken or len(landmarks) or len(keyframes)):
+        landmarks = ids_array([named[1]] if named[0] == "landmark" else [])
+        keyframes = ids_array([named[1]] if named[0] == "keyframe" else [])
+    leaving = ids_array(
+        k for k in keyframes.tolist() if k in new_keyframes or _is_bridged(k, shadow)
+    )
+    update = GraphUpdate(remove_landmarks=landmarks, remove_keyframes=leaving)
+    removal = remove(update, shadow, config)
+    tied = _tie(np.setdiff1d(keyframes, leaving), shadow, config)
+    bridged = (held, broken.bridged_keyframes, removal.bridged_keyframes, tied)
+    dropped = (landmarks, broken.dropped_landmarks, removal.dropped_landmarks)
+    return Repair(
+        np.unique(np.concatenate(dropped)),
+        leaving,
+        np.intersect1d(np.concatenate(bridged), shadow.keyframes.ids),
+    )
+
+
+def _is_bridged(keyframe: int, shadow: Shadow) -> bool:
+    factors = (shadow.pose_factors[n].factor for n in shadow.numbers_of_keyframes([keyframe]))
+    return any(getattr(factor, "kind", "") == "bridge" for factor in factors)
+
+
+def _broken_observations(shadow: Shadow, camera: Camera) -> IntArray:
+    """Pairs (N, 2) of observations without a finite error; a NaN spoils every value."""
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    poses = shadow.keyframes.get(seen.keyframe_ids)
+    points = shadow.landmarks.get(seen.landmark_ids)
+    _, chi2 = reprojection(seen, poses, points, camera)
+    bad = ~np.isfinite(chi2)
+    return np.stack([seen.keyframe_ids[bad], seen.landmark_ids[bad]], axis=1)
+
+
+def _loose_landmarks(shadow: Shadow, camera: Camera, config: SmootherConfig) -> IntArray:
+    """Landmarks that the views in front of a camera do not constrain."""
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    poses = shadow.keyframes.get(seen.keyframe_ids)
+    points = shadow.landmarks.get(seen.landmark_ids)
+    depth_m, _ = reprojection(seen, poses, points, camera)
+    useful = depth_m >= config.min_depth_m
+    held = constrained_landmarks(
+        seen.select(useful), poses[useful], points[useful], config.min_parallax_deg
+    )
+    return np.setdiff1d(shadow.landmarks.ids, held)
+
+
+def _tie(loose: IntArray, shadow: Shadow, config: SmootherConfig) -> IntArray:
+    """Bridge loose keyframes to firm ones, one at a time: one bridge may hold a whole part."""
+    bridged: list[int] = []
+    while len(loose):
+        firm = np.setdiff1d(shadow.keyframes.ids, loose)
+        if not len(firm):
+            break
+        k = int(loose[0])
+        nearest = int(firm[np.argmin(np.abs(firm - k))])
+        shadow.add_pose_factors([bridge(nearest, k, shadow, config)])
+        bridged.append(k)
+        loose = np.intersect1d(loose[1:], loose_in(shadow, config))
+    return ids_array(bridged)

@@ -1,0 +1,315 @@
+"""The factor graph of keyframe poses and landmarks, kept optimal by ISAM2."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.checks import (
+    observation_errors,
+    relative_pose_errors,
+    wrong_observations,
+)
+from bmask_slam.graph.factors.factor_tables import Shadow, ValueTable, ids_array
+from bmask_slam.graph.factors.graph_update import (
+    GraphEstimate,
+    GraphUpdate,
+    IntArray,
+    ObservationErrors,
+    PosePrior,
+    RelativePose,
+    RelativePoseErrors,
+    RemovalPolicy,
+)
+from bmask_slam.graph.factors.observability import diagonal_covariance
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.marginals.covariances import Marginals
+from bmask_slam.graph.marginals.landmark_marginalisation import (
+    Retirement,
+    forget,
+    note_retracted,
+    note_returned,
+    reinstate,
+    retire,
+    returning,
+)
+from bmask_slam.graph.smoother.anchoring import anchor_components, release_bridges
+from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError
+from bmask_slam.graph.smoother.removal import Removal, remove
+from bmask_slam.graph.smoother.repair import repair
+from bmask_slam.graph.smoother.storage import graph_arrays, read_graph, shadow_of, write_graph
+from bmask_slam.graph.smoother.update_report import UpdateReport
+from bmask_slam.graph.smoother.validation import Admitted, admit
+
+__all__ = ["Smoother", "SmootherConfig"]
+logger = logging.getLogger(__name__)
+
+
+class Smoother:
+    """Keyframe poses and landmarks under ISAM2, with a shadow that survives its failures.
+
+    An update never raises for what it is asked to add: whatever cannot enter is refused with
+    a reason, and a failure of ISAM2 is repaired and reported in the estimate. The first
+    keyframe gets a prior at its initial value unless the first update brings one.
+    """
+
+    def __init__(self, camera: Camera, config: SmootherConfig | None = None) -> None:
+        self._camera = camera
+        self._config = config or SmootherConfig()
+        self._shadow = Shadow()
+        self._solver = Solver(camera, self._config)
+
+    def update(self, update: GraphUpdate) -> GraphEstimate:
+        """Remove, add, optimise one step, and read everything back."""
+        started_s = time.perf_counter()
+        self._solver.elapsed_s = 0.0
+        model = self._shadow, self._camera, self._config
+        update = self._with_first_prior(update)
+        forgotten, removal = self._remove(update)
+        note_retracted(removal.dropped_landmarks, self._shadow.archive)
+        retired = retire(update.retire_landmarks, *model)
+        admitted = admit(returning(update, self._shadow, self._camera), *model)
+        report = UpdateReport(admitted.refused, admitted.refused_factors, removal.report)
+        report.add_removal(removal)
+        entered = self._enter(admitted, [forgotten, removal, retired], report)
+        change = dataclasses.replace(entered, max_iterations=update.max_iterations)
+        try:
+            self._solver.update(self._shadow, change)
+        except SolverError as failure:
+            ids = admitted.keyframe_ids
+            if not self._recover(failure, ids, report, self._solver.rebuild):
+                self._retract(admitted, change, report)
+        return self._estimate(report, started_s)
+
+    def optimise_batch(
+        self, max_iterations: int = 100, drop_outliers: bool = False
+    ) -> GraphEstimate:
+        """Full bundle adjustment (Levenberg-Marquardt, with the kernels) of the whole graph.
+
+        With ``drop_outliers`` observations beyond the 95 % bound of chi-square, taken without the
+        kernel, then leave the graph, and it is optimised again.
+        Retired landmarks come back with all their observations, and stay until they are
+        retired again.
+        ISAM2 is thrown away and made anew from the result if another update comes. A failure
+        is repaired as in an update; if it cannot be, the values stay and the costs are NaN.
+        """
+        started_s = time.perf_counter()
+        self._solver.elapsed_s = 0.0
+        reinstate(self._shadow, self._camera, self._config)
+        report, costs = UpdateReport(), [(math.nan, math.nan)]
+
+        def solve(shadow: Shadow) -> None:
+            costs.append(self._solver.optimise_batch(shadow, max_iterations))
+
+        for last in (False, True) if drop_outliers else (True,):
+            try:
+                solve(self._shadow)
+            except SolverError as failure:
+                if not self._recover(failure, ids_array([]), report, solve):
+                    logger.error("batch optimisation failed; the values stay as they were")
+                    break
+            if not last:
+                wrong = wrong_observations(self._shadow, self._camera)
+                update = GraphUpdate(remove_observations=wrong)
+                report.add_removal(remove(update, self._shadow, self._config))
+        before, after = costs[-1]
+        estimate = self._estimate(report, started_s)
+        return dataclasses.replace(estimate, cost_before=before, cost_after=after)
+
+    def estimate(self) -> GraphEstimate:
+        """The current estimate, without optimising."""
+        return self._estimate(UpdateReport(), time.perf_counter())
+
+    def observation_errors(self) -> ObservationErrors:
+        """Chi-square of every observation at the current estimate, to find outliers by."""
+        return observation_errors(self._shadow, self._camera)
+
+    def relative_pose_errors(self, kind: str) -> RelativePoseErrors:
+        """Chi-square of every relative pose of a kind at the current estimate."""
+        factors = [
+            entry.factor
+            for _, entry in sorted(self._shadow.pose_factors.items())
+            if isinstance(entry.factor, RelativePose) and entry.factor.kind == kind
+        ]
+        return relative_pose_errors(factors, self._shadow.keyframes)
+
+    def marginal_covariance(self, keyframe_id: int) -> Array:
+        """Covariance (6, 6) of a pose's ``[rotation rad, translation m]`` on its right side.
+
+        The true pose is about ``T_world_camera @ se3_exp(xi)``, xi ~ N(0, covariance).
+        Raises KeyError for an unknown id.
+        """
+        return self.joint_covariance(np.array([keyframe_id]))
+
+    def joint_covariance(
+        self, keyframe_ids: IntArray, landmark_ids: IntArray | None = None
+    ) -> Array:
+        """Joint covariance (6K + 3L square): keyframes in the given order, then landmarks."""
+        landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
+        _check_known(self._shadow.keyframes, keyframe_ids)
+        _check_known(self._shadow.landmarks, landmarks)
+        return self._solver.marginal_covariance(self._shadow, keyframe_ids, landmarks)
+
+    def marginals(self, landmark_ids: IntArray | None = None) -> Marginals:
+        """Covariances of every keyframe, and of some landmarks, from one factorisation.
+
+        Raises KeyError for an unknown id, SolverError for a graph that cannot be solved.
+        """
+        landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
+        _check_known(self._shadow.landmarks, landmarks)
+        return self._solver.marginals(self._shadow, landmarks)
+
+    def restart(self) -> None:
+        """Throw ISAM2 away; the next update makes it from the current values.
+
+        A loaded smoother starts so too: an undisturbed run that restarts where it saves goes
+        on exactly like one that is loaded from the file.
+        """
+        self._solver.reset()
+
+    def state(self) -> Arrays:
+        """Graph, values and ids as named arrays; ISAM2 is not among them, see ``restart``."""
+        return graph_arrays(self._shadow)
+
+    def restore(self, state: Arrays, path: Path) -> None:
+        """Become the smoother of a state that was read from a file. Raises InputError."""
+        self._shadow = shadow_of(state, path)
+        self.restart()
+
+    def save(self, path: Path) -> None:
+        """Write the graph, its values and ids into one file, atomically."""
+        write_graph(path, self._shadow, self._camera)
+
+    @classmethod
+    def load(cls, path: Path, config: SmootherConfig | None = None) -> Smoother:
+        """A smoother that goes on from a saved graph. Raises InputError for a bad file."""
+        shadow, camera = read_graph(path)
+        smoother = cls(camera, config)
+        smoother._shadow = shadow
+        return smoother
+
+    def _with_first_prior(self, update: GraphUpdate) -> GraphUpdate:
+        if len(self._shadow.keyframes.ids) or update.priors or not len(update.keyframe_ids):
+            return update
+        covariance = diagonal_covariance(
+            self._config.prior_sigma_rotation_rad, self._config.prior_sigma_translation_m
+        )
+        first = int(np.argmin(update.keyframe_ids))
+        prior = PosePrior(
+            int(update.keyframe_ids[first]), update.poses_world_camera[first], covariance
+        )
+        return dataclasses.replace(update, priors=(prior,))
+
+    def _remove(self, update: GraphUpdate) -> tuple[Retirement, Removal]:
+        """Carry out the removals on the archive and on the graph, or refuse them on both.
+
+        The archive comes first, so that what stands for the rest of it holds the keyframes.
+        """
+        model = self._shadow, self._camera, self._config
+        if update.removal_policy is RemovalPolicy.DROP:
+            return forget(update, *model), remove(update, self._shadow, self._config)
+        removal = remove(update, self._shadow, self._config)
+        refused = len(removal.report.refused) > 0
+        return (Retirement() if refused else forget(update, *model)), removal
+
+    def _enter(
+        self, admitted: Admitted, left: Sequence[Removal | Retirement], report: UpdateReport
+    ) -> Change:
+        """Put what was admitted into the shadow, and say what ISAM2 must be told."""
+        self._shadow.keyframes.insert(admitted.keyframe_ids, admitted.poses_world_camera)
+        self._shadow.landmarks.insert(admitted.landmark_ids, admitted.points_world)
+        rows = self._shadow.observations.add(admitted.observations)
+        note_returned(admitted.landmark_ids, self._shadow.archive)
+        numbers = [number for done in left for number in done.pose_factors]
+        numbers += self._shadow.add_pose_factors(admitted.pose_factors)
+        free, slots = release_bridges(admitted.observations, self._shadow, self._config)
+        report.bridged.difference_update(free.tolist())
+        return Change(
+            rows,
+            [number for number in numbers if number in self._shadow.pose_factors],
+            admitted.keyframe_ids,
+            admitted.landmark_ids,
+            sorted([*slots, *(slot for done in left for slot in done.slots)]),
+        )
+
+    def _recover(
+        self,
+        failure: SolverError,
+        new_keyframes: IntArray,
+        report: UpdateReport,
+        solve: Callable[[Shadow], None],
+    ) -> bool:
+        """Repair the shadow and solve anew until it works; whether it did.
+
+        The first attempt drops only what is visibly loose, later ones the named variable too.
+        """
+        report.rebuilt = True
+        for attempt in range(self._config.max_recoveries):
+            report.failed = failure.variable or report.failed
+            logger.warning("GTSAM failed near %s (%s)", report.failed_variable or "?", failure)
+            named = failure.variable if attempt else None
+            done = repair(named, new_keyframes, self._shadow, self._camera, self._config)
+            report.add_repair(done)
+            note_retracted(done.dropped_landmarks, self._shadow.archive)
+            try:
+                solve(self._shadow)
+                return True
+            except SolverError as again:
+                failure = again
+                if attempt and not done.changed:
+                    break
+        return False
+
+    def _retract(self, admitted: Admitted, change: Change, report: UpdateReport) -> None:
+        """Take the whole update out again, refused as SOLVER_FAILED."""
+        seen = admitted.observations
+        pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+        undo = GraphUpdate(
+            remove_keyframes=admitted.keyframe_ids,
+            remove_landmarks=admitted.landmark_ids,
+            remove_observations=pairs,
+        )
+        report.add_removal(remove(undo, self._shadow, self._config))
+        note_retracted(admitted.landmark_ids, self._shadow.archive)
+        present = [n for n in change.numbers if n in self._shadow.pose_factors]
+        self._shadow.remove_pose_factors(present)
+        anchor_components(self._shadow, self._config)
+        report.refuse_all(admitted)
+        try:
+            self._solver.rebuild(self._shadow)
+        except SolverError as failure:
+            logger.error("ISAM2 cannot solve the graph (%s); values stay as they were", failure)
+
+    def _estimate(self, report: UpdateReport, started_s: float) -> GraphEstimate:
+        return GraphEstimate(
+            self._shadow.keyframes.ids,
+            self._shadow.keyframes.values,
+            self._shadow.landmarks.ids,
+            self._shadow.landmarks.values,
+            report.refused,
+            report.refused_factors,
+            report.removal,
+            dropped_landmarks=ids_array(report.landmarks),
+            dropped_keyframes=ids_array(report.keyframes),
+            bridged_keyframes=ids_array(report.bridged),
+            rebuilt=report.rebuilt,
+            failed_variable=report.failed_variable,
+            update_ms=1e3 * (time.perf_counter() - started_s),
+            solver_ms=1e3 * self._solver.elapsed_s,
+            factors=len(self._shadow),
+        )
+
+
+def _check_known(table: ValueTable, ids: IntArray) -> None:
+    known = table.contains(ids)
+    if not known.all():
+        raise KeyError(f"not in the graph: {ids[~known].tolist()}")

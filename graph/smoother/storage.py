@@ -1,0 +1,159 @@
+"""A saved graph: every factor, value and id as named arrays, in one file
+(graph/files/array_file.py).
+
+ISAM2 itself cannot be saved; from this it is made anew, independent of GTSAM's version. A saved
+map holds the same arrays as a part (slam/run_folder/map_file.py).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
+from bmask_slam.graph.files.array_file import Arrays, FileKind, Header, read_arrays, write_arrays
+from bmask_slam.graph.smoother.marginalised_storage import SHAPES, archive_arrays, read_archive
+
+GRAPH_FILE = FileKind("graph", 3)
+_SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
+    "keyframe_ids": ("keyframe", ()),
+    "poses_world_camera": ("keyframe", (4, 4)),
+    "landmark_ids": ("landmark", ()),
+    "points_world": ("landmark", (3,)),
+    "observation_keyframe_ids": ("observation", ()),
+    "observation_landmark_ids": ("observation", ()),
+    "measurements": ("observation", (3,)),
+    "sigmas_px": ("observation", (3,)),
+    "pose_factor_keyframes": ("pose factor", (2,)),
+    "pose_factor_T": ("pose factor", (4, 4)),
+    "pose_factor_covariances": ("pose factor", (6, 6)),
+    "pose_factor_kinds": ("pose factor", ()),
+    "pose_factor_robust": ("pose factor", ()),
+    **SHAPES,
+}
+_PRIOR = "prior"
+
+
+def write_graph(path: Path, shadow: Shadow, camera: Camera) -> None:
+    """Save a shadow and its camera in one file, atomically. Raises InputError if it cannot."""
+    write_arrays(path, GRAPH_FILE, {"camera": dataclasses.asdict(camera)}, graph_arrays(shadow))
+
+
+def read_graph(path: Path) -> tuple[Shadow, Camera]:
+    """Load what write_graph saved. Raises InputError for a missing, foreign or broken file."""
+    header, arrays = read_arrays(path, GRAPH_FILE)
+    return shadow_of(arrays, path), read_camera(header, path)
+
+
+def graph_arrays(shadow: Shadow) -> Arrays:
+    """Everything a shadow knows, but for the places of its factors in ISAM2."""
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    factors = [shadow.pose_factors[number].factor for number in sorted(shadow.pose_factors)]
+    return {
+        "keyframe_ids": shadow.keyframes.ids,
+        "poses_world_camera": np.ascontiguousarray(shadow.keyframes.values),
+        "landmark_ids": shadow.landmarks.ids,
+        "points_world": np.ascontiguousarray(shadow.landmarks.values),
+        "observation_keyframe_ids": seen.keyframe_ids,
+        "observation_landmark_ids": seen.landmark_ids,
+        "measurements": seen.measurements,
+        "sigmas_px": seen.sigmas_px,
+        "pose_factor_keyframes": np.array([_ends(factor) for factor in factors], np.int64).reshape(
+            -1, 2
+        ),
+        "pose_factor_T": np.array([_measured(f) for f in factors], float).reshape(-1, 4, 4),
+        "pose_factor_covariances": np.array(
+            [factor.covariance for factor in factors], float
+        ).reshape(-1, 6, 6),
+        "pose_factor_kinds": np.array([getattr(f, "kind", _PRIOR) for f in factors], np.str_),
+        "pose_factor_robust": np.array([getattr(f, "robust", "") or "" for f in factors], np.str_),
+        **archive_arrays(shadow),
+    }
+
+
+def _ends(factor: RelativePose | PosePrior) -> tuple[int, int]:
+    if isinstance(factor, PosePrior):
+        return factor.keyframe_id, factor.keyframe_id
+    return factor.keyframe_a, factor.keyframe_b
+
+
+def _measured(factor: RelativePose | PosePrior) -> np.ndarray:
+    return factor.T_world_camera if isinstance(factor, PosePrior) else factor.T_a_b
+
+
+def _check(arrays: Arrays, path: Path) -> None:
+    """Every array there, of its shape, sorted ids, no factor on a variable that is missing."""
+    counts: dict[str, int] = {}
+    for name, (what, shape) in _SHAPES.items():
+        array = arrays.get(name)
+        if array is None or array.shape[1:] != shape or array.ndim != 1 + len(shape):
+            raise InputError(f"{path}: array {name!r} is missing or misshapen; save it again")
+        if counts.setdefault(what, len(array)) != len(array):
+            raise InputError(f"{path}: array {name!r} has {len(array)} rows; save it again")
+    for ids, references in (
+        (
+            "keyframe_ids",
+            (
+                "observation_keyframe_ids",
+                "pose_factor_keyframes",
+                "archived_keyframe_ids",
+                "summary_keyframe_ids",
+            ),
+        ),
+        ("landmark_ids", ("observation_landmark_ids",)),
+    ):
+        if (np.diff(arrays[ids]) <= 0).any():
+            raise InputError(f"{path}: {ids} are not ascending; save it again")
+        for name in references:
+            unknown = np.setdiff1d(arrays[name], arrays[ids])
+            if len(unknown):
+                raise InputError(f"{path}: {name} has unknown id {unknown[0]}; save it again")
+
+
+def shadow_of(arrays: Arrays, path: Path) -> Shadow:
+    """The shadow of ``graph_arrays``, read from a file.
+
+    Raises:
+        InputError: they do not fit together.
+    """
+    _check(arrays, path)
+    shadow = Shadow()
+    shadow.keyframes.insert(arrays["keyframe_ids"], arrays["poses_world_camera"])
+    shadow.landmarks.insert(arrays["landmark_ids"], arrays["points_world"])
+    shadow.observations.add(
+        Observations(
+            arrays["observation_keyframe_ids"],
+            arrays["observation_landmark_ids"],
+            arrays["measurements"],
+            arrays["sigmas_px"],
+        )
+    )
+    columns = (
+        arrays["pose_factor_keyframes"].tolist(),
+        arrays["pose_factor_T"],
+        arrays["pose_factor_covariances"],
+        arrays["pose_factor_kinds"].tolist(),
+        arrays["pose_factor_robust"].tolist(),
+    )
+    for (a, b), T, covariance, kind, robust in zip(*columns, strict=True):
+        factor: RelativePose | PosePrior = PosePrior(a, T, covariance)
+        if kind != _PRIOR:
+            factor = RelativePose(a, b, T, covariance, robust or None, kind)
+        shadow.add_pose_factors([factor])
+    shadow.archive = read_archive(arrays)
+    return shadow
+
+
+def read_camera(header: Header, path: Path) -> Camera:
+    """The camera of a file's header. Raises InputError if it is none."""
+    try:
+        fields = dict(header["camera"])
+        fields["distortion"] = tuple(fields["distortion"])
+        return Camera(**fields)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: its camera cannot be read ({error}); save it again") from error

@@ -1,0 +1,225 @@
+"""Algorithm 1 over a stream of keyframes, the fusion delayed until neighbours exist."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.mapping.inverse_depth.depth_map import DepthNoise, InverseDepthMap, from_sensor
+from bmask_slam.mapping.inverse_depth.fusion import MAX_NEIGHBOURS, fuse, stated
+from bmask_slam.mapping.inverse_depth.plane_sweep import completed, sweep
+from bmask_slam.mapping.inverse_depth.regularisation import regularise
+from bmask_slam.mapping.inverse_depth.search_range import search_range
+from bmask_slam.mapping.inverse_depth.stereo import match_stereo
+from bmask_slam.mapping.inverse_depth.warping import View
+
+DepthSource = Literal["sensor", "both", "stereo", "motion"]
+MIN_BASELINE_M, SWEEP_VIEWS = 0.03, 2
+Mask = NDArray[np.bool_]
+WINDOW = 6
+"""Keyframes on either side among which neighbours are chosen."""
+
+
+@dataclass(frozen=True, eq=False)
+class DenseKeyframe:
+    """What dense mapping needs of a keyframe.
+
+    Attributes:
+        id: its number in the map.
+        T_world_camera: (4, 4).
+        rgb: (H, W, 3) uint8, red first, undistorted.
+        depth_m: (H, W) float32 of the sensor, undistorted, NaN where missing.
+        landmark_ids: (L,) landmarks that it observes.
+        landmark_depths_m: (L,) their z in its camera.
+        instances: (H, W) uint16, number of the instance that each pixel shows, 0 for none; or None.
+        right: (H, W, 3) uint8, the right image of a rectified pair whose left one is ``rgb``, with
+            the camera's bf: u_right = u_left - bf / z; or None.
+        unmatched: (H, W) bool, pixels to which matching images must give no depth; or None.
+    """
+
+    id: int
+    T_world_camera: Array
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    landmark_ids: NDArray[np.int64]
+    landmark_depths_m: Array
+    instances: NDArray[np.uint16] | None = None
+    right: NDArray[np.uint8] | None = None
+    unmatched: Mask | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FusedKeyframe:
+    """A keyframe after Step 5.
+
+    Attributes:
+        keyframe: what it was made of.
+        map: inverse depth with its honest variance.
+        views: (H, W) uint8, keyframes that each estimate rests on; 0 where Step 5 filled.
+    """
+
+    keyframe: DenseKeyframe
+    map: InverseDepthMap
+    views: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class DenseConfig:
+    """How keyframes are fused.
+
+    Attributes:
+        noise: of the depth sensor.
+        neighbours: at most so many are fused with a keyframe.
+        source: "sensor"; "stereo", keyframes' right images; "motion", a plane sweep between
+            keyframes; or "both", where the sensor has nothing the right image, or else the sweep.
+        device: torch's name of where it is computed.
+    """
+
+    noise: DepthNoise = field(default_factory=DepthNoise)
+    neighbours: int = MAX_NEIGHBOURS
+    source: DepthSource = "sensor"
+    device: str = "cpu"
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A keyframe after Step 3."""
+
+    keyframe: DenseKeyframe
+    map: InverseDepthMap
+    image: Tensor
+
+
+class DenseMapper:
+    """Takes keyframes one after the other and gives each back, fused, once six later ones came.
+
+    Memory is bounded: thirteen keyframes are held, in the order of their ids. One that comes after
+    a later one still finds its place; those that are fused by then did without it.
+    """
+
+    def __init__(self, camera: Camera, config: DenseConfig | None = None) -> None:
+        self.camera = camera
+        self.config = config or DenseConfig()
+        self._held: list[_Prepared] = []
+        self._wanted: set[int] = set()
+
+    def push(self, keyframe: DenseKeyframe, wanted: bool = True) -> list[FusedKeyframe]:
+        """Take a keyframe in; the one for which all neighbours exist by that comes back.
+
+        One that is not ``wanted`` serves its neighbours only.
+        """
+        bisect.insort(self._held, self._prepare(keyframe), key=lambda p: p.keyframe.id)
+        if wanted:
+            self._wanted.add(keyframe.id)
+        return self._finished(len(self._held) - WINDOW)
+
+    def _prepare(self, keyframe: DenseKeyframe) -> _Prepared:
+        """Steps 1 to 3 of a keyframe, with those that came before it."""
+        config, measured = self.config, None
+        image = as_image(keyframe.rgb, config.device)
+        if config.source in ("sensor", "both"):
+            measured = from_sensor(keyframe.depth_m, self.camera, config.noise, config.device)
+        if config.source != "sensor":
+            matched = self._matched(keyframe, image)
+            if keyframe.unmatched is not None:
+                matched = matched.where(~torch.from_numpy(keyframe.unmatched).to(image.device))
+            measured = matched if measured is None else completed(measured, matched)
+        assert measured is not None
+        return _Prepared(keyframe, regularise(measured), image)
+
+    def _matched(self, keyframe: DenseKeyframe, image: Tensor) -> InverseDepthMap:
+        """Steps 1 and 2 with the right image, or else the last keyframes that stood elsewhere."""
+        window = search_range(keyframe.landmark_depths_m)
+        if window is not None and keyframe.right is not None:
+            right = as_image(keyframe.right, self.config.device)
+            return match_stereo(image, right, self.camera, window)
+        T_own_world = inverse(keyframe.T_world_camera)
+        others = [(p.image, T_own_world @ p.keyframe.T_world_camera) for p in self._held[-WINDOW:]]
+        apart = [o for o in others if np.linalg.norm(o[1][:3, 3]) > MIN_BASELINE_M]
+        if window is None or not apart or self.config.source == "stereo":
+            empty = torch.full(image.shape[-2:], torch.nan, device=image.device)
+            return InverseDepthMap(empty, empty)
+        return sweep(image, apart[-SWEEP_VIEWS:], self.camera, window)
+
+    def move(self, poses: Mapping[int, Array]) -> None:
+        """Take over the T_world_camera (4, 4) of keyframes by their ids, as optimised since."""
+        for k, held in enumerate(self._held):
+            T = poses.get(held.keyframe.id)
+            if T is not None and T is not held.keyframe.T_world_camera:
+                self._held[k] = replace(held, keyframe=replace(held.keyframe, T_world_camera=T))
+
+    def relabel(self, keyframe_id: int, instances: NDArray[np.uint16], moves: Mask) -> None:
+        """Take over the instances (H, W) of a keyframe, and what moves in it (H, W).
+
+        For those that wait for neighbours; any other keyframe is passed over.
+        """
+        for k, held in enumerate(self._held):
+            if held.keyframe.id == keyframe_id and keyframe_id in self._wanted:
+                depth_m = np.where(moves, np.float32(np.nan), held.keyframe.depth_m)
+                told = replace(held.keyframe, instances=instances, depth_m=depth_m, unmatched=moves)
+                self._held[k] = self._prepare(told)
+
+    def forget(self, keyframe_ids: Collection[int]) -> None:
+        """Do without keyframes from here on."""
+        self._held = [p for p in self._held if p.keyframe.id not in keyframe_ids]
+        self._wanted -= set(keyframe_ids)
+
+    def flush(self) -> list[FusedKeyframe]:
+        """What still waits for neighbours that will not come; what follows begins anew."""
+        results = self._finished(len(self._held))
+        self._held = []
+        return results
+
+    def _finished(self, end: int) -> list[FusedKeyframe]:
+        """Fuse those held up to ``end`` and let go of what nobody needs any more."""
+        ids = [p.keyframe.id for p in self._held[: max(end, 0)]]
+        results = [self._fuse(k) for k, number in enumerate(ids) if number in self._wanted]
+        self._wanted -= set(ids)
+        del self._held[: max(end - WINDOW, 0)]
+        return results
+
+    def _fuse(self, k: int) -> FusedKeyframe:
+        own = self._held[k]
+        window = self._held[max(k - WINDOW, 0) : k + WINDOW + 1]
+        others = {p.keyframe.id: p for p in window if p is not own}
+        chosen = neighbours(
+            own.keyframe, [p.keyframe for p in others.values()], self.config.neighbours
+        )
+        return fused(own, [others[n.id] for n in chosen], self.camera, self.config)
+
+
+def as_image(rgb: NDArray[np.uint8], device: str = "cpu") -> Tensor:
+    """Slightly blurred colours (3, H, W), 0 to 255, of an image (H, W, 3)."""
+    blurred = np.ascontiguousarray(cv2.blur(rgb, (3, 3)).transpose(2, 0, 1))
+    return torch.from_numpy(blurred).to(device, torch.float32)
+
+
+def fused(
+    own: _Prepared, others: list[_Prepared], camera: Camera, config: DenseConfig
+) -> FusedKeyframe:
+    """Steps 4 and 5 of a keyframe with its neighbours."""
+    T_own_world = inverse(own.keyframe.T_world_camera)
+    views = [
+        View(other.map, T_own_world @ other.keyframe.T_world_camera, other.image)
+        for other in others
+    ]
+    result = fuse(own.map, views, camera, own.image)
+    final = stated(regularise(result.map), result)
+    return FusedKeyframe(own.keyframe, final, result.views.cpu().numpy())
+
+
+def neighbours(own: DenseKeyframe, others: list[DenseKeyframe], count: int) -> list[DenseKeyframe]:
+    """The keyframes that share most landmarks with one, the nearer in order first of equals."""
+    shared = [len(np.intersect1d(own.landmark_ids, o.landmark_ids)) for o in others]
+    order = sorted(range(len(others)), key=lambda k: (-shared[k], abs(others[k].id - own.id)))
+    return [others[k] for k in order[:count]]

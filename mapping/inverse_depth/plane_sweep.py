@@ -1,0 +1,131 @@
+"""Step 2 between keyframes: a sweep over inverse depth, for what no sensor has measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.inverse_depth.matching_cost import (
+    GuidedFilter,
+    MatchingConfig,
+    matching_cost,
+    winner,
+)
+from bmask_slam.mapping.inverse_depth.warping import project
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """How a sweep is made.
+
+    Attributes:
+        levels: inverse depths tried, evenly over the search range.
+        shrink: the images are made smaller by it.
+        min_clearness: of the winner; below it the place is ambiguous.
+        max_cost: of the winner.
+        matching: constants of the costs.
+    """
+
+    levels: int = 48
+    shrink: int = 2
+    min_clearness: float = 1.15
+    max_cost: float = 2.5
+    matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(guided_radius=4))
+
+
+def sweep(
+    image: Tensor,
+    neighbours: Sequence[tuple[Tensor, Array]],
+    camera: Camera,
+    search_range: tuple[float, float],
+    config: SweepConfig | None = None,
+) -> InverseDepthMap:
+    """Inverse depth (H, W) of an image (3, H, W) by neighbours (image, T_own_neighbour).
+
+    At each level every neighbour is seen through the plane z = 1 / rho; of the neighbours the
+    better agrees, since the other may be occluded. The winner takes all, in the fraction of a
+    level. sigma_rho is one pixel of the small image over the baseline: 1 / |dp / d rho| in the
+    neighbour that moves most.
+    """
+    config = config or SweepConfig()
+    small = shrunk_camera(camera, config.shrink)
+    guide = _shrunk(image, config.shrink)
+    others = [(_shrunk(other, config.shrink), inverse(T)) for other, T in neighbours]
+    levels = torch.linspace(*search_range, config.levels, device=image.device)
+    planes = [_level(guide, others, small, float(rho), config.matching) for rho in levels]
+    costs = GuidedFilter(guide, config.matching)(torch.stack(planes))
+    index, clear = winner(costs)
+    good = (clear > config.min_clearness) & (costs.amin(0) < config.max_cost)
+    good &= (index > 0) & (index < config.levels - 1)
+    step = (search_range[1] - search_range[0]) / (config.levels - 1)
+    rho = torch.where(good, search_range[0] + index * step, torch.nan)
+    moved = torch.stack([_motion(rho, T, small) for _, T in others]).amax(0)
+    found = InverseDepthMap(rho, torch.where(moved > 0, moved**-2, torch.nan))
+    return _enlarged(found.where(moved > 0), image.shape[-2:])
+
+
+def _level(
+    guide: Tensor,
+    others: Sequence[tuple[Tensor, Array]],
+    camera: Camera,
+    rho: float,
+    config: MatchingConfig,
+) -> Tensor:
+    """Costs (h, w) of one inverse depth: the least of all neighbours'."""
+    plane = torch.full(guide.shape[-2:], rho, device=guide.device)
+    costs = []
+    for other, T_other_own in others:
+        u, v, _ = project(plane, T_other_own, camera)
+        seen = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
+        grid = torch.stack(
+            [u * (2 / (camera.width - 1)) - 1, v * (2 / (camera.height - 1)) - 1], dim=-1
+        )[None]
+        warped = grid_sample(other[None], grid, "bilinear", "border", align_corners=True)[0]
+        costs.append(matching_cost(guide, torch.where(seen, warped, torch.nan), config))
+    return torch.stack(costs).amin(0)
+
+
+def _motion(rho: Tensor, T_other_own: Array, camera: Camera) -> Tensor:
+    """|dp / d rho| (h, w) of the pixel in the neighbour, by a small step."""
+    step = 1e-3
+    u, v, _ = project(rho, T_other_own, camera)
+    u2, v2, _ = project(rho + step, T_other_own, camera)
+    return torch.nan_to_num(torch.hypot(u2 - u, v2 - v) / step, posinf=0.0)
+
+
+def shrunk_camera(camera: Camera, by: int) -> Camera:
+    """The camera of images averaged over by x by pixels: (u + 0.5) / by - 0.5."""
+    return Camera(
+        camera.width // by, camera.height // by, camera.fx / by, camera.fy / by,
+        (camera.cx + 0.5) / by - 0.5, (camera.cy + 0.5) / by - 0.5,
+        stereo_bf_px_m=camera.stereo_bf_px_m / by,
+    )  # fmt: skip
+
+
+def _shrunk(image: Tensor, by: int) -> Tensor:
+    return avg_pool2d(image[None], by)[0]
+
+
+def _enlarged(small: InverseDepthMap, shape: Sequence[int]) -> InverseDepthMap:
+    """Every pixel takes its block's estimate."""
+    rho, variance = (
+        interpolate(x[None, None], size=tuple(shape), mode="nearest-exact")[0, 0]
+        for x in (small.rho, small.variance)
+    )
+    return InverseDepthMap(rho, variance)
+
+
+def completed(measured: InverseDepthMap, swept: InverseDepthMap) -> InverseDepthMap:
+    """The measurement where there is one, what the sweep found elsewhere."""
+    known = measured.known
+    return InverseDepthMap(
+        torch.where(known, measured.rho, swept.rho),
+        torch.where(known, measured.variance, swept.variance),
+    )

@@ -1,0 +1,170 @@
+"""The cloud of all submaps: one point a voxel, colours averaged, labels fused in log space.
+
+Memory is bounded by the largest block of space, not by the map: points go through files on disk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from bmask_slam.graph.geometry import Array
+from bmask_slam.mapping.products.submaps import Submap, voxel_keys
+from bmask_slam.mapping.products.surface_labels import LabelTable
+
+BLOCK_VOXELS = 256
+CELL_VOXELS = 3
+"""Sides of a cell in which a submap that has no point in a voxel is asked for its labels."""
+_POINT = np.dtype(
+    [
+        ("point", "<f4", 3),
+        ("normal", "<f4", 3),
+        ("colour", "u1", 3),
+        ("weight", "<f4"),
+        ("instance", "<i4"),
+    ]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points of the map.
+
+    Attributes:
+        points, normals: (N, 3) float32 in the world, metres.
+        colours: (N, 3) uint8 red first.
+        sigmas_m: (N,) float32, standard deviation.
+        labels: (N,) uint16, most probable class; 0 is the background.
+        probabilities: (N,) float32 of that class.
+        views: (N,) uint16, submaps that were fused.
+    """
+
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    sigmas_m: NDArray[np.float32]
+    labels: NDArray[np.uint16]
+    probabilities: NDArray[np.float32]
+    views: NDArray[np.uint16]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def spill(submaps: Iterable[tuple[Submap, Array, int]], voxel_m: float, folder: Path) -> list[Path]:
+    """Sort the points of all submaps into one file a block of space; the files, in a fixed order.
+
+    Each submap comes with the pose of its anchor (4, 4) in the world and the number of its first
+    instance (its row 0) in a table of all submaps' instances.
+    """
+    files: dict[int, Path] = {}
+    for submap, T_world_anchor, first_instance in submaps:
+        rows = np.empty(len(submap), _POINT)
+        rows["point"], rows["normal"] = submap.placed(T_world_anchor)
+        rows["colour"], rows["weight"] = submap.colours, 1 / submap.variances
+        rows["instance"] = submap.instances.astype(np.int64) + first_instance
+        keys = voxel_keys(rows["point"], BLOCK_VOXELS * voxel_m)
+        order = np.argsort(keys, kind="stable")
+        keys, rows = keys[order], rows[order]
+        starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]][: len(keys)])
+        for start, part in zip(starts, np.split(rows, starts[1:]), strict=False):
+            path = files.setdefault(int(keys[start]), folder / f"{keys[start]}.points")
+            with path.open("ab") as file:
+                file.write(part.tobytes())
+    return [files[key] for key in sorted(files)]
+
+
+def merged(files: Iterable[Path], voxel_m: float, table: LabelTable) -> Iterator[Cloud]:
+    """The cloud of each block that ``spill`` wrote."""
+    for path in files:
+        yield merge(np.fromfile(path, _POINT), voxel_m, table)
+
+
+def merge(rows: NDArray, voxel_m: float, table: LabelTable) -> Cloud:
+    """One point a voxel of rows of type _POINT.
+
+    Positions and normals are means weighted by 1 / sigma^2, colours plain means. The variance is
+    the least of the voxel's points: their submaps were fused with each other and are no
+    independent views. Labels are what the submaps' instances say, each submap once.
+    """
+    _, voxel, views = np.unique(
+        voxel_keys(rows["point"], voxel_m), return_inverse=True, return_counts=True
+    )
+    count = len(views)
+    weight: Array = rows["weight"].astype(float)
+    total: Array = np.bincount(voxel, weight, count).astype(float)
+    points = _mean(voxel, rows["point"], weight, total)
+    normals = _mean(voxel, rows["normal"], weight, total)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    colours = _mean(voxel, rows["colour"], np.ones(len(rows)), views.astype(float))
+    best = np.zeros(count, np.float32)
+    np.maximum.at(best, voxel, rows["weight"])
+    cell = np.unique(voxel_keys(points, CELL_VOXELS * voxel_m), return_inverse=True)[1]
+    labels, probabilities = _fused_labels(voxel, cell, rows["instance"], table)
+    return Cloud(
+        points.astype(np.float32),
+        normals.astype(np.float32),
+        np.rint(colours).astype(np.uint8),
+        (1 / np.sqrt(best)).astype(np.float32),
+        labels,
+        probabilities,
+        np.minimum(views, 65535).astype(np.uint16),
+    )
+
+
+def _mean(voxel: NDArray, values: NDArray, weight: Array, total: Array) -> Array:
+    """Weighted means (M, 3) of values (N, 3) by voxel."""
+    columns = [np.bincount(voxel, weight * values[:, k], len(total)) for k in range(3)]
+    return np.stack(columns, axis=1) / total[:, None]
+
+
+def _fused_labels(
+    voxel: NDArray, cell: NDArray, instance: NDArray, table: LabelTable
+) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
+    """Class (M,) and its probability (M,) of voxels, points (N,) in them being of instances (N,).
+
+    ``cell`` (M,) is that of each voxel.
+    """
+    if table.log_likelihoods.shape[1] == 1:
+        return np.zeros(len(cell), np.uint16), np.ones(len(cell), np.float32)
+    evidence = table.fused(_views(voxel, cell, instance, table.submaps))
+    evidence -= evidence.max(axis=1, keepdims=True)
+    label = evidence.argmax(axis=1)
+    probability = 1 / np.exp(evidence, out=evidence).sum(axis=1)
+    return label.astype(np.uint16), probability
+
+
+def _views(
+    voxel: NDArray, cell: NDArray, instance: NDArray, submap_of: NDArray[np.int64]
+) -> csr_matrix:
+    """(M, I) shares of instances in what each submap shows of each voxel, one in all.
+
+    A submap that has points in a voxel's cell, but none in the voxel, since its own grid lies
+    otherwise, shows there what it shows in the cell.
+    """
+    submap, instances = submap_of[instance], len(submap_of)
+    count = int(submap_of[-1]) + 1
+    pairs, own = _shares(voxel * count + submap, instance, instances)
+    near_pairs, near = _shares(cell[voxel] * count + submap, instance, instances)
+    voxels, near_cells = pairs // count, near_pairs // count
+    beside = np.searchsorted(near_pairs, cell[voxels] * count + pairs % count)
+    missing = _sums(near_cells, near, int(cell.max()) + 1)[cell]
+    return missing + _sums(voxels, own - near[beside], len(cell))
+
+
+def _shares(pair: NDArray, instance: NDArray, instances: int) -> tuple[NDArray, csr_matrix]:
+    """The pairs (P,) that points (N,) have, rising, and the shares (P, I) of instances in each."""
+    pairs, row, points = np.unique(pair, return_inverse=True, return_counts=True)
+    share = (1 / points[row]).astype(np.float32)
+    return pairs, csr_matrix((share, (row, instance)), (len(pairs), instances))
+
+
+def _sums(group: NDArray, rows: csr_matrix, count: int) -> csr_matrix:
+    """Sums (count, I) of rows (P, I) by group (P,)."""
+    ones = np.ones(len(group), np.float32)
+    return csr_matrix((ones, (group, np.arange(len(group)))), (count, len(group))) @ rows

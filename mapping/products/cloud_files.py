@@ -1,0 +1,138 @@
+"""Point clouds written block by block: PLY and PCD, whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.mapping.products.cloud import Cloud
+
+_PLY_NAMES = {"<f4": "float", "|u1": "uchar", "<u2": "ushort"}
+_PCD_NAMES = {"f": "F", "u": "U"}
+_PCD_COLUMNS = {f"n{axis}": f"normal_{axis}" for axis in "xyz"}
+_PACKED = ("blue", "green", "red", "alpha")
+
+
+class CloudWriter:
+    """Takes blocks of a cloud and writes them as binary PLY and PCD under one name.
+
+    A context manager: the files take their names when the block ends well.
+    """
+
+    def __init__(self, stem: Path, palette: NDArray[np.uint8] | None = None) -> None:
+        """``stem`` is the path without suffix; with a ``palette`` (C, 3) points get their
+        label's colour.
+        """
+        self.stem = stem
+        self.count = 0
+        self._palette = palette
+        self._body: IO[bytes] | None = None
+
+    @property
+    def _temporary(self) -> Path:
+        return self.stem.with_name(f".{self.stem.name}.part")
+
+    def __enter__(self) -> CloudWriter:
+        self._body = self._temporary.open("wb")
+        return self
+
+    def write(self, cloud: Cloud) -> None:
+        """Append a block."""
+        assert self._body is not None
+        self._body.write(_rows(cloud, self._palette).tobytes())
+        self.count += len(cloud)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        assert self._body is not None
+        self._body.close()
+        try:
+            if error is None:
+                self._finish(".ply", _ply_header(self.count))
+                self._finish(".pcd", _pcd_header(self.count))
+        finally:
+            self._temporary.unlink(missing_ok=True)
+
+    def _finish(self, suffix: str, header: str) -> None:
+        with (
+            whole_file(self.stem.with_suffix(suffix)) as temporary,
+            temporary.open("wb") as out,
+            self._temporary.open("rb") as body,
+        ):
+            out.write(header.encode("ascii"))
+            shutil.copyfileobj(body, out)
+
+
+# PCD's rgb is a number of 32 bits: its bytes are PLY's blue, green, red and alpha.
+_LAYOUT = np.dtype(
+    [
+        *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")),
+        *((name, "u1") for name in _PACKED),
+        ("label", "<u2"),
+        ("probability", "<f4"),
+        ("sigma", "<f4"),
+    ]
+)
+
+
+def _rows(cloud: Cloud, palette: NDArray[np.uint8] | None) -> NDArray:
+    rows = np.empty(len(cloud), _LAYOUT)
+    colours = cloud.colours if palette is None else palette[cloud.labels]
+    for names, values in (
+        (("x", "y", "z"), cloud.points),
+        (("nx", "ny", "nz"), cloud.normals),
+        (("red", "green", "blue"), colours),
+    ):
+        for name, column in zip(names, values.T, strict=True):
+            rows[name] = column
+    rows["alpha"] = 255
+    rows["label"], rows["probability"] = cloud.labels, cloud.probabilities
+    rows["sigma"] = cloud.sigmas_m
+    return rows
+
+
+def _columns() -> Sequence[tuple[str, np.dtype]]:
+    assert _LAYOUT.fields is not None
+    return [(name, _LAYOUT.fields[name][0]) for name in _LAYOUT.names or ()]
+
+
+def _ply_header(count: int) -> str:
+    lines = ["ply", "format binary_little_endian 1.0", "comment bmask-slam, world frame, metres"]
+    lines.append(f"element vertex {count}")
+    lines += [f"property {_PLY_NAMES[kind.str]} {name}" for name, kind in _columns()]
+    return "\n".join([*lines, "end_header\n"])
+
+
+def _pcd_header(count: int) -> str:
+    fields = [
+        (_PCD_COLUMNS.get(n, n), k.itemsize, _PCD_NAMES[k.kind])
+        for n, k in _columns()
+        if n not in _PACKED
+    ]
+    fields.insert(6, ("rgb", 4, "U"))
+    names, sizes, kinds = zip(*fields, strict=True)
+    lines = [
+        "# .PCD v0.7 - bmask-slam, world frame, metres",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(names),
+        "SIZE " + " ".join(map(str, sizes)),
+        "TYPE " + " ".join(kinds),
+        "COUNT " + " ".join("1" for _ in names),
+        f"WIDTH {count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {count}",
+        "DATA binary",
+    ]
+    return "\n".join(lines) + "\n"

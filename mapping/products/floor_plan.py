@@ -1,0 +1,182 @@
+"""The map from above: what stands where, where one can walk, and what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.geometry import Array
+from bmask_slam.mapping.products.cloud import Cloud
+from bmask_slam.mapping.products.pictures import EMPTY, palette, with_legend
+
+FLOOR_COLOUR = (235, 230, 215)
+HEIGHTS_M = (0.1, 1.9)
+"""Above the floor: what stands between is in the way."""
+UPRIGHT_COSINE = 0.95
+BIN_M = 0.04
+GUESS_DEG, CANDIDATES = 45.0, 400
+
+
+def up_direction(normals: NDArray[np.floating], first_guess: Array) -> Array:
+    """The world's upward unit vector (3,): where most normals (N, 3) lie near ``first_guess``.
+
+    Floors and table tops have it, ceilings its opposite. The guess, e.g. the cameras' mean -y
+    axis, may be GUESS_DEG off. Of CANDIDATES normals the one with most others within 8 degrees
+    begins; means over cones that narrow to 4 degrees make it exact.
+    """
+    up = first_guess / np.linalg.norm(first_guess)
+    cosine = normals @ up
+    possible = (np.sign(cosine)[:, None] * normals)[np.abs(cosine) > np.cos(np.deg2rad(GUESS_DEG))]
+    if len(possible) < 100:
+        return np.asarray(up, float)
+    candidates = possible[:: max(len(possible) // CANDIDATES, 1)]
+    others = possible[:: max(len(possible) // (20 * CANDIDATES), 1)]
+    votes = (candidates @ others.T > np.cos(np.deg2rad(8))).sum(axis=1)
+    up = candidates[votes.argmax()]
+    for degrees in (12, 8, 6, 4):
+        near = possible[possible @ up > np.cos(np.deg2rad(degrees))]
+        mean = near.sum(axis=0)
+        up = mean / np.linalg.norm(mean)
+    return np.asarray(up, float)
+
+
+def levelled(points: Array, up: Array, floor_m: float) -> tuple[Array, float]:
+    """Up and the floor's height by a plane through the points (N, 3) near the floor.
+
+    Normals are noisy: over some metres their mean is centimetres off.
+    """
+    for _ in range(4):
+        near = points[np.abs(points @ up - floor_m) < 1.5 * BIN_M]
+        if len(near) < 100:
+            break
+        middle = near.mean(axis=0)
+        normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
+        up = normal * np.sign(normal @ up)
+        floor_m = float(middle @ up)
+    return up, floor_m
+
+
+def floor_height(heights_m: Array, share: float = 0.15) -> float:
+    """Height of the floor by those (N,) of upward-facing points: the lowest of the strong peaks."""
+    if not len(heights_m):
+        return 0.0
+    low = float(np.quantile(heights_m, 0.002))
+    bins = np.floor((heights_m - low) / BIN_M).astype(int)
+    count = np.bincount(np.maximum(bins, 0))
+    peak = int(np.flatnonzero(count >= share * count.max())[0])
+    near = np.abs(heights_m - (low + (peak + 0.5) * BIN_M)) < 1.5 * BIN_M
+    return float(np.median(heights_m[near]))
+
+
+@dataclass(frozen=True, eq=False)
+class PlanFrame:
+    """Axes of the plan in the world.
+
+    Attributes:
+        axes: (3, 3), rows right, forward and up.
+        floor_m: the floor's height along up.
+        cell_m: edge of a cell.
+    """
+
+    axes: Array
+    floor_m: float
+    cell_m: float
+
+
+def plan_frame(cloud_sample: Cloud, first_guess: Array, cell_m: float) -> PlanFrame:
+    """The frame by a sample of the cloud: up by the floor, right along the longest walls."""
+    up = up_direction(cloud_sample.normals, first_guess)
+    facing_up = cloud_sample.normals @ up > UPRIGHT_COSINE
+    level = cloud_sample.points[facing_up].astype(float)
+    up, floor_m = levelled(level, up, floor_height(level @ up))
+    helper = np.eye(3)[np.argmin(np.abs(up))]
+    right = np.cross(helper, up)
+    right /= np.linalg.norm(right)
+    forward = np.cross(up, right)
+    walls = cloud_sample.normals[np.abs(cloud_sample.normals @ up) < 0.1]
+    angle = np.arctan2(walls @ forward, walls @ right)
+    turn = np.angle(np.exp(4j * angle).sum()) / 4 if len(walls) else 0.0
+    right, forward = (
+        np.cos(turn) * right + np.sin(turn) * forward,
+        np.cos(turn) * forward - np.sin(turn) * right,
+    )
+    return PlanFrame(np.stack([right, forward, up]), floor_m, cell_m)
+
+
+class FloorPlan:
+    """Cells that fill as blocks of the cloud arrive."""
+
+    def __init__(self, frame: PlanFrame, classes: int) -> None:
+        self.frame = frame
+        self._classes = classes
+        self._standing = np.zeros((0, 4), np.int64)  # column, row, label, points
+        self._floor = np.zeros((0, 2), np.int64)
+
+    def add(self, cloud: Cloud) -> None:
+        """Take a block in."""
+        placed = cloud.points.astype(float) @ self.frame.axes.T
+        height_m = placed[:, 2] - self.frame.floor_m
+        cells = np.floor(placed[:, :2] / self.frame.cell_m).astype(np.int64)
+        standing = (height_m > HEIGHTS_M[0]) & (height_m < HEIGHTS_M[1])
+        rows = np.column_stack([cells[standing], cloud.labels[standing].astype(np.int64)])
+        found, count = np.unique(rows, axis=0, return_counts=True)
+        self._standing = np.concatenate([self._standing, np.column_stack([found, count])])
+        walked = cells[np.abs(height_m) < HEIGHTS_M[0] / 2]
+        self._floor = np.concatenate([self._floor, np.unique(walked, axis=0)])
+
+    def grid(self, path_world: Array) -> tuple[NDArray[np.int16], Array]:
+        """Cells (rows, the foremost last; columns right): label, -1 floor, -2 unseen.
+
+        Also the path (N, 3) in columns and rows (N, 2), all of it inside.
+        """
+        path = (path_world @ self.frame.axes.T)[:, :2] / self.frame.cell_m
+        cells = np.concatenate([self._standing[:, :2], self._floor, np.floor(path).astype(int)])
+        low, high = cells.min(axis=0), cells.max(axis=0)
+        width, height = high - low + 1
+        grid = np.full((height, width), -2, np.int16)
+        grid[high[1] - self._floor[:, 1], self._floor[:, 0] - low[0]] = -1
+        votes = np.zeros((height, width, self._classes), np.int64)
+        column, row, label, points = self._standing.T
+        np.add.at(votes, (high[1] - row, column - low[0], label), points)
+        occupied = votes.any(axis=2)
+        grid[occupied] = _labels(votes[occupied])
+        return grid, np.column_stack([path[:, 0] - low[0], high[1] + 1 - path[:, 1]])
+
+    def picture(self, names: Sequence[str], path_world: Array) -> NDArray[np.uint8]:
+        """The plan (H, W, 3), red first, with scale bar, legend and the camera's path (N, 3)."""
+        grid, path = self.grid(path_world)
+        scale = max(1, round(900 / max(grid.shape)))
+        colours = np.vstack([[[EMPTY] * 3, FLOOR_COLOUR], palette(len(names))]).astype(np.uint8)
+        image = np.kron(colours[grid + 2], np.ones((scale, scale, 1), np.uint8))
+        line = np.rint(path * scale).astype(np.int32)
+        cv2.polylines(image, [line], False, (220, 30, 30), 2, cv2.LINE_AA)
+        margin, white = 40, (EMPTY,) * 3
+        image = cv2.copyMakeBorder(
+            image, margin, 2 * margin, margin, margin, cv2.BORDER_CONSTANT, value=white
+        )
+        _scale_bar(image, scale / self.frame.cell_m, margin)
+        present = [label for label in range(len(names)) if (grid == label).any()]
+        return with_legend(image, names, present)
+
+
+def _labels(votes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The class of each cell (N, C): a thing before the background, with a fifth of the points."""
+    things = votes[:, 1:]
+    if things.shape[1] == 0:
+        return np.zeros(len(votes), np.int64)
+    enough = things.max(axis=1) > 0.2 * votes.sum(axis=1)
+    return np.where(enough, things.argmax(axis=1) + 1, 0)
+
+
+def _scale_bar(image: NDArray[np.uint8], px_per_m: float, margin: int) -> None:
+    """One metre, at the lower left."""
+    x, y, length = margin, image.shape[0] - margin // 2, round(px_per_m)
+    cv2.rectangle(image, (x, y - 6), (x + length, y), (0, 0, 0), -1)
+    cv2.putText(
+        image, "1 m", (x + length + 8, y + 1), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1,
+        cv2.LINE_AA,
+    )  # fmt: skip

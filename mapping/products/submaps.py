@@ -1,0 +1,137 @@
+"""Submaps: the surfaces that a keyframe sees, as points in its own frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
+from bmask_slam.graph.geometry import Array
+from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
+from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
+
+SUBMAP_FILE = FileKind("submap", 1, compressed=False)
+UNLABELLED = 0
+MAX_GRAZING_COSINE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """Points in the frame of an anchor keyframe; with the anchor's pose they move rigidly.
+
+    Attributes:
+        anchor: the keyframe's id.
+        points: (N, 3) float32 metres, anchor frame.
+        normals: (N, 3) float32 unit vectors towards the camera, anchor frame.
+        colours: (N, 3) uint8 red first.
+        variances: (N,) float32 m^2 of the depth.
+        instances: (N,) uint16, number of the keyframe's instance that shows there, from 1; 0 none.
+    """
+
+    anchor: int
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    variances: NDArray[np.float32]
+    instances: NDArray[np.uint16]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def placed(self, T_world_anchor: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Points and normals (N, 3) in the world for a pose of the anchor (4, 4)."""
+        T = T_world_anchor.astype(np.float32)
+        return self.points @ T[:3, :3].T + T[:3, 3], self.normals @ T[:3, :3].T
+
+
+def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) -> Submap:
+    """The submap of a fused keyframe, one point a voxel of ``voxel_m``.
+
+    Points without a normal, and those seen at less
+    than 6 degrees, are left out: they are rims.
+    """
+    grid = back_project(result.map, camera).reshape(-1, 3)
+    normals = surface_normals(result.map, camera).reshape(-1, 3)
+    facing = -(normals * grid).sum(-1) > MAX_GRAZING_COSINE * torch.linalg.norm(grid, dim=-1)
+    pixels = torch.nonzero(facing)[:, 0]
+    points = grid.index_select(0, pixels).cpu().numpy()
+    squared_depth = result.map.rho.square().reciprocal_()
+    depth_variance = (result.map.variance * squared_depth.square_()).reshape(-1)
+    variances = depth_variance.index_select(0, pixels).cpu().numpy()
+    keep = nearest_a_voxel(points, variances, voxel_m)
+    kept = pixels.cpu().numpy()[keep]
+    instances = result.keyframe.instances
+    if instances is None:
+        instances = np.zeros(result.keyframe.depth_m.shape, np.uint16)
+    return Submap(
+        result.keyframe.id,
+        points[keep],
+        normals.cpu().numpy()[kept],
+        result.keyframe.rgb.reshape(-1, 3)[kept],
+        variances[keep],
+        instances.reshape(-1)[kept],
+    )
+
+
+def relabelled(
+    submap: Submap, camera: Camera, instances: NDArray[np.uint16], moves: NDArray[np.bool_]
+) -> Submap:
+    """A submap with the instances (H, W) of its keyframe, without points on what ``moves`` (H, W).
+
+    Points were made of pixels' centres, which are found again by projection.
+    """
+    columns, rows = np.rint(camera.project(submap.points.astype(float))).astype(np.int64).T
+    keep = ~moves[rows, columns]
+    arrays = {name: values[keep] for name, values in _arrays(submap).items()}
+    return Submap(submap.anchor, **arrays | {"instances": instances[rows, columns][keep]})
+
+
+def nearest_a_voxel(
+    points: NDArray[np.float32], variances: NDArray[np.float32], voxel_m: float
+) -> NDArray[np.int64]:
+    """Indices, rising, of the surest point (N, 3) in each voxel, of equals the first."""
+    if len(points) == 0:
+        return np.zeros(0, np.int64)
+    keys = voxel_keys(points, voxel_m)
+    order = np.argsort(keys)
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    counts = np.diff(starts, append=len(keys))
+    sorted_variances = variances[order]
+    least = np.repeat(np.minimum.reduceat(sorted_variances, starts), counts)
+    surest = np.where(sorted_variances == least, order, len(keys))
+    return np.sort(np.minimum.reduceat(surest, starts))
+
+
+def voxel_keys(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
+    """One number (N,) for the voxel of each point (N, 3); 21 bits an axis."""
+    index = np.floor(points / voxel_m).astype(np.int64) + (1 << 20)
+    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+
+
+def write_submap(path: Path, submap: Submap) -> None:
+    """Save a submap; it appears whole or not at all. Raises InputError where it cannot."""
+    write_arrays(path, SUBMAP_FILE, {"anchor": submap.anchor}, _arrays(submap))
+
+
+def read_submap(path: Path) -> Submap:
+    """Read a submap. Raises InputError for a missing, foreign or broken file."""
+    header, arrays = read_arrays(path, SUBMAP_FILE)
+    check_like(arrays, _arrays(_empty()), path)
+    return Submap(int(header["anchor"]), **arrays)
+
+
+def _arrays(submap: Submap) -> dict[str, NDArray]:
+    names: Sequence[str] = ("points", "normals", "colours", "variances", "instances")
+    return {name: getattr(submap, name) for name in names}
+
+
+def _empty() -> Submap:
+    rows = np.zeros((0, 3), np.float32)
+    one = np.zeros(0, np.float32)
+    return Submap(0, rows, rows, rows.astype(np.uint8), one, one.astype(np.uint16))

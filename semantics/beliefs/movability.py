@@ -1,0 +1,179 @@
+"""Whether things move: a binary Bayes filter for many things at once, by their ids."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.labels import UNKNOWN, LabelSet
+
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+_FIRST_CAPACITY = 1024
+
+
+@dataclass(frozen=True)
+class MovabilityConfig:
+    """How evidence counts.
+
+    ``hit_rate`` is P(evidence says moving | moving) = P(evidence says static | static).
+    Frames in a row err together, so that one counts for ``frame_power`` of its likelihood. All
+    evidence together moves the log odds by at most ``max_evidence``: what stops moving becomes
+    static again, and the other way round.
+    """
+
+    hit_rate: float = 0.9
+    frame_power: float = 0.25
+    max_evidence: float = 2.7
+
+    def __post_init__(self) -> None:
+        if not 0.5 < self.hit_rate < 1:
+            raise ValueError("hit_rate must be between 0.5 and 1")
+        if not 0 < self.frame_power <= 1 or not 0 < self.max_evidence < np.inf:
+            raise ValueError("frame_power must be in (0, 1], max_evidence positive")
+
+    @property
+    def step(self) -> float:
+        """Log odds of one piece of evidence."""
+        return float(np.log(self.hit_rate / (1 - self.hit_rate)))
+
+
+class MovabilityFilter:
+    """P(moving) of every id from 0 on, as log odds: those of its prior and of the evidence.
+
+    The two are kept apart, since a label that comes later changes the prior alone. ``unknown``
+    is the prior of what has no label.
+    """
+
+    def __init__(self, unknown: float, config: MovabilityConfig | None = None) -> None:
+        self.config = config or MovabilityConfig()
+        self._unknown = float(np.float32(log_odds(unknown)))  # as it is stored
+        self._clear()
+
+    def set_priors(self, ids: Ints, priors: Array) -> None:
+        """Things ids (N,) are of classes that move with these probabilities (N,)."""
+        self._reserve(ids)
+        self._prior[ids] = log_odds(priors)
+
+    def update(self, ids: Ints, moving: Mask, power: float = 1.0) -> None:
+        """Evidence about things ids (N,), each at most once: moving or static (N,)."""
+        self._reserve(ids)
+        step = np.float32(power * self.config.step)
+        limit = np.float32(self.config.max_evidence)
+        gained = self._evidence[ids] + np.where(moving, step, -step)
+        self._evidence[ids] = np.clip(gained, -limit, limit)
+
+    def log_odds(self, ids: Ints) -> Array:
+        """(N,) for any ids (N,)."""
+        found = np.full(len(ids), self._unknown)
+        inside = ids < len(self._prior)
+        found[inside] = self._prior[ids[inside]] + self._evidence[ids[inside]]
+        return found
+
+    def probabilities(self, ids: Ints) -> Array:
+        """P(moving) (N,) for any ids (N,)."""
+        return 1 / (1 + np.exp(-self.log_odds(ids)))
+
+    def moving(self, ids: Ints) -> Mask:
+        """Which of any ids (N,) are more likely moving than not."""
+        return self.log_odds(ids) > 0
+
+    def known(self) -> Ints:
+        """Ids (N,) that were spoken of, rising."""
+        return np.flatnonzero((self._evidence != 0) | (self._prior != self._unknown))
+
+    def move(self, from_ids: Ints, to_ids: Ints) -> None:
+        """Evidence about from_ids (N,) is about to_ids (N,) as well; both are one thing."""
+        self._reserve(np.concatenate([from_ids, to_ids]))
+        limit = np.float32(self.config.max_evidence)
+        gained = self._evidence[from_ids]
+        labelled = self._prior[from_ids] != self._unknown
+        self._prior[to_ids[labelled]] = self._prior[from_ids[labelled]]
+        self.drop(from_ids)
+        np.add.at(self._evidence, to_ids, gained)
+        self._evidence[to_ids] = np.clip(self._evidence[to_ids], -limit, limit)
+
+    def drop(self, ids: Ints) -> None:
+        """Forget things (N,)."""
+        ids = ids[ids < len(self._prior)]
+        self._evidence[ids] = 0.0
+        self._prior[ids] = self._unknown
+
+    def state(self) -> Arrays:
+        """What is known, as named arrays with one row for each id that was spoken of."""
+        ids = self.known()
+        size = np.array(len(self._prior))
+        return {
+            "size": size,
+            "ids": ids,
+            "prior": self._prior[ids],
+            "evidence": self._evidence[ids],
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the filter of a state."""
+        self._clear()
+        self._reserve(state["size"].reshape(1) - 1)
+        self._prior[state["ids"]] = state["prior"]
+        self._evidence[state["ids"]] = state["evidence"]
+
+    def _clear(self) -> None:
+        self._prior: NDArray[np.float32] = np.full(_FIRST_CAPACITY, self._unknown, np.float32)
+        self._evidence: NDArray[np.float32] = np.zeros(_FIRST_CAPACITY, np.float32)
+
+    def _reserve(self, ids: Ints) -> None:
+        size, had = int(ids.max(initial=-1)) + 1, len(self._prior)
+        if size > had:
+            more = (1 << (size - 1).bit_length()) - had
+            self._prior = np.concatenate([self._prior, np.full(more, self._unknown, np.float32)])
+            self._evidence = np.concatenate([self._evidence, np.zeros(more, np.float32)])
+
+
+@dataclass(frozen=True)
+class MovabilityPriors:
+    """P(moving) by class name; ``unknown`` of what has no label, ``other`` of other classes."""
+
+    by_name: Mapping[str, float]
+    unknown: float
+    other: float
+
+    def of(self, labels: LabelSet) -> Array:
+        """(C,) of a label set's classes; label 0 is "unknown"."""
+        named = [self.by_name.get(name, self.other) for name in labels.names[1:]]
+        return np.array([self.unknown, *named])
+
+
+def read_priors(name: str) -> MovabilityPriors:
+    """Priors from a YAML file, or from the bare name of one in ``data/labels``.
+
+    Raises:
+        InputError: no such file, not a table of names and numbers, or a number outside (0, 1).
+    """
+    path = data_path("labels", f"{name}.yaml") if re.fullmatch(r"[\w-]+", name) else Path(name)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: cannot be read as YAML; write a line 'class: prior'") from error
+    if not isinstance(content, dict) or not {UNKNOWN, "other"} <= content.keys():
+        raise InputError(f"{path}: needs lines 'class: prior', '{UNKNOWN}' and 'other' among them")
+    for key, value in content.items():
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not isinstance(key, str) or not number or not 0 < value < 1:
+            raise InputError(f"{path}: {key}: {value!r} is no prior; give a number between 0 and 1")
+    named = {key: float(value) for key, value in content.items() if key not in (UNKNOWN, "other")}
+    return MovabilityPriors(named, float(content[UNKNOWN]), float(content["other"]))
+
+
+def log_odds(p: float | Array) -> Array:
+    """log(p / (1 - p)) of probabilities."""
+    return np.log(np.asarray(p) / (1 - np.asarray(p)))

@@ -1,0 +1,277 @@
+"""From a keyframe's instances to labelled landmarks: Algorithm 3 of the paper, made robust."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.instances.instances import Instance, mask_box
+from bmask_slam.semantics.instances.mask_order import painting_order
+from bmask_slam.semantics.labels import LabelSet
+
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+NOBODY = -1
+_MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True)
+class VoteConfig:
+    """Which pixels of a mask are believed.
+
+    Nearer than ``border_px`` to another mask or to the mask's edge a pixel says nothing, since
+    segmentation errs there, unless depth tells the sides apart: where all surface within
+    ``edge_px`` that is as far as the landmark, to the share ``edge_depth``, is of instances of one
+    class. A depth belongs to the mask's surface if it is within ``depth_sigmas`` robust
+    standard deviations, and ``depth_margin_m`` at 1 m that grows with the square of the depth,
+    of the median in the mask. What is farther than ``background_border_px`` from any mask is
+    missed by all. Where neither distance nor depth decides, a pixel speaks for its owner, or as
+    missed, with ``border_weight`` of the usual weight.
+
+    A mask that lies in another of at least twice its area, to the share ``nested``, is in front
+    of it whatever their scores, if it is of another class: a book in a bookcase.
+    """
+
+    border_px: int = 1
+    depth_sigmas: float = 3.5
+    depth_margin_m: float = 0.03
+    edge_px: int = 4
+    edge_depth: float = 0.03
+    background_border_px: int = 8
+    border_weight: float = 0.6
+    nested: float = 0.8
+
+    def __post_init__(self) -> None:
+        if (
+            min(self.border_px, self.edge_px, self.background_border_px) < 0
+            or self.depth_sigmas <= 0
+            or min(self.depth_margin_m, self.edge_depth) < 0
+        ):
+            raise ValueError("borders and what depths may differ by must not be negative")
+        if not 0 <= self.border_weight <= 1 or self.nested <= 0:
+            raise ValueError("border_weight must be in [0, 1], nested above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Claims:
+    """Who owns the pixels of a keyframe.
+
+    Attributes:
+        instances: in the order of their mask scores, the best first.
+        owner: (H, W) int16, the instance that a pixel belongs to, -1 for none.
+        under: (H, W) int16, the one that it would belong to without its owner, -1 for none.
+        inner: (H, W) bool, not near the border between two owners, or that of a mask and none.
+        depth_m: (h, w) every s-th pixel of the depth image both ways, NaN where missing.
+        depth_range_m: (K, 2) nearest and farthest depth of each instance's surface; NaN for one
+            without depth.
+    """
+
+    instances: tuple[Instance, ...]
+    owner: NDArray[np.int16]
+    under: NDArray[np.int16]
+    inner: Mask
+    depth_m: NDArray[np.float32]
+    depth_range_m: Array
+
+    def on_surface(self, owners: Ints, z_m: Array) -> Mask:
+        """Whether depths (N,) belong to the surfaces of instances (N,); unknown depths do."""
+        near, far = self.depth_range_m[owners].T
+        return ~((z_m < near) | (z_m > far))
+
+
+@dataclass(frozen=True, eq=False)
+class Votes:
+    """What a keyframe's masks say about landmarks.
+
+    Attributes:
+        rows: (M,) which of the landmarks.
+        instances: (M,) the instance that each is on for sure, -1 for none.
+        missed: (M,) no instance is there.
+        sure: (M,) distance or depth tells whose surface it is.
+        distributions: (M, C); zeros where missed.
+        weights: (M,) how likely the distribution, or the miss, is meant for this landmark.
+    """
+
+    rows: Ints
+    instances: Ints
+    missed: Mask
+    sure: Mask
+    distributions: NDArray[np.float32]
+    weights: NDArray[np.float32]
+
+
+def check_instances(
+    instances: Sequence[Instance], size: tuple[int, int], labels: LabelSet, name: str
+) -> None:
+    """Refuse instances that are not of an image of this (height, width) or of this label set.
+
+    Raises:
+        InputError: a mask of another size, a label or distribution outside the set.
+    """
+    for instance in instances:
+        if instance.mask.shape != size or instance.mask.dtype != bool:
+            raise InputError(
+                f"{name}: a mask of shape {instance.mask.shape}, {instance.mask.dtype}, but the "
+                f"images have {size}; give masks of these images"
+            )
+        if not 0 < instance.label < len(labels) or len(instance.distribution) != len(labels):
+            raise InputError(
+                f"{name}: label {instance.label} of {len(instance.distribution)}, but the label "
+                f"set has {len(labels)}; give the label set of these masks"
+            )
+        finite = np.isfinite(instance.distribution).all()
+        if not finite or not 0 <= instance.mask_score <= 1:
+            raise InputError(
+                f"{name}: mask score {instance.mask_score} or a class probability is not between "
+                "0 and 1; make the masks again"
+            )
+
+
+def claim_pixels(
+    instances: Sequence[Instance],
+    depth_m: NDArray[np.float32],
+    size: tuple[int, int],
+    config: VoteConfig,
+    in_boxes: bool = False,
+) -> Claims:
+    """Give each pixel to the instance with the best mask score that covers it, or is in front.
+
+    ``size`` is the image's (H, W); ``depth_m`` (H / s, W / s) may be every s-th pixel of the
+    depth image in both directions. With ``in_boxes`` it is enough for being in front of another
+    to lie within the box around its mask: a bookcase's mask may leave out the books.
+    """
+    ranked = tuple(sorted(instances, key=lambda i: -i.mask_score))
+    owner, under = np.full((2, *size), NOBODY, np.int16)
+    for k in painting_order(ranked, config.nested, in_boxes).tolist():
+        x1, y1, x2, y2 = mask_box(ranked[k].mask).astype(int)
+        here = ranked[k].mask[y1:y2, x1:x2]
+        under[y1:y2, x1:x2][here] = owner[y1:y2, x1:x2][here]
+        owner[y1:y2, x1:x2][here] = k
+    inner = np.ones(size, bool)
+    if ranked:
+        disc = _disc(config.border_px)
+        inner = cv2.erode(owner, disc) == cv2.dilate(owner, disc)
+        covered = (owner != NOBODY).astype(np.uint8)
+        near = cv2.dilate(covered, _disc(config.background_border_px)) > covered
+        inner &= ~near
+    surfaces = _surfaces(owner, inner, depth_m, len(ranked), config)
+    return Claims(ranked, owner, under, inner, depth_m, surfaces)
+
+
+def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteConfig) -> Votes:
+    """The votes of a keyframe about the landmarks that it sees (paper, Algorithm 3).
+
+    For each landmark, at ``pixels`` (N, 2) in the image and with z-depth ``z_m`` (N,) in the
+    camera, NaN if unknown: the instance that owns its pixel, unless the landmark is not on the
+    instance's surface, votes with its class distribution, weighted by its mask score; with what
+    that leaves, the one under it. Near a border it is the instance that alone has surface at the
+    landmark's depth. Where there is no instance, it is missed.
+    """
+    height, width = claims.owner.shape
+    columns, rows = np.rint(pixels).astype(np.int64).reshape(-1, 2).T
+    columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
+    owners = claims.owner[rows, columns].astype(np.int64)
+    inner = claims.inner[rows, columns]
+    sure, alone = inner.copy(), inner.copy()
+    edge = np.flatnonzero(~inner)
+    if claims.instances and config.edge_px and len(edge):
+        found, one = _at_edges(claims, rows[edge], columns[edge], z_m[edge], config)
+        told = found != NOBODY
+        owners[edge[told]], alone[edge], sure[edge] = found[told], one & told, told
+    covered = owners != NOBODY
+    votes = np.ones(len(owners), bool)
+    votes[covered] = claims.on_surface(owners[covered], z_m[covered])
+    votes &= sure | (config.border_weight > 0)
+    chosen = np.flatnonzero(votes)
+    speakers = owners[chosen]
+    same = speakers == claims.owner[rows[chosen], columns[chosen]]
+    behind = np.where(same, claims.under[rows[chosen], columns[chosen]], NOBODY)
+    distributions, weights = _mixed(claims.instances, speakers, behind, classes)
+    missed = speakers == NOBODY
+    weights[missed] = 1.0
+    sure = sure[chosen]
+    weights[~sure] *= np.float32(config.border_weight)
+    instances = np.where(alone[chosen], speakers, NOBODY)
+    return Votes(chosen, instances, missed, sure, distributions, weights)
+
+
+def _mixed(
+    instances: Sequence[Instance], first: Ints, second: Ints, classes: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What instances (M,) with others (M,) behind them, or NOBODY, say: distributions, weights."""
+    nothing = np.zeros(classes)
+    table: NDArray[np.float32] = np.array(
+        [*(i.distribution for i in instances), nothing], np.float32
+    )
+    scores: NDArray[np.float32] = np.array([*(i.mask_score for i in instances), 0.0], np.float32)
+    front, back = scores[first], (1 - scores[first]) * scores[second]
+    weights = front + back
+    sums = front[:, None] * table[first] + back[:, None] * table[second]
+    return (sums / np.maximum(weights, 1e-12)[:, None]).astype(np.float32), weights
+
+
+def _at_edges(
+    claims: Claims, rows: Ints, columns: Ints, z_m: Array, config: VoteConfig
+) -> tuple[Ints, Mask]:
+    """Whose surface landmarks (N,) at rows and columns (N,) near a border are on, by their depth.
+
+    The instance (N,) with the worst score of those of one class that have surface there, NOBODY
+    where classes differ or some of the surface is nobody's; whether it is the only one (N,).
+    """
+    step = max(claims.owner.shape[0] // max(claims.depth_m.shape[0], 1), 1)
+    limits = np.minimum(claims.depth_m.shape, np.array(claims.owner.shape) // step) - 1
+    reach = np.arange(-(config.edge_px // step), config.edge_px // step + 1)
+    shifts = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
+    around = np.stack([rows, columns], axis=1)[:, None] // step + shifts
+    rows, columns = np.moveaxis(np.clip(around, 0, limits), -1, 0)
+    apart_m = np.abs(claims.depth_m[rows, columns] - z_m[:, None])
+    there = apart_m < config.edge_depth * z_m[:, None]
+    owners = claims.owner[rows * step, columns * step].astype(np.int64)
+    count = len(claims.instances)
+    first = np.where(there, owners, count).min(axis=1, initial=count)
+    last = np.where(there, owners, NOBODY).max(axis=1, initial=NOBODY)
+    classes = np.array([i.label for i in claims.instances])
+    of_class = np.where(owners == NOBODY, 0, classes[owners])
+    one = (~there | (of_class == classes[last][:, None])).all(axis=1) & there.any(axis=1)
+    return np.where(one, last, NOBODY), first == last
+
+
+def _disc(radius_px: int) -> NDArray[np.uint8]:
+    side = 2 * radius_px + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
+
+
+def _surfaces(
+    owner: NDArray[np.int16],
+    inner: Mask,
+    depth_m: NDArray[np.float32],
+    count: int,
+    config: VoteConfig,
+) -> Array:
+    """Depth range (K, 2) of each instance's surface, by median and MAD of its inner pixels."""
+    step = owner.shape[0] // max(depth_m.shape[0], 1)
+    seen = owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
+    usable = inner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]] & (seen != NOBODY)
+    usable &= np.isfinite(depth_m[: seen.shape[0], : seen.shape[1]])
+    owners, depths = seen[usable].astype(np.int64), depth_m[usable].astype(float)
+    middle = grouped_median(depths, owners, count)
+    spread = grouped_median(np.abs(depths - middle[owners]), owners, count)
+    reach = config.depth_sigmas * _MAD_TO_SIGMA * spread + config.depth_margin_m * middle**2
+    return np.stack([middle - reach, middle + reach], axis=1)
+
+
+def grouped_median(values: Array, groups: Ints, count: int) -> Array:
+    """The upper median (count,) of the values (N,) of each group (N,); NaN for an empty one."""
+    order = np.lexsort((values, groups))
+    sizes = np.bincount(groups, minlength=count)
+    middle = np.cumsum(sizes) - sizes + sizes // 2
+    found = np.full(count, np.nan)
+    some = sizes > 0
+    found[some] = values[order][middle[some]]
+    return found

@@ -1,0 +1,54 @@
+"""Decoding of image files, with every way in which they can be broken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.errors import InputError
+
+_TAIL_BYTES = 4096
+_COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+def read_colour(path: Path) -> NDArray[np.uint8]:
+    """A colour image (H, W, 3), red first; grey images are expanded.
+
+    Raises:
+        InputError: a missing, truncated or unreadable file, or more than 8 bits a channel.
+    """
+    bgr = decode_image(path, _COLOUR)
+    if bgr.dtype != np.uint8:
+        raise InputError(
+            f"{path}: {8 * bgr.dtype.itemsize} bits a channel where colour is expected; "
+            "list 8-bit colour images (are rgb and depth swapped?)"
+        )
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def decode_image(path: Path, flags: int) -> NDArray:
+    """The decoded image; a truncated file is refused, where OpenCV would fill it up with grey."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        reason = "no such image" if not path.exists() else f"cannot be read ({error.strerror})"
+        raise InputError(f"{path}: {reason}; restore it or correct the list") from error
+    return decode_bytes(data, flags, str(path))
+
+
+def decode_bytes(data: bytes, flags: int, where: str) -> NDArray:
+    """An image from the bytes of its file; ``where`` they are from, for errors."""
+    if not data:
+        raise InputError(f"{where}: the image is empty (0 bytes); restore it or leave it out")
+    tail = data[-_TAIL_BYTES:]
+    truncated = (data.startswith(b"\xff\xd8") and b"\xff\xd9" not in tail) or (
+        data.startswith(b"\x89PNG") and b"IEND" not in tail
+    )
+    image = None if truncated else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        reason = "truncated" if truncated else "not a readable image"
+        raise InputError(f"{where}: {reason} ({len(data)} bytes); restore it or leave it out")
+    return image

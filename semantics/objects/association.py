@@ -1,0 +1,122 @@
+"""Which detection is which object: one gated assignment a keyframe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
+
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.beliefs.votes import Ints, Mask
+
+_IMPOSSIBLE = 1e6
+
+
+@dataclass(frozen=True)
+class AssociationConfig:
+    """When a detection may be an object.
+
+    Points of both are the same surface within ``radius_m`` and three sigmas of a depth at 1 m,
+    ``depth_sigma_m``, which grows with its square. ``min_overlap`` is the share of either that
+    the other must cover. The cost of a pair is the share that is not covered, plus
+    ``class_weight`` times the distance of the class distributions, plus ``time_weight`` as the
+    object was not seen for long, against ``forget_s``; it must not be above ``max_cost``.
+    """
+
+    radius_m: float = 0.03
+    depth_sigma_m: float = 0.002
+    min_overlap: float = 0.2
+    class_weight: float = 0.5
+    time_weight: float = 0.05
+    forget_s: float = 30.0
+    max_cost: float = 1.0
+
+    def reach_m(self, z_m: Array) -> Array:
+        """How far apart points of one surface may be, at depths (...)."""
+        return self.radius_m + 3 * self.depth_sigma_m * z_m**2
+
+
+@dataclass(frozen=True, eq=False)
+class Overlap:
+    """How far D detections and O objects are the same surface.
+
+    Attributes:
+        of_detection: (D, O) share of the detection's points that lie on the object, each point
+            on the object that is nearest to it.
+        of_object: (D, O) share of the object's points in view that the detection covers.
+        in_view: (O,) how many points of the object are in view.
+    """
+
+    of_detection: Array
+    of_object: Array
+    in_view: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What a keyframe's D detections and O objects know of their classes and times.
+
+    Attributes:
+        detected: (D, C) and ``known``: (O, C), class distributions.
+        unseen_s: (O,) since the object was seen last.
+    """
+
+    detected: Array
+    known: Array
+    unseen_s: Array
+
+
+def shares(first: Ints, second: Ints, sizes: Ints, shape: tuple[int, int]) -> Array:
+    """(A, B) how many pairs (first, second) there are, as shares of sizes (A,)."""
+    counts = np.zeros(shape)
+    np.add.at(counts, (first, second), 1.0)
+    return counts / np.maximum(sizes, 1)[:, None]
+
+
+def points_on_objects(
+    points: Array, object_points: Array, owners: Ints, config: AssociationConfig
+) -> Ints:
+    """The object (P,) that is nearest to each point (P, 3), -1 for none.
+
+    ``object_points`` (N, 3) are of objects ``owners`` (N,); all points in the camera's frame.
+    """
+    found = np.full(len(points), -1)
+    if not len(object_points) or not len(points):
+        return found
+    reach_m = config.reach_m(points[:, 2])
+    distance_m, nearest = KDTree(object_points).query(
+        points, distance_upper_bound=float(reach_m.max())
+    )
+    near = distance_m <= reach_m
+    found[near] = owners[nearest[near]]
+    return found
+
+
+def class_affinity(detected: Array, known: Array) -> Array:
+    """Bhattacharyya coefficients (D, O) of distributions (D, C) and (O, C): 1 for equal ones."""
+    return np.sqrt(detected) @ np.sqrt(known).T
+
+
+def assign(overlap: Overlap, evidence: Evidence, config: AssociationConfig) -> Ints:
+    """The object of each detection (D,), -1 for a new one; no object has two detections."""
+    found = np.full(overlap.of_detection.shape[0], -1)
+    if not overlap.of_detection.size:
+        return found
+    affinity = class_affinity(evidence.detected, evidence.known)
+    covered = 0.5 * (overlap.of_detection + overlap.of_object)
+    age = 1.0 - np.exp(-evidence.unseen_s / config.forget_s)
+    cost = 1.0 - covered + config.class_weight * (1.0 - affinity) + config.time_weight * age
+    possible = allowed(overlap, config) & (cost <= config.max_cost)
+    rows, columns = linear_sum_assignment(np.where(possible, cost, _IMPOSSIBLE))
+    good = possible[rows, columns]
+    found[rows[good]] = columns[good]
+    return found
+
+
+def allowed(overlap: Overlap, config: AssociationConfig) -> Mask:
+    """Which pairs (D, O) overlap enough."""
+    return np.asarray(
+        np.maximum(overlap.of_detection, overlap.of_object) >= config.min_overlap, bool
+    )

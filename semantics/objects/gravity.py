@@ -1,0 +1,89 @@
+"""Which way is up, from what keyframes see and how they are held."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array
+
+_SAMPLES = 64
+_MAX_STEP = 0.05  # of the depth
+_UP_CAMERA = np.array([0.0, -1.0, 0.0])
+
+
+class Upright:
+    """Surface normals of each keyframe, in its frame, so that they turn with the graph."""
+
+    def __init__(self) -> None:
+        self._normals: dict[int, NDArray[np.float32]] = {}
+
+    def add(self, keyframe_id: int, depth_m: NDArray[np.float32], rays: Array) -> None:
+        """Sample the normals of a depth image (h, w); ``rays`` (h, w, 3) have z = 1."""
+        self._normals[keyframe_id] = sample_normals(depth_m, rays)
+
+    def up_world(self, poses: dict[int, Array]) -> Array:
+        """A unit vector (3,); the keyframes T_world_keyframe by id say how cameras are held."""
+        known = [k for k in self._normals if k in poses]
+        if not known:
+            return _UP_CAMERA
+        normals = [self._normals[k] @ poses[k][:3, :3].T for k in known]
+        ups = np.array([poses[k][:3, :3] @ _UP_CAMERA for k in known])
+        return up_direction(np.concatenate(normals).astype(float), ups)
+
+    def keep(self, keyframe_ids: set[int]) -> None:
+        """Forget keyframes that are not among these."""
+        self._normals = {k: n for k, n in self._normals.items() if k in keyframe_ids}
+
+    def state(self) -> Arrays:
+        """The samples as named arrays."""
+        rows = list(self._normals.values())
+        return {
+            "keyframes": np.array(list(self._normals), np.int64),
+            "normals": np.array(rows, np.float32).reshape(-1, _SAMPLES, 3),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the samples of a state."""
+        self._normals = dict(zip(state["keyframes"].tolist(), state["normals"], strict=True))
+
+
+def sample_normals(depth_m: NDArray[np.float32], rays: Array) -> NDArray[np.float32]:
+    """Unit normals (64, 3) toward the camera, spread over the smooth parts of a depth image.
+
+    Zero where there are fewer. Differences over a few pixels, since depth is noisy.
+    """
+    points = rays[::2, ::2] * depth_m[::2, ::2, None]
+    step = 2
+    across = points[:-step, step:] - points[:-step, :-step]
+    down = points[step:, :-step] - points[:-step, :-step]
+    with np.errstate(invalid="ignore"):
+        steps = np.maximum(np.abs(across[..., 2]), np.abs(down[..., 2]))
+        smooth = steps < _MAX_STEP * points[:-step, :-step, 2]
+    normals = np.cross(down, across)[smooth]  # x right, y down: toward the camera
+    found = np.zeros((_SAMPLES, 3), np.float32)
+    if len(normals) >= _SAMPLES:
+        chosen = normals[np.linspace(0, len(normals) - 1, _SAMPLES).astype(int)]
+        found[:] = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+    return found
+
+
+def up_direction(normals_world: Array, camera_ups_world: Array, cone_deg: float = 40.0) -> Array:
+    """Which way is up: a unit vector (3,).
+
+    Cameras are held upright on the whole, so it is near the mean of their up axes (K, 3); floors
+    and tables, whose normals are among ``normals_world`` (N, 3), say it exactly. A mean of the
+    normals in a cone around the last answer, the cone narrowing to 5 degrees.
+    """
+    up = camera_ups_world.sum(axis=0)
+    up = up / max(np.linalg.norm(up), 1e-12)
+    angle_deg = cone_deg
+    while angle_deg > 5.0:
+        near = normals_world[normals_world @ up > np.cos(np.deg2rad(angle_deg))]
+        if len(near) < 10:
+            return up
+        middle = np.median(near, axis=0)
+        up = middle / np.linalg.norm(middle)
+        angle_deg *= 0.7
+    return up

@@ -1,0 +1,161 @@
+"""What objects are made of, as tables: points in keyframes' frames, sightings, landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array, transform
+from bmask_slam.semantics.beliefs.votes import Ints
+
+
+class ObjectPoints:
+    """Rows of points, sightings and landmarks, each with the object it is of."""
+
+    def __init__(self) -> None:
+        self._next_id = 0
+        self._points: NDArray[np.float32] = np.zeros((0, 3), np.float32)  # in the anchor's frame
+        self._anchors: Ints = np.zeros(0, np.int64)
+        self._owners: Ints = np.zeros(0, np.int64)
+        self._sightings: Ints = np.zeros((0, 2), np.int64)  # object, keyframe
+        self._seen_s: Array = np.zeros(0)
+        self._landmarks: Ints = np.zeros((0, 2), np.int64)  # landmark, object
+
+    def new_ids(self, count: int) -> Ints:
+        """Ids (count,) that were never used."""
+        ids = np.arange(self._next_id, self._next_id + count)
+        self._next_id += count
+        return ids
+
+    def add(self, seen: tuple[int, float], objects: Ints, points: Array, owners: Ints) -> None:
+        """A keyframe, by id and stamp, saw objects (D,) and points (P, 3) in its frame on them."""
+        keyframe_id, stamp_s = seen
+        pairs = np.stack([objects, np.full(len(objects), keyframe_id)], axis=1)
+        self._sightings = np.concatenate([self._sightings, pairs])
+        self._seen_s = np.append(self._seen_s, np.full(len(objects), stamp_s))
+        self._points = np.concatenate([self._points, points.astype(np.float32)])
+        self._anchors = np.append(self._anchors, np.full(len(points), keyframe_id))
+        self._owners = np.append(self._owners, owners)
+
+    def in_world(self, poses: dict[int, Array]) -> tuple[Ints, Array]:
+        """Owners (N,) and world points (N, 3) of the rows whose keyframe has a pose."""
+        rows = self.rows(poses)
+        anchors, where = np.unique(self._anchors[rows], return_inverse=True)
+        T_world_anchor = np.array([poses[k] for k in anchors.tolist()]).reshape(-1, 4, 4)
+        points = self._points[rows].astype(float)
+        moved = transform(T_world_anchor[where], points[:, None])[:, 0]
+        return self._owners[rows], moved
+
+    def rays_in_world(self, poses: dict[int, Array]) -> Array:
+        """(N, 3) of the same rows: what an error of z^2 in its depth z moves a point by."""
+        rows = self.rows(poses)
+        anchors, where = np.unique(self._anchors[rows], return_inverse=True)
+        R_world_anchor = np.array([poses[k][:3, :3] for k in anchors.tolist()]).reshape(-1, 3, 3)
+        points = self._points[rows].astype(float)
+        turned = np.einsum("nij,nj->ni", R_world_anchor[where], points)
+        return np.asarray(turned * points[:, 2:])
+
+    def rows(self, poses: dict[int, Array]) -> Ints:
+        """The rows of points whose keyframe has a pose."""
+        return np.flatnonzero(np.isin(self._anchors, list(poses)))
+
+    def give(self, rows: Ints, object_id: int) -> None:
+        """Rows of points become another object's, and the sightings from their keyframes too."""
+        before = np.unique(self._owners[rows])
+        theirs = np.isin(self._sightings[:, 0], before)
+        theirs &= np.isin(self._sightings[:, 1], self._anchors[rows])
+        theirs &= ~np.isin(self._sightings[:, 1], self.sightings(object_id)[0])
+        copied = self._sightings[theirs].copy()
+        copied[:, 0] = object_id
+        self._owners[rows] = object_id
+        self._sightings = np.concatenate([self._sightings, copied])
+        self._seen_s = np.append(self._seen_s, self._seen_s[theirs])
+
+    def merge(self, kept: int, gone: int) -> None:
+        """All that was one object's becomes another's."""
+        self._owners[self._owners == gone] = kept
+        self._landmarks[self._landmarks[:, 1] == gone, 1] = kept
+        both = np.where(self._sightings == [gone, -1], [kept, -1], self._sightings)
+        _, first = np.unique(both, axis=0, return_index=True)
+        first = np.sort(first)
+        self._sightings, self._seen_s = both[first], self._seen_s[first]
+
+    def thin(self, most: int) -> None:
+        """Keep at most so many points an object, spread over the time in which they came."""
+        sizes = np.bincount(self._owners, minlength=self._next_id)
+        if sizes.max(initial=0) <= most:
+            return
+        order = np.argsort(self._owners, kind="stable")
+        sorted_owners = self._owners[order]
+        place = np.arange(len(order)) - (np.cumsum(sizes) - sizes)[sorted_owners]
+        share = np.minimum(1.0, 0.75 * most / np.maximum(sizes, 1))
+        share[sizes <= most] = 1.0
+        share = share[sorted_owners]
+        kept = np.sort(order[np.floor((place + 1) * share) > np.floor(place * share)])
+        self._points, self._anchors = self._points[kept], self._anchors[kept]
+        self._owners = self._owners[kept]
+
+    def anchors(self) -> list[int]:
+        """The keyframes whose frames hold points."""
+        return list(np.unique(self._anchors).tolist())
+
+    def hand_over(self, keyframe_id: int, heir_id: int, T_heir_keyframe: Array) -> None:
+        """A keyframe leaves the map: its points are in the frame of another from now on."""
+        rows = self._anchors == keyframe_id
+        self._points[rows] = transform(T_heir_keyframe, self._points[rows].astype(float))
+        self._anchors[rows] = heir_id
+
+    def sightings(self, object_id: int) -> tuple[Ints, Array]:
+        """Keyframes (K,), rising, that saw an object, and their stamps (K,)."""
+        rows = np.flatnonzero(self._sightings[:, 0] == object_id)
+        rows = rows[np.argsort(self._sightings[rows, 1], kind="stable")]
+        return self._sightings[rows, 1], self._seen_s[rows]
+
+    def last_seen_s(self, object_ids: Ints) -> Array:
+        """When objects (N,) were seen last; -inf for one that never was."""
+        found = np.full(self._next_id + 1, -np.inf)
+        np.maximum.at(found, self._sightings[:, 0], self._seen_s)
+        return found[object_ids]
+
+    def place_landmarks(self, landmark_ids: Ints, object_ids: Ints) -> None:
+        """Landmarks (N,) lie on objects (N,), wherever they were before."""
+        kept = self._landmarks[~np.isin(self._landmarks[:, 0], landmark_ids)]
+        placed = np.stack([landmark_ids, object_ids], axis=1)
+        both = np.concatenate([kept, placed])
+        self._landmarks = both[np.argsort(both[:, 0], kind="stable")]
+
+    def landmarks_of(self, object_id: int) -> Ints:
+        """Landmarks (N,) on an object."""
+        return self._landmarks[self._landmarks[:, 1] == object_id, 0]
+
+    def landmarks(self) -> Ints:
+        """All landmarks (N,) on objects, rising."""
+        return self._landmarks[:, 0]
+
+    def rename_landmarks(self, old_ids: Ints, new_ids: Ints) -> None:
+        """Landmarks (N,) were fused into others (N,), or are gone: -1."""
+        table = dict(zip(old_ids.tolist(), new_ids.tolist(), strict=True))
+        ids = np.array([table.get(i, i) for i in self._landmarks[:, 0].tolist()], np.int64)
+        _, first = np.unique(ids, return_index=True)
+        first = first[ids[first] >= 0]
+        self._landmarks = np.stack([ids[first], self._landmarks[first, 1]], axis=1)
+
+    def state(self) -> Arrays:
+        """All tables as named arrays."""
+        return {
+            "next_id": np.array(self._next_id),
+            "points": self._points,
+            "anchors": self._anchors,
+            "owners": self._owners,
+            "sightings": self._sightings,
+            "seen_s": self._seen_s,
+            "landmarks": self._landmarks,
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the tables of a state."""
+        self._next_id = int(state["next_id"])
+        self._points, self._anchors = state["points"], state["anchors"]
+        self._owners, self._sightings = state["owners"], state["sightings"]
+        self._seen_s, self._landmarks = state["seen_s"], state["landmarks"]

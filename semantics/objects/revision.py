@@ -1,0 +1,91 @@
+"""Second thoughts: evidence that two objects are one, or that one is two."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.beliefs.votes import Ints
+from bmask_slam.semantics.objects.association import Overlap, class_affinity
+
+
+@dataclass(frozen=True)
+class RevisionConfig:
+    """When objects are merged or split.
+
+    A keyframe speaks for one object where one detection covers ``covered`` of both, of classes
+    that are alike by ``min_affinity`` (Bhattacharyya), and for two where each has a detection of
+    its own. It speaks for a split where two detections cover ``part`` or more of one object each;
+    then what is nearest to the one that is not the object's, within ``reach_m``, leaves. It is
+    done when the keyframes for it are ``needed`` more than those against; neither side gets more
+    than ``most`` ahead, so that a belief can be overcome.
+    """
+
+    covered: float = 0.5
+    part: float = 0.2
+    reach_m: float = 0.5
+    min_affinity: float = 0.5
+    needed: int = 2
+    most: int = 4
+
+
+class Balance:
+    """Keyframes for a revision less those against, by key."""
+
+    def __init__(self, config: RevisionConfig) -> None:
+        self.config = config
+        self._counts: dict[tuple[int, int], int] = {}
+
+    def speak(self, key: tuple[int, int], step: int) -> None:
+        """One more keyframe for (1) or against (-1)."""
+        value = self._counts.get(key, 0) + step
+        self._counts[key] = max(-self.config.most, min(self.config.needed, value))
+
+    def decided(self, key: tuple[int, int]) -> bool:
+        """Whether the revision is to be made."""
+        return self._counts.get(key, 0) >= self.config.needed
+
+    def forget(self, number: int) -> None:
+        """Drop every key with an object in it."""
+        self._counts = {key: v for key, v in self._counts.items() if number not in key}
+
+    def state(self) -> NDArray[np.int64]:
+        """Rows (N, 3) of key and count, by key."""
+        rows = [(a, b, n) for (a, b), n in sorted(self._counts.items())]
+        return np.array(rows, np.int64).reshape(-1, 3)
+
+    def restore(self, rows: NDArray[np.int64]) -> None:
+        """Become the balance of a state."""
+        self._counts = {(a, b): n for a, b, n in rows.tolist()}
+
+
+def merges(
+    overlap: Overlap, assigned: Ints, known: Array, config: RevisionConfig
+) -> list[tuple[int, int, int]]:
+    """Pairs of objects a < b and +1 (one detection covers both) or -1 (each has its own).
+
+    ``assigned`` (D,) is the object of each detection or -1, ``known`` (O, C) the objects'
+    class distributions.
+    """
+    covers = (overlap.of_object >= config.covered) & (overlap.in_view > 0)
+    alike = class_affinity(known, known) >= config.min_affinity
+    joint = (covers.astype(int).T @ covers.astype(int) > 0) & alike
+    own = np.zeros(overlap.of_object.shape[1], bool)
+    own[assigned[assigned >= 0]] = True
+    apart = own[:, None] & own[None]
+    found = [(a, b, 1) for a, b in np.argwhere(np.triu(joint & ~apart, 1)).tolist()]
+    near = overlap.in_view > 0
+    against = np.triu(apart & alike & near[:, None] & near[None], 1)
+    return found + [(a, b, -1) for a, b in np.argwhere(against).tolist()]
+
+
+def splits(overlap: Overlap, config: RevisionConfig) -> list[tuple[int, int]]:
+    """Objects and +1 (two detections share it) or -1 (one has it all)."""
+    shared = (overlap.of_object >= config.part).sum(axis=0) >= 2
+    whole = (overlap.of_object >= 1 - config.part / 2).any(axis=0)
+    return [(o, 1) for o in np.flatnonzero(shared).tolist()] + [
+        (o, -1) for o in np.flatnonzero(whole).tolist()
+    ]

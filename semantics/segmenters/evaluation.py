@@ -1,0 +1,219 @@
+"""COCO's figures for a segmenter: box and mask AP, with and without the predicted mask IoU."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.figure
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import CocoFile, CocoImage
+from bmask_slam.semantics.instances.image_files import read_colour
+from bmask_slam.semantics.instances.instances import Instance, as_annotation
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
+
+CLASS_SCORE = "class score"
+MASK_SCORE = "class score x MaskIoU"
+MATCH_IOU = 0.5
+"""A detection stands for the object of its class that its box overlaps most, by at least this; so
+are boxes chosen in which mask and MaskIoU are learnt."""
+AP_50 = 0
+"""Index of the threshold 0.5 among COCO's ten."""
+
+
+@dataclass(frozen=True, eq=False)
+class ApCurve:
+    """COCO's average precision and the curve behind it.
+
+    Attributes:
+        kind: "bbox" or "segm".
+        ranked_by: the score that orders detections.
+        ap, ap50, ap75: means over the classes that occur, in 0..1.
+        precision: (101,) at recalls 0, 0.01, ..., 1 and IoU 0.5, mean over classes.
+    """
+
+    kind: str
+    ranked_by: str
+    ap: float
+    ap50: float
+    ap75: float
+    precision: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentationResult:
+    """All figures of one segmenter on one data set.
+
+    Attributes:
+        curves: box AP by class score, mask AP by class score, mask AP by mask score.
+        iou_correlation: Pearson's, of predicted and true mask IoU of the detections that stand
+            for an object; NaN for fewer than 3 or where no IoU is predicted.
+        iou_correlation_of_good: the same of those alone whose true IoU is at least 0.5.
+        images, instances: how many.
+    """
+
+    curves: tuple[ApCurve, ...]
+    iou_correlation: float
+    iou_correlation_of_good: float
+    images: int
+    instances: int
+
+
+def evaluate_segmenter(
+    segmenter: Segmenter,
+    truth: CocoFile,
+    folder: Path,
+    progress: Callable[[int, int], None],
+) -> SegmentationResult:
+    """Run a segmenter over the images of a COCO file and compare, classes matched by name.
+
+    Objects of classes that the segmenter does not know are left out of the truth.
+
+    Raises:
+        InputError: the label sets have no class in common.
+    """
+    numbers = [segmenter.labels.number(name) for name in truth.labels.names]
+    if not any(numbers):
+        raise InputError(f"{folder}: none of the data's classes is among the segmenter's")
+    found: list[list[Instance]] = []
+    for k, image in enumerate(truth.images, 1):
+        path = folder / image.file_name
+        found.append(segmenter.segment(read_colour(path), image.file_name))
+        progress(k, len(truth.images))
+    known = COCO()
+    with contextlib.redirect_stdout(io.StringIO()):
+        known.dataset = _truth(truth.images, numbers)
+        known.createIndex()
+    ways = (("bbox", CLASS_SCORE), ("segm", CLASS_SCORE), ("segm", MASK_SCORE))
+    curves = tuple(_average_precision(known, found, *way) for way in ways)
+    of_images = [_iou_pairs(f, i, numbers) for f, i in zip(found, truth.images, strict=True)]
+    pairs = np.concatenate(of_images)
+    good = pairs[pairs[:, 1] >= MATCH_IOU]
+    count = sum(len(f) for f in found)
+    return SegmentationResult(curves, _correlation(pairs), _correlation(good), len(found), count)
+
+
+def _truth(images: Sequence[CocoImage], numbers: Sequence[int]) -> dict[str, Any]:
+    """The annotations in pycocotools' form, under the segmenter's labels."""
+    annotations: list[dict[str, Any]] = []
+    for k, image in enumerate(images, 1):
+        for o in image.objects:
+            if numbers[o.label] == 0:
+                continue
+            x1, y1, x2, y2 = o.box
+            annotations.append({
+                "id": len(annotations) + 1, "image_id": k, "category_id": numbers[o.label],
+                "bbox": [x1, y1, x2 - x1, y2 - y1], "area": float(coco_mask.area(o.runs)),
+                "segmentation": o.runs, "iscrowd": int(o.crowd),
+            })  # fmt: skip
+    sizes = [{"id": k, "height": i.height, "width": i.width} for k, i in enumerate(images, 1)]
+    return {
+        "images": sizes,
+        "categories": [{"id": n} for n in sorted({n for n in numbers if n})],
+        "annotations": annotations,
+    }
+
+
+def _average_precision(
+    known: COCO, found: Sequence[Sequence[Instance]], kind: str, ranked_by: str
+) -> ApCurve:
+    entries = []
+    for k, instances in enumerate(found, 1):
+        for i in instances:
+            score = i.class_score if ranked_by == CLASS_SCORE else i.mask_score
+            entry = {**as_annotation(i), "image_id": k, "score": score}
+            if kind == "bbox":
+                del entry["segmentation"]
+            entries.append(entry)
+    if not entries:
+        return ApCurve(kind, ranked_by, 0.0, 0.0, 0.0, np.zeros(101))
+    with contextlib.redirect_stdout(io.StringIO()):
+        evaluation = COCOeval(known, known.loadRes(entries), kind)
+        evaluation.evaluate()
+        evaluation.accumulate()
+        evaluation.summarize()
+    precision = evaluation.eval["precision"][AP_50, :, :, 0, -1]  # of all areas, 100 detections
+    occurring = precision[:, (precision > -1).any(axis=0)]
+    ap, ap50, ap75 = (max(float(v), 0.0) for v in evaluation.stats[:3])
+    mean = np.mean(occurring, axis=1) if occurring.size else np.zeros(101)
+    return ApCurve(kind, ranked_by, ap, ap50, ap75, mean)
+
+
+def _iou_pairs(
+    found: Sequence[Instance], image: CocoImage, numbers: Sequence[int]
+) -> NDArray[np.float64]:
+    """(N, 2) predicted and true mask IoU of the detections that stand for an object."""
+    pairs = []
+    for i in found:
+        same = [o for o in image.objects if numbers[o.label] == i.label and not o.crowd]
+        if not same:
+            continue
+        boxes = np.array([o.box for o in same])
+        overlap = coco_mask.iou(_with_size(i.box[None]), _with_size(boxes), [0] * len(same))
+        best = int(np.argmax(overlap))
+        if overlap[0, best] >= MATCH_IOU:
+            runs = coco_mask.encode(np.asfortranarray(i.mask.astype(np.uint8)))
+            true_iou = float(coco_mask.iou([runs], [same[best].runs], [0])[0, 0])
+            pairs.append((i.mask_score / max(i.class_score, 1e-9), true_iou))
+    return np.array(pairs, np.float64).reshape(-1, 2)
+
+
+def _with_size(boxes: NDArray[Any]) -> NDArray[np.float64]:
+    """x, y, width, height of boxes (N, 4)."""
+    return np.c_[boxes[:, :2], boxes[:, 2:] - boxes[:, :2]].astype(np.float64)
+
+
+def _correlation(pairs: NDArray[np.float64]) -> float:
+    if len(pairs) < 3 or pairs[:, 0].std() < 1e-9 or pairs[:, 1].std() < 1e-9:
+        return float("nan")
+    matrix: NDArray[np.float64] = np.asarray(np.corrcoef(pairs.T), np.float64)
+    return float(matrix[0, 1])
+
+
+def draw_precision_recall(result: SegmentationResult, picture: Path) -> None:
+    """Precision against recall at IoU 0.5 (the paper's Fig. 9)."""
+    figure = matplotlib.figure.Figure(figsize=(5, 4), layout="constrained")
+    axes = figure.add_subplot()
+    for curve in result.curves:
+        label = f"{curve.kind}, by {curve.ranked_by}"
+        axes.plot(np.linspace(0, 1, 101), curve.precision, label=label)
+    axes.set(xlabel="recall", ylabel="precision at IoU 0.5", xlim=(0, 1), ylim=(0, 1))
+    axes.legend()
+    axes.grid(alpha=0.3)
+    figure.savefig(picture, dpi=120)
+
+
+def write_curves(result: SegmentationResult, path: Path) -> None:
+    """Write the curves as a table of kind, ranked_by, recall and precision at IoU 0.5."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("kind", "ranked_by", "recall", "precision"))
+        for curve in result.curves:
+            for k, precision in enumerate(curve.precision):
+                writer.writerow((curve.kind, curve.ranked_by, f"{k / 100:.2f}", f"{precision:.6f}"))
+
+
+def format_segmentation(result: SegmentationResult) -> str:
+    """A table for a terminal."""
+    lines = [f"{'':8} {'ranked by':24} {'AP':>7} {'AP50':>7} {'AP75':>7}"]
+    for c in result.curves:
+        kind = "boxes" if c.kind == "bbox" else "masks"
+        lines.append(f"{kind:8} {c.ranked_by:24} {c.ap:7.4f} {c.ap50:7.4f} {c.ap75:7.4f}")
+    lines.append(
+        f"correlation of predicted and true mask IoU  {result.iou_correlation:.3f}, "
+        f"where the true one is at least 0.5  {result.iou_correlation_of_good:.3f}"
+    )
+    lines.append(f"{result.instances} instances in {result.images} images")
+    return "\n".join(lines)

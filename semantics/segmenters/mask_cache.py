@@ -1,0 +1,145 @@
+"""Masks of many images on disk: made once, one file an image, and as one COCO file at the end."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.semantics.instances.image_files import read_colour
+from bmask_slam.semantics.instances.instances import as_annotation
+from bmask_slam.semantics.instances.overlay import draw
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
+
+logger = logging.getLogger(__name__)
+
+ANNOTATIONS = "annotations.json"
+SETTINGS = "settings.json"
+
+
+@dataclass(frozen=True)
+class CacheResult:
+    """What was done.
+
+    Attributes:
+        file: the COCO file of all images.
+        images, instances: how many it holds.
+        reused: images whose masks were there already.
+        broken: images that could not be read; they are left out.
+    """
+
+    file: Path
+    images: int
+    instances: int
+    reused: int
+    broken: int
+
+
+@dataclass(frozen=True)
+class CacheOptions:
+    """Where masks go.
+
+    Attributes:
+        out: the folder.
+        settings: what they are made with; a folder holds masks of one setting.
+        overlays: also draw them over the images.
+    """
+
+    out: Path
+    settings: dict[str, str]
+    overlays: bool = True
+
+
+def cache_masks(
+    segmenter: Segmenter,
+    files: Sequence[tuple[str, Path]],
+    options: CacheOptions,
+    progress: Callable[[int, int], None],
+) -> CacheResult:
+    """Segment images (name, file), skipping those that are done, and write one COCO file.
+
+    Raises:
+        InputError: the folder holds masks made with other settings, or no image can be read.
+    """
+    _check_settings(options)
+    entries: list[dict[str, Any]] = []
+    reused = broken = 0
+    for k, (name, path) in enumerate(files):
+        cached = (options.out / "images" / name).with_suffix(".json")
+        if cached.is_file():
+            entries.append(json.loads(cached.read_text()))
+            reused += 1
+        else:
+            try:
+                entries.append(_segmented(segmenter, name, path, options))
+                _write_json(cached, entries[-1])
+            except InputError as error:
+                if k == 0:  # most likely all are like that
+                    raise
+                logger.warning("%s; left out", error)
+                broken += 1
+        progress(k + 1, len(files))
+    content = _as_coco(entries, segmenter.labels)
+    _write_json(options.out / ANNOTATIONS, content)
+    count = len(content["annotations"])
+    return CacheResult(options.out / ANNOTATIONS, len(entries), count, reused, broken)
+
+
+def _check_settings(options: CacheOptions) -> None:
+    path = options.out / SETTINGS
+    if path.is_file():
+        before = json.loads(path.read_text())
+        different = [k for k, v in options.settings.items() if before.get(k) != v]
+        if different:
+            key = different[0]
+            raise InputError(
+                f"{options.out}: holds masks made with {key} {before.get(key)}, now it is "
+                f"{options.settings[key]}; choose another --out or delete it"
+            )
+        return
+    if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
+        raise InputError(f"{options.out}: is no folder of masks; choose another --out")
+    _write_json(path, options.settings)
+
+
+def _segmented(
+    segmenter: Segmenter, name: str, path: Path, options: CacheOptions
+) -> dict[str, Any]:
+    """One image's entry; its overlay is drawn on the way."""
+    image = read_colour(path)
+    instances = segmenter.segment(image, name)
+    if options.overlays:
+        picture = draw(image, instances, segmenter.labels)
+        target = (options.out / "overlays" / name).with_suffix(".jpg")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(target), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    height, width = image.shape[:2]
+    annotations = [as_annotation(i) for i in instances]
+    return {"file_name": name, "height": height, "width": width, "annotations": annotations}
+
+
+def _as_coco(entries: Sequence[dict[str, Any]], labels: LabelSet) -> dict[str, Any]:
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for number, entry in enumerate(entries, 1):
+        image = {key: entry[key] for key in ("file_name", "height", "width")}
+        images.append({"id": number, **image})
+        for annotation in entry["annotations"]:
+            ids = {"id": len(annotations) + 1, "image_id": number}
+            annotations.append({**ids, **annotation})
+    categories = [{"id": k, "name": name} for k, name in enumerate(labels.names) if k > 0]
+    return {"images": images, "annotations": annotations, "categories": categories}
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(content, separators=(",", ":")) + "\n")

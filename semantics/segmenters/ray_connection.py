@@ -1,0 +1,59 @@
+"""The one way to a Ray cluster (``pip install 'bmask-slam[ray]'``)."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from typing import Any
+
+from bmask_slam.graph.errors import InputError
+
+LOCAL = "local"
+TIMEOUT_S = 5.0
+
+
+def connect(address: str, local_cpus: int | None = None) -> Any:
+    """The ``ray`` module, connected to a cluster.
+
+    ``address`` is a cluster's, "auto" for the one that this machine belongs to, or "local" for one
+    that is started here, with so many CPUs, and ends with this process.
+
+    Raises:
+        InputError: Ray is not installed, or there is no cluster at the address.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray  # noqa: PLC0415 - optional, and slow to load
+    except ImportError as error:
+        raise InputError("--ray: needs Ray: pip install 'bmask-slam[ray]'") from error
+    if ray.is_initialized():
+        return ray
+    _check_address(address)
+    here = address == LOCAL
+    try:
+        ray.init(
+            address,
+            num_cpus=local_cpus if here else None,
+            include_dashboard=False if here else None,
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+        )
+    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"--ray {address}: no cluster answers there ({reason})") from error
+    return ray
+
+
+def _check_address(address: str) -> None:
+    """Refuse HOST:PORT where nothing listens: Ray itself would try for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not (colon and port.isdigit()):
+        return
+    try:
+        socket.create_connection((host, int(port)), TIMEOUT_S).close()
+    except OSError as error:
+        raise InputError(
+            f"--ray {address}: nothing answers there ({error}); start it by ray start --head, or "
+            "leave --ray away"
+        ) from error

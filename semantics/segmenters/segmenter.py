@@ -1,0 +1,136 @@
+"""``Segmenter``: anything that finds instances in an image; and the simple ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import CocoImage, read_coco
+from bmask_slam.semantics.instances.image_files import decode_image
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.labels import LabelSet, label_set
+
+Image = NDArray[np.uint8]
+INSTANCES_A_CLASS = 1000
+"""In a label PNG, value = 1000 * label + instance; below 1000 the value is the label alone."""
+
+
+class Segmenter(Protocol):
+    """Finds instances. ``labels`` says what their numbers mean."""
+
+    labels: LabelSet
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """Instances in an image (H, W, 3), red first, best mask score first.
+
+        ``name`` is the image's file name, relative to its sequence, for those who look it up.
+        """
+
+
+def check_image(image: Image, name: str) -> None:
+    """Refuse anything but a colour image of 8 bits with pixels in it.
+
+    Raises:
+        InputError: another shape or type.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+        raise InputError(
+            f"{name}: an image of shape {image.shape} and type {image.dtype}; "
+            "segmentation needs (height, width, 3) in 8 bits, and at least one pixel"
+        )
+
+
+class NoSegmenter:
+    """Finds nothing."""
+
+    labels = label_set(())
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """An empty list."""
+        check_image(image, name)
+        return []
+
+
+class CocoSegmenter:
+    """Looks instances up in a COCO file: cached masks, or the truth of a rendered sequence."""
+
+    def __init__(self, path: Path) -> None:
+        content = read_coco(path)
+        self.path = path
+        self.labels = content.labels
+        self._images = {Path(i.file_name).as_posix(): i for i in content.images}
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """What the file says about the image of this name.
+
+        Raises:
+            InputError: the file does not know the image, or knows it in another size.
+        """
+        check_image(image, name)
+        known = self._images.get(Path(name).as_posix())
+        if known is None:
+            raise InputError(f"{self.path}: has no image {name}; make the masks of this sequence")
+        if image.shape[:2] != (known.height, known.width):
+            raise InputError(
+                f"{self.path}: {name} has {known.width}x{known.height} pixels there, but "
+                f"{image.shape[1]}x{image.shape[0]} here; make the masks of this sequence"
+            )
+        found = _instances(known, len(self.labels))
+        return sorted(found, key=lambda i: -i.mask_score)
+
+
+def _instances(image: CocoImage, classes: int) -> list[Instance]:
+    found = []
+    for o in image.objects:
+        if o.distribution is not None and len(o.distribution) == classes:
+            distribution = np.array(o.distribution, np.float32)
+        else:
+            distribution = certain(o.label, classes, o.class_score)
+        box = np.array(o.box, np.float32)
+        found.append(Instance(o.mask(), box, o.label, distribution, o.class_score, o.score))
+    return found
+
+
+class LabelImageSegmenter:
+    """Reads label PNGs of any tool: one of the image's name in a folder, 8 or 16 bits."""
+
+    def __init__(self, folder: Path, labels: LabelSet) -> None:
+        self.folder = folder
+        self.labels = labels
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """An instance for each value in the PNG but 0.
+
+        Raises:
+            InputError: no PNG for the image, one of another size, or a label that is not known.
+        """
+        check_image(image, name)
+        path = self._file(name)
+        values = decode_image(path, cv2.IMREAD_UNCHANGED)
+        if values.shape != image.shape[:2]:
+            raise InputError(
+                f"{path}: shape {values.shape}, but the image has {image.shape[:2]}; "
+                "label images have one channel and their image's size"
+            )
+        found = []
+        for value in np.unique(values[values > 0]).tolist():
+            label = value // INSTANCES_A_CLASS if value >= INSTANCES_A_CLASS else value
+            if label >= len(self.labels):
+                raise InputError(
+                    f"{path}: the value {value} means label {label}, but the label set ends at "
+                    f"{len(self.labels) - 1}; give the label set of these images"
+                )
+            mask = values == value
+            distribution = certain(label, len(self.labels))
+            found.append(Instance(mask, mask_box(mask), label, distribution, 1.0, 1.0))
+        return found
+
+    def _file(self, name: str) -> Path:
+        """The PNG of an image: under the same path, or the same file name alone."""
+        whole = (self.folder / name).with_suffix(".png")
+        return whole if whole.is_file() else self.folder / f"{Path(name).stem}.png"

@@ -1,0 +1,112 @@
+"""Segmenters by name."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.labels import read_label_set
+from bmask_slam.semantics.segmenters.segmenter import (
+    CocoSegmenter,
+    LabelImageSegmenter,
+    NoSegmenter,
+    Segmenter,
+)
+
+NAMES = {
+    "light": "MobileNetV2-FPN of this project, with its own weights or --weights",
+    "mask-scoring-rcnn": "ResNet-FPN, with --weights",
+    "precomputed": "masks that any tool made: --masks FILE.json (COCO) or a folder of label PNGs",
+    "truth": "the annotations of a rendered sequence",
+    "none": "no instances",
+}
+LIGHT_WEIGHTS = ("weights", "light.safetensors")
+"""Those that come with the project, in its data folder."""
+TRUTH_FILE = "annotations.json"
+
+
+@dataclass(frozen=True)
+class SegmenterOptions:
+    """What to segment with.
+
+    Attributes:
+        name: one of NAMES.
+        weights: file or ``torchvision:NAME``, for the networks.
+        proposals: ONNX file of a detector that finds the boxes for a network.
+        masks: COCO file or folder of label PNGs, for "precomputed".
+        labels: label set of the weights or the PNGs, where it is not in the file.
+        min_score: class score below which a network's detection is dropped.
+        ray: address of a Ray cluster that it runs on, see `semantics.segmenters.ray_segmenter`; ""
+        for here.
+    """
+
+    name: str = "light"
+    weights: str | None = None
+    proposals: Path | None = None
+    masks: Path | None = None
+    labels: str | None = None
+    min_score: float = 0.5
+    ray: str = ""
+
+    def described(self) -> dict[str, str]:
+        """The options as text, to compare with those of an earlier run."""
+        return {key: str(value) for key, value in asdict(self).items()}
+
+
+def make_segmenter(options: SegmenterOptions, sequence: Path) -> Segmenter:
+    """The segmenter of that name for the images of a folder.
+
+    Raises:
+        InputError: an unknown name, or one without the file that it needs.
+    """
+    if options.name not in NAMES:
+        raise InputError(f"segmenter {options.name!r}: not known; there are: {', '.join(NAMES)}")
+    if options.name == "none":
+        return NoSegmenter()
+    if options.ray:
+        from bmask_slam.semantics.segmenters.ray_segmenter import RaySegmenter  # noqa: PLC0415
+
+        return RaySegmenter(replace(options, ray=""), sequence, options.ray)
+    if options.name == "truth":
+        path = sequence / TRUTH_FILE
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; only rendered sequences have the truth")
+        return CocoSegmenter(path)
+    if options.name == "precomputed":
+        return _precomputed(options)
+    return _network(options)
+
+
+def _precomputed(options: SegmenterOptions) -> Segmenter:
+    if options.masks is None:
+        raise InputError("segmenter 'precomputed': give --masks, a COCO file or a folder of PNGs")
+    if options.masks.is_dir():
+        return LabelImageSegmenter(options.masks, read_label_set(options.labels or "coco"))
+    return CocoSegmenter(options.masks)
+
+
+def _network(options: SegmenterOptions) -> Segmenter:
+    """Imports torch, which takes a second: only for those who need it."""
+    if options.weights is None and options.name != "light":
+        raise InputError(f"segmenter {options.name!r}: give --weights, a file or torchvision:NAME")
+    from bmask_slam.semantics.segmenters.network_segmenter import NetworkSegmenter  # noqa: PLC0415
+    from bmask_slam.semantics.segmenters.yolox import YoloxConfig, YoloxDetector  # noqa: PLC0415
+    from bmask_slam.semantics.weights.checkpoints import find_weights, load_network  # noqa: PLC0415
+
+    labels = read_label_set(options.labels) if options.labels else None
+    path = find_weights(options.weights) if options.weights else data_path(*LIGHT_WEIGHTS)
+    network = load_network(path, labels)
+    light = network.model.config.backbone == "mobilenet_v2"
+    if light != (options.name == "light"):
+        kind = network.model.config.backbone
+        other = "light" if light else "mask-scoring-rcnn"
+        raise InputError(
+            f"{options.weights}: a {kind} network, which is not {options.name!r}; take {other!r}"
+        )
+    detector = None
+    if options.proposals:
+        config = YoloxConfig(min_score=max(options.min_score, YoloxConfig.min_score))
+        detector = YoloxDetector(options.proposals, config)
+    return NetworkSegmenter(network, options.min_score, detector)

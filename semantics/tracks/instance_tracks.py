@@ -1,0 +1,299 @@
+"""Where movable things are between the keyframes that showed them: a Kalman filter each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from filterpy.common import Q_discrete_white_noise
+from filterpy.kalman import predict, update
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.tracks.instance_track import Sighting, Track
+
+Mask = NDArray[np.bool_]
+_H = np.eye(3, 6)
+_NEVER = 1e9
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """The motion that is expected, and when a track ends.
+
+    ``acceleration_m_s2``: standard deviation of the white acceleration. ``speed_m_s``: that of
+    an unknown speed. ``centroid_sigma_m``: that of a measured centroid, of which part may be
+    hidden. ``gate_chi2`` (3 degrees of freedom) is where a detection no longer belongs to a track;
+    one with a quite different class costs ``class_cost`` more. Of two things whose classes have
+    ``same_class`` in common, one in the middle of the other's box is a part of it. A track ends
+    ``patience_s`` after it was last seen, which is longer than keyframes are mostly apart. Boxes
+    are widened by ``box_sigmas`` of the prediction, but by no more than ``box_slack_m``, and by
+    ``box_margin_m``. Classes that move with less than ``min_prior`` have no tracks. All evidence
+    moves a track's log odds by at most ``max_evidence``; ``max_missed`` keyframes in a row that
+    show its place, but not it, end it.
+    """
+
+    acceleration_m_s2: float = 1.0
+    speed_m_s: float = 0.7
+    centroid_sigma_m: float = 0.08
+    gate_chi2: float = 16.0
+    class_cost: float = 8.0
+    same_class: float = 0.5
+    patience_s: float = 3.0
+    box_sigmas: float = 1.0
+    box_slack_m: float = 0.25
+    box_margin_m: float = 0.08
+    min_prior: float = 0.2
+    max_evidence: float = 2.7
+    max_missed: int = 2
+
+    def __post_init__(self) -> None:
+        if min(self.acceleration_m_s2, self.speed_m_s, self.centroid_sigma_m) <= 0:
+            raise ValueError("acceleration, speed and centroid sigma must be positive")
+        if self.patience_s <= 0 or self.gate_chi2 <= 0:
+            raise ValueError("patience_s and gate_chi2 must be positive")
+        if self.max_evidence <= 0 or self.max_missed < 1:
+            raise ValueError("max_evidence must be positive, max_missed at least 1")
+
+
+class InstanceTracks:
+    """All tracks, by one gated assignment a keyframe."""
+
+    def __init__(self, config: TrackConfig | None = None) -> None:
+        self.config = config or TrackConfig()
+        self.tracks: list[Track] = []
+        self._next_id = 0
+
+    def see(
+        self, time_s: float, sightings: Sequence[Sighting], R_world_camera: Array | None = None
+    ) -> list[int]:
+        """The movable things of a keyframe; returns the id of the track of each.
+
+        A part that was seen besides its whole is on the whole's track. Masks that come after those
+        of a later keyframe, and tracks that have ended, are of no use. ``R_world_camera`` (3, 3)
+        turns the boxes' axes into the world's, by default they are the same.
+        """
+        self.expire(time_s)
+        if any(track.time_s > time_s for track in self.tracks):
+            return []
+        R = np.eye(3) if R_world_camera is None else R_world_camera
+        whole = self._wholes(sightings, R)
+        distinct = np.flatnonzero(whole == np.arange(len(sightings))).tolist()
+        ahead = [self.predicted(track, time_s) for track in self.tracks]
+        chosen = self._assign(ahead, [sightings[k] for k in distinct])
+        ids = np.zeros(len(sightings), np.int64)
+        for k, row in zip(distinct, chosen, strict=True):
+            if row < 0:
+                self.tracks.append(self._begun(sightings[k], time_s))
+            else:
+                self.tracks[row] = self._joined(ahead[row], sightings[k], time_s)
+            ids[k] = self.tracks[row].id
+        self._end_doubles(time_s, R)
+        found: list[int] = ids[whole].tolist()
+        return found
+
+    def miss(self, time_s: float, shown: Sequence[Track]) -> None:
+        """A keyframe showed the places of these tracks; those not seen in it were missed.
+
+        Masks that come after those of a later keyframe are of no use here either.
+        """
+        if any(track.time_s > time_s for track in self.tracks):
+            return
+        unseen = {track.id for track in shown if track.time_s < time_s}
+        tracks = [replace(t, missed=t.missed + (t.id in unseen)) for t in self.tracks]
+        self.tracks = [t for t in tracks if t.missed < self.config.max_missed]
+
+    def acquit(self, track_id: int, prior: float) -> None:
+        """A thing was found to stand: its class does not count, its log odds begin at a prior."""
+        self.tracks = [
+            replace(t, prior=min(t.prior, prior), evidence=min(t.evidence, 0.0), stood=True)
+            if t.id == track_id
+            else t
+            for t in self.tracks
+        ]
+
+    def expire(self, time_s: float) -> None:
+        """End the tracks that were not seen for long."""
+        limit = time_s - self.config.patience_s
+        self.tracks = [track for track in self.tracks if track.time_s >= limit]
+
+    def predicted(self, track: Track, time_s: float) -> Track:
+        """A track at another time, by constant velocity; its ``time_s`` stays that of sight."""
+        dt = time_s - track.time_s
+        F = np.eye(6)
+        F[:3, 3:] = dt * np.eye(3)
+        variance = self.config.acceleration_m_s2**2
+        Q = Q_discrete_white_noise(2, abs(dt), variance, block_size=3, order_by_dim=False)
+        mean, covariance = predict(track.mean, track.covariance, F=F, Q=Q)
+        return replace(track, mean=mean, covariance=covariance)
+
+    def reach_m(self, track: Track) -> Array:
+        """Half size (3,) m of a predicted track's box, widened by what is not known."""
+        sigma_m = np.sqrt(max(np.trace(track.covariance[:3, :3]) / 3, 0.0))
+        return track.half_size + self._slack_m(sigma_m)
+
+    def moving_boxes(self, time_s: float) -> tuple[Array, Array]:
+        """Centres in the world and half sizes (T, 3) m of the moving tracks' boxes at a time.
+
+        Those of ``predicted`` and ``reach_m``, of all at once: the trace of a constant-velocity
+        prediction's covariance of position is that of P_pp + 2 dt P_pv + dt^2 P_vv + dt^4 / 4 a^2.
+        """
+        moving = [track for track in self.tracks if track.moving]
+        if not moving:
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        dt = time_s - np.array([track.time_s for track in moving])
+        means = np.array([track.mean for track in moving])
+        P = np.array([track.covariance for track in moving]).reshape(-1, 2, 3, 2, 3)
+        traces = np.einsum("tajbj->abt", P)
+        variance = (traces[0, 0] + 2 * dt * traces[0, 1] + dt**2 * traces[1, 1]) / 3
+        variance += 0.25 * dt**4 * self.config.acceleration_m_s2**2
+        slack_m = self._slack_m(np.sqrt(np.maximum(variance, 0)))
+        sizes = np.array([track.half_size for track in moving])
+        return means[:, :3] + dt[:, None] * means[:, 3:], sizes + slack_m[:, None]
+
+    def clear(self) -> None:
+        """End all tracks: another recording."""
+        self.tracks = []
+
+    def state(self) -> Arrays:
+        """All tracks as named arrays."""
+        tracks = self.tracks
+        return {
+            "next_id": np.array(self._next_id),
+            "ids": np.array([t.id for t in tracks], np.int64),
+            "times_s": np.array([t.time_s for t in tracks], float),
+            "means": np.array([t.mean for t in tracks], float).ravel(),
+            "covariances": np.array([t.covariance for t in tracks], float).ravel(),
+            "half_sizes": np.array([t.half_size for t in tracks], float).ravel(),
+            "distributions": np.array([t.distribution for t in tracks], np.float32).ravel(),
+            "priors": np.array([t.prior for t in tracks], float),
+            "evidence": np.array([t.evidence for t in tracks], float),
+            "sightings": np.array([t.sightings for t in tracks], np.int64),
+            "missed": np.array([t.missed for t in tracks], np.int64),
+            "stood": np.array([t.stood for t in tracks], bool),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the tracks of a state."""
+        n = len(state["ids"])
+        self._next_id = int(state["next_id"])
+        distributions = state["distributions"].reshape(n, -1) if n else np.zeros((0, 1))
+        self.tracks = [
+            Track(*row)
+            for row in zip(
+                state["ids"].tolist(),
+                state["times_s"].tolist(),
+                state["means"].reshape(n, 6).copy(),
+                state["covariances"].reshape(n, 6, 6).copy(),
+                state["half_sizes"].reshape(n, 3).copy(),
+                distributions.astype(np.float32),
+                state["priors"].tolist(),
+                state["evidence"].tolist(),
+                state["sightings"].tolist(),
+                state["missed"].tolist(),
+                state["stood"].tolist(),
+                strict=True,
+            )
+        ]
+
+    def _wholes(self, sightings: Sequence[Sighting], R_world_box: Array) -> NDArray[np.int64]:
+        """(N,) the largest sighting that each is a part of, itself if there is none."""
+        if not sightings:
+            return np.zeros(0, np.int64)
+        centres = np.array([s.centroid_world for s in sightings])
+        sizes = np.array([s.half_size for s in sightings])
+        alike = [[_alike(a.distribution, b.distribution) for b in sightings] for a in sightings]
+        within = _within(centres, centres, sizes, R_world_box)
+        within &= np.array(alike) >= self.config.same_class
+        np.fill_diagonal(within, True)
+        volume = sizes.prod(axis=1)
+        whole = np.where(within, volume, -1.0).argmax(axis=1)
+        while not np.array_equal(whole, whole[whole]):
+            whole = whole[whole]
+        return whole
+
+    def _end_doubles(self, time_s: float, R_world_box: Array) -> None:
+        """End the tracks that were not seen where one of the same class was."""
+        now = [track for track in self.tracks if track.time_s == time_s]
+        others = [track for track in self.tracks if track.time_s != time_s]
+        if not now or not others:
+            return
+        centres = np.array([self.predicted(track, time_s).mean[:3] for track in others])
+        seen, sizes = np.array([t.mean[:3] for t in now]), np.array([t.half_size for t in now])
+        alike = [[_alike(a.distribution, b.distribution) for b in now] for a in others]
+        double = _within(centres, seen, sizes, R_world_box)
+        double &= np.array(alike) >= self.config.same_class
+        ended = {others[k].id for k in np.flatnonzero(double.any(axis=1)).tolist()}
+        self.tracks = [track for track in self.tracks if track.id not in ended]
+
+    def _slack_m(self, sigma_m: Array) -> Array:
+        """By how much boxes are widened whose centres are not known better."""
+        known = self.config.box_sigmas * sigma_m
+        return np.minimum(known, self.config.box_slack_m) + self.config.box_margin_m
+
+    def _assign(self, ahead: list[Track], sightings: Sequence[Sighting]) -> list[int]:
+        """The row of the track of each sighting, -1 for none: the cheapest pairs in the gate."""
+        chosen = [-1] * len(sightings)
+        if not ahead or not sightings:
+            return chosen
+        cost = np.full((len(sightings), len(ahead)), _NEVER)
+        noise = self.config.centroid_sigma_m**2 * np.eye(3)
+        for k, track in enumerate(ahead):
+            away = np.array([s.centroid_world for s in sightings]) - track.mean[:3]
+            S = track.covariance[:3, :3] + noise
+            chi2 = np.einsum("ij,ij->i", away, np.linalg.solve(S, away.T).T)
+            alike = np.array([_alike(s.distribution, track.distribution) for s in sightings])
+            total = chi2 + self.config.class_cost * (1 - alike)
+            cost[:, k] = np.where(total < self.config.gate_chi2, total, _NEVER)
+        for row, column in zip(*linear_sum_assignment(cost), strict=True):
+            if cost[row, column] < _NEVER:
+                chosen[row] = int(column)
+        return chosen
+
+    def _begun(self, sighting: Sighting, time_s: float) -> Track:
+        self._next_id += 1
+        variances = [self.config.centroid_sigma_m**2] * 3 + [self.config.speed_m_s**2] * 3
+        return Track(
+            id=self._next_id - 1,
+            time_s=time_s,
+            mean=np.concatenate([sighting.centroid_world, np.zeros(3)]),
+            covariance=np.diag(variances),
+            half_size=sighting.half_size,
+            distribution=sighting.distribution,
+            prior=sighting.prior,
+            evidence=sighting.evidence,
+            sightings=1,
+        )
+
+    def _joined(self, ahead: Track, sighting: Sighting, time_s: float) -> Track:
+        limit = self.config.max_evidence
+        noise = self.config.centroid_sigma_m**2 * np.eye(3)
+        mean, covariance = update(
+            ahead.mean, ahead.covariance, sighting.centroid_world, noise, H=_H
+        )
+        return replace(
+            ahead,
+            time_s=time_s,
+            mean=mean,
+            covariance=covariance,
+            half_size=np.maximum(sighting.half_size, 0.8 * ahead.half_size),
+            distribution=np.float32(0.5) * (ahead.distribution + sighting.distribution),
+            prior=ahead.prior if ahead.stood else (ahead.prior + sighting.prior) / 2,
+            evidence=float(np.clip(ahead.evidence + sighting.evidence, -limit, limit)),
+            sightings=ahead.sightings + 1,
+            missed=0,
+        )
+
+
+def _within(points: Array, centres: Array, sizes: Array, R_world_box: Array) -> Mask:
+    """Whether points (N, 3) lie in boxes at centres (M, 3) of half sizes (M, 3): (N, M)."""
+    away = np.abs((points[:, None] - centres) @ R_world_box)
+    return np.asarray((away <= sizes).all(axis=2))
+
+
+def _alike(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """How much two distributions (C,) have in common, 0 to 1."""
+    return float(np.sqrt(a * b).sum()) if a.shape == b.shape else 0.0

@@ -1,0 +1,246 @@
+"""Weight files: read without running what is in them, recognised, compared, written."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.downloads import cache_folder, fetch
+from bmask_slam.semantics.labels import LabelSet, label_set, read_label_set
+from bmask_slam.semantics.network.config import (
+    RESNET50,
+    RESNET50_V2,
+    RESNET101,
+    AnchorConfig,
+    DetectionConfig,
+    ImageConfig,
+    NetworkConfig,
+    ProposalConfig,
+)
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.weights.checkpoint_names import State, current_names, is_mask_scoring
+
+PREFIX = "torchvision:"
+PUBLISHED = {
+    "maskrcnn_resnet50_fpn_coco":
+        "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth",
+    "maskrcnn_resnet50_fpn_v2_coco":
+        "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_v2_coco-73cbd019.pth",
+}  # fmt: skip
+NO_EPS = "maskrcnn_resnet50_fpn_coco-"
+"""Files of this name were made with an eps of 0 in batch norm."""
+CAFFE_IMAGES = ImageConfig(
+    mean=(122.7717 / 255, 115.9465 / 255, 102.9801 / 255), std=(1 / 255, 1 / 255, 1 / 255)
+)
+"""The original Mask Scoring R-CNN subtracts the mean from 0..255 and does not divide."""
+CLASSES_KEY = "roi_heads.box_predictor.cls_score.weight"
+SHOWN = 4
+
+
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A network with its weights, and the names of its classes."""
+
+    model: MaskRCNN
+    labels: LabelSet
+
+
+def find_weights(name: str, folder: Path | None = None) -> Path:
+    """The file of ``--weights``: a path, or ``torchvision:NAME``, downloaded once.
+
+    Raises:
+        InputError: an unknown name, no connection, no such file.
+    """
+    if name.startswith(PREFIX):
+        url = PUBLISHED.get(name.removeprefix(PREFIX))
+        if url is None:
+            known = ", ".join(PREFIX + n for n in PUBLISHED)
+            raise InputError(f"--weights {name}: not known; there are: {known}; or give a file")
+        return fetch(url, folder or cache_folder())
+    path = Path(name)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give weights as .pth or .safetensors")
+    return path
+
+
+def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
+    """The network that a file holds the weights of, ready to detect.
+
+    Files of this project (.safetensors with its configuration) say what they are; others are
+    recognised by their names and shapes: torchvision's, and the original Mask Scoring R-CNN's.
+
+    Raises:
+        InputError: an unreadable file, or weights that fit no network, or another label set; the
+            message says what differs.
+    """
+    state, metadata = read_state(path)
+    own: LabelSet | None
+    if "network" in metadata:
+        config, own = _described(path, metadata)
+    else:
+        state, config = current_names(state), recognise(path, state)
+        own = _published_labels(config.classes)
+    labels = labels or own
+    if labels is None or len(labels) != config.classes:
+        given = "none is known" if labels is None else f"the label set has {len(labels)}"
+        raise InputError(
+            f"{path}: has {config.classes} classes with the background, but {given}; "
+            "give the label set that it was trained on"
+        )
+    with torch.device("meta"):
+        model = MaskRCNN(config)
+    _check(path, state, model)
+    floats = {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
+    model.load_state_dict(floats, assign=True)
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return TrainedNetwork(model.eval(), labels)
+
+
+def load_mobilenet(model: MaskRCNN, path: Path) -> None:
+    """Give a light network the body of an ImageNet classifier; its last layers are not needed.
+
+    Raises:
+        InputError: the file is not a MobileNetV2 with batch norm folded into its weights.
+    """
+    state, _ = read_state(path)
+    wanted = model.backbone.body.state_dict()
+    different = sorted(k for k, v in wanted.items() if k not in state or state[k].shape != v.shape)
+    if different:
+        raise InputError(
+            f"{path}: not a folded MobileNetV2; {len(different)} of {len(wanted)} parameters are "
+            f"missing or of another shape, such as {different[0]}"
+        )
+    model.backbone.body.load_state_dict({k: state[k] for k in wanted})
+
+
+def save_network(network: TrainedNetwork, path: Path, half: bool = True) -> None:
+    """Write weights, configuration and class names; in half precision unless told otherwise."""
+    state = {}
+    for name, value in network.model.state_dict().items():
+        small = value.half() if half and value.is_floating_point() else value
+        state[name] = small.detach().cpu().contiguous()
+    metadata = {
+        "network": json.dumps(asdict(network.model.config), sort_keys=True),
+        "labels": json.dumps(network.labels.names),
+    }
+    temporary = path.with_name(path.name + ".tmp")
+    save_file(state, temporary, metadata)
+    os.replace(temporary, path)
+
+
+def read_state(path: Path) -> tuple[State, dict[str, str]]:
+    """Tensors by name, and the metadata of a safetensors file; no code in the file is run.
+
+    Raises:
+        InputError: a truncated file, a pickle of anything but tensors, or no file at all.
+    """
+    if path.suffix == ".safetensors":
+        try:
+            with safetensors.safe_open(path, "pt") as file:
+                metadata = file.metadata() or {}
+            return load_file(path), metadata
+        except (safetensors.SafetensorError, OSError) as error:
+            raise InputError(f"{path}: not a whole safetensors file ({error})") from error
+    try:
+        content: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise InputError(
+            f"{path}: holds more than tensors, which is not loaded since it could run code; "
+            "save the state_dict alone"
+        ) from error
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: truncated or no PyTorch file ({path.stat().st_size} bytes); get it again"
+        ) from error
+    for key in ("model", "state_dict"):
+        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
+            content = content[key]
+    if not isinstance(content, Mapping) or not content:
+        raise InputError(f"{path}: holds a {type(content).__name__}, not a state_dict")
+    stranger = next((k for k, v in content.items() if not isinstance(v, Tensor)), None)
+    if stranger is not None:
+        raise InputError(f"{path}: the entry {stranger!r} is no tensor; save the state_dict alone")
+    return {str(name): value for name, value in content.items()}, {}
+
+
+def recognise(path: Path, state: State) -> NetworkConfig:
+    """The configuration whose parameters agree best with a state_dict in any known naming."""
+    caffe = is_mask_scoring(state)
+    state = current_names(state)
+    candidates = [RESNET50, RESNET50_V2, RESNET101]
+    if caffe:
+        candidates = [
+            replace(c, stride_in_1x1=True, image=CAFFE_IMAGES) for c in (RESNET50, RESNET101)
+        ]
+    if path.name.startswith(NO_EPS):
+        candidates = [replace(RESNET50, norm_eps=0.0)]
+    if CLASSES_KEY in state and state[CLASSES_KEY].ndim == 2:
+        candidates = [replace(c, classes=len(state[CLASSES_KEY])) for c in candidates]
+    if any(".maskiou_" in name for name in state):
+        candidates = [c.with_maskiou() for c in candidates]
+    return min(candidates, key=lambda config: len(_names(config) ^ state.keys()))
+
+
+def _names(config: NetworkConfig) -> set[str]:
+    with torch.device("meta"):
+        return set(MaskRCNN(config).state_dict())
+
+
+def _check(path: Path, state: State, model: MaskRCNN) -> None:
+    """Refuse weights that are not exactly the model's, and say what differs."""
+    wanted = model.state_dict()
+    missing, extra = sorted(wanted.keys() - state.keys()), sorted(state.keys() - wanted.keys())
+    shaped = [
+        f"{k} {tuple(state[k].shape)} instead of {tuple(wanted[k].shape)}"
+        for k in sorted(wanted.keys() & state.keys())
+        if state[k].shape != wanted[k].shape
+    ]
+    kinds = (("missing", missing), ("not known", extra), ("of another shape", shaped))
+    parts = [
+        f"{len(names)} {kind}: {', '.join(names[:SHOWN])}{' ...' if len(names) > SHOWN else ''}"
+        for kind, names in kinds
+        if names
+    ]
+    if parts:
+        config = model.config
+        raise InputError(
+            f"{path}: not the weights of a Mask R-CNN with {config.backbone} and "
+            f"{config.classes} classes; {'; '.join(parts)}; give weights of that network"
+        )
+
+
+def _described(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkConfig, LabelSet]:
+    """What a file of this project says about itself."""
+    parts = {
+        "image": ImageConfig,
+        "anchors": AnchorConfig,
+        "proposals": ProposalConfig,
+        "detections": DetectionConfig,
+    }
+    try:
+        values = json.loads(metadata["network"])
+        for name, cls in parts.items():
+            given = values.get(name, {})
+            inner = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+            values[name] = cls(**inner)
+        names = tuple(json.loads(metadata["labels"]))
+        return NetworkConfig(**values), label_set(names[1:])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: made by another version of this project ({error})") from error
+
+
+def _published_labels(classes: int) -> LabelSet | None:
+    """COCO's label set with this many entries, background included."""
+    known = {len(s): s for s in (read_label_set("coco91"), read_label_set("coco"))}
+    return known.get(classes)

@@ -1,0 +1,238 @@
+"""Which of the map's observations enter the factor graph, and how its answer is read back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bmask_slam.features.brisk import Features, spread_order
+from bmask_slam.graph.factors.graph_update import (
+    GraphEstimate,
+    GraphUpdate,
+    Observations,
+    PosePrior,
+    concatenate,
+)
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array
+from bmask_slam.world.landmark_table import Ints, Mask
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+
+@dataclass(frozen=True)
+class GraphFeedConfig:
+    """The graph's size decides its cost: measurements are capped per keyframe.
+
+    A landmark enters when ``min_views`` keyframes see it, with all its observations so far. It
+    retires (`graph.marginals.landmark_marginalisation`) when none of the ``window_keyframes`` that
+    share most with the
+    newest one sees it, and as soon as ``retire_batch`` wait for it, at most twice as many at once;
+    it comes back when it is seen again. A map of up to ``full_keyframes`` keeps every landmark in
+    the graph: that is more accurate, and fast enough. 0 window keyframes: so does every map.
+    """
+
+    max_observations: int = 200
+    min_views: int = 2
+    bucket_px: int = 60
+    full_keyframes: int = 300
+    window_keyframes: int = 20
+    window_min_shared: int = 15
+    retire_batch: int = 100
+
+
+class GraphFeed:
+    """Turns changes of the map into updates of the graph and estimates back into the map."""
+
+    def __init__(self, config: GraphFeedConfig):
+        self.config = config
+        self._removed: list[Ints] = []
+        self._removed_keyframes: list[int] = []
+
+    def forget_landmarks(self, ids: Ints) -> None:
+        """These landmarks were culled or fused: their factors go with the next update."""
+        self._removed.append(ids)
+
+    def forget_keyframe(self, keyframe_id: int) -> None:
+        """This keyframe was culled: its factors go with the next update."""
+        self._removed_keyframes.append(keyframe_id)
+
+    def state(self) -> Arrays:
+        """What still has to leave the graph; what entered is known to map and graph."""
+        return {
+            "removed": np.concatenate([np.zeros(0, np.int64), *self._removed]),
+            "removed_keyframes": np.array(self._removed_keyframes, np.int64),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the feed of a state."""
+        self._removed = [state["removed"]]
+        self._removed_keyframes = state["removed_keyframes"].tolist()
+
+    def keyframe_update(self, world: WorldMap, keyframe: Keyframe) -> GraphUpdate:
+        """The update that adds one keyframe and its landmarks, with every other change."""
+        keypoints, ids = world.observed(keyframe)
+        inside = world.landmarks.in_graph[ids]
+        new_ids = self._promoted(world, keyframe, keypoints[~inside], ids[~inside], inside.sum())
+        world.landmarks.in_graph[new_ids] = True
+        retired = self._outside_window(world, ids)
+        world.landmarks.in_graph[retired] = False
+        begins = world.in_segment(keyframe.segment) == [keyframe]
+        return replace(
+            self._changes(world),
+            keyframe_ids=np.array([keyframe.id]),
+            poses_world_camera=keyframe.T_world_camera[None],
+            landmark_ids=new_ids,
+            points_world=world.landmarks.points_world[new_ids],
+            priors=(segment_prior(keyframe),) if begins else (),
+            retire_landmarks=retired,
+        )
+
+    def map_update(self, world: WorldMap) -> GraphUpdate:
+        """The update of what changed in the map, no keyframe being new: fused, forgotten.
+
+        Retired landmarks that were given observations come back with them.
+        """
+        again = np.flatnonzero(was_sent(world) & ~world.landmarks.in_graph & world.landmarks.alive)
+        unsent = [k.landmark_ids[k.sent_ids != k.landmark_ids] for k in world.keyframes.values()]
+        again = np.intersect1d(again, np.concatenate([np.zeros(0, np.int64), *unsent]))
+        world.landmarks.in_graph[again] = True
+        points = world.landmarks.points_world[again]
+        return replace(self._changes(world), landmark_ids=again, points_world=points)
+
+    def _changes(self, world: WorldMap) -> GraphUpdate:
+        update = GraphUpdate(
+            observations=self._unsent_observations(world),
+            remove_landmarks=np.concatenate([np.zeros(0, np.int64), *self._removed]),
+            remove_keyframes=np.array(self._removed_keyframes, np.int64),
+        )
+        self._removed, self._removed_keyframes = [], []
+        return update
+
+    def whole_update(self, world: WorldMap) -> GraphUpdate:
+        """The update that fills an empty graph with the whole map, one prior a segment."""
+        self._removed, self._removed_keyframes = [], []
+        keyframes = list(world.keyframes.values())
+        landmarks = world.landmarks
+        landmarks.in_graph[:] = (landmarks.in_graph | was_sent(world)) & landmarks.alive
+        first = {k.segment: k for k in reversed(keyframes)}
+        for keyframe in keyframes:
+            keyframe.sent_ids[:] = -1
+        ids = np.flatnonzero(landmarks.in_graph)
+        return GraphUpdate(
+            keyframe_ids=np.array([k.id for k in keyframes]),
+            poses_world_camera=np.array([k.T_world_camera for k in keyframes]),
+            landmark_ids=ids,
+            points_world=landmarks.points_world[ids],
+            observations=self._unsent_observations(world),
+            priors=tuple(segment_prior(first[s]) for s in sorted(first)),
+        )
+
+    def _promoted(
+        self, world: WorldMap, keyframe: Keyframe, keypoints: Ints, ids: Ints, already: int
+    ) -> Ints:
+        """Landmarks of the keyframe that enter the graph now: well spread, most seen first."""
+        views = world.landmarks.observations[ids]
+        enough = views >= self.config.min_views
+        keypoints, ids, views = keypoints[enough], ids[enough], views[enough]
+        room = max(self.config.max_observations - int(already), 0)
+        pixels = keyframe.features.image_pixels[keypoints] // self.config.bucket_px
+        bucket = (pixels[:, 1] * 1000 + pixels[:, 0]).astype(np.int64)
+        return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
+
+    def _outside_window(self, world: WorldMap, seen_ids: Ints) -> Ints:
+        """Landmarks in the graph that no keyframe of the active window sees, once enough wait.
+
+        Those that were not seen for longest come first.
+        """
+        count, landmarks = self.config.window_keyframes, world.landmarks
+        if not count or len(world.keyframes) <= self.config.full_keyframes:
+            return np.zeros(0, np.int64)
+        near = [k for _, k in world.covisible(seen_ids, self.config.window_min_shared)[:count]]
+        active = np.zeros(len(landmarks) + 1, bool)  # the last entry answers for id -1
+        active[seen_ids] = True
+        for keyframe in near:
+            active[keyframe.landmark_ids] = True
+        waiting = np.flatnonzero(landmarks.in_graph & landmarks.alive & ~active[:-1])
+        batch = self.config.retire_batch
+        if len(waiting) < batch:
+            return waiting[:0]
+        oldest = np.argsort(landmarks.last_keyframe[waiting], kind="stable")[: 2 * batch]
+        return np.sort(waiting[oldest])
+
+    def _unsent_observations(self, world: WorldMap) -> Observations:
+        """Every observation of a landmark in the graph that was not sent yet, in all keyframes.
+
+        Observations that older keyframes gained by fusion are among them.
+        """
+        in_graph = np.append(world.landmarks.in_graph, False)  # the last entry answers for id -1
+        parts = []
+        for keyframe in world.keyframes.values():
+            ids = keyframe.landmark_ids
+            rows = np.flatnonzero(in_graph[ids] & (keyframe.sent_ids != ids))
+            if len(rows):
+                parts.append(observations_of(keyframe, rows, ids[rows]))
+                keyframe.sent_ids[rows] = ids[rows]
+        return concatenate(parts)
+
+
+def was_sent(world: WorldMap) -> Mask:
+    """Mask (N,) of the landmarks of which the graph was given observations, retired ones too."""
+    sent = np.zeros(len(world.landmarks) + 1, bool)  # the last entry answers for id -1
+    for keyframe in world.keyframes.values():
+        sent[keyframe.sent_ids] = True
+    return sent[:-1]
+
+
+def segment_prior(keyframe: Keyframe) -> PosePrior:
+    """The first keyframe of a segment fixes the segment's frame."""
+    return PosePrior(keyframe.id, keyframe.T_world_camera, np.eye(6) * 1e-8)
+
+
+def observations_of(keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> Observations:
+    """The graph's observations of some keypoints of a keyframe."""
+    features = keyframe.features
+    return Observations(
+        keyframe_ids=np.full(len(keypoints), keyframe.id),
+        landmark_ids=landmark_ids,
+        measurements=stereo_measurements(features, keypoints),
+        sigmas_px=quantised(features.sigmas_px[keypoints]),
+    )
+
+
+def quantised(sigmas_px: Array) -> Array:
+    """Sigmas rounded to powers of 2^(1/3), so that factors can share noise models."""
+    return np.exp2(np.round(3 * np.log2(sigmas_px)) / 3)
+
+
+def stereo_measurements(features: Features, keypoints: Ints) -> Array:
+    """(N, 3) of u_left, v, u_right = u_left - disparity; u_right NaN without depth."""
+    pixels = features.pixels[keypoints]
+    return np.column_stack([pixels, pixels[:, 0] - features.disparity_px[keypoints]])
+
+
+def read_back(world: WorldMap, estimate: GraphEstimate) -> None:
+    """Write the graph's poses and points into the map.
+
+    Landmarks outside the graph move rigidly with the keyframe that made them.
+    """
+    landmarks = world.landmarks
+    before = landmarks.in_graph.copy()
+    inside = estimate.landmark_ids[landmarks.alive[estimate.landmark_ids]]
+    landmarks.in_graph[:] = False  # not those either that were sent and refused
+    landmarks.in_graph[inside] = True
+    left_out = np.append(before & ~landmarks.in_graph, False)
+    if left_out.any():  # their observations may be sent again later
+        for keyframe in world.keyframes.values():
+            keyframe.sent_ids[left_out[keyframe.sent_ids]] = -1
+    known = np.array([i in world.keyframes for i in estimate.keyframe_ids], bool)
+    ids, T_new = estimate.keyframe_ids[known], estimate.poses_world_camera[known]
+    T_old = np.array([world.keyframes[i].T_world_camera for i in ids]).reshape(-1, 4, 4)
+    moved = np.abs(T_new - T_old).max(axis=(1, 2)) > 1e-9
+    outside = np.flatnonzero(landmarks.alive & ~landmarks.in_graph)
+    if moved.any():
+        landmarks.move_with_hosts(outside, ids[moved], T_old[moved], T_new[moved])
+    for i, T in zip(ids, T_new, strict=True):
+        world.keyframes[i].T_world_camera = T
+    position = np.searchsorted(estimate.landmark_ids, inside)
+    landmarks.points_world[inside] = estimate.points_world[position]

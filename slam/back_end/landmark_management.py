@@ -1,0 +1,135 @@
+"""What happens to the map at a keyframe: landmarks are made, fused and culled, keyframes culled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bmask_slam.back_end.triangulation import TriangulationConfig
+from bmask_slam.features.matching import Matches, WindowIndex
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import transform
+from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
+from bmask_slam.tracking.tracker import Tracker
+from bmask_slam.world.landmark_table import Ints
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """How many landmarks are made and which are kept.
+
+    ``fuse_neighbours`` covisible keyframes are searched for the new landmarks. A landmark is
+    culled if it was found in less than ``min_found_ratio`` of the frames that should have
+    seen it, or if ``probation_keyframes`` after it was made fewer than ``min_observations`` see it;
+    at once if none does.
+    A keyframe is redundant if ``redundant_share`` of its landmarks are seen by at least
+    ``redundant_views`` others.
+    """
+
+    local_keyframes: int = 15
+    local_min_shared: int = 15
+    fuse_neighbours: int = 5
+    fuse_radius_px: float = 4.0
+    min_found_ratio: float = 0.25
+    probation_keyframes: int = 2
+    min_observations: int = 2
+    redundant_share: float = 0.9
+    redundant_views: int = 3
+    triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
+
+
+def local_landmarks(world: WorldMap, seen_ids: Ints, config: MappingConfig) -> Ints:
+    """Ids of the landmarks of the keyframes that share most with the seen ones, sorted."""
+    strong = world.covisible(seen_ids, config.local_min_shared)[: config.local_keyframes]
+    if not strong:
+        return np.unique(seen_ids)
+    chosen = np.zeros(len(world.landmarks) + 1, bool)  # the last entry answers for id -1
+    for ids in (*(keyframe.landmark_ids for _, keyframe in strong), seen_ids):
+        chosen[ids] = True
+    return np.flatnonzero(chosen[:-1] & world.landmarks.alive)
+
+
+def create_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> Ints:
+    """Landmarks from every keypoint of a keyframe that has depth and no landmark yet."""
+    features = keyframe.features
+    free = np.flatnonzero(keyframe.free & np.isfinite(features.depth_m))
+    points = camera.backproject(features.pixels[free], features.depth_m[free])
+    return world.make_landmarks(keyframe, free, transform(keyframe.T_world_camera, points))
+
+
+def fuse_into_neighbours(
+    world: WorldMap, keyframe: Keyframe, new_ids: Ints, tracker: Tracker, config: MappingConfig
+) -> Ints:
+    """Look for a keyframe's new landmarks in its covisible neighbours; returns the ids removed."""
+    _, tracked = world.observed(keyframe)
+    neighbours = [k for _, k in world.covisible(tracked, 15) if k is not keyframe]
+    return fuse_into(
+        world, neighbours[: config.fuse_neighbours], new_ids, tracker, config.fuse_radius_px
+    )
+
+
+def fuse_into(
+    world: WorldMap, keyframes: list[Keyframe], ids: Ints, tracker: Tracker, radius_px: float
+) -> Ints:
+    """Look for landmarks in keyframes that may show them too.
+
+    A free keypoint there becomes one more observation; one that has another landmark shows a
+    duplicate, and the younger is fused into the older. Returns the ids removed.
+    """
+    removed = [np.zeros(0, np.int64)]
+    for keyframe in keyframes:
+        living = world.landmarks.living(ids)
+        visible, matches = consistent_matches(world, keyframe, living, tracker, radius_px)
+        here, there = visible[matches.query], keyframe.landmark_ids[matches.train]
+        old = there >= 0
+        old[old] = world.landmarks.alive[there[old]]
+        world.attach(keyframe, matches.train[~old], here[~old])
+        pairs = np.sort(np.stack([here[old], there[old]], axis=1), axis=1)
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        if len(pairs):
+            removed.append(world.replace_landmarks(pairs[:, 1], pairs[:, 0]))
+    return np.concatenate(removed)
+
+
+def consistent_matches(
+    world: WorldMap, keyframe: Keyframe, ids: Ints, tracker: Tracker, radius_px: float
+) -> tuple[Ints, Matches]:
+    """Matches of landmarks in a keyframe that also pass the chi-square gate at its pose."""
+    features, T = keyframe.features, keyframe.T_world_camera
+    index = WindowIndex(features.pixels)
+    visible, matches = tracker.search(features, index, T, ids, radius_px, world.landmarks)
+    points = world.landmarks.points_world[visible[matches.query]]
+    measured = features.measurements[matches.train]
+    r, _ = residuals(T, points, measured, tracker.camera)
+    whitened = r / features.sigmas_px[matches.train]
+    chi2 = np.nansum(whitened**2, axis=1)
+    gate = np.where(np.isfinite(measured[:, 2]), CHI2_3DOF, CHI2_2DOF)
+    return visible, matches[chi2 < gate]
+
+
+def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> Ints:
+    """Of the candidates, those rarely found again or seen by too few keyframes; removed here."""
+    landmarks = world.landmarks
+    ids = landmarks.living(candidates)
+    age, views = world.next_keyframe_id - 1 - landmarks.host[ids], landmarks.observations[ids]
+    rarely = landmarks.found[ids] < config.min_found_ratio * landmarks.visible[ids]
+    few = (age >= config.probation_keyframes) & (views < config.min_observations)
+    culled = ids[rarely | few | (views == 0)]
+    landmarks.remove(culled)
+    return culled
+
+
+def redundant_keyframe(
+    world: WorldMap, candidates: list[Keyframe], config: MappingConfig
+) -> Keyframe | None:
+    """The first candidate nearly all of whose landmarks enough other keyframes see, if any."""
+    for keyframe in candidates:
+        _, ids = world.observed(keyframe)
+        if len(ids) == 0:
+            continue
+        often = world.landmarks.observations[ids] > config.redundant_views
+        if often.mean() > config.redundant_share:
+            return keyframe
+    return None

@@ -1,0 +1,299 @@
+"""The map's owner: keyframes go in, the graph is optimised, segments are joined."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bmask_slam.back_end.factor_selection import GraphFeed, GraphFeedConfig, read_back
+from bmask_slam.back_end.landmark_management import (
+    MappingConfig,
+    create_landmarks,
+    cull_landmarks,
+    fuse_into,
+    fuse_into_neighbours,
+    local_landmarks,
+    redundant_keyframe,
+)
+from bmask_slam.back_end.pruning import MapPruner
+from bmask_slam.back_end.segment_joining import join_segment
+from bmask_slam.back_end.triangulation import triangulate_landmarks
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.graph_update import GraphEstimate
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.files.array_file import Arrays, nested, part
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
+from bmask_slam.loops.place_recognition import DescriptorIndex
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.tracker import Tracked, Tracker
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.landmark_table import Ints, Patches
+from bmask_slam.world.map_state import world_of, world_state
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
+
+MEDIAN_CHI2_6DOF = 5.348
+
+
+class Mapper:
+    """Holds map, graph and frame history, and keeps the three consistent."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        tracker: Tracker,
+        config: tuple[MappingConfig, GraphFeedConfig, SmootherConfig, LoopClosingConfig],
+    ):
+        self.camera = camera
+        self.world = WorldMap()
+        self.history = FrameHistory()
+        self.smoother = Smoother(camera, config[2])
+        self.loops = LoopCloser(camera, config[3])
+        self.update_ms: list[float] = []
+        self._tracker = tracker
+        self._mapping, self._graph_config = config[0], config[2]
+        self._feed = GraphFeed(config[1])
+
+    @property
+    def places(self) -> DescriptorIndex:
+        """What finds the keyframes that look like a frame."""
+        return self.loops.index
+
+    @property
+    def idle(self) -> bool:
+        """Whether it waits for work: always, since every update ends before the next frame."""
+        return True
+
+    def state(self) -> Arrays:
+        """Map, history and graph as named arrays."""
+        return {
+            "update_ms": np.array(self.update_ms, float),
+            **nested(
+                world=world_state(self.world),
+                history=self.history.state(),
+                graph=self.smoother.state(),
+                feed=self._feed.state(),
+                loops=self.loops.state(),
+            ),
+        }
+
+    def restore(self, state: Arrays, path: Path) -> None:
+        """Become the mapper of a state that was read from a file. Raises InputError."""
+        self.update_ms = state["update_ms"].tolist()
+        self.world = world_of(part(state, "world"))
+        self.history.restore(part(state, "history"))
+        self.smoother.restore(part(state, "graph"), path)
+        self._feed.restore(part(state, "feed"))
+        self.loops.restore(part(state, "loops"), self.world)
+
+    def restart(self) -> None:
+        """Build anew, from now on, what a state cannot hold: go on like one that was restored."""
+        self.smoother.restart()
+        self.loops.index.rebuild()
+
+    def begin_session(self) -> None:
+        """Forget the frames that were tracked, and the times; map and graph stay."""
+        self.history = FrameHistory()
+        self.update_ms = []
+
+    def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
+        """Make a tracked frame a keyframe: landmarks are made, fused and culled."""
+        world = self.world
+        keyframe = add_keyframe(world, frame, tracked, segment)
+        world.attach(keyframe, tracked.keypoints, tracked.landmark_ids)
+        new_ids = create_landmarks(world, keyframe, self.camera)
+        fused = fuse_into_neighbours(world, keyframe, new_ids, self._tracker, self._mapping)
+        triangulate_landmarks(world, keyframe, self.camera, self._mapping.triangulation)
+        world.renew_patches(keyframe, self._tracker.config.subpixel)
+        keyframe.features = without_image(keyframe.features)
+        self._feed.forget_landmarks(fused)
+        self._feed.forget_landmarks(cull_landmarks(world, local_ids, self._mapping))
+        self.loops.add(keyframe)
+        return keyframe
+
+    def optimise(self, keyframe: Keyframe) -> None:
+        """Put a keyframe into the graph, read all poses and points back, cull a redundant one."""
+        self._apply(self.smoother.update(self._feed.keyframe_update(self.world, keyframe)))
+        self._cull_keyframe(keyframe)
+
+    def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
+        """Look for known places from a keyframe; loops that hold move the map and fuse landmarks.
+
+        The graph is asked afterwards: a loop that does not fit is removed and waits for more
+        support; an older one that no longer fits goes with what it fused.
+        """
+        confirmed = self.loops.loops_of(keyframe, self.world)
+        if not confirmed:
+            return []
+        self._change_graph(relative_poses=self.loops.relative_poses(confirmed))
+        believed = self.loops.is_strong(confirmed)
+        self.loops.closed |= {loop.ends: believed for loop in confirmed}
+        refuted = self._refuted_loops()
+        kept = [loop for loop in confirmed if loop.ends not in refuted]
+        self.loops.waiting += [loop for loop in confirmed if loop.ends in refuted]
+        self._remove_loops(refuted, {loop.ends for loop in confirmed})
+        if kept:
+            self._fuse(kept)
+        return kept
+
+    def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
+        """A frame of one segment was recognised in another: move the segment there, as one map.
+
+        Returns the frame as it is seen in the joined map.
+        """
+        joined = join_segment(self.world, segment, tracked, recognised)
+        self.smoother = Smoother(self.camera, self._graph_config)
+        self._apply(self.smoother.update(self._feed.whole_update(self.world)))
+        return joined
+
+    def pruner(self) -> MapPruner:
+        """Takes things out of map and graph, such as what a mask covers, at any time."""
+        return MapPruner(self.world, self.smoother, self.camera)
+
+    def take_back(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
+        """Keypoints (N,) of a keyframe that were masked observe landmarks after all.
+
+        Those that the map has by now, or new ones; either have the patches (N) of what the
+        keypoints observed before, unless they have others.
+        """
+        world = self.world
+        keyframe = world.keyframes.get(keyframe_id)
+        if keyframe is None or not len(keypoints):
+            return
+        world.unmask(keyframe, keypoints)
+        _, seen = world.observed(keyframe)
+        known = np.setdiff1d(local_landmarks(world, seen, self._mapping), seen)
+        radius_px = self._mapping.fuse_radius_px
+        fused = fuse_into(world, [keyframe], known, self._tracker, radius_px)
+        self._feed.forget_landmarks(fused)
+        create_landmarks(world, keyframe, self.camera)
+        ids = keyframe.landmark_ids[keypoints]
+        world.landmarks.give_patches(ids[ids >= 0], patches[ids >= 0])
+
+    def finish(self) -> None:
+        """Full bundle adjustment of the graph, then without outliers; the map is then final."""
+        if self.world.keyframes:
+            self._apply(self.smoother.optimise_batch(drop_outliers=True), timed=False)
+
+    def _apply(self, estimate: GraphEstimate, timed: bool = True) -> None:
+        if timed:
+            self.update_ms.append(estimate.update_ms)
+        if estimate.rebuilt:
+            logger.warning("graph rebuilt after a failure at %s", estimate.failed_variable)
+        read_back(self.world, estimate)
+
+    def _change_graph(self, **changes: Any) -> None:
+        """An update that moves much of the graph: ISAM2 goes on until nothing moves any more."""
+        rounds = self.loops.config.max_iterations
+        update = replace(self._feed.map_update(self.world), max_iterations=rounds, **changes)
+        self._apply(self.smoother.update(update))
+
+    def _refuted_loops(self) -> set[tuple[int, int]]:
+        """Loops that are not in the graph, or do not fit it.
+
+        A strong set is believed against the path, but not one of its loops against the others:
+        their bound is as much wider as their median says that the set fits worse than it should.
+        """
+        errors = self.smoother.relative_pose_errors("loop")
+        pairs = list(zip(errors.keyframe_a.tolist(), errors.keyframe_b.tolist(), strict=True))
+        believed = np.array([self.loops.closed.get(pair, False) for pair in pairs], bool)
+        wider = np.ones(len(pairs))
+        if believed.any():
+            ratio = float(np.median(errors.chi2[believed])) / MEDIAN_CHI2_6DOF
+            wider[believed] = max(ratio, 1.0)
+        fits = (errors.chi2 <= wider * self.loops.config.gate).tolist()
+        inside = dict(zip(pairs, fits, strict=True))
+        return {
+            pair
+            for pair in self.loops.closed
+            if self.world.keyframes.keys() >= set(pair)  # else it left with a culled keyframe
+            and not inside.get(pair, False)
+        }
+
+    def _remove_loops(self, refuted: set[tuple[int, int]], fresh: set[tuple[int, int]]) -> None:
+        """Take loops out of the graph, and apart what those that are not fresh have fused."""
+        if not refuted:
+            return
+        logger.info("loops refuted by the graph: %s", sorted(refuted))
+        gone = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
+        self._change_graph(remove_relative_poses=gone)
+        for a, b in sorted(refuted - fresh):
+            self.pruner().prune_loop(a, b)
+        for ends in refuted:
+            self.loops.closed.pop(ends, None)
+
+    def _fuse(self, loops: list[LoopConstraint]) -> None:
+        """Landmarks of both sides that are one become one: first the loops' own pairs."""
+        world = self.world
+        old_ids, new_side = self._sides(loops)
+        for loop in loops:
+            pairs = np.sort(loop.landmark_pairs, axis=1)
+            pairs = pairs[world.landmarks.alive[pairs].all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
+            self._feed.forget_landmarks(world.replace_landmarks(pairs[:, 1], pairs[:, 0]))
+        self._feed.forget_landmarks(
+            fuse_into(world, new_side, old_ids, self._tracker, self._mapping.fuse_radius_px)
+        )
+        self._change_graph()
+
+    def _sides(self, loops: list[LoopConstraint]) -> tuple[Ints, list[Keyframe]]:
+        """Landmarks around the loops' older ends, and the keyframes around their newer ends."""
+        world, count = self.world, self.loops.config.fuse_keyframes
+        old_ids, new_side = [], {}
+        for loop in loops:
+            _, seen = world.observed(world.keyframes[loop.keyframe_a])
+            old_ids.append(local_landmarks(world, seen, self._mapping))
+            _, seen = world.observed(world.keyframes[loop.keyframe_b])
+            near = world.covisible(seen, self._mapping.local_min_shared)[:count]
+            new_side.update({k.id: k for _, k in near})
+        return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
+
+    def _cull_keyframe(self, newest: Keyframe) -> None:
+        """Take the youngest keyframe out that adds nothing to those around the newest one.
+
+        With it go the landmarks that too few others see. What the map has stood on for longest
+        stays: it would wander if new views took its place.
+        """
+        _, seen = self.world.observed(newest)
+        kept = self.loops.ends | {0}  # with a loop's end its relative pose would leave the graph
+        near = {k.id: k for _, k in self.world.covisible(seen, 15)}
+        old = [near[i] for i in sorted(near.keys() - kept, reverse=True) if i < newest.id - 2]
+        redundant = redundant_keyframe(self.world, old, self._mapping)
+        if redundant is None:
+            return
+        _, ids = self.world.observed(redundant)
+        heir = next(k for _, k in self.world.covisible(ids, 0) if k is not redundant)
+        T_heir_keyframe = inverse(heir.T_world_camera) @ redundant.T_world_camera
+        self.history.hand_over(redundant.id, heir.id, T_heir_keyframe)
+        self.world.remove_keyframe(redundant, heir)
+        self._feed.forget_keyframe(redundant.id)
+        self._feed.forget_landmarks(cull_landmarks(self.world, ids, self._mapping))
+        self.loops.remove(redundant.id)
+
+
+def add_keyframe(world: WorldMap, frame: Frame, tracked: Tracked, segment: int) -> Keyframe:
+    """Put a tracked frame into a map; it observes nothing yet."""
+    keyframe = Keyframe(
+        id=world.next_keyframe_id,
+        frame_index=frame.index,
+        timestamp_s=frame.timestamp_s,
+        segment=segment,
+        T_world_camera=tracked.T_world_camera,
+        features=tracked.features,
+        landmark_ids=np.full(len(tracked.features), -1, np.int64),
+    )
+    world.add_keyframe(keyframe)
+    return keyframe
+
+
+def without_image(features: Features) -> Features:
+    """The features without their picture, which a keyframe needs no more once patches are cut."""
+    return replace(features, gray=np.zeros((0, 0), np.uint8))

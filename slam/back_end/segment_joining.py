@@ -1,0 +1,49 @@
+"""Joining map segments: what was tracked after a loss is moved to where it belongs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.world.world_map import WorldMap
+
+
+def join_segment(world: WorldMap, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
+    """Move a segment into the frame of another where one of its frames was recognised.
+
+    ``tracked`` is the frame in the moving segment, ``recognised`` the same frame in the other.
+    Landmarks that both hold at one keypoint are fused. Returns the frame with all its landmarks
+    in the joined map.
+    """
+    T_other_segment = recognised.T_world_camera @ inverse(tracked.T_world_camera)
+    target = world.segment_of(recognised.landmark_ids)
+    move_segment(world, segment, T_other_segment, target)
+    both, a, b = np.intersect1d(
+        tracked.keypoints, recognised.keypoints, assume_unique=True, return_indices=True
+    )
+    old, new = tracked.landmark_ids[a], recognised.landmark_ids[b]
+    world.replace_landmarks(old[old != new], new[old != new])
+    only = ~np.isin(tracked.keypoints, both)
+    return replace(
+        recognised,
+        keypoints=np.concatenate([recognised.keypoints, tracked.keypoints[only]]),
+        landmark_ids=np.concatenate([recognised.landmark_ids, tracked.landmark_ids[only]]),
+    )
+
+
+def move_segment(world: WorldMap, segment: int, T_other_segment: Array, target: int) -> None:
+    """Move all keyframes and landmarks of a segment rigidly; it becomes part of the target."""
+    landmarks = world.landmarks
+    moving = world.in_segment(segment)
+    hosts = np.array([k.id for k in moving])
+    ids = np.flatnonzero(np.isin(landmarks.host, hosts) & landmarks.alive)
+    landmarks.points_world[ids] = transform(T_other_segment, landmarks.points_world[ids])
+    R_other_segment = T_other_segment[:3, :3]
+    landmarks.directions[ids] = landmarks.directions[ids] @ R_other_segment.T
+    landmarks.patch_views[ids] = landmarks.patch_views[ids] @ R_other_segment.T
+    for keyframe in moving:
+        keyframe.T_world_camera = T_other_segment @ keyframe.T_world_camera
+        keyframe.segment = target

@@ -1,0 +1,152 @@
+"""What a calibration found, in words: values, 95 % bounds, and what the motion made observable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.calibration.calibration import CalibrationResult
+from bmask_slam.graph.calibration.model import FACTOR, PARAMETERS
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array
+
+NORMAL_95 = 1.96
+UNOBSERVED, WEAK = 0.8, 0.4
+"""Shares of the prior's sigma above which a posterior's says nothing new, or little."""
+UNITS = {
+    "depth_offset_m": ("depth offset", "mm", 1e3),
+    "time_offset_s": ("time offset", "ms", 1e3),
+    "rolling_shutter_s": ("rolling shutter", "ms", 1e3),
+}
+CURES = {
+    **dict.fromkeys(("fx", "fy"), "turn the camera, over things near and far"),
+    **dict.fromkeys(
+        ("cx", "cy", "p1", "p2"), "roll the camera about its optical axis, and tilt it"
+    ),
+    **dict.fromkeys(("k1", "k2", "k3"), "let things pass from the image's middle to its corners"),
+    "depth_factor": "give --reference or --known-distance",
+    "depth_offset_m": "look at the same things from near and far",
+    "time_offset_s": "move faster, and toward and away from things",
+    "rolling_shutter_s": "turn the camera faster",
+}
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration and what is known about it.
+
+    Attributes:
+        path: the camera.yaml; camera: what it holds; before: the run's camera.
+        result: of the solver; prior_sigmas: (13,), 0 where held fixed.
+        has_anchor: whether anything metric was given.
+        keyframes, landmarks, observations: how many were used.
+    """
+
+    path: Path
+    camera: Camera
+    before: Camera
+    result: CalibrationResult
+    prior_sigmas: Array
+    has_anchor: bool
+    keyframes: int
+    landmarks: int
+    observations: int
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (13,) of PARAMETERS."""
+        return np.sqrt(np.diag(self.result.covariance))
+
+
+def format_calibration(done: Calibrated) -> str:
+    """A table of before, after and 95 % bounds, and a plain statement of what was observable."""
+    result = done.result
+    rows: list[tuple[str, ...]] = [("", "before", "after", "95 %", "prior 95 %", "")]
+    rows += [_row(done, i) for i in range(len(PARAMETERS))]
+    widths = [max(len(row[c]) for row in rows) for c in range(5)]
+    table = ["  ".join(_pad(row, widths)).rstrip() for row in rows]
+    noise_px, noise_depth = result.noise_scales
+    lines = [
+        f"{done.keyframes} keyframes, {done.landmarks} landmarks, {done.observations} observations",
+        f"noise: pixels {noise_px:.2f} and depths {noise_depth:.2f} times their nominal sigmas; "
+        f"{100 * result.inlier_share:.1f} % within 3 sigma",
+        "",
+        *table,
+        "",
+        *_statements(done),
+    ]
+    return "\n".join(lines)
+
+
+def _pad(row: tuple[str, ...], widths: list[int]) -> list[str]:
+    return [row[0].ljust(widths[0]), *(row[c].rjust(widths[c]) for c in range(1, 5)), row[5]]
+
+
+def _row(done: Calibrated, i: int) -> tuple[str, ...]:
+    """Name, before, after, bounds, prior bounds and verdict of one parameter."""
+    name = PARAMETERS[i]
+    label, unit, factor = UNITS.get(name, (name, "", 1.0))
+    shown = np.array([_of(done.before)[i], _of(done.camera)[i]]) * factor
+    sigma, prior = done.sigmas[i] * factor, done.prior_sigmas[i] * factor
+    if i == FACTOR:  # shown as the depth scale, whose error has the same share
+        label, sigma, prior = "depth scale", sigma * shown[1], prior * shown[1]
+    digits = 1 if i == FACTOR else 5 if name[0] in "kp" else 2
+    texts = [f"{x:.{digits}f}" for x in shown]
+    bounds = [f"+-{NORMAL_95 * x:.{digits}f}" if prior else "" for x in (sigma, prior)]
+    return f"{label} {unit}".strip(), *texts, *bounds, _verdict(done, i)
+
+
+def _of(camera: Camera) -> Array:
+    """The vector of PARAMETERS as it is shown: the depth scale in place of the factor."""
+    return np.array(
+        [
+            *(camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion),
+            *(camera.depth_scale, camera.depth_offset_m),
+            *(camera.depth_time_offset_s, camera.rolling_shutter_s),
+        ]
+    )
+
+
+def _share(done: Calibrated, i: int) -> float:
+    """The posterior's sigma over the prior's; 0 for what is held fixed."""
+    prior = done.prior_sigmas[i]
+    return float(done.sigmas[i] / prior) if prior else 0.0
+
+
+def _verdict(done: Calibrated, i: int) -> str:
+    if not done.prior_sigmas[i]:
+        return "held fixed"
+    share = _share(done, i)
+    return "not observable" if share > UNOBSERVED else "weakly observable" if share > WEAK else ""
+
+
+def _statements(done: Calibrated) -> list[str]:
+    """One line for everything that a user must know before trusting the numbers."""
+    lines = []
+    if not done.has_anchor:
+        lines.append(
+            "The depth scale is not observable: images and depths fit a world of any size equally "
+            "well. It keeps its value; with --reference or --known-distance it is estimated."
+        )
+    if done.result.body_arm_m.any():
+        x, y, z = 1e3 * done.result.body_arm_m
+        lines.append(
+            f"The reference is of a point ({x:.0f}, {y:.0f}, {z:.0f}) mm in the camera's frame."
+        )
+    for i, name in enumerate(PARAMETERS):
+        share = _share(done, i)
+        if share <= WEAK or (i == FACTOR and not done.has_anchor):
+            continue
+        how = "not" if share > UNOBSERVED else "only weakly"
+        label = "depth scale" if i == FACTOR else UNITS.get(name, (name,))[0]
+        lines.append(
+            f"{label}: {how} observable in this run: posterior sigma is {share:.2f} of the "
+            f"prior's; to observe it, {CURES[name]}."
+        )
+    if not done.result.converged:
+        lines.append("The solver did not converge: run again with this camera, calibrate again.")
+    if not lines:
+        lines.append("Everything was observable in this run.")
+    return lines

@@ -1,0 +1,124 @@
+"""What is compared: sequences, configurations, seeds, other systems, published figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S
+from bmask_slam.rendering.sequence import RenderConfig
+
+VERDICT_METRICS = ("ate_rmse", "rpe_trans_rmse_second", "rpe_rot_rmse_second")
+"""Not times: cells that run side by side disturb each other's."""
+OPTIONS = ("segmenter", "weights", "max_frames", "stride", "dense")
+"""What a configuration can say beside its parameters."""
+
+
+@dataclass(frozen=True)
+class SequenceSource:
+    """Where the images of a sequence come from.
+
+    Attributes:
+        name: as printed, unique.
+        folder: a path, from the experiment's file on, or what a data folder holds, such as
+            ``tum/freiburg1_xyz``; "" where it is rendered.
+        render: what to draw, the seed being each cell's; None for a folder.
+        reference: file that takes the place of the folder's own ground truth.
+        camera: camera.yaml that takes the place of the folder's own.
+    """
+
+    name: str
+    folder: str = ""
+    render: RenderConfig | None = None
+    reference: Path | None = None
+    camera: Path | None = None
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """This system with some of its parameters changed: what ``bmask-slam run`` is called with.
+
+    Attributes:
+        note: what it is for, printed with the tables.
+        config: YAML file or the name of a shipped one.
+        set: ``a.b=c`` each.
+        segmenter, weights: as ``--segmenter`` and ``--weights``.
+        max_frames, stride: as the options of these names.
+        dense: also make a dense map.
+    """
+
+    note: str = ""
+    config: str = ""
+    set: tuple[str, ...] = ()
+    segmenter: str = ""
+    weights: str = ""
+    max_frames: int | None = None
+    stride: int | None = None
+    dense: bool = False
+
+    def arguments(self) -> list[str]:
+        """For the command line of ``bmask-slam run``."""
+        named = ("config", "segmenter", "weights", "max_frames", "stride")
+        given = {name: value for name in named if (value := getattr(self, name))}
+        words = [w for name, v in given.items() for w in (f"--{name.replace('_', '-')}", str(v))]
+        words += [word for setting in self.set for word in ("--set", setting)]
+        return words + ["--map"] * self.dense
+
+
+@dataclass(frozen=True)
+class OtherSystem:
+    """Another system, whose trajectory files are evaluated here.
+
+    Attributes:
+        note: what it is.
+        with_scale: align its trajectories by Sim(3).
+        trajectories: file by sequence, or by ``SEQUENCE@SEED`` of a rendered one; looked for from
+            the experiment's file on and in the data folders.
+    """
+
+    note: str = ""
+    with_scale: bool = False
+    trajectories: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Quotation:
+    """Figures of one method from one source: by metric and sequence, in the metric's unit."""
+
+    method: str
+    source: str
+    with_scale: bool = False
+    figures: dict[str, dict[str, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All that an experiment's file says.
+
+    Attributes:
+        name, title, description: of it.
+        file: where it was read; relative paths begin there.
+        sequences: in the order of the columns.
+        configurations: by name, in the order of the rows; the first is what others are held to.
+        seeds: of a rendered sequence the seed draws the images; of all it is the system's own.
+        systems: other systems by name.
+        published: what others wrote.
+        with_scale: align all runs by Sim(3).
+        max_time_difference_s: largest difference of the stamps of poses that belong together.
+        verdicts: metrics by which configurations are judged.
+        networks: folders of trained networks by name, whose curves the report draws.
+    """
+
+    name: str
+    title: str
+    file: Path
+    sequences: tuple[SequenceSource, ...]
+    description: str = ""
+    configurations: dict[str, Configuration] = field(default_factory=dict)
+    seeds: tuple[int, ...] = (0,)
+    systems: dict[str, OtherSystem] = field(default_factory=dict)
+    published: tuple[Quotation, ...] = ()
+    with_scale: bool = False
+    max_time_difference_s: float = MAX_TIME_DIFFERENCE_S
+    verdicts: tuple[str, ...] = VERDICT_METRICS
+    networks: dict[str, Path] = field(default_factory=dict)

@@ -1,0 +1,181 @@
+"""What a comparison holds when it is done, or half done: plain values that can be saved as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import whole_file
+
+if TYPE_CHECKING:
+    import pandas
+
+RESULTS = "results.json"
+FORMAT_VERSION = 1
+
+
+class Kind(Enum):
+    """RUN: run here. TRAJECTORY: another system's file, evaluated here. PUBLISHED: a quotation."""
+
+    RUN = "run"
+    TRAJECTORY = "trajectory"
+    PUBLISHED = "published"
+
+
+class CellStatus(Enum):
+    """Whether a cell has figures; one without never enters a mean."""
+
+    DONE = "done"
+    FAILED = "failed"
+    PENDING = "pending"
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the tables: a configuration of this system, or another system.
+
+    Attributes:
+        name: as printed, unique.
+        kind: where its figures come from.
+        note: a configuration's differences, or the source of a published figure.
+        with_scale: aligned by Sim(3), which is marked wherever the row is printed.
+    """
+
+    name: str
+    kind: Kind
+    note: str = ""
+    with_scale: bool = False
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A method on a sequence with a seed.
+
+    Attributes:
+        sequence, method: their names.
+        seed: of a run; None where there is none.
+        status: DONE, FAILED or PENDING.
+        metrics: value by metric name (`comparison.experiment.metric_table`), only those that exist.
+        folder: the run folder, relative to the comparison's; "" without one.
+        trajectory, reference: TUM files that were compared, relative to the comparison's folder or
+            absolute; "" without.
+        log: file with what the run had to say; "" without one.
+        error: why it failed, one line.
+        source: of a published figure.
+    """
+
+    sequence: str
+    method: str
+    seed: int | None
+    status: CellStatus
+    metrics: dict[str, float] = field(default_factory=dict)
+    folder: str = ""
+    trajectory: str = ""
+    reference: str = ""
+    log: str = ""
+    error: str = ""
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All cells of an experiment and where they come from.
+
+    Attributes:
+        name, title, description: of the experiment.
+        sequences: names in the order of the columns.
+        methods: in the order of the rows.
+        cells: one for each sequence, method and seed that was asked for.
+        provenance: commit, machine, versions, command, date, the resolved experiment; by name.
+        drawn: sequences whose images the seed draws, so that each seed is a sequence of its own;
+            of the others the seed is the system's alone.
+    """
+
+    name: str
+    title: str
+    description: str
+    sequences: tuple[str, ...]
+    methods: tuple[Method, ...]
+    cells: tuple[Cell, ...]
+    provenance: dict[str, Any] = field(default_factory=dict)
+    drawn: tuple[str, ...] = ()
+
+    def of(self, sequence: str, method: str) -> Iterator[Cell]:
+        """The cells of a sequence and a method, one for each seed."""
+        return (c for c in self.cells if c.sequence == sequence and c.method == method)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A row a cell: sequence, method, kind, seed, status, error, and a column a metric.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            import pandas  # noqa: PLC0415 - optional
+        except ImportError as error:
+            raise InputError("a frame of the results needs pandas: pip install pandas") from error
+        kinds = {method.name: method.kind.value for method in self.methods}
+        rows = [
+            {
+                "sequence": cell.sequence,
+                "method": cell.method,
+                "kind": kinds[cell.method],
+                "seed": cell.seed,
+                "status": cell.status.value,
+                "error": cell.error,
+                **cell.metrics,
+            }
+            for cell in self.cells
+        ]
+        return pandas.DataFrame(rows)
+
+
+def write_results(path: Path, comparison: Comparison) -> None:
+    """Write a comparison as JSON, whole or not at all; NaN becomes null."""
+    plain = {"format": FORMAT_VERSION} | asdict(comparison)
+    text = json.dumps(_finite(plain), indent=1, default=lambda value: value.value)
+    with whole_file(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_results(path: Path) -> Comparison:
+    """Read what `write_results` wrote; ``path`` is the file or the comparison's folder.
+
+    Raises:
+        InputError: it is missing, not JSON, or of another format.
+    """
+    path = path / RESULTS if path.is_dir() else path
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; make it by bmask-slam compare") from error
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: not JSON ({error}); run bmask-slam compare again") from error
+    if not isinstance(plain, dict) or plain.pop("format", None) != FORMAT_VERSION:
+        raise InputError(f"{path}: not a comparison of format {FORMAT_VERSION}; compare again")
+    methods = tuple(Method(**m | {"kind": Kind(m["kind"])}) for m in plain.pop("methods"))
+    cells = tuple(_cell(cell) for cell in plain.pop("cells"))
+    names = {key: tuple(plain.get(key, ())) for key in ("sequences", "drawn")}
+    return Comparison(**plain | names, methods=methods, cells=cells)
+
+
+def _cell(plain: dict[str, Any]) -> Cell:
+    metrics = {name: math.nan if v is None else v for name, v in plain["metrics"].items()}
+    return Cell(**plain | {"status": CellStatus(plain["status"]), "metrics": metrics})
+
+
+def _finite(value: object) -> object:
+    """The same with None for what JSON does not know: NaN and infinity."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,115 @@
+"""Cells of other systems: their trajectory files, and what others published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from bmask_slam.comparison.experiment.experiment import Experiment, OtherSystem
+from bmask_slam.comparison.experiment.result import Cell, CellStatus, Kind, Method
+from bmask_slam.comparison.jobs.cells import Place
+from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
+from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.lists import read_pairs
+from bmask_slam.sequences.sequence import SequenceConfig
+
+Files = dict[tuple[str, str], Path]
+"""Trajectory file by method and SEQUENCE or SEQUENCE@SEED."""
+
+
+def parse_trajectory(text: str) -> tuple[tuple[str, str], Path]:
+    """``METHOD:SEQUENCE=FILE`` or ``METHOD:SEQUENCE@SEED=FILE``. Raises InputError."""
+    name, separator, file = text.partition("=")
+    method, colon, sequence = name.rpartition(":")
+    if not (separator and colon and method and sequence and file):
+        raise InputError(f"--trajectory {text}: write it as METHOD:SEQUENCE=FILE")
+    return (method, sequence), Path(file)
+
+
+def with_files(experiment: Experiment, files: Files) -> Experiment:
+    """The experiment with the given files in place of its own, and their systems if it lacks them.
+
+    Raises:
+        InputError: a file that does not exist, or a sequence or method that cannot be.
+    """
+    systems = dict(experiment.systems)
+    for (method, sequence), file in files.items():
+        there = [s.name for s in experiment.sequences]
+        if sequence.partition("@")[0] not in there:
+            raise InputError(
+                f"--trajectory {method}:{sequence}: no such sequence; there are: {', '.join(there)}"
+            )
+        taken = [*experiment.configurations, *(q.method for q in experiment.published)]
+        if method in taken:
+            raise InputError(f"--trajectory {method}:{sequence}: {method!r} is another row's name")
+        if not file.is_file():
+            raise InputError(f"{file}: no such file; give a trajectory in TUM format")
+        system = systems.get(method, OtherSystem())
+        given = {**system.trajectories, sequence: str(file.absolute())}
+        systems[method] = replace(system, trajectories=given)
+    return replace(experiment, systems=systems)
+
+
+def trajectory_cells(
+    experiment: Experiment,
+    find_place: Callable[[str, int | None], Place],
+    files: Mapping[tuple[str, str], Path | None],
+) -> Iterator[Cell]:
+    """A cell for each file; one that cannot be evaluated is FAILED, a missing one PENDING."""
+    for (method, key), file in files.items():
+        name, _, seed = key.partition("@")
+        place = find_place(name, int(seed) if seed.isdigit() else None)
+        rules = Rules(experiment.max_time_difference_s, experiment.systems[method].with_scale)
+        cell = Cell(name, method, place.seed, CellStatus.PENDING)
+        if file is None:
+            wanted = experiment.systems[method].trajectories[key]
+            cure = f"give it by --trajectory '{method}:{key}=FILE', or its folder by --data"
+            yield replace(cell, error=f"{wanted}: not found; {cure}")
+        else:
+            yield _evaluated(cell, file, place, rules)
+
+
+def _evaluated(cell: Cell, file: Path, place: Place, rules: Rules) -> Cell:
+    cell = replace(cell, status=CellStatus.FAILED, trajectory=str(file.absolute()))
+    if place.reference is None or not place.reference.is_file():
+        return replace(
+            cell,
+            error=f"{cell.sequence}: no ground truth; give it by --reference {cell.sequence}=FILE",
+        )
+    cell = replace(cell, reference=str(place.reference.absolute()))
+    try:
+        metrics = trajectory_errors(file, place.reference, rules, _frame_count(place.folder))
+    except InputError as error:
+        return replace(cell, error=str(error))
+    return replace(cell, status=CellStatus.DONE, metrics=metrics)
+
+
+def _frame_count(folder: Path | None) -> int | None:
+    """Frames of a sequence, None where its images are not there."""
+    if folder is None:
+        return None
+    limit_s = SequenceConfig().max_time_difference_s
+    return len(read_pairs(folder, limit_s, 0.0).timestamps_s)
+
+
+def published_cells(experiment: Experiment) -> Iterator[Cell]:
+    """A cell for each sequence and source that has figures."""
+    for quotation in experiment.published:
+        by_sequence: dict[str, dict[str, float]] = {}
+        for metric, values in quotation.figures.items():
+            for sequence, value in values.items():
+                by_sequence.setdefault(sequence, {})[metric] = value
+        for sequence, metrics in by_sequence.items():
+            yield Cell(
+                sequence, quotation.method, None, CellStatus.DONE, metrics, source=quotation.source
+            )
+
+
+def other_methods(experiment: Experiment) -> Iterator[Method]:
+    """The rows after this system's own."""
+    for name, system in experiment.systems.items():
+        yield Method(name, Kind.TRAJECTORY, system.note, system.with_scale)
+    for name in dict.fromkeys(q.method for q in experiment.published):
+        with_scale = any(q.with_scale for q in experiment.published if q.method == name)
+        yield Method(name, Kind.PUBLISHED, with_scale=with_scale)

@@ -1,0 +1,154 @@
+"""One job: a command of this program in a process of its own, and the record of how it ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bmask_slam.comparison.experiment.result import CellStatus
+from bmask_slam.graph.whole_file import whole_file
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+LAST_LINES = 30
+LINE_LIMIT = 300
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to run. Files are absolute, so that a job can be sent to another process.
+
+    Attributes:
+        name: for the progress.
+        group: jobs of one group take about as long as each other.
+        arguments: of ``bmask-slam``.
+        product: file that is there when it has succeeded.
+        record: file that says how it ended; it is written last.
+        log: what the command printed.
+        depends: what its result depends on: a text by name.
+        sequence: folder whose truth is compared with the finished run ``run``; "" for none.
+        run: the run folder, if it makes one.
+        fresh: folder that is removed first, "" for none.
+    """
+
+    name: str
+    group: str
+    arguments: tuple[str, ...]
+    product: str
+    record: str
+    log: str
+    depends: dict[str, str] = field(default_factory=dict)
+    sequence: str = ""
+    run: str = ""
+    fresh: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended.
+
+    Attributes:
+        status: DONE, FAILED, or PENDING where it was stopped before its end.
+        error: one line.
+        wall_s: how long it took.
+        figures: what was measured against the sequence's truth, by metric.
+        depends: of the job.
+    """
+
+    status: CellStatus
+    error: str = ""
+    wall_s: float = 0.0
+    figures: dict[str, float] = field(default_factory=dict)
+    depends: dict[str, str] = field(default_factory=dict)
+
+
+Start = Callable[["subprocess.Popen[bytes]"], None]
+
+
+def finished(job: Job) -> Outcome | None:
+    """The outcome of an earlier run of the same job, if it succeeded and nothing has changed."""
+    outcome = read_record(Path(job.record))
+    if outcome is None or outcome.status is not CellStatus.DONE or outcome.depends != job.depends:
+        return None
+    return outcome if Path(job.product).exists() else None
+
+
+def run_job(job: Job, threads: int = 1, started: Start = lambda process: None) -> Outcome:
+    """Run a job to its end and record it; ``started`` is given the process.
+
+    The process ends itself when this one is no longer there, however that came about.
+    """
+    record, log = Path(job.record), Path(job.log)
+    record.parent.mkdir(parents=True, exist_ok=True)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    record.unlink(missing_ok=True)
+    if job.fresh:
+        shutil.rmtree(job.fresh, ignore_errors=True)
+    begin_s = time.monotonic()
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "bmask_slam.comparison.jobs.child", json.dumps(asdict(job))],
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment(threads),
+            start_new_session=True,
+        )
+        with process:
+            started(process)
+            code = process.wait()
+    outcome = _outcome(job, code, time.monotonic() - begin_s)
+    write_record(record, outcome)
+    return outcome
+
+
+def environment(threads: int) -> dict[str, str]:
+    """This process's, with the threads of the numerical libraries limited."""
+    return {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
+
+
+def figures_file(job: Job) -> Path:
+    """Where the process leaves its figures."""
+    return Path(job.record).with_name("figures.json")
+
+
+def read_record(path: Path) -> Outcome | None:
+    """The outcome in a file; None where there is none that can be read."""
+    try:
+        plain: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return Outcome(**plain | {"status": CellStatus(plain["status"])})
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+
+
+def write_record(path: Path, outcome: Outcome) -> None:
+    """Write an outcome, whole or not at all."""
+    plain = asdict(outcome) | {"status": outcome.status.value}
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+
+
+def _outcome(job: Job, code: int, wall_s: float) -> Outcome:
+    if code == 0 and Path(job.product).exists():
+        file = figures_file(job)
+        figures = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        return Outcome(CellStatus.DONE, "", wall_s, figures, job.depends)
+    error = _last_words(Path(job.log)) or f"ended with status {code} and said nothing"
+    if code < 0:
+        error = f"killed by signal {-code}"
+    return Outcome(CellStatus.FAILED, error, wall_s, {}, job.depends)
+
+
+def _last_words(log: Path) -> str:
+    """The last error message in a log, else its last line."""
+    text = log.read_text(encoding="utf-8", errors="replace").replace("\r", "\n")
+    lines = [line.strip() for line in text.splitlines() if line.strip()][-LAST_LINES:]
+    errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
+    return (errors or lines or [""])[-1][:LINE_LIMIT]

@@ -1,0 +1,86 @@
+"""Where jobs run: beside each other on this machine, or on a Ray cluster."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+from collections.abc import Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from types import TracebackType
+from typing import Protocol
+
+from bmask_slam.comparison.jobs.job import Job, Outcome, run_job
+from bmask_slam.runtime.machine import available_cores
+
+Done = tuple[Job, Outcome]
+
+
+class Pool(Protocol):
+    """Runs jobs; ``workers`` of them at a time."""
+
+    @property
+    def workers(self) -> int: ...
+
+    def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
+        """Yield each job with its outcome as it ends; when closed early, the others are ended."""
+        ...
+
+
+class LocalPool:
+    """Processes on this machine.
+
+    ``workers`` None: as many as there are cores. Each gets its share of the cores as threads.
+    """
+
+    def __init__(self, workers: int | None = None) -> None:
+        self._workers = workers or available_cores()
+        self._threads = max(1, available_cores() // self._workers)
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._lock = threading.Lock()
+        self._stopping = False
+
+    def __enter__(self) -> LocalPool:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stop()
+
+    @property
+    def workers(self) -> int:
+        return self._workers
+
+    def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
+        """See `Pool.run`."""
+        self._stopping = False
+        with ThreadPoolExecutor(self._workers) as executor:
+            futures: dict[Future[Outcome], Job] = {
+                executor.submit(run_job, job, self._threads, self._started): job for job in jobs
+            }
+            try:
+                for future in as_completed(futures):
+                    yield futures[future], future.result()
+            finally:
+                executor.shutdown(wait=False, cancel_futures=True)
+                self._stop()
+
+    def _started(self, process: subprocess.Popen[bytes]) -> None:
+        with self._lock:
+            self._running = {p for p in self._running if p.poll() is None} | {process}
+            stopping = self._stopping
+        if stopping:
+            process.kill()
+
+    def _stop(self) -> None:
+        """End what still runs."""
+        with self._lock:
+            self._stopping = True
+            for process in self._running:
+                with suppress(ProcessLookupError):
+                    process.kill()
+            self._running = set()

@@ -1,0 +1,135 @@
+"""What a run on a rendered sequence says of things and surfaces, against what was drawn."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.config.configuration import resolve
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices, read_tum
+from bmask_slam.run_folder.semantic_files import LABELS, read_labels
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
+from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.system_config import SystemConfig
+
+MIN_DEPTH_M, OUTLIER_M = 0.1, 0.05
+NEAR_M = (0.02, 0.01)  # at 0 m, and what the square of the depth adds
+
+
+def truth_figures(run: Path, folder: Path) -> dict[str, float]:
+    """Figures by metric; none where the run has none to compare or the sequence no truth."""
+    sequence = open_sequence(folder)
+    found = {"label_accuracy": label_accuracy(run, sequence)}
+    found["depth_rmse_ratio"] = depth_ratio(run, sequence)
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def label_accuracy(run: Path, sequence: Sequence) -> float | None:
+    """Of landmarks on an object of a class that the segmenter knows, the share with its label.
+
+    A landmark lies where most keyframes that can see it show it.
+    """
+    folder = sequence.folder
+    if not (run / LABELS).is_file() or not (folder / "annotations.json").is_file():
+        return None
+    config = resolve(SystemConfig, run / "config.yaml")
+    names = make_segmenter(config.semantics.segmenter, folder).labels
+    if sequence.groundtruth is None:
+        return None
+    keyframes, truth = associate(read_tum(run / "keyframes.txt"), sequence.groundtruth)
+    if not len(keyframes):
+        return None
+    cloud, labels = read_ply(run / "landmarks.ply"), read_labels(run)
+    points_world = np.column_stack([cloud[axis] for axis in "xyz"]).astype(float)
+    points_truth = transform(truth_from_world(keyframes, truth), points_world)
+    classes = true_classes(folder, names)
+    counts = np.zeros((len(points_truth), len(names)), int)
+    indices = nearest_indices(sequence.timestamps_s, truth.timestamps_s)
+    for index, T_truth_camera in zip(indices.tolist(), truth.poses_world_camera, strict=True):
+        instances = _image(sequence, "instances", index).astype(np.int64)
+        points_camera = transform(inverse(T_truth_camera), points_truth)
+        rows, pixels = visible(points_camera, true_depth(sequence, index), sequence.camera)
+        counts[rows, classes[instances[pixels[:, 1], pixels[:, 0]]]] += 1
+    true = counts.argmax(axis=1)  # the background, 0, for those that no keyframe sees
+    found = np.array([names.number(name) for name in labels.labels])
+    on_objects = true > 0
+    return float((found[on_objects] == true[on_objects]).mean()) if on_objects.any() else None
+
+
+def depth_ratio(run: Path, sequence: Sequence) -> float | None:
+    """RMSE of the dense map's depth over that of the sensor's, at the same pixels.
+
+    These are the pixels of keyframes where both and the truth are known and neither is off by more
+    than 5 cm, which are outliers of another kind.
+    """
+    exact, finished = sequence.folder / "depth_true", run / "dense" / "dense.json"
+    if not exact.is_dir() or not finished.is_file():
+        return None
+    dense = DenseFolder.opened(run)
+    squares = np.zeros(2)
+    for index, keyframe in keyframe_frames(run):
+        if dense.is_done(keyframe):
+            truth = true_depth(sequence, index)
+            both = np.stack([dense.fused(keyframe).depth_m(), sequence.load(index).depth_m])
+            errors = both - truth
+            near = (np.abs(errors) < OUTLIER_M).all(axis=0)  # False where one is NaN
+            squares += (errors[:, near].astype(float) ** 2).sum(axis=1)
+    return float(np.sqrt(squares[0] / squares[1])) if squares[1] > 0 else None
+
+
+def keyframe_frames(run: Path) -> list[tuple[int, int]]:
+    """(index of the frame, id) of every keyframe that was made."""
+    with (run / "frames.csv").open(encoding="utf-8", newline="") as file:
+        made = [row for row in csv.DictReader(file) if row["keyframe"]]
+    return [(int(row["index"]), int(row["keyframe"])) for row in made]
+
+
+def truth_from_world(keyframes: Trajectory, truth: Trajectory) -> Array:
+    """T_truth_world (4, 4), the mean over poses that belong together."""
+    T = truth.poses_world_camera @ inverse(keyframes.poses_world_camera)
+    return np.asarray(T[0] @ se3_exp(se3_log(inverse(T[0]) @ T).mean(axis=0)))
+
+
+def true_classes(folder: Path, names: LabelSet) -> NDArray[np.int64]:
+    """The label of each instance number, 0 for background and classes that the set lacks."""
+    content = json.loads((folder / "annotations.json").read_text(encoding="utf-8"))
+    by_id = {c["id"]: c["name"] for c in content["categories"]}
+    classes = np.zeros(np.iinfo(np.uint16).max + 1, np.int64)
+    for annotation in content["annotations"]:
+        classes[annotation["instance_id"]] = names.number(by_id[annotation["category_id"]])
+    return classes
+
+
+def visible(
+    points_camera: Array, depth_m: Array, camera: Camera
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which points (N, 3) an image shows: their rows (M,), and pixels (M, 2) as (u, v)."""
+    ahead = np.flatnonzero(points_camera[:, 2] > MIN_DEPTH_M)
+    pixels = np.rint(camera.project(points_camera[ahead])).astype(np.int64)
+    inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    rows, pixels = ahead[inside], pixels[inside]
+    z = points_camera[rows, 2]
+    near = np.abs(depth_m[pixels[:, 1], pixels[:, 0]] - z) < NEAR_M[0] + NEAR_M[1] * z**2
+    return rows[near], pixels[near]
+
+
+def true_depth(sequence: Sequence, index: int) -> Array:
+    """Depth (H, W) in metres, NaN where nothing is; the sensor's if the exact one was not kept."""
+    kept = (sequence.folder / "depth_true").is_dir()
+    depth = _image(sequence, "depth_true" if kept else "depth", index)
+    return np.where(depth > 0, depth / sequence.camera.depth_scale, np.nan)
+
+
+def _image(sequence: Sequence, kind: str, index: int) -> NDArray[np.uint16]:
+    name = sequence.pairs.rgb_files[index].name
+    return np.asarray(cv2.imread(str(sequence.folder / kind / name), cv2.IMREAD_UNCHANGED))

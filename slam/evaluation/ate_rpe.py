@@ -1,0 +1,256 @@
+"""How good a trajectory is: one call from files to a table of named numbers."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, so3_log
+from bmask_slam.graph.hand_eye import body_trajectory, hand_eye
+from bmask_slam.graph.metrics import (
+    AbsoluteError,
+    RelativeError,
+    absolute_error,
+    distance_pairs,
+    frame_pairs,
+    relative_error,
+    time_pairs,
+)
+from bmask_slam.graph.trajectory import (
+    MAX_TIME_DIFFERENCE_S,
+    Trajectory,
+    associate,
+    nearest_indices,
+)
+from bmask_slam.graph.trajectory_formats import read_times, read_trajectory
+
+logger = logging.getLogger(__name__)
+
+MIN_POSES = 3
+
+
+class Row(TypedDict):
+    """One line of metrics.json; unit "1" is a share."""
+
+    name: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluationResult:
+    """The errors of a trajectory, and the same as rows for metrics.json.
+
+    Attributes:
+        absolute: pose by pose after alignment.
+        per_frame: relative error of consecutive associated poses; across a gap in the estimate
+            such a pair spans the gap.
+        per_second: relative error over one second, None where no two poses are that far apart.
+        per_metre: the same over one metre of the reference's path.
+        rows: what is printed and saved.
+    """
+
+    absolute: AbsoluteError
+    per_frame: RelativeError | None
+    per_second: RelativeError | None
+    per_metre: RelativeError | None
+    rows: list[Row]
+
+    def value(self, name: str) -> float:
+        """The value of a row; KeyError when there is no such row."""
+        return {row["name"]: row["value"] for row in self.rows}[name]
+
+
+def evaluate_trajectory(
+    estimate: Trajectory,
+    reference: Trajectory,
+    expected_frames: int | None = None,
+    with_scale: bool = False,
+    max_time_difference_s: float = MAX_TIME_DIFFERENCE_S,
+) -> EvaluationResult:
+    """Compare an estimate with a reference whose world frame may be another.
+
+    Poses are associated by stamp; the alignment is SE(3), or Sim(3) with ``with_scale`` (for
+    monocular systems only), whose scale relative errors are taken with too. ``expected_frames``,
+    the frames that the system was given, adds the share that it tracked.
+
+    Raises:
+        InputError: fewer than three poses belong together.
+    """
+    matched, truth = associate(estimate, reference, max_time_difference_s)
+    if len(matched) < MIN_POSES:
+        raise InputError(
+            f"{len(matched)} of {len(estimate)} poses have a reference pose within "
+            f"{max_time_difference_s:g} s, at least {MIN_POSES} are needed; estimate "
+            f"{_span(estimate)}, reference {_span(reference)}: use the same clock in both"
+        )
+    absolute = absolute_error(matched, truth, with_scale)
+    scaled = absolute.alignment.apply(matched) if with_scale else matched
+    per_frame = relative_error(scaled, truth, frame_pairs(len(matched)))
+    per_second = relative_error(scaled, truth, time_pairs(matched.timestamps_s))
+    path_pairs = distance_pairs(truth.positions_world)
+    per_metre = relative_error(scaled, truth, path_pairs)
+    rows = _absolute_rows(absolute) + _relative_rows("frame", per_frame)
+    rows += _relative_rows("second", per_second) + _relative_rows("metre", per_metre)
+    rows += _coverage_rows(estimate, reference, matched)
+    if expected_frames:
+        rows.append(_row("tracked_share", len(estimate) / expected_frames, "1"))
+    return EvaluationResult(absolute, per_frame, per_second, per_metre, rows)
+
+
+def evaluate(
+    run_or_trajectory: Path,
+    reference: Path,
+    plot: Path | None = None,
+    with_scale: bool = False,
+    times: Path | None = None,
+    with_body: bool = False,
+) -> EvaluationResult:
+    """Evaluate a run folder or a trajectory against a trajectory or a sequence folder.
+
+    Trajectories are in the format of TUM, EuRoC or KITTI. The latter's stamps are those of the file
+    ``times``, or of the run's frames. ``with_body`` takes the reference's poses for those of
+    another body, such as markers or an IMU, finds where it sits on the camera, and compares its
+    path.
+
+    Raises:
+        InputError: a file that is missing or broken, trajectories that share no time, or a body on
+            a camera that does not turn or whose scale is unknown.
+    """
+    if with_body and with_scale:
+        raise InputError("--hand-eye with --with-scale: a body's place needs metres; leave one out")
+    run_or_trajectory, reference = Path(run_or_trajectory), Path(reference)
+    file = _file_in(run_or_trajectory, "trajectory.txt", "a run folder or a trajectory file")
+    truth_file = _reference_file(reference)
+    frames_s = frame_stamps(file)
+    stamps_s = read_times(times) if times else frames_s
+    estimate, truth = (read_trajectory(path, stamps_s) for path in (file, truth_file))
+    frames = None if frames_s is None else len(frames_s)
+    try:
+        body: list[Row] = []
+        if with_body:
+            T_camera_body = hand_eye(*associate(estimate, truth))
+            estimate, body = body_trajectory(estimate, T_camera_body), _body_rows(T_camera_body)
+        result = evaluate_trajectory(estimate, truth, frames, with_scale)
+        result.rows.extend(body)
+    except InputError as error:
+        raise InputError(f"{file} against {truth_file}: {error}") from error
+    if plot is not None:
+        from bmask_slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib loads slowly
+
+        plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, with_scale)
+    return result
+
+
+def read_reference(path: Path, stamps_s: Array | None = None) -> Trajectory:
+    """The trajectory in a file, or a sequence folder's ground truth.
+
+    ``stamps_s`` are those of the lines of a file in the format of KITTI.
+
+    Raises:
+        InputError: it is missing or broken.
+    """
+    return read_trajectory(_reference_file(path), stamps_s)
+
+
+def frame_stamps(trajectory_file: Path) -> Array | None:
+    """Stamps of all frames of the run that a trajectory.txt belongs to, None if it has no run."""
+    path = trajectory_file.parent / "frames.csv"
+    if trajectory_file.name != "trajectory.txt" or not path.is_file():
+        return None
+    with path.open(encoding="utf-8", newline="") as file:
+        return np.array([float(row["timestamp"]) for row in csv.DictReader(file)])
+
+
+def _reference_file(path: Path) -> Path:
+    return _file_in(path, "groundtruth.txt", "a sequence with ground truth or a trajectory file")
+
+
+def format_table(rows: list[Row]) -> str:
+    """Rows as aligned text, shares in per cent."""
+    lines = []
+    for row in rows:
+        value, unit = row["value"], row["unit"]
+        if unit == "1":
+            value, unit = 100 * value, "%"
+        number = f"{value:d}" if isinstance(value, int) else f"{value:.4f}"
+        lines.append(f"{row['name']:<24}{number:>12} {unit}")
+    return "\n".join(lines)
+
+
+def format_json(rows: list[Row]) -> str:
+    """Rows as the JSON list that metrics.json holds."""
+    return json.dumps(rows, indent=1)
+
+
+def _row(name: str, value: float, unit: str) -> Row:
+    return {"name": name, "value": value, "unit": unit}
+
+
+def _absolute_rows(error: AbsoluteError) -> list[Row]:
+    names = ("rmse", "mean", "median", "max")
+    rows = [_row(f"ate_{name}", getattr(error.translation_m, name), "m") for name in names]
+    return [*rows, _row("ate_rot_rmse", float(np.rad2deg(error.rotation_rad.rmse)), "deg")]
+
+
+def _relative_rows(step: str, error: RelativeError | None) -> list[Row]:
+    """Rows for a step, "frame", "second" or "metre"; none when no pair was found.
+
+    A warning tells of the first two; a camera that moves less than a metre is nothing unusual.
+    """
+    if error is None:
+        if step != "metre":
+            logger.warning("no two associated poses one %s apart: no RPE per %s", step, step)
+        return []
+    degrees = float(np.rad2deg(error.rotation_rad.rmse))
+    return [
+        _row(f"rpe_trans_rmse_{step}", error.translation_m.rmse, "m"),
+        _row(f"rpe_rot_rmse_{step}", degrees, "deg"),
+    ]
+
+
+def _body_rows(T_camera_body: Array) -> list[Row]:
+    """Where the reference's body sits on the camera."""
+    names = ("body_x", "body_y", "body_z")
+    rows = [_row(name, float(t), "m") for name, t in zip(names, T_camera_body[:3, 3], strict=True)]
+    angle_rad = np.linalg.norm(so3_log(T_camera_body[:3, :3]))
+    return [*rows, _row("body_angle", float(np.rad2deg(angle_rad)), "deg")]
+
+
+def _coverage_rows(estimate: Trajectory, reference: Trajectory, matched: Trajectory) -> list[Row]:
+    """How much was compared: of the estimate by poses, of the reference by time.
+
+    A reference pose counts as covered when the estimate has a pose within its own typical step,
+    so that a reference at 100 Hz can be covered whole by an estimate at 30 Hz.
+    """
+    step_s = max(float(np.median(np.diff(estimate.timestamps_s))), MAX_TIME_DIFFERENCE_S)
+    nearest = nearest_indices(estimate.timestamps_s, reference.timestamps_s)
+    covered = np.abs(estimate.timestamps_s[nearest] - reference.timestamps_s) <= step_s
+    estimate_share = len(matched) / len(estimate)
+    if estimate_share < 0.5:
+        logger.warning("only %.0f %% of the estimate has a reference pose", 100 * estimate_share)
+    return [
+        _row("associated_poses", len(matched), "poses"),
+        _row("estimate_share", estimate_share, "1"),
+        _row("reference_share", float(covered.mean()), "1"),
+    ]
+
+
+def _span(trajectory: Trajectory) -> str:
+    stamps_s = trajectory.timestamps_s
+    return f"{stamps_s[0]:.3f} to {stamps_s[-1]:.3f} s" if len(stamps_s) else "without a pose"
+
+
+def _file_in(path: Path, name: str, expected: str) -> Path:
+    """The file itself, or the file of this name in a folder."""
+    file = path / name if path.is_dir() else path
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; give {expected}")
+    return file

@@ -1,0 +1,280 @@
+"""BRISK keypoints with bucketing, depth and the pseudo-stereo coordinate, as arrays."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.features.fixed_size_descriptor import FixedSizeBrisk
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array
+from bmask_slam.sequences.frame import Frame
+
+FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """The front end's parameters; pixels are those of the full image.
+
+    The corner threshold is the highest of ``thresholds`` at which FAST, a fortieth of BRISK's
+    cost, finds ``max_keypoints`` in the finest layer; so a blurred frame gets its keypoints and
+    a rich one costs no more. ``octaves`` is BRISK's: each adds a half-scale layer and an
+    intra-octave. Nearer to the border than ``border_px`` BRISK has no descriptor.
+    ``pixel_sigma`` is that of a BRISK keypoint at scale 1. ``disparity_sigma_px`` is the depth
+    sensor's: for structured light a constant in disparity, sigma_z = z^2 / bf * sigma_d, with
+    0.07 px the laboratory value (Nguyen 2012) at bf = 40 px m. ``depth_window_px`` and
+    ``depth_edge_ratio``: see sample_depth.
+    """
+
+    thresholds: tuple[int, ...] = (50, 35, 25, 18, 13)
+    octaves: int = 0
+    max_keypoints: int = 850
+    bucket_px: int = 40
+    border_px: int = 20
+    pixel_sigma: float = 0.7
+    disparity_sigma_px: float = 0.08
+    depth_window_px: int = 2
+    depth_edge_ratio: float = 0.04
+    min_depth_m: float = 0.3
+    max_depth_m: float = 8.0
+
+
+@dataclass(frozen=True)
+class Features:
+    """N keypoints of one frame.
+
+    Attributes:
+        pixels: (N, 2) undistorted (u, v).
+        image_pixels: (N, 2) as detected in the image, for looking up pixels and masks.
+        descriptors: (N, 8) uint64, the 512 bits of BRISK.
+        scales: (N,) keypoint size relative to the finest layer, >= 1.
+        angles_rad: (N,) BRISK's orientation in the image.
+        depth_m: (N,) z-depth, NaN where missing or ambiguous.
+        disparity_px: (N,) bf / z, NaN where depth is missing.
+        sigmas_px: (N, 3) standard deviation of u, v and disparity.
+        colours: (N, 3) uint8 red first.
+        gray: (H, W) uint8, the image they come from.
+    """
+
+    pixels: Array
+    image_pixels: Array
+    descriptors: NDArray[np.uint64]
+    scales: Array
+    angles_rad: Array
+    depth_m: Array
+    disparity_px: Array
+    sigmas_px: Array
+    colours: NDArray[np.uint8]
+    gray: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def measurements(self) -> Array:
+        """(N, 3) of u, v and disparity in pixels; disparity NaN where depth is missing."""
+        return np.column_stack([self.pixels, self.disparity_px])
+
+
+class BriskExtractor:
+    """Detects, buckets and describes; holds OpenCV's detector, so one per thread."""
+
+    def __init__(self, camera: Camera, config: FeatureConfig):
+        self.camera = camera
+        self.config = config
+        self._describer = FixedSizeBrisk(FINEST_SIZE_PX)
+        self._border_px = max(config.border_px, self._describer.reach_px)
+        self._fast = {t: cv2.FastFeatureDetector_create(t) for t in config.thresholds}
+
+    def extract(self, frame: Frame) -> Features:
+        """The features of a frame. Pure: the same frame gives the same arrays."""
+        gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        pixels, response, threshold = self._corners(gray, self.config.max_keypoints)
+        if self.config.octaves > 0:
+            return self._with_scales(frame, gray, threshold)
+        order = self._spread(pixels, response, gray.shape[1])[: self.config.max_keypoints]
+        pixels = pixels[np.sort(order)]
+        descriptors, angles_rad = self._describer.describe(gray, pixels)
+        raw, scales = pixels.astype(float), np.ones(len(pixels))
+        return self._assemble(frame, gray, (raw, scales, angles_rad), descriptors)
+
+    def reserve(self, frame: Frame, features: Features, share: float) -> Features:
+        """Further keypoints of a frame, best first, where a share of its features is of no use.
+
+        Together with the features they are those of so much larger a search. Their descriptors
+        are 0; see ``described``. With octaves there are none.
+        """
+        gray, width = features.gray, features.gray.shape[1]
+        enough = math.ceil(self.config.max_keypoints / (1 - share))
+        pixels, response, _ = self._corners(gray, enough)
+        if self.config.octaves > 0:
+            pixels, response = pixels[:0], response[:0]
+        pixels = pixels[self._spread(pixels, response, width)[:enough]]
+        places, known = ((p @ [1, width]).astype(np.int64) for p in (pixels, features.image_pixels))
+        raw = pixels[~np.isin(places, known)].astype(float)
+        descriptors = np.zeros((len(raw), features.descriptors.shape[1]), np.uint64)
+        return self._assemble(
+            frame, gray, (raw, np.ones(len(raw)), np.zeros(len(raw))), descriptors
+        )
+
+    def described(self, features: Features) -> Features:
+        """Keypoints of a ``reserve`` with their descriptors and orientations."""
+        found = self._describer.describe(features.gray, features.image_pixels.astype(np.float32))
+        return replace(features, descriptors=found[0], angles_rad=found[1])
+
+    def _corners(
+        self, gray: NDArray[np.uint8], enough: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], int]:
+        """Pixels (N, 2) and responses (N,) at the highest threshold that gives enough, and it.
+
+        A corner's response is the highest threshold at which it is still found, so that one
+        detection serves all thresholds above its own. Without octaves BRISK's detector is FAST
+        with non-maximum suppression, and its sub-pixel step is not needed, since matches are
+        registered to patches later.
+        """
+        inside = self._inside(gray)
+        thresholds = self.config.thresholds
+        for lowest in (thresholds[len(thresholds) // 2], thresholds[-1]):
+            found = self._fast[lowest].detect(gray, inside)
+            if len(found) >= enough:
+                break
+        response = np.array([keypoint.response for keypoint in found])
+        usable = (t for t in thresholds if t > lowest and (response >= t).sum() >= enough)
+        threshold = next(usable, lowest)
+        strong = response >= threshold
+        pixels = np.reshape(cv2.KeyPoint_convert(found), (-1, 2)).astype(np.float32, copy=False)
+        return pixels[strong], response[strong], threshold
+
+    def _inside(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """255 where a descriptor can be had."""
+        border, (height, width) = self._border_px, gray.shape
+        inside = np.zeros_like(gray)
+        inside[border : height - border, border : width - border] = 255
+        return inside
+
+    def _with_scales(self, frame: Frame, gray: NDArray[np.uint8], threshold: int) -> Features:
+        """Features of several sizes, by OpenCV's BRISK."""
+        brisk = cv2.BRISK_create(threshold, self.config.octaves)
+        found = brisk.detect(gray, self._inside(gray))
+        pixels = np.reshape(cv2.KeyPoint_convert(found), (-1, 2))
+        response = np.array([keypoint.response for keypoint in found])
+        order = self._spread(pixels, response, gray.shape[1])
+        kept = np.sort(order[: self.config.max_keypoints])
+        keypoints, descriptors = brisk.compute(gray, [found[i] for i in kept])
+        table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], float).reshape(-1, 4)
+        bits = np.zeros((0, 64), np.uint8) if descriptors is None else descriptors
+        columns = table[:, :2], np.maximum(table[:, 2] / FINEST_SIZE_PX, 1.0)
+        return self._assemble(
+            frame,
+            gray,
+            (*columns, np.deg2rad(table[:, 3])),
+            np.ascontiguousarray(bits).view(np.uint64),
+        )
+
+    def _spread(
+        self, pixels: NDArray[np.float32], response: Array, width: int
+    ) -> NDArray[np.int64]:
+        """The order of keypoints (N, 2): every bucket's strongest, then the second, and so on."""
+        size = self.config.bucket_px
+        column, row = (pixels // size).astype(np.int64).T
+        return spread_order(row * -(-width // size) + column, response)
+
+    def _assemble(
+        self,
+        frame: Frame,
+        gray: NDArray[np.uint8],
+        keypoints: tuple[Array, Array, Array],
+        descriptors: NDArray[np.uint64],
+    ) -> Features:
+        """With depth and noise, from pixels (N, 2), scales (N,) and angles (N,) in radians."""
+        raw, scales, angles_rad = keypoints
+        depth_m, spread_m = sample_depth(frame.depth_m, raw, self.config)
+        disparity = self.camera.stereo_bf_px_m / depth_m
+        sigmas = np.empty((len(raw), 3))
+        sigmas[:, :2] = (self.config.pixel_sigma * np.sqrt(scales))[:, None]
+        depth_to_disparity = self.camera.stereo_bf_px_m / depth_m**2
+        sigmas[:, 2] = np.hypot(self.config.disparity_sigma_px, depth_to_disparity * spread_m)
+        rows, columns = np.rint(raw[:, 1]).astype(int), np.rint(raw[:, 0]).astype(int)
+        return Features(
+            pixels=undistort(self.camera, raw),
+            image_pixels=raw,
+            descriptors=descriptors,
+            scales=scales,
+            angles_rad=angles_rad,
+            depth_m=depth_m,
+            disparity_px=disparity,
+            sigmas_px=sigmas,
+            colours=frame.rgb[rows, columns],
+            gray=gray,
+        )
+
+
+def select(features: Features, rows: NDArray[np.int64]) -> Features:
+    """Some of the keypoints, by their rows (M,)."""
+    columns = {f.name: getattr(features, f.name) for f in fields(features)}
+    return Features(**{n: a if n == "gray" else a[rows] for n, a in columns.items()})
+
+
+def joined(first: Features, second: Features) -> Features:
+    """Keypoints of one frame, found at two times, one after the other."""
+    names = [f.name for f in fields(first) if f.name != "gray"]
+    pairs = {name: [getattr(first, name), getattr(second, name)] for name in names}
+    return replace(first, **{name: np.concatenate(pair) for name, pair in pairs.items()})
+
+
+def spread_order(bucket: NDArray[np.int64], score: Array) -> NDArray[np.int64]:
+    """Indices ordered by their rank inside their bucket, then by score, best first.
+
+    A prefix of any length is spread over the buckets as evenly as they allow.
+    """
+    order = np.lexsort((-score, bucket))
+    sorted_bucket = bucket[order]
+    starts = np.flatnonzero(np.r_[True, sorted_bucket[1:] != sorted_bucket[:-1]])
+    run_lengths = np.diff(np.r_[starts, len(order)])
+    rank = np.arange(len(order)) - np.repeat(starts, run_lengths)
+    return order[np.lexsort((-score[order], rank))]
+
+
+def sample_depth(
+    depth_m: NDArray[np.float32], pixels: Array, config: FeatureConfig
+) -> tuple[Array, Array]:
+    """Depth (N,) at keypoints and its local spread (N,) in metres.
+
+    The depth is the median of the valid pixels in a small window; the spread is half
+    their interquartile range, so that slanted and rough surfaces are trusted less. Where the window
+    straddles a depth edge (a range above ``depth_edge_ratio`` z) colour and depth disagree about
+    which side the keypoint is on, and the depth is NaN.
+    """
+    radius = config.depth_window_px
+    height, width = depth_m.shape
+    offsets = np.arange(-radius, radius + 1)
+    rows = np.clip(np.rint(pixels[:, 1]).astype(int)[:, None] + offsets, 0, height - 1)
+    columns = np.clip(np.rint(pixels[:, 0]).astype(int)[:, None] + offsets, 0, width - 1)
+    window = depth_m[rows[:, :, None], columns[:, None, :]].reshape(len(pixels), offsets.size**2)
+    window = np.sort(window.astype(float), axis=1)  # NaN sorts last
+    count = np.isfinite(window).sum(axis=1)
+    index = np.arange(len(pixels))
+    last = np.maximum(count - 1, 0)
+    median = window[index, last // 2]
+    spread = (window[index, (3 * last) // 4] - window[index, last // 4]) / 2
+    extent = window[index, last] - window[:, 0]
+    good = (
+        (count * 2 > offsets.size**2)
+        & (median > config.min_depth_m)
+        & (median < config.max_depth_m)
+        & (extent < config.depth_edge_ratio * median)
+    )
+    return np.where(good, median, np.nan), np.where(good, spread, np.nan)
+
+
+def undistort(camera: Camera, pixels: Array) -> Array:
+    """Undistorted pixels (N, 2) of detected ones (N, 2), in the same camera matrix."""
+    if not any(camera.distortion) or len(pixels) == 0:
+        return pixels.copy()
+    distortion = np.array(camera.distortion)
+    return cv2.undistortPoints(pixels[:, None], camera.K, distortion, P=camera.K)[:, 0]

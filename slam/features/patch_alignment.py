@@ -1,0 +1,147 @@
+"""Sub-pixel registration of matched keypoints to the image patch that made their landmark.
+
+A corner is found to half a pixel at best, and anew in every image. The pose error that this causes
+is why dense alignment beats plain features. Aligning the patch around each match with the
+landmark's own patch (Lucas-Kanade, inverse compositional: Baker and Matthews 2004) leaves a
+fraction of that; benchmarks/keypoint_noise.py measures it where the truth is exact. The error is
+then no longer drawn anew in every image: all that are aligned with one patch share it. So patches
+are compared at the scale at which things are seen, and are few (``WorldMap.renew_patches``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.geometry import Array
+
+PATCH_PX = 17  # side of a stored patch: enough of it to be made smaller
+_RADIUS = 5  # of the template; the outermost ring only serves the gradients
+
+
+@dataclass(frozen=True)
+class SubpixelConfig:
+    """``sigma_px`` is the standard deviation after registration; the rest are its gates.
+
+    A registration counts if it moved the keypoint by less than ``max_shift_px`` times the square
+    root of its scale and the patches then correlate by at least ``min_correlation``. A patch
+    serves views within ``max_angle_deg`` of the direction of its own, nearer or farther by at most
+    the factor ``max_zoom``; a landmark gets a new one where none of its patches serves.
+    """
+
+    enabled: bool = True
+    iterations: int = 4
+    sigma_px: float = 0.2
+    max_shift_px: float = 2.0
+    min_correlation: float = 0.8
+    max_angle_deg: float = 20.0
+    max_zoom: float = 1.5
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """How far from a patch's own view it serves: a turn in radians, a factor of distance."""
+        return math.radians(self.max_angle_deg), self.max_zoom
+
+
+def cut_patches(gray: NDArray[np.uint8], pixels: Array) -> NDArray[np.uint8]:
+    """Patches (M, 17, 17) uint8 around pixels (M, 2), interpolated linearly."""
+    window = np.rint(_sample(gray, pixels, PATCH_PX // 2)).astype(np.uint8)
+    return np.ascontiguousarray(window.transpose(2, 0, 1))
+
+
+def register_patches(
+    gray: NDArray[np.uint8],
+    pixels: Array,
+    patches: NDArray[np.uint8],
+    iterations: int,
+    zooms: Array | None = None,
+) -> tuple[Array, Array]:
+    """Where patches (M, 17, 17) lie in an image near pixels (M, 2).
+
+    Each patch is first magnified by its zoom (M,), 1 without: a corner among other things comes to
+    lie beside its place where the two are not of one scale, every time the same way. Then it is
+    aligned by translation, its brightness and contrast free. Returns the pixels (M, 2) and the
+    correlation (M,) of patch and image there, -1 to 1.
+
+    Inside, the patches are the last axis, so that every operation runs along contiguous memory.
+    A gradient without its mean does not see the image's, and needs no normalised copy of it.
+    """
+    zooms = np.ones(len(patches)) if zooms is None else zooms
+    template = _zoomed(patches, zooms)
+    half = np.float32(0.5)
+    gx = _centred((template[1:-1, 2:] - template[1:-1, :-2]) * half)
+    gy = _centred((template[2:, 1:-1] - template[:-2, 1:-1]) * half)
+    inner = _centred(template[1:-1, 1:-1])
+    contrast = _norm(inner)
+    inner /= contrast
+    xx, xy, yy = (_dot(gx, gx) + 1e-3, _dot(gx, gy), _dot(gy, gy) + 1e-3)
+    determinant = xx * yy - xy * xy
+    own_x, own_y = _dot(gx, inner), _dot(gy, inner)
+    moved = pixels.astype(float)
+    for _ in range(iterations):
+        image = _centred(_sample(gray, moved, _RADIUS - 1))
+        norm = _norm(image)
+        bx = contrast * (_dot(gx, image) / norm - own_x)
+        by = contrast * (_dot(gy, image) / norm - own_y)
+        step = np.stack([yy * bx - xy * by, xx * by - xy * bx], axis=1) / determinant[:, None]
+        moved -= np.clip(step, -1.0, 1.0)
+    image = _centred(_sample(gray, moved, _RADIUS - 1))
+    return moved, _dot(image, inner) / _norm(image)
+
+
+def _zoomed(patches: NDArray[np.uint8], zooms: Array) -> NDArray[np.float32]:
+    """The middles (11, 11, M) of patches (M, 17, 17), each magnified about its centre.
+
+    Interpolated linearly; what lies beyond a patch looks like its rim.
+    """
+    at = PATCH_PX // 2 + np.arange(-_RADIUS, _RADIUS + 1)[:, None] / zooms
+    at = np.clip(at, 0, PATCH_PX - 1 - 1e-3)  # (11, M), alike for rows and columns
+    whole = at.astype(np.int64)
+    share = (at - whole).astype(np.float32)
+    first = np.arange(len(patches)) * PATCH_PX**2
+    corner = (first + whole * PATCH_PX)[:, None] + whole
+    values = patches.reshape(-1).astype(np.float32)
+
+    def along_row(start: int) -> NDArray[np.float32]:
+        left = values[start:].take(corner)
+        return left + share * (values[start + 1 :].take(corner) - left)
+
+    top = along_row(0)
+    return top + share[:, None] * (along_row(PATCH_PX) - top)
+
+
+def _centred(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Windows (S, S, M) as columns (S * S, M) of zero mean."""
+    columns = values.reshape(values.shape[0] * values.shape[1], values.shape[2])
+    return columns - columns.mean(axis=0)
+
+
+def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> Array:
+    """Products (M,) of columns, in double precision from here on."""
+    return np.einsum("km,km->m", a, b).astype(float)
+
+
+def _norm(columns: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Norms (M,) of columns, never 0."""
+    return np.sqrt(np.einsum("km,km->m", columns, columns)) + np.float32(1e-3)
+
+
+def _sample(gray: NDArray[np.uint8], pixels: Array, radius: int) -> NDArray[np.float32]:
+    """Windows (2r+1, 2r+1, M) float32 around pixels (M, 2), by linear interpolation.
+
+    All pixels of a window share one fraction of a pixel. OpenCV's remap would round it to 1/32.
+    """
+    side = 2 * radius + 2
+    limit = np.array(gray.shape[::-1]) - side
+    corner = np.clip(pixels - radius, 0, limit - 1e-3)
+    whole = np.floor(corner)
+    column, row = whole.astype(np.int64).T
+    a, b = (corner - whole).astype(np.float32).T
+    steps = np.arange(side)
+    offsets = (steps[:, None] * gray.shape[1] + steps)[:, :, None]
+    window = gray.ravel()[offsets + (row * gray.shape[1] + column)].astype(np.float32)
+    rows = window[:, :-1] + a * (window[:, 1:] - window[:, :-1])
+    return rows[:-1] + b * (rows[1:] - rows[:-1])

@@ -1,0 +1,121 @@
+"""Which landmarks a keyframe shows, when its masks come."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.moving.free_space_check import distorted
+from bmask_slam.world.landmark_table import Ints, Mask
+from bmask_slam.world.world_map import Keyframe
+
+_REACH = 0.02
+"""How far off the depth image a landmark may lie, as a share of its depth."""
+_NINE = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(9, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Pixels (N, 2), as detected, and landmark ids (N,) of a keyframe, which may be culled.
+
+    It stands in the frame of a keyframe of the map, ``anchor``: itself or its heir.
+    """
+
+    pixels: Array
+    landmark_ids: Ints
+    anchor: Keyframe
+    T_anchor_camera: Array
+
+    @property
+    def T_world_camera(self) -> Array:
+        return self.anchor.T_world_camera @ self.T_anchor_camera
+
+    def located(self, mapper: Mapper) -> Located:
+        """The landmarks where the keyframe is."""
+        T_world_camera = self.T_world_camera
+        points = mapper.world.landmarks.points_world[self.landmark_ids]
+        z_m = transform(inverse(T_world_camera), points)[:, 2]
+        return Located(self.pixels, z_m, self.landmark_ids, T_world_camera, self.anchor.segment)
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Landmarks in a keyframe's image: pixels (N, 2), depth (N,), ids (N,).
+
+    It stands at ``T_world_camera`` in a map segment.
+    """
+
+    pixels: Array
+    z_m: Array
+    landmark_ids: Ints
+    T_world_camera: Array
+    segment: int
+
+    def among(self, wanted: Mask) -> Located:
+        """Those of the ``wanted`` landmarks, a mask over all."""
+        keep = wanted[self.landmark_ids]
+        kept = self.pixels[keep], self.z_m[keep], self.landmark_ids[keep]
+        return Located(*kept, self.T_world_camera, self.segment)
+
+    def with_visible(
+        self,
+        depth_m: NDArray[np.float32],
+        camera: Camera,
+        mapper: Mapper,
+        wanted: Mask | None = None,
+    ) -> Located:
+        """These and all others of the segment that lie where the keyframe's depth shows surface.
+
+        It need not be at the very pixel: at the rim of a thing, where many landmarks are, colour
+        and depth disagree by a pixel or two. ``depth_m`` (H / s, W / s) is every s-th pixel of the
+        depth image both ways, of which the nearest nine are looked at; ``wanted`` says which of
+        all landmarks are asked for, else all that live are.
+        """
+        landmarks = mapper.world.landmarks
+        others = (landmarks.alive if wanted is None else wanted).copy()
+        others[self.landmark_ids] = False
+        ids = np.flatnonzero(others)
+        hosts = [k.id for k in mapper.world.in_segment(self.segment)]
+        ids = ids[np.isin(landmarks.host[ids], hosts)]
+        local = transform(inverse(self.T_world_camera), landmarks.points_world[ids])
+        ahead = np.flatnonzero(local[:, 2] > 0.1)
+        pixels = distorted(camera, local[ahead])
+        whole = np.rint(pixels)
+        inside = ((whole >= 0) & (whole < [camera.width, camera.height])).all(axis=1)
+        rows, pixels = ahead[inside], pixels[inside]
+        step = camera.height // depth_m.shape[0]
+        limits = np.array(depth_m.shape) - 1
+        nearest = whole[inside, ::-1].astype(np.int64) // step
+        v, u = np.moveaxis(np.clip(nearest[:, None] + _NINE, 0, limits), -1, 0)
+        z_m = local[rows, 2]
+        there = (np.abs(depth_m[v, u] - z_m[:, None]) < _REACH * z_m[:, None]).any(axis=1)
+        return Located(
+            np.concatenate([self.pixels, pixels[there]]),
+            np.concatenate([self.z_m, z_m[there]]),
+            np.concatenate([self.landmark_ids, ids[rows[there]]]),
+            self.T_world_camera,
+            self.segment,
+        )
+
+
+def observed_by(keyframe_id: int, mapper: Mapper) -> Observed | None:
+    """What a keyframe of the map, or a culled one, sees of the landmarks that live."""
+    world = mapper.world
+    keyframe = world.keyframes.get(keyframe_id)
+    if keyframe is not None:
+        rows, ids = world.observed(keyframe)
+        return Observed(keyframe.features.image_pixels[rows], ids, keyframe, np.eye(4))
+    culled = world.culled.get(keyframe_id)
+    heir_id, T_heir_keyframe = mapper.history.heir(keyframe_id)
+    heir = world.keyframes.get(heir_id)
+    if culled is None or heir is None:
+        return None
+    rows = np.flatnonzero(culled.landmark_ids >= 0)
+    ids = world.landmarks.current(culled.landmark_ids[rows])
+    alive = world.landmarks.alive[ids]
+    return Observed(culled.image_pixels[rows[alive]], ids[alive], heir, T_heir_keyframe)

@@ -1,0 +1,115 @@
+"""Keyframes' masks vote on the labels of landmarks: of those in sight, and of those made later."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.labelling.landmark_visibility import Located, Observed, observed_by
+from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.votes import Claims, VoteConfig, vote
+from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.world.landmark_table import Ints
+
+RECENT = 8
+"""Of so many keyframes the masks vote on landmarks that are made later."""
+_NO_MASK = np.zeros((0, 0), bool)
+
+
+class LabelVotes:
+    """Gives what masks say of landmarks to a label store.
+
+    A landmark is often made by a keyframe later than those that show its place best. It is then
+    voted on by the last RECENT keyframes whose masks came before it, as if it had been there.
+    """
+
+    _recent: dict[int, Claims]
+
+    def __init__(self, camera: Camera, config: VoteConfig) -> None:
+        self._camera, self._config = camera, config
+        self._recent = {}
+
+    def take(
+        self,
+        keyframe_id: int,
+        claims: Claims,
+        observed: Observed,
+        mapper: Mapper,
+        store: LabelStore,
+    ) -> Ints:
+        """All of a keyframe's instances vote on all landmarks in sight; the ids (N,) of those."""
+        new = mapper.world.landmarks.alive.copy()
+        new[store.known()] = False
+        for earlier_id, earlier in self._recent.items():
+            seen = observed_by(earlier_id, mapper)
+            if seen is not None:
+                matched = seen.located(mapper).among(new)
+                located = matched.with_visible(earlier.depth_m, self._camera, mapper, new)
+                self._vote(earlier, located, store)
+        located = observed.located(mapper).with_visible(claims.depth_m, self._camera, mapper)
+        ids = self._vote(claims, located, store)
+        without = [replace(i, mask=_NO_MASK) for i in claims.instances]
+        self._recent[keyframe_id] = replace(claims, instances=tuple(without))
+        if len(self._recent) > RECENT:
+            del self._recent[min(self._recent)]
+        return ids
+
+    def _vote(self, claims: Claims, seen: Located, store: LabelStore) -> Ints:
+        votes = vote(claims, seen.pixels, seen.z_m, store.classes, self._config)
+        ids, hit = seen.landmark_ids[votes.rows], ~votes.missed
+        store.update(ids[hit], votes.distributions[hit], votes.weights[hit])
+        store.miss(ids[~hit], votes.weights[~hit])
+        return ids
+
+    def state(self) -> Arrays:
+        """What later landmarks will be voted on with, as named arrays."""
+        views = list(self._recent.values())
+        instances = [i for c in views for i in c.instances]
+        return {
+            "keyframes": np.array(list(self._recent), np.int64),
+            "shape": np.array([v.owner.shape for v in views], np.int64).ravel(),
+            "depth_shape": np.array([v.depth_m.shape for v in views], np.int64).ravel(),
+            "owner": np.array([v.owner for v in views], np.int16).ravel(),
+            "under": np.array([v.under for v in views], np.int16).ravel(),
+            "inner": np.array([v.inner for v in views], bool).ravel(),
+            "depth_m": np.array([v.depth_m for v in views], np.float32).ravel(),
+            "ranges_m": np.concatenate([np.zeros(0), *(v.depth_range_m.ravel() for v in views)]),
+            "counts": np.array([len(v.instances) for v in views], np.int64),
+            "boxes": np.array([i.box for i in instances], np.float32).ravel(),
+            "labels": np.array([i.label for i in instances], np.int64),
+            "distributions": np.array([i.distribution for i in instances], np.float32).ravel(),
+            "scores": np.array([(i.class_score, i.mask_score) for i in instances], float).ravel(),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the votes of a state."""
+        count = len(state["keyframes"])
+        shape, depth_shape = (state[n][:2].tolist() for n in ("shape", "depth_shape"))
+        images = {n: state[n].reshape(count, *shape) for n in ("owner", "under", "inner")}
+        depths_m = state["depth_m"].reshape(count, *depth_shape)
+        ranges_m = state["ranges_m"].reshape(-1, 2)
+        instances, ends = _instances(state), np.cumsum(state["counts"])
+        self._recent = {}
+        for k, keyframe_id in enumerate(state["keyframes"].tolist()):
+            mine = slice(ends[k] - state["counts"][k], ends[k])
+            owner, under, inner = (images[n][k] for n in ("owner", "under", "inner"))
+            self._recent[keyframe_id] = Claims(
+                tuple(instances[mine]), owner, under, inner, depths_m[k], ranges_m[mine]
+            )
+
+
+def _instances(state: Arrays) -> Sequence[Instance]:
+    boxes, count = state["boxes"].reshape(-1, 4), max(len(state["labels"]), 1)
+    distributions = state["distributions"].reshape(-1, max(len(state["distributions"]) // count, 1))
+    scores = state["scores"].reshape(-1, 2).tolist()
+    return [
+        Instance(_NO_MASK, box, label, distribution, *score)
+        for box, label, distribution, score in zip(
+            boxes, state["labels"].tolist(), distributions, scores, strict=True
+        )
+    ]

@@ -1,0 +1,301 @@
+"""What the map's things are: keyframes' masks vote on landmarks and make objects."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import Arrays, nested, part
+from bmask_slam.labelling.landmark_visibility import Observed, observed_by
+from bmask_slam.labelling.landmark_votes import LabelVotes
+from bmask_slam.labelling.results import LandmarkLabels, MapObjects
+from bmask_slam.moving.keyframe_masks import KeyframeMasks
+from bmask_slam.moving.moving_object_filter import Dynamics
+from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.semantics.beliefs.votes import (
+    Claims,
+    VoteConfig,
+    check_instances,
+    claim_pixels,
+    vote,
+)
+from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.objects.gravity import Upright
+from bmask_slam.semantics.objects.object_map import (
+    KeyframeView,
+    ObjectConfig,
+    ObjectMap,
+    pixel_rays,
+)
+from bmask_slam.semantics.segmenters.segmenter import NoSegmenter, Segmenter
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.landmark_table import Ints
+from bmask_slam.world.world_map import Keyframe
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_SEGMENTER = "light"
+DEPTH_STEP = 2
+"""Of a keyframe's depth image every second pixel each way waits for its masks."""
+MAX_WAITING = 100
+VOTE_SCORE = 0.1
+
+
+@dataclass(frozen=True)
+class SemanticsConfig:
+    """Where masks come from, and what is believed of them.
+
+    Of instances with a class score below ``object_score`` the votes count, but nothing else: they
+    make no objects and nothing moves for them.
+    """
+
+    segmenter: SegmenterOptions = field(
+        default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER, min_score=VOTE_SCORE)
+    )
+    object_score: float = 0.5
+    votes: VoteConfig = field(default_factory=VoteConfig)
+    labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)
+    objects: ObjectConfig = field(default_factory=ObjectConfig)
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """What became of a keyframe's masks.
+
+    Attributes:
+        keyframe_id: whose they are.
+        instances: how many there were.
+        landmark_ids: (N,) that they spoke about.
+        refused: why they were not used; "" if they were.
+    """
+
+    keyframe_id: int
+    instances: int = 0
+    landmark_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    refused: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    """What a keyframe's masks will need: its stamp and every second pixel of its depth (h, w)."""
+
+    timestamp_s: float
+    depth_m: NDArray[np.float32]
+
+
+class SemanticMapper:
+    """Segments keyframes and keeps what their masks say about the map, also when they come late.
+
+    Without a segmenter and without masks it does nothing. The map is changed by ``dynamics`` alone,
+    which is told what the masks say.
+    """
+
+    _done: set[int]
+    _waiting: dict[int, _Waiting]
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: SemanticsConfig,
+        segmenter: Segmenter | None = None,
+        dynamics: Dynamics | None = None,
+    ) -> None:
+        self._dynamics = dynamics
+        self.camera = camera
+        self.config = config
+        self.segmenter = segmenter or NoSegmenter()
+        self._rays = pixel_rays(camera, DEPTH_STEP)
+        self._begin(self.segmenter.labels)
+
+    @property
+    def enabled(self) -> bool:
+        """Whether there are labels to tell apart."""
+        return len(self.names) > 1
+
+    def observe(self, frame: Frame, keyframe: Keyframe, mapper: Mapper) -> None:
+        """Segment a keyframe and let its masks speak; follow what became of the map.
+
+        Raises:
+            InputError: the first keyframe cannot be segmented; later ones are passed over.
+        """
+        self.follow(mapper)
+        if not len(self.segmenter.labels) > 1:
+            return
+        self.expect(keyframe, kept_depth(frame.depth_m))
+        try:
+            instances = self.segmenter.segment(frame.rgb, frame.name)
+            self.attach(keyframe.id, instances, mapper)
+        except InputError as error:
+            if not self._done:
+                raise
+            logger.warning("keyframe %d has no masks: %s", keyframe.id, error)
+
+    def expect(self, keyframe: Keyframe, depth_m: NDArray[np.float32]) -> None:
+        """Keep of a keyframe what its masks will need, its ``kept_depth``, until they come."""
+        self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, depth_m)
+        self._upright.add(keyframe.id, depth_m, self._rays)
+        if len(self._waiting) > MAX_WAITING:
+            del self._waiting[min(self._waiting)]
+
+    def attach(self, keyframe_id: int, instances: Sequence[Instance], mapper: Mapper) -> Attachment:
+        """Use the masks of a keyframe, at any time after it was made, once.
+
+        Fused landmarks are followed; a culled keyframe's masks still reach its landmarks.
+
+        Raises:
+            InputError: masks of another size or with labels that are not in the label set.
+        """
+        size = (self.camera.height, self.camera.width)
+        check_instances(instances, size, self.names, f"keyframe {keyframe_id}")
+        observed = observed_by(keyframe_id, mapper)
+        refused = "" if observed is not None else "it is not in the map"
+        if keyframe_id in self._done:
+            refused = "it has its masks already"
+        if observed is None or refused:
+            logger.info("masks of keyframe %d are not used: %s", keyframe_id, refused)
+            return Attachment(keyframe_id, len(instances), refused=refused)
+        self._done.add(keyframe_id)
+        nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
+        waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
+        strong = [i for i in instances if i.class_score >= self.config.object_score]
+        claims = claim_pixels(strong, waiting.depth_m, size, self.config.votes)
+        seen = observed.located(mapper)
+        votes = vote(claims, seen.pixels, seen.z_m, len(self.names), self.config.votes)
+        ids = observed.landmark_ids[votes.rows[votes.sure]]
+        on = votes.instances[votes.sure]
+        everything = claim_pixels(instances, waiting.depth_m, size, self.config.votes, True)
+        spoken = self._label_votes.take(keyframe_id, everything, observed, mapper, self.labels)
+        if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
+            objects = self._add_objects((keyframe_id, waiting), claims, observed, mapper)[on]
+            self.objects.place_landmarks(ids[objects >= 0], objects[objects >= 0])
+        if self._dynamics is not None:
+            about = (ids, on, self.labels.probabilities(ids))
+            view = (claims, waiting.depth_m, observed.T_world_camera)
+            masks = KeyframeMasks(keyframe_id, self.names, *view, *about)
+            self._dynamics.see(masks, mapper)
+        return Attachment(keyframe_id, len(instances), spoken)
+
+    def follow(self, mapper: Mapper) -> None:
+        """Keep up with the map.
+
+        Landmarks that were fused take what was known of them along, culled ones lose it; points
+        of objects in a culled keyframe's frame go on in its heir's.
+        """
+        landmarks, keyframes = mapper.world.landmarks, mapper.world.keyframes
+        known = np.union1d(self.labels.known(), self.objects.points.landmarks())
+        gone = known[~landmarks.alive[known]]
+        if len(gone):
+            heirs = landmarks.current(gone)
+            alive = landmarks.alive[heirs]
+            self.labels.move(gone[alive], heirs[alive])
+            self.labels.drop(gone[~alive])
+            self.objects.points.rename_landmarks(gone, np.where(alive, heirs, -1))
+        for keyframe_id in self.objects.points.anchors():
+            if keyframe_id not in keyframes:
+                self.objects.points.hand_over(keyframe_id, *mapper.history.heir(keyframe_id))
+        self._upright.keep(keyframes.keys() | self._waiting.keys())
+
+    def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
+        """What landmarks (N,) are; None where nothing tells labels apart."""
+        return LandmarkLabels(self.names, self.labels.estimates(ids)) if self.enabled else None
+
+    def map_objects(self, keyframes: Sequence[Keyframe]) -> MapObjects:
+        """The objects that these keyframes, all of one map segment, saw."""
+        poses = {k.id: k.T_world_camera for k in keyframes}
+        up_world = self._upright.up_world(poses)
+        return MapObjects(self.names, self.objects.objects(poses, up_world), up_world)
+
+    def state(self) -> Arrays:
+        """All that was learned, as named arrays."""
+        waiting = list(self._waiting.values())
+        return {
+            "names": np.array(self.names.names),
+            "done": np.array(sorted(self._done), np.int64),
+            "waiting": np.array(list(self._waiting), np.int64),
+            "waiting_s": np.array([w.timestamp_s for w in waiting], float),
+            "waiting_shape": np.array([w.depth_m.shape for w in waiting], np.int64).ravel(),
+            "waiting_depth_m": np.array([w.depth_m for w in waiting], np.float32).ravel(),
+            **nested(
+                labels=self.labels.state(),
+                votes=self._label_votes.state(),
+                objects=self.objects.state(),
+                upright=self._upright.state(),
+            ),
+        }
+
+    def restore(self, state: Arrays, path: Path) -> None:
+        """Go on from a state.
+
+        Raises:
+            InputError: it was learned with another label set.
+        """
+        names = LabelSet(tuple(state["names"].tolist()))
+        if len(names) > 1 and self.enabled and names != self.names:
+            raise InputError(
+                f"{path}: its landmarks have {len(names) - 1} labels that are not the segmenter's "
+                f"{len(self.names) - 1}; take the segmenter that it was made with, or none"
+            )
+        if len(names) == 1:
+            return  # nothing was learned
+        self._begin(names)
+        self.labels.restore(part(state, "labels"))
+        if votes := part(state, "votes"):
+            self._label_votes.restore(votes)
+        self.objects.restore(part(state, "objects"))
+        self._upright.restore(part(state, "upright"))
+        self._done = set(state["done"].tolist())
+        shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
+        depths_m = state["waiting_depth_m"].reshape(len(state["waiting"]), *shape)
+        waiting = map(_Waiting, state["waiting_s"].tolist(), depths_m)
+        self._waiting = dict(zip(state["waiting"].tolist(), waiting, strict=True))
+
+    def begin_session(self) -> None:
+        """Masks of keyframes of an earlier recording are not waited for."""
+        self._waiting = {}
+
+    def _begin(self, names: LabelSet) -> None:
+        """Know nothing yet."""
+        self.names = names
+        self.labels = LabelStore(len(names), self.config.labels)
+        self._label_votes = LabelVotes(self.camera, self.config.votes)
+        self.objects = ObjectMap(self.camera, len(names), self.config.objects, self.config.labels)
+        self._upright = Upright()
+        self._done = set()
+        self._waiting = {}
+
+    def _add_objects(
+        self, waited: tuple[int, _Waiting], claims: Claims, observed: Observed, mapper: Mapper
+    ) -> Ints:
+        """The object of each of the claims' instances (K,) and -1 for the last, "none"."""
+        keyframe_id, waiting = waited
+        here = mapper.world.in_segment(observed.anchor.segment)
+        T_world_camera = observed.T_world_camera
+        view = KeyframeView(
+            keyframe_id,
+            waiting.timestamp_s,
+            T_world_camera,
+            waiting.depth_m,
+            self._rays,
+            claims,
+            {k.id: k.T_world_camera for k in here} | {keyframe_id: T_world_camera},
+        )
+        objects = self.objects.add(view)
+        if keyframe_id != observed.anchor.id:
+            heir = observed.anchor.id, observed.T_anchor_camera
+            self.objects.points.hand_over(keyframe_id, *heir)
+        return np.append(objects, -1)
+
+
+def kept_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Every DEPTH_STEP-th pixel each way of a z-depth image (H, W) in m."""
+    return depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()

@@ -1,0 +1,129 @@
+"""What tracking's side and the dense map's process say to each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.dense.keyframe_view import SeenKeyframe
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array
+from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.world.landmark_table import Ints
+
+
+@dataclass(frozen=True)
+class DenseOrder:
+    """What is to be mapped.
+
+    Attributes:
+        run: the run folder. camera: of its frames.
+        masks: where masks come from. labels: names of their classes.
+        shown: points of each submap that a viewer is to have, at most; 0: none.
+    """
+
+    run: Path
+    camera: Camera
+    masks: SegmenterOptions
+    labels: tuple[str, ...]
+    shown: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeToMap:
+    """To the process: a keyframe as it is in the map at this moment.
+
+    Attributes:
+        seen: it, with its images.
+        instances: its masks; none that were found, or that have not come.
+        poses: T_world_camera (4, 4) of it and of the keyframes around, by id.
+    """
+
+    seen: SeenKeyframe
+    instances: list[Instance]
+    poses: dict[int, Array]
+
+    @property
+    def id(self) -> int:
+        """Of the keyframe."""
+        return self.seen.id
+
+
+@dataclass(frozen=True, eq=False)
+class LateMasks:
+    """To the process: masks of a keyframe that it has; landmark_ids (L,) at pixels (L, 2)."""
+
+    keyframe_id: int
+    instances: list[Instance]
+    landmark_ids: Ints
+    pixels: Array
+
+
+@dataclass(frozen=True)
+class Forget:
+    """To the process: keyframes left the map."""
+
+    keyframe_ids: list[int]
+
+
+@dataclass(frozen=True, eq=False)
+class FinishMap:
+    """To the process: no more keyframes; the run folder holds the map.
+
+    Attributes:
+        poses: T_world_camera (4, 4) of all keyframes, by id.
+        left_out: keyframes that were not sent, and why.
+    """
+
+    poses: dict[int, Array]
+    left_out: dict[int, str]
+
+
+@dataclass(frozen=True)
+class Taken:
+    """From the process: it has taken a keyframe in, and can take another."""
+
+    keyframe_id: int
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Some points (N, 3) of a submap in the frame of its keyframe, and colours (N, 3)."""
+
+    points: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """From the process: a keyframe's submap is saved; ``preview`` where there is a viewer."""
+
+    keyframe_id: int
+    preview: Preview | None = None
+
+
+@dataclass(frozen=True)
+class NotMapped:
+    """From the process: a keyframe has no submap, and why."""
+
+    keyframe_id: int
+    reason: str
+    disk_full: bool = False
+
+
+@dataclass(frozen=True)
+class MapWritten:
+    """From the process: the clouds are written.
+
+    Attributes:
+        points: in the cloud. missing: keyframes of the map without a submap.
+        failure: why they are not written; empty if they are.
+    """
+
+    points: int = 0
+    missing: list[int] = field(default_factory=list)
+    failure: str = ""

@@ -1,0 +1,164 @@
+"""The dense map's own process: keyframes are fused into submaps, as by ``bmask-slam map``."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+
+from bmask_slam.dense.assembly import folder_settings, settled
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.fusion import FusionCounts, KeyframeFusion
+from bmask_slam.dense.input import dense_keyframe, read_saved_map
+from bmask_slam.dense.map_run import MapSummary, write_summary
+from bmask_slam.dense.options import MapOptions
+from bmask_slam.dense.products import FusedMap, finished, write_clouds
+from bmask_slam.graph.errors import InputError
+from bmask_slam.live.channel import Channel
+from bmask_slam.live.messages import Ready
+from bmask_slam.live.processes.dense_messages import (
+    DenseOrder,
+    FinishMap,
+    Forget,
+    KeyframeToMap,
+    LateMasks,
+    Mapped,
+    MapWritten,
+    NotMapped,
+    Preview,
+    Taken,
+)
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.products.submaps import Submap
+from bmask_slam.mapping.products.surface_labels import InstanceEvidence
+from bmask_slam.run_folder.folder import DISK_ERRORS
+from bmask_slam.semantics.labels import LabelSet
+
+logger = logging.getLogger(__name__)
+
+NICENESS = 15
+
+
+def serve_dense(channel: Channel, order: DenseOrder) -> None:
+    """Map keyframes until the channel ends."""
+    os.nice(NICENESS)
+    cv2.setNumThreads(1)
+    keeper = DenseKeeper(order, channel.send)
+    channel.send(Ready())
+    for message in channel.messages():
+        keeper.handle(message)
+
+
+class PatientFolder(DenseFolder):
+    """The folder of a dense map, which outlives a full disk.
+
+    Attributes:
+        unwritten: keyframes whose submaps found no room, and why.
+    """
+
+    unwritten: dict[int, str]
+
+    def write(self, submap: Submap, fused: InverseDepthMap, evidence: InstanceEvidence) -> None:
+        """Save a finished keyframe, or note that it cannot be."""
+        try:
+            super().write(submap, fused, evidence)
+        except InputError as error:
+            self.unwritten[submap.anchor] = str(error)
+            self.remove(submap.anchor)
+
+
+class DenseKeeper:
+    """Carries out what tracking's side says; ``send`` takes the answers."""
+
+    def __init__(self, order: DenseOrder, send: Callable[[Any], None]) -> None:
+        """Begin, or go on with what another process left. Raises InputError."""
+        self._order, self._send = order, send
+        self._labels = LabelSet(order.labels)
+        self._options = settled(MapOptions(order.run, masks=order.masks), self._labels)
+        settings = folder_settings(self._options, self._labels)
+        self._folder = PatientFolder(order.run, settings)
+        self._folder.unwritten = {}
+        self._fusion = KeyframeFusion(order.camera, self._labels, self._folder, self._options)
+
+    def handle(self, message: Any) -> None:
+        """Carry out one message."""
+        match message:
+            case KeyframeToMap():
+                self.take(message)
+                self._send(Taken(message.id))
+            case LateMasks():
+                self.relabel(message)
+            case Forget():
+                self._fusion.forget(message.keyframe_ids)
+            case FinishMap():
+                self._fusion.move(message.poses)
+                self._tell(self._fusion.finish())
+                self._send(self.write_products(message))
+            case _:
+                raise TypeError(f"no message for the dense map: {message!r}")
+
+    def take(self, message: KeyframeToMap) -> None:
+        """Take a keyframe in, and say what that finished."""
+        seen = message.seen
+        if self._folder.is_done(seen.id):  # another process had died before it said so
+            self._send(Mapped(seen.id))
+        try:
+            dense = dense_keyframe(seen, self._order.camera)
+        except InputError as error:
+            self._send(NotMapped(seen.id, str(error)))
+            return
+        shown = self._fusion.read(message.instances, seen.landmark_ids, seen.pixels)
+        self._tell(self._fusion.take(dense, seen.segment, shown, message.poses))
+
+    def relabel(self, message: LateMasks) -> None:
+        """Use masks that come late."""
+        shown = self._fusion.read(message.instances, message.landmark_ids, message.pixels)
+        try:
+            self._fusion.relabel(message.keyframe_id, shown)
+        except InputError as error:
+            logger.warning("keyframe %d keeps its old labels: %s", message.keyframe_id, error)
+
+    def write_products(self, message: FinishMap) -> MapWritten:
+        """Write the clouds from the run folder's final map."""
+        started_s = time.perf_counter()
+        try:
+            run = read_saved_map(self._order.run)
+            missing = [k.id for k in run.keyframes if not self._folder.is_done(k.id)]
+            if not finished(run, self._folder):
+                return MapWritten(missing=missing, failure="no keyframe has a submap")
+            fused = FusedMap(run, self._labels, self._folder, self._options)
+            products = write_clouds(fused)
+            counts = self._counts(missing, message.left_out)
+            products_s = time.perf_counter() - started_s
+            write_summary(self._folder, MapSummary(self._folder.path, counts, products, products_s))
+        except (InputError, OSError) as error:
+            if isinstance(error, OSError) and error.errno not in DISK_ERRORS:
+                raise
+            return MapWritten(failure=str(error))
+        return MapWritten(products.points, missing)
+
+    def _counts(self, missing: list[int], left_out: dict[int, str]) -> FusionCounts:
+        """What became of the keyframes, with those that did not come here."""
+        reasons = self._folder.unwritten | left_out
+        counts = self._fusion.counts
+        counts.left_out = {number: reasons.get(number, "") for number in missing}
+        return counts
+
+    def _tell(self, submaps: list[Submap]) -> None:
+        """Say which submaps are saved, and show them."""
+        for submap in submaps:
+            reason = self._folder.unwritten.get(submap.anchor)
+            if reason is None:
+                self._send(Mapped(submap.anchor, self._preview(submap)))
+            else:
+                self._send(NotMapped(submap.anchor, reason, disk_full=True))
+
+    def _preview(self, submap: Submap) -> Preview | None:
+        if not self._order.shown:
+            return None
+        step = -(-len(submap) // self._order.shown) or 1
+        return Preview(submap.points[::step].copy(), submap.colours[::step].copy())

@@ -1,0 +1,308 @@
+"""Tracking's side of the map: a copy to track against, and the process that keeps the original.
+
+What is sent to the process is remembered until it has saved a state that contains it. If it dies,
+another one begins with that state and is told the rest again; tracking goes on meanwhile.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bmask_slam.back_end.mapper import add_keyframe, without_image
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.labelling.semantic_mapper import kept_depth
+from bmask_slam.live.messages import (
+    Began,
+    Finish,
+    LostKeyframe,
+    MapChanged,
+    NewKeyframe,
+    Ready,
+    SaveState,
+    Sightings,
+    StateSaved,
+    TakeBack,
+)
+from bmask_slam.live.processes.remote_pruner import RemotePruner
+from bmask_slam.live.processes.supervision import late_start
+from bmask_slam.live.processes.worker import Failure, Worker
+from bmask_slam.live.replica import apply_delta
+from bmask_slam.loops.place_recognition import DescriptorIndex
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.world.frame_history import NOBODY, Entries, FrameHistory
+from bmask_slam.world.landmark_table import Ints, Patches
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
+
+SAVE_EVERY = 20
+"""Keyframes from one saved state to the next."""
+MAX_DEATHS = 3
+"""Deaths without a saved state between them, after which the map is given up."""
+
+
+class RemoteMapper:
+    """Stands where an offline system has its ``Mapper``.
+
+    Attributes:
+        world: the copy, with keyframes that the process has not answered yet.
+        history: of every tracked frame.
+        places: what finds keyframes that look like a frame.
+        update_ms: time that the process took for each keyframe.
+        changes: how often the copy was brought up to date.
+        deaths: how often the process has died.
+        reference: the keyframe that tracking refers to; set before ``insert``.
+    """
+
+    def __init__(
+        self, camera: Camera, config: SystemConfig, names: tuple[str, ...], folder: Path
+    ) -> None:
+        self.world, self.history = WorldMap(), FrameHistory()
+        self.places = DescriptorIndex(config.loops.index)
+        self.update_ms: list[float] = []
+        self.loops_closed = 0
+        self.changes = 0
+        self.deaths = 0
+        self.reference: Keyframe | None = None
+        self._arguments = (camera, config, names)
+        self._folder = folder
+        self._state: Path | None = None
+        self._journal: dict[int, Any] = {}
+        self._number = 0
+        self._told_frames = 0
+        self._saved_keyframes = 0
+        self._deaths_in_a_row = 0
+        self._pending: set[int] = set()
+        self._is_ready = False
+        self._began = self._died_at = 0
+        self._worker = self._start()
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._worker.pid
+
+    @property
+    def pending(self) -> int:
+        """Keyframes that the process has not finished with."""
+        return len(self._pending)
+
+    def awaits(self, keyframe_id: int) -> bool:
+        """Whether the process has not finished with a keyframe."""
+        return keyframe_id in self._pending
+
+    @property
+    def idle(self) -> bool:
+        """Whether the process waits for work."""
+        return not self._pending
+
+    @property
+    def given_up(self) -> bool:
+        """Whether the process died too often to be started again."""
+        return self._deaths_in_a_row >= MAX_DEATHS
+
+    def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
+        """Put a tracked frame into the copy as a keyframe, and tell the process.
+
+        Until the answer comes it observes what was tracked, and nothing new.
+        """
+        reference = self.reference
+        keyframe = add_keyframe(self.world, frame, tracked, segment)
+        keyframe.features = without_image(keyframe.features)
+        keyframe.landmark_ids[tracked.keypoints] = tracked.landmark_ids
+        self.places.add(keyframe.id, keyframe.features.descriptors)
+        self._pending.add(keyframe.id)
+        self.tell(
+            NewKeyframe(
+                keyframe.id,
+                frame.index,
+                frame.timestamp_s,
+                tracked,
+                segment,
+                None if reference is None else (reference.id, reference.T_world_camera),
+                local_ids,
+                self._sightings(),
+                self._untold_history(),
+                kept_depth(frame.depth_m),
+            )
+        )
+        return keyframe
+
+    def optimise(self, keyframe: Keyframe) -> None:
+        """The process does it."""
+
+    def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
+        """The process does it."""
+        return []
+
+    def pruner(self) -> RemotePruner:
+        """Takes things out of the map."""
+        return RemotePruner(self.world, self.tell)
+
+    def take_back(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
+        """As ``Mapper.take_back``; the map is changed when the answer comes."""
+        if len(keypoints):
+            self.tell(TakeBack(keyframe_id, keypoints, patches))
+
+    def tell(self, message: Any) -> None:
+        """Send a message, to be sent again to another process if this one dies."""
+        self._number += 1
+        self._journal[self._number] = message
+        self._worker.send((self._number, message))
+
+    def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
+        """Bring the copy up to date; waits so long for an answer if there is none.
+
+        Returns what came that is not about the map's own state.
+        """
+        others = self._heed(self._worker.receive(timeout_s))
+        if not self._worker.alive and not self.given_up:
+            self._worker.kill()
+            others += self._heed(self._worker.receive())
+            self._restart()
+        return others
+
+    def _heed(self, messages: list[Any]) -> list[Any]:
+        """Take in the answers that are about the map; returns the others."""
+        others = []
+        for message in messages:
+            match message:
+                case Began():
+                    self._began = message.number
+                case MapChanged():
+                    self._apply(message)
+                case StateSaved():
+                    self._journal = {n: m for n, m in self._journal.items() if n > message.number}
+                    self._state, self._deaths_in_a_row = message.path, 0
+                case Ready():
+                    self._is_ready = True
+                case Failure():
+                    logger.error("the map's process failed: %s", message.text)
+                case _:
+                    others.append(message)
+        return others
+
+    def wait_until_ready(self, timeout_s: float) -> None:
+        """Wait until the process can work. Raises InputError if it cannot start."""
+        deadline_s = time.monotonic() + timeout_s
+        while not self._is_ready:
+            if self.given_up:
+                self.close()
+                raise InputError("the map's process did not start; see the lines above")
+            if time.monotonic() > deadline_s:
+                self.close()
+                raise InputError(late_start("map", timeout_s))
+            self.catch_up(0.1)
+
+    def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:
+        """Wait until a keyframe's landmarks are there, or so long; not for one that was lost."""
+        deadline_s = time.monotonic() + timeout_s
+        while len(self.world.observed(keyframe)[1]) == 0 and not self.given_up:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0 or self.history.heir(keyframe.id)[0] == NOBODY:
+                return False
+            self.catch_up(min(left_s, 0.05))
+        return True
+
+    def finish(self, timeout_s: float) -> Path:
+        """Let the process optimise once more and save everything; the file's path.
+
+        Raises:
+            InputError: it could not, within that time.
+        """
+        path = self._folder / ".live-final"
+        self.tell(Finish(path, self._untold_history()))
+        deadline_s = time.monotonic() + timeout_s
+        while self._journal and not self.given_up and time.monotonic() < deadline_s:
+            self.catch_up(0.1)
+        self._worker.stop()
+        if self._journal:
+            raise InputError(f"{self._folder}: the map's process did not finish")
+        return path
+
+    def close(self) -> None:
+        """End the process at once and remove its files."""
+        self._worker.kill()
+        for path in self._folder.glob(".live-*"):
+            path.unlink(missing_ok=True)
+
+    def _start(self) -> Worker:
+        return Worker(
+            "map", "bmask_slam.live.processes.map_process:serve_map", *self._arguments, self._state
+        )
+
+    def _restart(self) -> None:
+        """Another process, from the last saved state, is told what came after that."""
+        self.deaths += 1
+        self._deaths_in_a_row += 1
+        if self.given_up:
+            logger.error(
+                "the map's process died %d times in a row; no map from here on", MAX_DEATHS
+            )
+            return
+        logger.warning("the map's process died; started again, %d messages", len(self._journal))
+        if self._died_at == self._began > 0:
+            self._pass_over(self._began)
+        self._died_at = self._began
+        self._worker = self._start()
+        for number, message in sorted(self._journal.items()):
+            self._worker.send((number, message))
+
+    def _pass_over(self, number: int) -> None:
+        """Twice the process died of a message: do without it."""
+        message = self._journal.pop(number, None)
+        logger.error("message %d, %s, is passed over", number, type(message).__name__)
+        match message:
+            case NewKeyframe():
+                heir_id, T_heir_lost = _heir(message)
+                self.history.hand_over(message.id, heir_id, T_heir_lost)
+                known = len(self.world.landmarks)
+                about = (message.id, heir_id, T_heir_lost, message.history, known)
+                self._journal[number] = LostKeyframe(*about)
+
+    def _apply(self, message: MapChanged) -> None:
+        apply_delta(message.delta, self.world, self.history)
+        held = set(self.places.keyframe_ids)
+        for keyframe_id in held - self.world.keyframes.keys():
+            self.places.remove(keyframe_id)
+        for keyframe_id in sorted(self.world.keyframes.keys() - held):
+            self.places.add(keyframe_id, self.world.keyframes[keyframe_id].features.descriptors)
+        self.changes += 1
+        self.loops_closed = message.loops_closed
+        if not message.done:
+            return
+        self.update_ms.append(message.update_ms)
+        self._pending -= set(message.delta.keyframe_ids.tolist()) | {message.keyframe_id}
+        if message.keyframe_id + 1 - self._saved_keyframes >= SAVE_EVERY:
+            self._saved_keyframes = message.keyframe_id + 1
+            self.tell(SaveState(self._folder / ".live-state"))
+
+    def _sightings(self) -> Sightings:
+        landmarks = self.world.landmarks
+        ids = np.flatnonzero(landmarks.visible)
+        found = Sightings(ids, landmarks.visible[ids], landmarks.found[ids])
+        landmarks.visible[:] = landmarks.found[:] = 0
+        return found
+
+    def _untold_history(self) -> Entries:
+        entries = self.history.since(self._told_frames)
+        self._told_frames += len(entries)
+        return entries
+
+
+def _heir(lost: NewKeyframe) -> tuple[int, Array]:
+    """The keyframe that takes the frames of one that cannot be in the map, and T_heir_lost."""
+    if lost.reference is None:
+        return NOBODY, np.eye(4)
+    heir_id, T_world_heir = lost.reference
+    return heir_id, inverse(T_world_heir) @ lost.tracked.T_world_camera

@@ -1,0 +1,125 @@
+"""A process that works on messages, and how it looks to its owner when it dies.
+
+It is a fresh interpreter with a socket: a caller's script needs no ``if __name__ == "__main__"``,
+and nothing is inherited by accident. It ends when its owner does, however that came. It stays in
+its owner's session, since Linux weighs priorities within a session only (autogroups).
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import itertools
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+from bmask_slam.live.channel import Channel, ForwardedLog
+from bmask_slam.live.shared_memory import SIZE, Ring, nameless_file
+
+logger = logging.getLogger(__name__)
+
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
+"""Each worker has a core at most: libraries' threads would take tracking's."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """The last message of a worker that met an error: its traceback."""
+
+    text: str
+
+
+class Worker:
+    """A running process that executes ``target``, named ``module:function``.
+
+    The function is called with a ``Channel`` and ``arguments``, which must pickle; it should return
+    when the channel's messages end.
+    """
+
+    def __init__(self, name: str, target: str, *arguments: Any) -> None:
+        self.name = name
+        ours, theirs = socket.socketpair()
+        path = os.pathsep.join(filter(None, sys.path))
+        files = [nameless_file(SIZE) for _ in range(2)]
+        descriptors = [theirs.fileno(), *files]
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", f"from {__name__} import serve; serve(*{descriptors})"],
+                pass_fds=descriptors,
+                stdin=subprocess.DEVNULL,
+                env=os.environ | ONE_THREAD | {"PYTHONPATH": path},
+                process_group=0,  # Ctrl-C in a terminal is for the owner to act on
+            )
+            self._channel = Channel(Connection(ours.detach()), (Ring(files[0]), Ring(files[1])))
+        finally:
+            theirs.close()
+            for file in files:
+                os.close(file)
+        self.send((target, arguments))
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still runs and listens."""
+        return self._channel.open and self._process.poll() is None
+
+    def send(self, message: Any) -> None:
+        """Give it a message; returns at once, and does nothing once the worker is dead."""
+        self._channel.send(message)
+
+    def receive(self, timeout_s: float = 0.0) -> list[Any]:
+        """Every message that has come, waiting for the first for at most ``timeout_s``."""
+        return self._channel.receive(timeout_s)
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Let it finish what it was sent; kill it if that takes too long. May be called twice."""
+        self._channel.finish(timeout_s)
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            logger.warning("%s does not end; killed", self.name)
+            self.kill()
+        self._channel.close()
+
+    def kill(self) -> None:
+        """End it at once. What it said before can still be received."""
+        self._process.kill()
+        self._process.wait()
+        self._channel.read_to_the_end()
+        self._channel.close()
+
+
+def serve(connection: int, theirs: int, ours: int) -> None:
+    """The worker's own process, given descriptors: the first message says what to run."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    channel = Channel(Connection(connection), (Ring(ours), Ring(theirs)))
+    os.close(theirs)
+    os.close(ours)
+    logging.getLogger().addHandler(ForwardedLog(channel))
+    logging.getLogger().setLevel(logging.INFO)
+
+    def tell(kind: type[BaseException], error: BaseException, where: TracebackType | None) -> None:
+        channel.send(Failure("".join(traceback.format_exception(kind, error, where))))
+        channel.finish()
+
+    sys.excepthook = tell
+    for target, arguments in itertools.islice(channel.messages(), 1):
+        module, _, function = target.partition(":")
+        run: Callable[..., None] = getattr(importlib.import_module(module), function)
+        gc.freeze()  # modules are not worth looking through again and again
+        run(channel, *arguments)
+    channel.finish()

@@ -1,0 +1,280 @@
+"""From a keyframe to loops that may enter the graph: recognise, verify, wait for confirmation.
+
+One verified loop can still be wrong: rooms repeat. It waits until others, found from other
+keyframes, agree with it (pairwise consistency, Mangelson et al., ICRA 2018). What it does to the
+graph is tested once more afterwards, see ``Mapper.close_loops``.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.checks import mahalanobis
+from bmask_slam.graph.factors.graph_update import RelativePose
+from bmask_slam.graph.files.array_file import Arrays, nested, part
+from bmask_slam.graph.geometry import Array, inverse, se3_log
+from bmask_slam.graph.pose_graph.loop_consistency import cycle_chi2
+from bmask_slam.loops.place_recognition import (
+    DescriptorIndex,
+    IndexConfig,
+    PlaceConfig,
+    PlaceRecogniser,
+)
+from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
+from bmask_slam.world.landmark_table import Ints, Mask
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LoopClosingConfig:
+    """When a loop enters the graph, and how strongly.
+
+    A candidate's ``neighbours`` most covisible keyframes are verified with it. ``min_support``
+    loops from two keyframes must agree with each other at ``probability``; the last ``waiting``
+    ones are remembered. The map is trusted within ``drift_rad_per_m`` and ``drift_m_per_m`` of a
+    path: a loop must not ask for more drift, and only loops whose ends are within ``comparable_m``
+    of path are compared.
+
+    A loop's covariance is raised by ``model_sigma_rad``, ``model_sigma_m`` and ``model_share`` of
+    its own turn and shift: what its inliers do not know of, such as calibration. It stays while
+    its chi-square in the graph is below that of ``probability``. A map with a systematic error
+    (a wrong focal length) is surer of itself than it should be and would refute every loop; so
+    ``strong_support`` loops from three keyframes enter without a robust kernel and untested.
+    ``fuse_keyframes`` of the new side are searched for the old side's landmarks.
+    """
+
+    enabled: bool = True
+    neighbours: int = 2
+    min_support: int = 3
+    strong_support: int = 6
+    waiting: int = 30
+    probability: float = 0.999
+    comparable_m: float = 10.0
+    drift_rad_per_m: float = 0.005
+    drift_m_per_m: float = 0.02
+    model_sigma_rad: float = 0.003
+    model_sigma_m: float = 0.005
+    model_share: float = 0.02
+    robust: str = "cauchy"
+    max_iterations: int = 10
+    fuse_keyframes: int = 10
+    index: IndexConfig = field(default_factory=IndexConfig)
+    places: PlaceConfig = field(default_factory=PlaceConfig)
+    verification: LoopConfig = field(default_factory=LoopConfig)
+
+    @property
+    def gate(self) -> float:
+        """Chi-square with 6 degrees of freedom at ``probability``."""
+        return float(chi2.ppf(self.probability, 6))
+
+
+class LoopCloser:
+    """Knows every keyframe's descriptors, and which loops wait for confirmation."""
+
+    def __init__(self, camera: Camera, config: LoopClosingConfig):
+        self.config = config
+        self.index = DescriptorIndex(config.index)
+        self.recogniser = PlaceRecogniser(self.index, config.places)
+        self.waiting: list[LoopConstraint] = []
+        self.closed: dict[tuple[int, int], bool] = {}
+        """Ends of the loops closed so far, and whether each is believed against the graph."""
+        self._camera = camera
+
+    def state(self) -> Arrays:
+        """What was closed, what waits, and what the last query found."""
+        waiting = self.waiting
+        return {
+            "closed": np.array(list(self.closed), np.int64).reshape(-1, 2),
+            "believed": np.array(list(self.closed.values()), bool),
+            "ends": np.array([loop.ends for loop in waiting], np.int64).reshape(-1, 2),
+            "T_a_b": np.array([loop.T_a_b for loop in waiting]).reshape(-1, 4, 4),
+            "covariances": np.array([loop.covariance for loop in waiting]).reshape(-1, 6, 6),
+            "inliers": np.array([loop.inliers for loop in waiting], np.int64),
+            "noise_scales": np.array([loop.noise_scale for loop in waiting], float),
+            "landmark_pairs": np.concatenate(
+                [np.zeros((0, 2), np.int64), *(loop.landmark_pairs for loop in waiting)]
+            ),
+            "pairs": np.array([len(loop.landmark_pairs) for loop in waiting], np.int64),
+            **nested(recogniser=self.recogniser.state()),
+        }
+
+    def restore(self, state: Arrays, world: WorldMap) -> None:
+        """Become the closer of a state, with the keyframes of a map."""
+        self.index.restore({k.id: k.features.descriptors for k in world.keyframes.values()})
+        self.recogniser.restore(part(state, "recogniser"))
+        ends_closed = map(tuple, state["closed"].tolist())
+        self.closed = dict(zip(ends_closed, state["believed"].tolist(), strict=True))
+        columns = (
+            state["T_a_b"],
+            state["covariances"],
+            state["inliers"].tolist(),
+            state["noise_scales"].tolist(),
+            np.split(state["landmark_pairs"], np.cumsum(state["pairs"])[:-1]),
+        )
+        a, b = state["ends"].T.tolist()
+        self.waiting = list(map(LoopConstraint, a, b, *columns))
+
+    @property
+    def ends(self) -> set[int]:
+        """Keyframes that closed loops begin or end in."""
+        return {end for pair in self.closed for end in pair}
+
+    def add(self, keyframe: Keyframe) -> None:
+        """A keyframe can be recognised from now on."""
+        self.index.add(keyframe.id, keyframe.features.descriptors)
+
+    def remove(self, keyframe_id: int) -> None:
+        """A keyframe left the map; loops that end in it are forgotten."""
+        self.index.remove(keyframe_id)
+        self.waiting = [loop for loop in self.waiting if keyframe_id not in loop.ends]
+
+    def loops_of(self, keyframe: Keyframe, world: WorldMap) -> list[LoopConstraint]:
+        """Loops from a new keyframe that are confirmed now, and those that they confirm."""
+        if not self.config.enabled:
+            return []
+        return self.confirm(self.propose(keyframe, world), world)
+
+    def propose(self, keyframe: Keyframe, world: WorldMap) -> list[LoopConstraint]:
+        """Verified loops that end in a keyframe, each beginning in an older one."""
+
+        def covisible(keyframe_id: int) -> list[int]:
+            _, ids = world.observed(world.keyframes[keyframe_id])
+            return [k.id for _, k in world.covisible(ids, 1) if k.id != keyframe_id]
+
+        descriptors = keyframe.features.descriptors
+        candidates = self.recogniser.query(keyframe.id, descriptors, covisible)
+        if not candidates:
+            return []
+        found: list[LoopConstraint] = []
+        tried = self.recogniser.excluded(keyframe.id, covisible)
+        view = loop_view(keyframe, world)
+        for candidate in candidates:
+            others = [k for k in covisible(candidate.keyframe_id) if k not in tried]
+            others = others[: self.config.neighbours]
+            for other in (candidate.keyframe_id, *others):
+                if other in tried or world.keyframes[other].segment != keyframe.segment:
+                    break
+                tried.add(other)
+                old = loop_view(world.keyframes[other], world)
+                result = verify_loop(old, view, self._camera, self.config.verification)
+                if isinstance(result, NoLoop):
+                    logger.info("no loop %d-%d: %s", other, keyframe.id, result)
+                    break
+                logger.info("loop %d-%d, %d inliers", other, keyframe.id, result.inliers)
+                found.append(result)
+        return found
+
+    def confirm(self, proposed: list[LoopConstraint], world: WorldMap) -> list[LoopConstraint]:
+        """The largest set that agrees, if it is large enough; the others go on waiting.
+
+        Every member is returned, so that a loop which waited enters with the one that confirms it.
+        """
+        loops = [loop for loop in proposed if self._within_drift(loop, world)]
+        if not loops:
+            return []
+        loops = [*self.waiting, *loops][-self.config.waiting :]
+        chosen = _largest_clique(self._agreement(loops, world))
+        supported = len(chosen) >= self.config.min_support
+        confirmed = [loops[k] for k in chosen] if supported else []
+        if len({loop.keyframe_b for loop in confirmed}) < 2:
+            confirmed = []
+        entering = {loop.ends for loop in confirmed}
+        self.waiting = [loop for loop in loops if loop.ends not in entering]
+        return confirmed
+
+    def is_strong(self, loops: list[LoopConstraint]) -> bool:
+        """Whether a confirmed set is believed against the graph."""
+        keyframes = {loop.keyframe_b for loop in loops}
+        return len(loops) >= self.config.strong_support and len(keyframes) >= 3
+
+    def relative_poses(self, loops: list[LoopConstraint]) -> tuple[RelativePose, ...]:
+        """What enters the graph for a confirmed set."""
+        robust = None if self.is_strong(loops) else self.config.robust
+        return tuple(
+            RelativePose(*k.ends, k.T_a_b, self._loop_covariance(k), robust, "loop") for k in loops
+        )
+
+    def _loop_covariance(self, loop: LoopConstraint) -> Array:
+        """Covariance (6, 6) of a loop with what its inliers do not know of."""
+        rules, change = self.config, np.linalg.norm(se3_log(loop.T_a_b).reshape(2, 3), axis=1)
+        sigmas = np.array([rules.model_sigma_rad, rules.model_sigma_m]) + rules.model_share * change
+        return loop.covariance + np.diag(np.repeat(sigmas**2, 3))
+
+    def _within_drift(self, loop: LoopConstraint, world: WorldMap) -> bool:
+        """Whether the map can have drifted as far as a loop says."""
+        a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
+        ids, travelled_m = _travelled(world)
+        row_a, row_b = np.searchsorted(ids, loop.ends)
+        S = loop.covariance + self._map_covariances(travelled_m[row_b] - travelled_m[row_a])
+        r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
+        fits = bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
+        if not fits:
+            logger.info("loop %d-%d asks for too much drift", *loop.ends)
+        return fits
+
+    def _agreement(self, loops: list[LoopConstraint], world: WorldMap) -> Mask:
+        """(N, N) whether loops agree; False where the map cannot say."""
+        first, second = np.triu_indices(len(loops), 1)
+        a, b = (np.array([getattr(k, f"keyframe_{end}") for k in loops]) for end in "ab")
+        poses = np.array([k.T_world_camera for k in world.keyframes.values()])
+        ids, travelled_m = _travelled(world)
+        row_a, row_b = np.searchsorted(ids, a), np.searchsorted(ids, b)
+        lengths = np.stack(
+            [np.abs(travelled_m[k[first]] - travelled_m[k[second]]) for k in (row_a, row_b)]
+        )
+        chi_square = cycle_chi2(
+            np.array([loop.T_a_b for loop in loops]),
+            np.array([loop.covariance for loop in loops]),
+            (poses[row_a], poses[row_b]),
+            (first, second),
+            self._map_covariances(lengths),
+        )
+        fine = (lengths < self.config.comparable_m).all(axis=0) & (chi_square < self.config.gate)
+        agree = np.zeros((len(loops), len(loops)), bool)
+        agree[first, second] = agree[second, first] = fine
+        return agree
+
+    def _map_covariances(self, lengths_m: Array) -> Array:
+        """Covariances (..., 6, 6) of the map's relative pose over a path of these lengths.
+
+        A turn that grows along a path displaces its end by half of it times the length.
+        """
+        rules = self.config
+        sigmas = np.stack(
+            [
+                rules.model_sigma_rad + rules.drift_rad_per_m * lengths_m,
+                rules.model_sigma_m
+                + (rules.drift_m_per_m + rules.drift_rad_per_m * lengths_m / 2) * lengths_m,
+            ],
+            axis=-1,
+        )
+        return np.repeat(sigmas**2, 3, axis=-1)[..., None] * np.eye(6)
+
+
+def _travelled(world: WorldMap) -> tuple[Ints, Array]:
+    """Ids (K,) of all keyframes, ascending, and metres (K,) of path up to each."""
+    ids = np.fromiter(world.keyframes, np.int64)
+    centres = np.array([k.T_world_camera[:3, 3] for k in world.keyframes.values()])
+    steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
+    return ids, np.cumsum(steps)
+
+
+def _largest_clique(agree: Mask) -> Ints:
+    """Indices of a largest set of which all agree, found greedily from each member."""
+    best: list[int] = []
+    order = np.argsort(-agree.sum(axis=1), kind="stable").tolist()
+    for start in order:
+        clique = [start]
+        for k in order:
+            if agree[k, clique].all():
+                clique.append(k)
+        if len(clique) > len(best):
+            best = clique
+    return np.sort(np.array(best, np.int64))

@@ -1,0 +1,43 @@
+"""Which evidence of motion counts, and how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from bmask_slam.moving.depth_segments import DepthRegionConfig
+from bmask_slam.moving.free_space_check import StaticCheckConfig
+from bmask_slam.moving.static_verification import SuspectConfig
+from bmask_slam.semantics.beliefs.movability import MovabilityConfig
+from bmask_slam.semantics.tracks.instance_tracks import TrackConfig
+
+
+@dataclass(frozen=True)
+class DynamicsConfig:
+    """Which evidence of motion counts: that of masks by their ``labels``, that of ``geometry``.
+
+    ``priors`` is a YAML file of P(moving) by class, or the name of one in ``data/labels``. With
+    fewer than ``min_static`` keypoints left all are used, and the frame says so. If more than
+    ``doubt_share`` of them seem to move, the pose is looked at again. Masks of moving
+    things are widened by ``mask_border_px``. An instance is judged by at least ``min_judged`` of
+    its pixels.
+    """
+
+    labels: bool = True
+    geometry: bool = True
+    priors: str = "movability"
+    doubt_share: float = 0.5
+    settled_share: float = 0.2
+    min_static: int = 60
+    mask_border_px: int = 5
+    min_judged: int = 20
+    movability: MovabilityConfig = field(default_factory=MovabilityConfig)
+    check: StaticCheckConfig = field(default_factory=StaticCheckConfig)
+    regions: DepthRegionConfig = field(default_factory=DepthRegionConfig)
+    tracks: TrackConfig = field(default_factory=TrackConfig)
+    suspects: SuspectConfig = field(default_factory=SuspectConfig)
+
+    def __post_init__(self) -> None:
+        if self.min_static < 0 or self.mask_border_px < 0 or self.min_judged < 1:
+            raise ValueError(
+                "min_static and mask_border_px must not be negative, min_judged at least 1"
+            )

@@ -1,0 +1,147 @@
+"""What the last keyframes, or frames, saw of space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array
+from bmask_slam.moving.depth_segments import MovingSpace
+from bmask_slam.moving.free_space_check import DepthView
+from bmask_slam.world.landmark_table import Mask
+
+
+@dataclass(frozen=True, eq=False)
+class RememberedView:
+    """The depth that a frame saw, and when; ``view`` is without what moved, ``seen`` with it.
+
+    Its pose is ``T_keyframe_camera`` (4, 4) from a keyframe, which is mostly itself.
+    """
+
+    keyframe_id: int
+    timestamp_s: float
+    view: DepthView
+    seen: DepthView
+    T_keyframe_camera: Array
+
+
+class PosedView(NamedTuple):
+    """A remembered view, ``T_world_camera`` (4, 4)."""
+
+    keyframe_id: int
+    timestamp_s: float
+    view: DepthView
+    seen: DepthView
+    T_world_camera: Array
+
+
+THINNED = 2
+"""Of a view that is remembered every second pixel each way is kept."""
+
+
+class ViewMemory:
+    """The depth of the last ``count`` keyframes, or frames, at least ``interval_s`` apart."""
+
+    def __init__(self, count: int, interval_s: float) -> None:
+        self.count, self.interval_s = count, interval_s
+        self.views: list[RememberedView] = []
+
+    def add(
+        self,
+        keyframe_id: int,
+        timestamp_s: float,
+        view: DepthView,
+        moving: MovingSpace | None = None,
+        T_keyframe_camera: Array | None = None,
+    ) -> None:
+        """Remember what a keyframe saw, or a frame at a pose (4, 4) from it; of what moved nothing.
+
+        It is not remembered if the last is too recent.
+        """
+        if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.interval_s:
+            return
+        seen = view.thinned(THINNED)
+        told = seen.thinned(1)
+        if moving is not None:
+            _forget(told, moving.covers(told.nearest_m, told.step))
+        pose = np.eye(4) if T_keyframe_camera is None else T_keyframe_camera
+        self.views.append(RememberedView(keyframe_id, timestamp_s, told, seen, pose))
+        del self.views[: -self.count]
+
+    def posed(self, segment: int, mapper: Mapper) -> list[PosedView]:
+        """What is remembered of a map segment, with poses as optimised since."""
+        found = []
+        for kept in self.views:
+            heir_id, T_heir_keyframe = mapper.history.heir(kept.keyframe_id)
+            heir = mapper.world.keyframes.get(heir_id)
+            if heir is not None and heir.segment == segment:
+                pose = heir.T_world_camera @ T_heir_keyframe @ kept.T_keyframe_camera
+                when = kept.keyframe_id, kept.timestamp_s
+                found.append(PosedView(*when, kept.view, kept.seen, pose))
+        return found
+
+    def forget_space(self, keyframe_id: int, covered: Mask) -> None:
+        """A keyframe's view says nothing about space where something (H, W) moved."""
+        for kept in self._of(keyframe_id):
+            _forget(kept.view, _thinned_to(kept.view, covered))
+
+    def recall_space(self, keyframe_id: int, covered: Mask) -> None:
+        """A keyframe's view says all it saw where something (H, W) stood after all."""
+        for kept in self._of(keyframe_id):
+            where = _thinned_to(kept.view, covered)
+            kept.view.nearest_m[where] = kept.seen.nearest_m[where]
+            kept.view.farthest_m[where] = kept.seen.farthest_m[where]
+
+    def clear(self) -> None:
+        """Forget all: another recording."""
+        self.views = []
+
+    def state(self) -> Arrays:
+        """All views as named arrays; of those without what moved, where they say something."""
+        views = self.views
+        speak = [(v.view.nearest_m != 0) | (v.view.farthest_m != 0) for v in views]
+        return {
+            "keyframe_ids": np.array([v.keyframe_id for v in views], np.int64),
+            "timestamps_s": np.array([v.timestamp_s for v in views], float),
+            "T_keyframe_camera": np.array([v.T_keyframe_camera for v in views], float).ravel(),
+            "step": np.array([v.view.step for v in views], np.int64),
+            "shape": np.array([s.shape for s in speak[:1]], np.int64).ravel(),
+            "speak": np.packbits(np.array(speak, bool)),
+            "nearest_m": np.array([v.seen.nearest_m for v in views], np.float32).ravel(),
+            "farthest_m": np.array([v.seen.farthest_m for v in views], np.float32).ravel(),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the memory of a state."""
+        ids = state["keyframe_ids"].tolist()
+        size = len(ids), *(state["shape"].tolist() or [0, 0])
+        stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
+        poses = state["T_keyframe_camera"].reshape(len(ids), 4, 4).copy()
+        speak = np.unpackbits(state["speak"], count=np.prod(size)).reshape(size).astype(bool)
+        depths = (state[name].reshape(size) for name in ("nearest_m", "farthest_m"))
+        self.views = []
+        for i, stamp_s, T, step, told, near, far in zip(
+            ids, stamps_s, poses, steps, speak, *depths, strict=True
+        ):
+            seen = DepthView(near.copy(), far.copy(), step)
+            view = seen.thinned(1)
+            _forget(view, ~told)
+            self.views.append(RememberedView(i, stamp_s, view, seen, T))
+
+    def _of(self, keyframe_id: int) -> list[RememberedView]:
+        return [kept for kept in self.views if kept.keyframe_id == keyframe_id]
+
+
+def _thinned_to(view: DepthView, mask: Mask) -> Mask:
+    """A mask (H, W) at a view's pixels."""
+    height, width = view.nearest_m.shape
+    return mask[:: view.step, :: view.step][:height, :width]
+
+
+def _forget(view: DepthView, where: Mask) -> None:
+    """Let a view say nothing at some of its pixels (h, w)."""
+    view.nearest_m[where] = view.farthest_m[where] = 0.0

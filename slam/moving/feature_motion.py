@@ -1,0 +1,116 @@
+"""Which of a frame's keypoints lie on what moves: by earlier views, and by boxes in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.moving.depth_segments import DepthRegionConfig, MovingSpace, depth_regions
+from bmask_slam.moving.depth_view_buffer import PosedView
+from bmask_slam.moving.free_space_check import StaticCheck, Verdict, Verdicts, distorted
+from bmask_slam.semantics.objects.object_map import pixel_rays
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.landmark_table import Mask
+
+NEAREST_M = 0.2
+"""A box whose middle is nearer to the camera is not looked for in the image."""
+
+
+Boxes = tuple[Array, Array]
+"""Centres in the world (T, 3) m, and half sizes (T, 3) m along an image's columns, its rows and
+the depth."""
+
+
+class Judged(NamedTuple):
+    """What is said about features (N,), and where the frame moves; None if no view says it."""
+
+    verdicts: Verdicts
+    space: MovingSpace | None
+
+
+class FeatureCheck:
+    """Judges keypoints and the depth regions that they lie on: pure functions of a camera."""
+
+    def __init__(self, camera: Camera, check: StaticCheck, config: DepthRegionConfig) -> None:
+        self.camera = camera
+        self.config = config
+        self._check = check
+        self._rays = pixel_rays(camera, config.step_px)
+        places = np.indices(self._rays.shape[:2])[::-1]
+        self._samples = config.step_px * places.reshape(2, -1).T.astype(float)
+
+    def judge(
+        self,
+        frame: Frame,
+        features: Features,
+        T_world_camera: Array,
+        views: Sequence[PosedView],
+        moving: Boxes,
+    ) -> Judged:
+        """What earlier keyframes and boxes that move say about features, at a predicted pose.
+
+        What was seen to be static stays so in a box.
+        """
+        judged = Judged(np.zeros(len(features), np.int8), None)
+        if views:
+            judged = self._by_views(frame, features, T_world_camera, views, moving)
+        where = features.image_pixels, features.depth_m
+        in_boxes = self.in_boxes(where, moving, T_world_camera)
+        judged.verdicts[in_boxes & (judged.verdicts != Verdict.STATIC)] = Verdict.MOVING
+        return judged
+
+    def _by_views(
+        self,
+        frame: Frame,
+        features: Features,
+        T_world_camera: Array,
+        views: Sequence[PosedView],
+        boxes_world: Boxes,
+    ) -> Judged:
+        """What views say about features; ``boxes_world`` move, and what they hold.
+
+        A region that was seen to move does so with all that is on it.
+        """
+        regions = depth_regions(frame.depth_m, self.config)
+        samples = (self._rays * regions.depth_m[..., None]).reshape(-1, 3)
+        points = self.camera.backproject(features.pixels, features.depth_m)
+        points_world = transform(T_world_camera, np.concatenate([points, samples]))
+        told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
+        verdicts = self._check.agree(told)
+        by_sample = verdicts[len(features) :].reshape(regions.labels.shape)
+        where = self._samples, regions.depth_m.ravel().astype(float)
+        moving = regions.moving(by_sample)
+        taken = self.in_boxes(where, boxes_world, T_world_camera).reshape(by_sample.shape)
+        taken &= (by_sample != Verdict.STATIC) & (regions.labels > 0)
+        taken |= regions.held(moving | taken, by_sample)
+        seen, space = regions.space(moving), regions.space(moving | taken)
+        verdicts = self._check.spread(features.pixels, features.depth_m, verdicts[: len(features)])
+        where = features.image_pixels, features.depth_m
+        verdicts[space.on(*where) & (verdicts != Verdict.STATIC)] = Verdict.MOVING
+        verdicts[seen.on(*where)] = Verdict.MOVING
+        return Judged(verdicts, space)
+
+    def in_boxes(
+        self, where: tuple[Array, Array], boxes_world: Boxes, T_world_camera: Array
+    ) -> Mask:
+        """Points of a frame (N,) in any of some boxes, in the image and in depth.
+
+        ``where`` are their pixels (N, 2) and depths (N,) m; without depth only the image counts.
+        """
+        pixels, depth_m = where
+        centres_world, half_sizes_m = boxes_world
+        centres = transform(inverse(T_world_camera), centres_world)
+        ahead = centres[:, 2] >= NEAREST_M
+        centres, half_sizes_m = centres[ahead], half_sizes_m[ahead]
+        z = centres[:, 2:]
+        middle = distorted(self.camera, centres)
+        half_px = np.array([self.camera.fx, self.camera.fy]) * half_sizes_m[:, :2] / z
+        inside = ~(np.abs(depth_m - z) > half_sizes_m[:, 2:])
+        for k in (0, 1):
+            inside &= np.abs(pixels[:, k] - middle[:, k, None]) < half_px[:, k, None]
+        return np.asarray(inside.any(axis=0))

@@ -1,0 +1,232 @@
+"""Geometry's evidence of motion: a point in space that a camera saw through cannot be there.
+
+A keypoint's point is compared with what earlier keyframes saw, a landmark with the present depth
+image; neither needs a match or a class. A point behind a surface is hidden and nothing is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse
+
+Depths = NDArray[np.float32]
+Verdicts = NDArray[np.int8]
+
+
+class Verdict(IntEnum):
+    """What views say about a point."""
+
+    MOVING = -1
+    """It lies in space that was seen to be free."""
+    UNKNOWN = 0
+    """It is hidden, out of view or without depth."""
+    STATIC = 1
+    """There is a surface."""
+
+
+@dataclass(frozen=True)
+class StaticCheckConfig:
+    """When a point lies in free space, and how much is remembered.
+
+    A view saw through a point if every depth within ``window_px`` of it is farther by
+    ``margin_m`` and ``depth_sigmas`` standard deviations of a difference of such depths; the
+    window allows for errors of the poses and for the depth image's ragged edges. There is a surface
+    if the nearest or the farthest depth in the window is as near as that. Nothing is judged beyond
+    ``max_depth_m``.
+    ``views`` keyframes are remembered, at least ``interval_s`` apart. ``neighbours`` within
+    ``neighbour_px`` decide about a keypoint that cannot be judged by itself, if their depths
+    differ by less than ``same_depth`` of it. A thing stood still if each of two or more views that
+    are at least ``still_s`` away in time found ``still_share`` of it where it is.
+    """
+
+    margin_m: float = 0.1
+    depth_sigmas: float = 4.0
+    window_px: int = 5
+    max_depth_m: float = 6.0
+    views: int = 6
+    interval_s: float = 0.25
+    neighbours: int = 5
+    neighbour_px: float = 30.0
+    same_depth: float = 0.05
+    still_s: float = 1.0
+    still_share: float = 0.9
+
+    def __post_init__(self) -> None:
+        if self.margin_m <= 0 or self.depth_sigmas < 0 or self.window_px < 0:
+            raise ValueError("margin_m must be positive, depth_sigmas and window_px not negative")
+        if not 1 <= self.views <= 127 or self.neighbours < 1:
+            raise ValueError("views must be 1 to 127, neighbours at least 1")
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """What a depth image says about space, at every ``step``-th pixel in both directions.
+
+    Attributes:
+        nearest_m: (H / step, W / step) nearest depth in a window; 0 where one is missing, since
+            anything may be there.
+        farthest_m: the farthest depth in it, 0 where all are missing.
+    """
+
+    nearest_m: Depths
+    farthest_m: Depths
+    step: int
+
+    def thinned(self, factor: int) -> DepthView:
+        """Every ``factor``-th of its pixels each way, in arrays of their own."""
+        near, far = (a[::factor, ::factor].copy() for a in (self.nearest_m, self.farthest_m))
+        return DepthView(near, far, factor * self.step)
+
+
+def depth_view(depth_m: Depths, window_px: int) -> DepthView:
+    """The view of a depth image (H, W), NaN where missing, at every second pixel."""
+    return thinned_view(depth_m[::2, ::2].copy(), 2, window_px)
+
+
+def thinned_view(depth_m: Depths, step: int, window_px: int) -> DepthView:
+    """The view of every ``step``-th pixel each way of a depth image; they are overwritten."""
+    cv2.patchNaNs(depth_m, 0.0)
+    side = 2 * (window_px // step) + 1
+    window = np.ones((side, side), np.uint8)
+    return DepthView(cv2.erode(depth_m, window), cv2.dilate(depth_m, window), step)
+
+
+class StaticCheck:
+    """Compares points with views: pure functions of a camera and its depth noise."""
+
+    def __init__(self, camera: Camera, disparity_sigma_px: float, config: StaticCheckConfig):
+        self.camera = camera
+        self.config = config
+        both = np.sqrt(2.0) * disparity_sigma_px / camera.stereo_bf_px_m
+        self._sigmas_per_m2 = config.depth_sigmas * both
+
+    def judge(self, points_world: Array, view: DepthView, T_world_camera: Array) -> Verdicts:
+        """What one view says about points (N, 3); nothing about those that are NaN."""
+        return self.judge_all(points_world, [(view, T_world_camera)])[0]
+
+    def judge_all(self, points_world: Array, views: Sequence[tuple[DepthView, Array]]) -> Verdicts:
+        """What views, each with T_world_camera (4, 4), say about points (N, 3): (K, N).
+
+        The views have one size and step.
+        """
+        z, ahead, nearest, farthest = self._seen(points_world, views)
+        margin = self._margin_m(z)
+        verdicts = ((np.abs(nearest - z) < margin) | (np.abs(farthest - z) < margin)).view(np.int8)
+        verdicts[nearest - z > self._margin_m(nearest)] = Verdict.MOVING
+        verdicts *= ahead
+        return verdicts
+
+    def offsets(
+        self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
+    ) -> tuple[Depths, NDArray[np.bool_]]:
+        """How far behind points (N, 3) the surface is that views, each with T_world_camera, show.
+
+        (K, N) m, 0 within the window's depths; NaN out of view, where a depth is missing in it, and
+        where the two are not one surface; and which are in view (K, N).
+        """
+        z, ahead, nearest, farthest = self._seen(points_world, views)
+        off_m = np.clip(z, nearest, farthest) - z
+        off_m[~ahead | (nearest == 0) | (np.abs(off_m) > self._margin_m(z))] = np.nan
+        return off_m, ahead
+
+    def agree(self, verdicts: Verdicts) -> Verdicts:
+        """What several views (K, N) say together (N,): the majority of those that say anything."""
+        return np.asarray(np.sign(verdicts.sum(axis=0, dtype=np.int8)))
+
+    def stood_still(self, verdicts: Verdicts, apart_s: Array, at_least: int) -> bool:
+        """Whether views (K, N) of a thing's points, taken ``apart_s`` (K,) from it, show it there.
+
+        A view that speaks of fewer than ``at_least`` points does not count.
+        """
+        known = np.count_nonzero(verdicts, axis=1)
+        asked = (np.abs(apart_s) >= self.config.still_s) & (known >= at_least)
+        there = np.count_nonzero(verdicts == Verdict.STATIC, axis=1)
+        good = there[asked] >= self.config.still_share * known[asked]
+        return bool(len(good) >= 2 and good.all())
+
+    def spread(self, pixels: Array, depth_m: Array, verdicts: Verdicts) -> Verdicts:
+        """Verdicts (N,) with those of keypoints that have none taken from their neighbours.
+
+        Args:
+            pixels: (N, 2) of the keypoints.
+            depth_m: (N,) NaN where missing, and then of no matter.
+            verdicts: (N,).
+        """
+        open_, known = np.flatnonzero(verdicts == 0), np.flatnonzero(verdicts)
+        if not len(open_) or not (verdicts[known] < 0).any():
+            return verdicts
+        tree, count = cKDTree(pixels[known]), min(self.config.neighbours, len(known))
+        distance, near = tree.query(
+            pixels[open_], count, distance_upper_bound=self.config.neighbour_px
+        )
+        distance, near = distance.reshape(len(open_), -1), near.reshape(len(open_), -1)
+        there = known[np.minimum(near, len(known) - 1)]
+        apart = np.abs(depth_m[there] - depth_m[open_, None])
+        differs = apart > self.config.same_depth * depth_m[open_, None]
+        speaks = np.isfinite(distance) & ~differs
+        spread = verdicts.copy()
+        spread[open_] = np.sign((verdicts[there] * speaks).sum(axis=1))
+        return spread
+
+    def _seen(
+        self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
+    ) -> tuple[Depths, NDArray[np.bool_], Depths, Depths]:
+        """Of points (N, 3) in views: depth, whether in view, nearest and farthest there (K, N)."""
+        T_camera_world = inverse(np.array([T for _, T in views])).astype(np.float32)
+        to_cameras = T_camera_world[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3)
+        x, y, z = (to_cameras @ points_world.T.astype(np.float32)).reshape(3, len(views), -1)
+        x, y, z = (
+            a + t[:, None] for a, t in zip((x, y, z), T_camera_world[:, :3, 3].T, strict=True)
+        )
+        ahead = (z > 0.1) & (z < self.config.max_depth_m)
+        u, v = self._pixels(x, y, np.where(ahead, z, np.float32(1)))
+        ahead &= (u > 0) & (u < self.camera.width - 1) & (v > 0) & (v < self.camera.height - 1)
+        step = views[0][0].step
+        height, width = views[0][0].nearest_m.shape
+        rows, columns = (np.where(ahead, a, 0) / np.float32(step) for a in (v, u))
+        place = np.minimum(np.rint(rows), height - 1) * np.float32(width)
+        place += np.minimum(np.rint(columns), width - 1)
+        nearest, farthest = _looked_up([view for view, _ in views], place.astype(np.int64))
+        return z, ahead, nearest, farthest
+
+    def _margin_m(self, depth_m: Depths) -> Depths:
+        """How far apart two depths as large as these may lie and still be one surface."""
+        return np.float32(self.config.margin_m) + np.float32(self._sigmas_per_m2) * depth_m**2
+
+    def _pixels(self, x: Depths, y: Depths, z: Depths) -> tuple[Depths, Depths]:
+        """Columns and rows (K, N) in the image as recorded of points (K, N) before it."""
+        if any(self.camera.distortion):
+            points = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(float)
+            u, v = distorted(self.camera, points).astype(np.float32).T.reshape(2, *z.shape)
+            return u, v
+        camera, per_z = self.camera, 1 / z
+        u = camera.fx * x * per_z + camera.cx
+        v = camera.fy * y * per_z + camera.cy
+        return u.astype(np.float32, copy=False), v.astype(np.float32, copy=False)
+
+
+def _looked_up(views: Sequence[DepthView], place: NDArray[np.int64]) -> tuple[Depths, Depths]:
+    """Nearest and farthest depths (K, N) of each view at its places (K, N), counted by rows."""
+    nearest = np.empty(place.shape, np.float32)
+    farthest = np.empty(place.shape, np.float32)
+    for view, where, near, far in zip(views, place, nearest, farthest, strict=True):
+        view.nearest_m.take(where, out=near, mode="clip")
+        view.farthest_m.take(where, out=far, mode="clip")
+    return nearest, farthest
+
+
+def distorted(camera: Camera, points_camera: Array) -> Array:
+    """Pixels (N, 2) in the image as recorded of points (N, 3) in front of the camera."""
+    if not any(camera.distortion) or not len(points_camera):
+        return camera.project(points_camera)
+    zero, lens = np.zeros(3), np.array(camera.distortion)
+    return cv2.projectPoints(points_camera, zero, zero, camera.K, lens)[0][:, 0]

@@ -1,0 +1,86 @@
+"""Where a keyframe's instances are in space, and whether they move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.moving.depth_view_buffer import PosedView
+from bmask_slam.moving.feature_motion import NEAREST_M
+from bmask_slam.moving.free_space_check import StaticCheck, distorted
+from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
+from bmask_slam.moving.motion_state import Stance, stance
+from bmask_slam.semantics.beliefs.movability import MovabilityPriors, log_odds
+from bmask_slam.semantics.tracks.instance_track import Sighting, Track
+
+
+@dataclass(frozen=True, eq=False)
+class Witness:
+    """Tells of instances by their masks, their classes' priors and what other keyframes saw.
+
+    Attributes:
+        step: by how much the log odds of an instance that was seen to move or to stand change.
+        min_judged: it is judged by at least so many of its pixels.
+    """
+
+    camera: Camera
+    check: StaticCheck
+    priors: MovabilityPriors
+    step: float
+    min_judged: int
+
+    def sightings(
+        self,
+        masks: KeyframeMasks,
+        seen: Sequence[Surface | None],
+        stood: Sequence[bool],
+        views: Sequence[PosedView],
+        now_s: float,
+    ) -> list[Sighting | None]:
+        """A keyframe's instances (K,) in space; None for those without a surface.
+
+        Of those that ``stood`` that is known. Of the views the keyframe's own does not count. It
+        was taken at ``now_s``.
+        """
+        others = [v for v in views if v.keyframe_id != masks.keyframe_id]
+        found: list[Sighting | None] = []
+        for k, surface in enumerate(seen):
+            if surface is None:
+                found.append(None)
+                continue
+            points_world = transform(masks.T_world_camera, surface.points)
+            rules = self.check, self.min_judged
+            known = Stance.STILL if stood[k] else stance(points_world, now_s, others, *rules)
+            found.append(self._sighting(k, surface, masks, known))
+        return found
+
+    def shows(self, masks: KeyframeMasks, track: Track) -> bool:
+        """Whether a keyframe shows the place of a track, as predicted, or what is behind it."""
+        (centre,) = transform(inverse(masks.T_world_camera), track.mean[None, :3])
+        if centre[2] < NEAREST_M:
+            return False
+        column, row = distorted(self.camera, centre[None])[0]
+        if not (0 <= column < self.camera.width and 0 <= row < self.camera.height):
+            return False
+        depth_m, step = masks.depth_m, masks.step
+        height, width = depth_m.shape
+        there_m = depth_m[min(int(row / step), height - 1), min(int(column / step), width - 1)]
+        return bool(there_m > centre[2] - track.half_size[2] - self.check.config.margin_m)
+
+    def _sighting(self, k: int, surface: Surface, masks: KeyframeMasks, found: Stance) -> Sighting:
+        low, centroid, high = np.percentile(surface.points, (4, 50, 96), axis=0)
+        distribution, still = masks.claims.instances[k].distribution, found is Stance.STILL
+        prior = float(distribution @ self.priors.of(masks.names))
+        prior = min(prior, self.priors.unknown) if still else prior
+        return Sighting(
+            centroid_world=transform(masks.T_world_camera, centroid[None])[0],
+            half_size=np.maximum(high - centroid, centroid - low),
+            distribution=distribution,
+            prior=float(log_odds(np.clip(prior, 0.01, 0.99))),
+            evidence=self.step * (int(found is Stance.MOVING) - int(found.is_static)),
+            still=still,
+        )

@@ -1,0 +1,264 @@
+"""Things that are left out for their class alone, watched until they are seen to stand.
+
+A mask says at once that a person moves; that what it shows is no person, or stands, is known only
+once it was watched for a while. What was taken out of the map for it meanwhile then comes back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bmask_slam.back_end.pruning import covered
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array, transform
+from bmask_slam.moving.depth_view_buffer import PosedView
+from bmask_slam.moving.free_space_check import DepthView, StaticCheck
+from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
+from bmask_slam.semantics.instances.instances import PackedMask
+from bmask_slam.semantics.tracks.instance_track import Track
+from bmask_slam.world.landmark_table import Ints, LandmarkTable, Mask, Patches
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+
+@dataclass(frozen=True)
+class SuspectConfig:
+    """When a thing stands: what a keyframe saw of it is where it was ``stands_s`` later, or more.
+
+    A frame says so if ``share`` of its points in view lie on a surface and the median of their
+    distances from it along the ray is below ``shift_m``; at least ``frames`` have to, and ``share``
+    of those that say anything. Someone who walks has left a third of his own place after 0.3 s. A
+    thing is watched for ``patience_s``. One that was there as long before is not left out at all:
+    so say, by the same rule, ``recent`` frames, remembered ``interval_s`` apart. With ``stands_s``
+    of 0 there is neither: only what stood for ``StaticCheckConfig.still_s`` is structure.
+    """
+
+    stands_s: float = 0.4
+    share: float = 0.8
+    shift_m: float = 0.03
+    frames: int = 3
+    patience_s: float = 3.0
+    recent: int = 10
+    interval_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.stands_s < 0 or self.patience_s <= 0 or self.frames < 1:
+            raise ValueError("stands_s must not be negative, patience_s positive, frames 1 or more")
+        if not 0 < self.share <= 1 or self.shift_m <= 0:
+            raise ValueError("share must be in (0, 1], shift_m positive")
+        if self.recent < 1 or self.interval_s <= 0:
+            raise ValueError("recent must be 1 or more, interval_s positive")
+
+    def stands(self, there: int, gone: int) -> bool:
+        """Whether so many frames that found a thing where it was, and that did not, say so."""
+        return there >= max(self.frames, self.share * (there + gone))
+
+
+@dataclass(frozen=True, eq=False)
+class Removed:
+    """What was taken out of a keyframe for a thing.
+
+    Attributes:
+        keyframe_id: its.
+        keypoints: (N,) that were masked.
+        patches: (N) of the landmarks that they observed.
+        mask: the thing's.
+    """
+
+    keyframe_id: int
+    keypoints: Ints
+    patches: Patches
+    mask: PackedMask
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A thing as a keyframe saw it.
+
+    Attributes:
+        track_id: of its track, which may have ended.
+        keyframe_id, time_s: where and when it was seen.
+        points: (N, 3) on its surface, m, in the keyframe's camera frame.
+        removed: what was taken out for it, of this and later keyframes.
+        there, gone: frames, long enough after that, that found it where it was, and that did not.
+    """
+
+    track_id: int
+    keyframe_id: int
+    time_s: float
+    points: Array
+    removed: tuple[Removed, ...]
+    there: int = 0
+    gone: int = 0
+
+
+class Suspects:
+    """All things that are watched; map and graph belong to the caller.
+
+    ``at_least`` so many of a thing's points have to be in view. ``border_px`` are those by which
+    masks of moving things are widened.
+    """
+
+    def __init__(
+        self, check: StaticCheck, config: SuspectConfig, at_least: int, border_px: int
+    ) -> None:
+        self.config = config
+        self.watched: list[Suspect] = []
+        self._check = check
+        self._at_least, self._border_px = at_least, border_px
+
+    def add(
+        self,
+        masks: KeyframeMasks,
+        seen: Sequence[Surface | None],
+        tracks: Sequence[Track | None],
+        world: WorldMap,
+    ) -> None:
+        """A keyframe's instances (K,) on these tracks are about to be taken out of it.
+
+        What is seen again is watched on from the first time, unless it was found to move.
+        """
+        if self.config.stands_s == 0:
+            return
+        keyframe = world.keyframes[masks.keyframe_id]
+        for k, (surface, track) in enumerate(zip(seen, tracks, strict=True)):
+            if surface is None or track is None:
+                continue
+            mask = masks.claims.owner == k
+            removed = _about_to_be_removed(mask, keyframe, world.landmarks, self._border_px)
+            points = surface.points[surface.complete]
+            when = keyframe.id, keyframe.timestamp_s
+            suspect = Suspect(track.id, *when, points, (removed,))
+            before = [s for s in self.watched if s.track_id == track.id and s.gone <= s.there]
+            if before:
+                suspect = replace(before[0], removed=(*before[0].removed, removed))
+            self.watched = [s for s in self.watched if s.track_id != track.id] + [suspect]
+
+    def stood(
+        self,
+        masks: KeyframeMasks,
+        seen: Sequence[Surface | None],
+        recent: Sequence[PosedView],
+        now_s: float,
+    ) -> list[bool]:
+        """Which of the things (K,) that a keyframe saw at ``now_s`` stood there for long enough.
+
+        Recent frames say so by the rule for what is watched, those before it as well as those
+        after it, which there are where masks come late.
+        """
+        least_s = self.config.stands_s
+        apart = [v for v in recent if abs(v.timestamp_s - now_s) >= least_s]
+        if least_s == 0 or not apart:
+            return [False] * len(seen)
+        views = [(v.seen, v.T_world_camera) for v in apart]
+        stood = []
+        for surface in seen:
+            points = np.zeros((0, 3)) if surface is None else surface.points[surface.complete]
+            points_world = transform(masks.T_world_camera, points)
+            stood.append(self.config.stands(*self._there_or_gone(points_world, views)))
+        return stood
+
+    def watch(
+        self, time_s: float, view: DepthView, T_world_camera: Array, world: WorldMap
+    ) -> list[Suspect]:
+        """What a tracked frame's depth says; returns the things that stand, not watched further."""
+        oldest_s = time_s - self.config.patience_s
+        recent = [s for s in self.watched if s.time_s >= oldest_s]
+        kept = [s for s in recent if s.keyframe_id in world.keyframes]
+        told = [
+            self._told(s, view, T_world_camera, world)
+            if time_s - s.time_s >= self.config.stands_s
+            else s
+            for s in kept
+        ]
+        stand = [self.config.stands(s.there, s.gone) for s in told]
+        self.watched = [s for s, stands in zip(told, stand, strict=True) if not stands]
+        return [s for s, stands in zip(told, stand, strict=True) if stands]
+
+    def without_watched(self, removed: Removed) -> Mask:
+        """Which of the keypoints (N,) that were taken out nothing else that is watched covers."""
+        others = [r.keypoints for s in self.watched for r in s.removed if _same(r, removed)]
+        return ~np.isin(removed.keypoints, np.concatenate([np.zeros(0, np.int64), *others]))
+
+    def clear(self) -> None:
+        """Watch nothing: another recording."""
+        self.watched = []
+
+    def state(self) -> Arrays:
+        """All that is watched, as named arrays."""
+        every = self.watched
+        removed = [r for s in every for r in s.removed]
+        no_patches = LandmarkTable().patches_of(np.zeros(0, np.int64))
+        points, keypoints = [s.points for s in every], [r.keypoints for r in removed]
+        counts = [(s.track_id, s.keyframe_id, s.there, s.gone, len(s.removed)) for s in every]
+        return {
+            "counts": np.array(counts, np.int64).reshape(-1, 5),
+            "times_s": np.array([s.time_s for s in every], float),
+            "points": np.concatenate([np.zeros((0, 3)), *points]),
+            "points_each": np.array([len(p) for p in points], np.int64),
+            "keyframe_ids": np.array([r.keyframe_id for r in removed], np.int64),
+            "keypoints": np.concatenate([np.zeros(0, np.int64), *keypoints]),
+            "keypoints_each": np.array([len(k) for k in keypoints], np.int64),
+            "patches": np.concatenate([no_patches.images, *(r.patches.images for r in removed)]),
+            "patch_views": np.concatenate([no_patches.views, *(r.patches.views for r in removed)]),
+            "bits": np.array([r.mask.bits for r in removed], np.uint8).ravel(),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Go on from a state."""
+        points = np.split(state["points"], np.cumsum(state["points_each"])[:-1])
+        ends = np.cumsum(state["keypoints_each"])[:-1]
+        keypoints = np.split(state["keypoints"], ends)
+        images, views = np.split(state["patches"], ends), np.split(state["patch_views"], ends)
+        patches = [Patches(*both) for both in zip(images, views, strict=True)]
+        ids = state["keyframe_ids"].tolist()
+        bits = state["bits"].reshape(max(len(ids), 1), -1)
+        shape = self._check.camera.height, self._check.camera.width
+        masks = [PackedMask(of_one, shape) for of_one in bits]
+        removed = [Removed(*row) for row in zip(ids, keypoints, patches, masks, strict=False)]
+        self.watched = []
+        rows = zip(state["counts"].tolist(), state["times_s"].tolist(), points, strict=False)
+        for (track_id, keyframe_id, there, gone, count), time_s, of_one in rows:
+            mine, removed = tuple(removed[:count]), removed[count:]
+            self.watched.append(Suspect(track_id, keyframe_id, time_s, of_one, mine, there, gone))
+
+    def _told(
+        self, suspect: Suspect, view: DepthView, T_world_camera: Array, world: WorldMap
+    ) -> Suspect:
+        """A suspect with what a frame says of it counted."""
+        pose = world.keyframes[suspect.keyframe_id].T_world_camera
+        points_world = transform(pose, suspect.points)
+        now = [(view, T_world_camera)]
+        there, gone = self._there_or_gone(points_world, now)
+        return replace(suspect, there=suspect.there + there, gone=suspect.gone + gone)
+
+    def _there_or_gone(
+        self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
+    ) -> tuple[int, int]:
+        """How many views, each with T_world_camera, find a thing at points (N, 3), and do not.
+
+        A view with too few of the points in it says nothing.
+        """
+        off_m, inside = self._check.offsets(points_world, views)
+        in_view, found = inside.sum(axis=1), np.isfinite(off_m)
+        told = in_view >= self._at_least
+        stays = told & (found.sum(axis=1) >= self.config.share * in_view)
+        shift_m = [np.median(off_m[k, found[k]]) for k in np.flatnonzero(stays)]
+        there = int(np.count_nonzero(np.abs(shift_m) < self.config.shift_m))
+        return there, int(np.count_nonzero(told)) - there
+
+
+def _about_to_be_removed(
+    mask: Mask, keyframe: Keyframe, landmarks: LandmarkTable, border_px: int
+) -> Removed:
+    """What a mask (H, W), widened, covers of a keyframe that is not masked yet."""
+    keypoints = covered(mask, keyframe.features.image_pixels, -border_px)
+    free = keypoints[~keyframe.masked[keypoints]]
+    patches = landmarks.patches_of(keyframe.landmark_ids[free])
+    return Removed(keyframe.id, free, patches, PackedMask.of(mask))
+
+
+def _same(a: Removed, b: Removed) -> bool:
+    return a.keyframe_id == b.keyframe_id

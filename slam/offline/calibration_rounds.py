@@ -1,0 +1,76 @@
+"""Self-calibration in rounds: run again with the camera that was found, and calibrate that run.
+
+A run with a wrong camera matches, gates and registers with it, and what it keeps leans toward it;
+the second run is free of most of that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import re
+import tempfile
+from pathlib import Path
+
+from bmask_slam.calibration.calibrate import (
+    CalibrateOptions,
+    calibrate_run,
+    refuse_early,
+    sequence_of,
+)
+from bmask_slam.calibration.report import Calibrated, format_calibration
+from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation import frame_stamps
+from bmask_slam.graph.errors import InputError
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.sequences import write_camera
+from bmask_slam.system_config import SystemConfig
+
+logger = logging.getLogger(__name__)
+
+
+def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = False) -> Calibrated:
+    """Calibrate a run, and ``rounds - 1`` times one that is made anew with what was found.
+
+    The runs made here are configured as the first and are not kept. The file is written at the end.
+
+    Returns:
+        The last calibration; its ``before`` is the camera of the first run.
+
+    Raises:
+        InputError: as by `calibrate_run`, or no round.
+    """
+    if rounds < 1:
+        raise InputError(f"--rounds {rounds}: must be a whole number of at least 1")
+    out = refuse_early(options)
+    sequence = options.sequence or sequence_of(options.run)
+    with tempfile.TemporaryDirectory(prefix=".calibrate-", dir=out.parent) as made:
+        folder = Path(made)
+        options_1 = dataclasses.replace(options, out=folder / "camera-1.yaml", sequence=sequence)
+        done = calibrate_run(options_1)
+        before = done.before
+        for k in range(2, rounds + 1):
+            logger.info("calibrated %d of %d times; running again", k - 1, rounds)
+            again = folder / f"run-{k}"
+            run(_again(options.run, sequence, done.path, again, quiet))
+            camera = folder / f"camera-{k}.yaml"
+            done = calibrate_run(dataclasses.replace(options_1, run=again, out=camera))
+    done = dataclasses.replace(done, path=out, before=before)
+    write_camera(out, done.camera, format_calibration(done))
+    return done
+
+
+def _again(before: Path, sequence: Path, camera: Path, out: Path, quiet: bool) -> RunOptions:
+    """The same frames with the same configuration and another camera."""
+    config = before / "config.yaml"
+    stride = re.search(r"stride (\d+)$", config.read_text(encoding="utf-8").partition("\n")[0])
+    frames = frame_stamps(before / "trajectory.txt")
+    return RunOptions(
+        sequence,
+        resolve(SystemConfig, config),
+        out=out,
+        camera=camera,
+        max_frames=None if frames is None else len(frames),
+        stride=int(stride[1]) if stride else 1,
+        quiet=quiet,
+    )

@@ -1,0 +1,178 @@
+"""Checkpoints: where a run was, as one file in its folder, so that a killed run can go on.
+
+A run with checkpoints and one that was killed and resumed end in the same bytes. What a state
+cannot hold (ISAM2) is therefore built anew at each checkpoint in both: `SlamSystem.restart`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam import __version__
+from bmask_slam.config.configuration import dump, resolve
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import (
+    Arrays,
+    FileKind,
+    nested,
+    part,
+    read_arrays,
+    write_arrays,
+)
+from bmask_slam.graph.smoother.storage import read_camera
+from bmask_slam.offline.options import RunOptions
+from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
+from bmask_slam.run_folder.metrics import Tally
+from bmask_slam.sequences import Sequence
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.system_interface import System
+
+logger = logging.getLogger(__name__)
+
+CHECKPOINT_FILE = FileKind("checkpoint", 6)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Where a run was after some frames.
+
+    Attributes:
+        options: what it was told.
+        camera: the sequence's.
+        stamps: digest of all its timestamps.
+        skipped: index and reason of the broken frames so far.
+        frames_bytes: size of frames.csv.
+        tally: what was counted.
+        state: of the system.
+    """
+
+    options: RunOptions
+    camera: Camera
+    stamps: str
+    skipped: list[tuple[int, str]]
+    frames_bytes: int
+    tally: Tally
+    state: Arrays
+
+    def check_sequence(self, sequence: Sequence) -> None:
+        """Refuse a sequence that is not the run's. Raises InputError."""
+        for what, same in (
+            ("camera", sequence.camera == self.camera),
+            ("frames", digest(sequence) == self.stamps),
+        ):
+            if not same:
+                raise InputError(
+                    f"{sequence.folder}: not the {what} that the run was begun with; "
+                    "restore the sequence, or start a new run"
+                )
+
+
+def digest(sequence: Sequence) -> str:
+    """A short text that two sequences share only if their timestamps are equal."""
+    return hashlib.sha256(sequence.timestamps_s.tobytes()).hexdigest()
+
+
+class Checkpoints:
+    """Writes the checkpoints of one run, if its options ask for them."""
+
+    def __init__(self, folder: RunFolder, options: RunOptions, sequence: Sequence) -> None:
+        self._folder = folder
+        self._options = options
+        self._sequence = sequence
+        self._every = options.checkpoint_every
+        self._frames = -1  # of the last one
+
+    def after_frame(self, system: System, tally: Tally) -> None:
+        """Write one if it is due."""
+        if self._every is not None and tally.frames % self._every == 0:
+            self.write(system, tally)
+
+    def write(self, system: System, tally: Tally) -> None:
+        """Write one now, over the last, which stays until the new one is whole.
+
+        Nothing is written where the last one is of the same frame.
+        """
+        if self._every is None or tally.frames == self._frames:
+            return
+        start_s = time.perf_counter()
+        system.restart()
+        skipped = [(i, reason) for i, reason in self._sequence.skipped if i < tally.next_index]
+        path = self._folder.path / CHECKPOINT
+        checkpoint = Checkpoint(
+            self._options,
+            self._sequence.camera,
+            digest(self._sequence),
+            skipped,
+            self._folder.synced_bytes(),
+            tally,
+            system.state(),
+        )
+        write_checkpoint(path, checkpoint)
+        self._frames = tally.frames
+        megabytes, ms = path.stat().st_size / 1e6, 1e3 * (time.perf_counter() - start_s)
+        logger.info("checkpoint after %d frames: %.1f MB, %.0f ms", tally.frames, megabytes, ms)
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Save a checkpoint in one file, atomically. Raises InputError if it cannot."""
+    tally = dataclasses.asdict(checkpoint.tally)
+    header = {
+        "bmask-slam": __version__,
+        "options": checkpoint.options.recorded(),
+        "config": dump(checkpoint.options.config),
+        "camera": dataclasses.asdict(checkpoint.camera),
+        "stamps": checkpoint.stamps,
+        "skipped": checkpoint.skipped,
+        "frames_bytes": checkpoint.frames_bytes,
+        "tally": {name: value for name, value in tally.items() if name != "tracking_ms"},
+    }
+    tracking_ms = np.array(checkpoint.tally.tracking_ms, float)
+    arrays = nested(run={"tracking_ms": tracking_ms}, system=checkpoint.state)
+    write_arrays(path, CHECKPOINT_FILE, header, arrays)
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """The checkpoint of a run folder.
+
+    Raises:
+        InputError: it is missing, foreign, broken or of another version, or config.yaml is not
+            what it was made with.
+    """
+    path = folder / CHECKPOINT
+    if not path.exists():
+        raise InputError(
+            f"{folder}: holds no checkpoint, so there is nothing to resume; give the folder of a "
+            "run that was begun with --checkpoint-every, or start the run again with --overwrite"
+        )
+    header, arrays = read_arrays(path, CHECKPOINT_FILE)
+    config = resolve(SystemConfig, folder / "config.yaml")
+    try:
+        if header["config"] != dump(config):
+            raise InputError(
+                f"{folder / 'config.yaml'}: not the configuration that {path.name} was made with; "
+                "restore it, or start a new run"
+            )
+        if header["bmask-slam"] != __version__:
+            logger.warning("%s: written by bmask-slam %s", path, header["bmask-slam"])
+        tracking_ms = arrays["run.tracking_ms"].tolist()
+        return Checkpoint(
+            RunOptions.from_recorded(header["options"], config, folder),
+            read_camera(header, path),
+            header["stamps"],
+            [(int(i), str(reason)) for i, reason in header["skipped"]],
+            int(header["frames_bytes"]),
+            Tally(tracking_ms=tracking_ms, **header["tally"]),
+            part(arrays, "system"),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: its header cannot be read ({error}); start the run again"
+        ) from error

@@ -1,0 +1,80 @@
+"""Localisation in a finished map: frames in, poses in the map's frame out, nothing learned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.runtime.stage_clock import StageClock
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
+from bmask_slam.tracking.tracker import Tracked
+
+REFRESH_FRAMES = 5  # a sixth of a second at 30 Hz
+
+
+class MapLocalisation(SlamSystem):
+    """A system that was restored from a map and is only to find frames in its largest segment.
+
+    No keyframe is made and nothing is optimised. Every few frames, and wherever a frame was
+    recognised, the local map is chosen anew around what was seen.
+    """
+
+    def begin_session(self) -> None:
+        """Forget where the camera was; the map stays."""
+        super().begin_session()
+        self._frames_since_refresh = 0
+        self._found: list[tuple[float, Array]] = []
+
+    def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
+        """Find a frame in the map."""
+        clock = StageClock()
+        self.localiser.expect(frame.timestamp_s)
+        with clock.stage("features"):
+            features = features if features is not None else self.prepare(frame)
+        with clock.stage("tracking"):
+            assert self._reference is not None, "restore a map and begin a session first"
+            tracked = self.localiser.track(features, self.mapper.world, self._reference)
+            T_world_camera = self._follow(frame, tracked)
+        return FrameResult(
+            index=frame.index,
+            timestamp_s=frame.timestamp_s,
+            status=tracked.status,
+            T_world_camera=T_world_camera,
+            segment=self._segment,
+            matches=tracked.matches,
+            inliers=len(tracked.landmark_ids),
+            stage_ms=clock.stage_ms,
+        )
+
+    def finish(self) -> None:
+        """Nothing was learned that could be optimised."""
+
+    def segments(self) -> dict[int, Trajectory]:
+        """The frames that were found, all in the map's largest segment."""
+        stamps_s, poses = [stamp_s for stamp_s, _ in self._found], [T for _, T in self._found]
+        return {self._segment: Trajectory(np.array(stamps_s), np.array(poses))} if poses else {}
+
+    def files(self) -> dict[str, Callable[[Path], None]]:
+        """None: the map is as it was."""
+        return {}
+
+    def _follow(self, frame: Frame, tracked: Tracked) -> Array | None:
+        if tracked.status is TrackingStatus.LOST:
+            return None
+        T, ids, world = tracked.T_world_camera, tracked.landmark_ids, self.mapper.world
+        self.localiser.moved_on(T, T, ids)
+        self._found.append((frame.timestamp_s, T))
+        self._frames_since_refresh += 1
+        elsewhere = not np.isin(ids, self.localiser.local_ids).all()
+        if elsewhere or self._frames_since_refresh >= REFRESH_FRAMES:
+            self._frames_since_refresh = 0
+            self._reference = world.covisible(ids, 1)[0][1]
+            self.localiser.new_local_map(world, self._reference)
+        return T

@@ -1,0 +1,81 @@
+"""The picture of an optimisation: a graph before and after it, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.trajectory import Indices
+from bmask_slam.graph.whole_file import whole_file
+
+PICTURE_TYPES = (".png", ".pdf", ".svg")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One half of the picture.
+
+    Attributes:
+        title: above it.
+        points: (N, 2 or 3) in metres, the ends of the edges.
+        edges: rows (M, 2) into the points, with colour and width, drawn in this order.
+        cloud: (L, 2 or 3) in metres, dots behind the edges.
+        axes: names of the columns.
+    """
+
+    title: str
+    points: Array
+    edges: Sequence[tuple[Indices, str, float]]
+    cloud: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    axes: str = "xyz"
+
+
+def check_picture(path: Path) -> None:
+    """Refuse, before the work, a picture that could not be written after it."""
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} is not there; make it first")
+    if path.is_dir():
+        raise InputError(f"{path}: a folder; give the name of a file to write")
+    if path.suffix.lower() not in PICTURE_TYPES:
+        raise InputError(f"{path}: cannot draw {path.suffix!r}; use {', '.join(PICTURE_TYPES)}")
+
+
+def draw_before_after(path: Path, before: View, after: View) -> None:
+    """Write the picture; it appears whole or not at all."""
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    for k, view in enumerate((before, after), start=1):
+        projection = "3d" if view.points.shape[1] == 3 else None
+        axes = figure.add_subplot(1, 2, k, projection=projection)
+        axes.set_title(view.title)
+        _draw(axes, view)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=150, format=path.suffix[1:].lower())
+
+
+def _draw(axes: Any, view: View) -> None:
+    points = view.points
+    lines: Any = LineCollection if points.shape[1] == 2 else Line3DCollection
+    if len(view.cloud):
+        axes.scatter(*view.cloud.T, s=0.6, color="0.6", linewidths=0)
+    for edges, colour, width in view.edges:
+        if len(edges):
+            axes.add_collection(lines(points[edges], colors=colour, linewidths=width))
+    seen = np.vstack([points, view.cloud]) if len(view.cloud) else points
+    low, high = np.percentile(seen, (0, 100) if seen is points else (1, 99), axis=0)
+    low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+    centre, half = (low + high) / 2, 0.55 * max(float(np.max(high - low)), 1e-3)
+    for name, label, middle in zip("xyz", view.axes, centre, strict=False):
+        getattr(axes, f"set_{name}lim")(middle - half, middle + half)
+        getattr(axes, f"set_{name}label")(f"{label} [m]")
+    axes.set_aspect("equal")

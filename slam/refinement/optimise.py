@@ -1,0 +1,144 @@
+"""Offline optimisation of a g2o file, with landmarks or without: read, optimise, write, draw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.batch.bundle_adjustment import Adjustment, adjust
+from bmask_slam.graph.batch.iteration import Progress
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.g2o.landmark_graphs import write_landmark_graph
+from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
+from bmask_slam.graph.g2o.pose_graphs import read_g2o, write_g2o
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.pose_graph.optimisation import (
+    Method,
+    PoseGraphConfig,
+    PoseGraphResult,
+    optimise_pose_graph,
+)
+from bmask_slam.graph.pose_graph.pose_graph import Mask, PoseGraph
+from bmask_slam.graph.trajectory import Indices
+from bmask_slam.refinement.adjustment_plot import View, check_picture, draw_before_after
+from bmask_slam.refinement.adjustment_report import Placed, draw_adjustment
+
+
+def optimise_file(
+    file: Path,
+    out: Path,
+    method: Method = "lm",
+    plot: Path | None = None,
+    progress: Progress = lambda iteration, cost: None,
+) -> PoseGraphResult:
+    """Optimise a g2o file and write the graph, without the edges found wrong, to ``out``.
+
+    Raises:
+        InputError: an output whose folder is not there, a picture of a type that is
+            not known, or a file that ``read_g2o`` or the solver refuses.
+    """
+    _check_output(out)
+    if plot is not None:
+        check_picture(plot)
+    graph = read_g2o(file)
+    try:
+        result = optimise_pose_graph(graph, PoseGraphConfig(method=method), progress)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    write_g2o(out, result.graph.with_edges(~result.is_outlier))
+    if plot is not None:
+        _draw(result, plot)
+    return result
+
+
+def adjust_file(
+    file: Path,
+    out: Path,
+    plot: Path | None = None,
+    progress: Progress = lambda iteration, cost: None,
+) -> tuple[Adjustment, Placed]:
+    """Adjust the graph with landmarks of a g2o file and write it, without outliers, to ``out``.
+
+    Raises:
+        InputError: as ``optimise_file``.
+    """
+    _check_output(out)
+    if plot is not None:
+        check_picture(plot)
+    shadow, camera = read_landmark_graph(file)
+    before = Placed.of(shadow)
+    try:
+        adjustment = adjust(shadow, camera, progress=progress)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    after = Placed.of(shadow)
+    write_landmark_graph(out, shadow, camera)
+    if plot is not None:
+        draw_adjustment(plot, before, after, adjustment)
+    return adjustment, after
+
+
+def _check_output(out: Path) -> None:
+    """What would fail after the work is refused before it."""
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
+    if out.is_dir():
+        raise InputError(f"{out}: a folder; give the name of a file to write")
+
+
+def format_result(result: PoseGraphResult) -> str:
+    """A few lines on what was optimised, from where, and how it ended."""
+    graph = result.graph
+    rows = [
+        ("vertices", f"{len(graph.ids)} ({'2-D' if graph.is_planar else '3-D'})"),
+        ("edges", f"{len(graph.edges)} ({np.sum(~graph.is_odometry)} between non-consecutive ids)"),
+        ("method", result.method),
+        ("cost before", f"{result.given_cost:.6g} ({result.given})"),
+        ("initial value", result.start),
+        ("initial cost", f"{result.initial_cost:.6g}"),
+        ("final cost", f"{result.final_cost:.6g}"),
+        ("iterations", str(result.iterations)),
+        ("time", f"{result.duration_ms:.0f} ms"),
+    ]
+    if result.method == "gnc":
+        rows.insert(7, ("outliers", f"{result.is_outlier.sum()} edges, left out of the output"))
+    return "\n".join(f"{name:15}{value}" for name, value in rows)
+
+
+# --- picture -------------------------------------------------------------------------------------
+
+
+def _draw(result: PoseGraphResult, path: Path) -> None:
+    """Draw the graph at the poses given (or the odometry) and at the optimised ones.
+
+    Odometry is blue, loops are grey, and those found wrong are red, in the left picture alone. A
+    3-D graph is seen from above when it is nearly flat, else in perspective.
+    """
+    graph = result.graph
+    spatial = not graph.is_planar and not _is_flat(graph.poses[:, :3, 3])
+    columns = slice(3 if spatial else 2)
+    before = f"before ({result.given}), cost {result.given_cost:.5g}"
+    after = f"after ({result.method}), cost {result.final_cost:.5g}"
+    edges = _edges(graph, result.is_outlier)
+    draw_before_after(
+        path,
+        View(before, result.given_poses[:, columns, 3], edges),
+        View(after, graph.poses[:, columns, 3], [edges[0], edges[2]]),
+    )
+
+
+def _is_flat(points: Array) -> bool:
+    """Whether the extent in z is less than a tenth of that in x and y."""
+    extent_m = np.ptp(points, axis=0)
+    return bool(extent_m[2] < 0.1 * extent_m[:2].max())
+
+
+def _edges(graph: PoseGraph, is_outlier: Mask) -> list[tuple[Indices, str, float]]:
+    """Loops, wrong loops and odometry, with colours and widths."""
+    odometry = graph.is_odometry
+    return [
+        (graph.edges[~odometry & ~is_outlier], "0.7", 0.4),
+        (graph.edges[is_outlier], "tab:red", 0.4),
+        (graph.edges[odometry], "tab:blue", 0.9),
+    ]

@@ -1,0 +1,153 @@
+"""Light that does not depend on the viewer, baked into textures once per scene.
+
+Lambert's law for lamps with soft shadows, plus an ambient term with occlusion: exactly what a
+diffuse room looks like, at no cost per frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.geometry import Array
+from bmask_slam.mapping.open3d_loader import load_open3d
+from bmask_slam.rendering.engine.builder import Image, Part
+from bmask_slam.rendering.engine.meshes import Shape
+
+_CELL_M = 0.05
+_SKY_RAYS = 24
+_SKY_REACH_M = 0.9
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A lamp: centre in metres, power, half size along x and y in metres.
+
+    At distance d it gives power / (0.5 + d^2) to a surface that faces it.
+    """
+
+    centre: tuple[float, float, float]
+    power: float = 1.6
+    half_size: tuple[float, float] = (0.5, 0.15)
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """The lamps and the share of light that comes from everywhere."""
+
+    lamps: tuple[Lamp, ...]
+    ambient: float = 0.5
+
+
+def irradiance(lighting: Lighting, points: Array, normals: Array) -> Array:
+    """Unshadowed light (N,) on points (N, 3) with unit normals (N, 3); for moving things."""
+    total = np.full(len(points), 0.9 * lighting.ambient)
+    for lamp in lighting.lamps:
+        total += _from_lamp(lamp, np.asarray(lamp.centre), points, normals)
+    return total
+
+
+def _from_lamp(lamp: Lamp, centre: Array, points: Array, normals: Array) -> Array:
+    to_lamp = centre - points
+    distance2 = (to_lamp**2).sum(-1)
+    cosine = np.einsum("nj,nj->n", to_lamp, normals) / np.sqrt(distance2 + 1e-9)
+    return lamp.power * np.maximum(cosine, 0) / (0.5 + distance2)
+
+
+def bake(parts: list[Part], lighting: Lighting, seed: int) -> tuple[list[Image], list[Array]]:
+    """Lit textures of the flat parts, and the light at the corners (T, 3) of every part."""
+    scene = _scene(parts)
+    grids = [_grid(part) for part in parts]
+    points = np.concatenate([g[0] for g in grids])
+    normals = np.concatenate([g[1] for g in grids])
+    light = _gather(scene, lighting, points, normals, np.random.default_rng(seed))
+    textures: list[Image] = []
+    corners: list[Array] = []
+    first = 0
+    for part, (points_part, _, shape) in zip(parts, grids, strict=True):
+        own = light[first : first + len(points_part)].reshape(shape)
+        first += len(points_part)
+        if part.shines:
+            textures.append(part.texture)
+            corners.append(np.ones((len(part.shape.corners), 3)))
+        elif part.flat:
+            textures.append(_lit(part.texture, own))
+            corners.append(np.ones((len(part.shape.corners), 3)))
+        else:
+            textures.append(part.texture)
+            corners.append(own)
+    return textures, corners
+
+
+def _scene(parts: list[Part]) -> Any:
+    o3d = load_open3d()
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    corners = np.concatenate([p.shape.corners for p in parts]).astype(np.float32)
+    index = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
+    scene.add_triangles(o3d.core.Tensor(corners.reshape(-1, 3)), o3d.core.Tensor(index))
+    return scene
+
+
+def _grid(part: Part) -> tuple[Array, Array, tuple[int, ...]]:
+    """Where the light of a part is computed: points, normals and the shape of the answer."""
+    shape: Shape = part.shape
+    if not part.flat:
+        return shape.corners.reshape(-1, 3), shape.normals.reshape(-1, 3), (len(shape.corners), 3)
+    origin, right, below = shape.corners[0, 0], shape.corners[0, 1], shape.corners[0, 2]
+    u, v = right - origin, below - right
+    columns, rows = (int(np.clip(np.linalg.norm(e) / _CELL_M, 2, 400)) for e in (u, v))
+    s, t = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
+    points = origin + s[None, :, None] * u + t[:, None, None] * v
+    normals = np.broadcast_to(shape.normals[0, 0], points.shape)
+    return points.reshape(-1, 3), normals.reshape(-1, 3), (rows, columns)
+
+
+def _lit(texture: Image, light: Array) -> Image:
+    rows, columns = texture.shape[:2]
+    smooth = cv2.resize(light.astype(np.float32), (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return np.clip(texture * smooth[..., None] + 0.5, 0, 255).astype(np.uint8)
+
+
+def _gather(
+    scene: Any, lighting: Lighting, points: Array, normals: Array, rng: np.random.Generator
+) -> Array:
+    start = points + 3e-3 * normals
+    total = lighting.ambient * _open_sky(scene, start, normals, rng)
+    for lamp in lighting.lamps:
+        for corner in ((-1, -1), (1, -1), (-1, 1), (1, 1), (0, 0)):
+            jitter = rng.uniform(-0.3, 0.3, (len(points), 2)) + corner
+            centre = np.asarray(lamp.centre) + np.stack(
+                [
+                    jitter[:, 0] * lamp.half_size[0],
+                    jitter[:, 1] * lamp.half_size[1],
+                    np.zeros(len(points)),
+                ],
+                -1,
+            )
+            visible = ~_blocked(scene, start, centre - start, 0.97)
+            total += 0.2 * visible * _from_lamp(lamp, centre, points, normals)
+    return total
+
+
+def _open_sky(scene: Any, start: Array, normals: Array, rng: np.random.Generator) -> Array:
+    """The share of cosine-weighted directions that are free within reach, (N,) in [0.25, 1]."""
+    free = np.zeros(len(start))
+    for _ in range(_SKY_RAYS):
+        direction = rng.normal(size=start.shape)
+        direction = direction / np.linalg.norm(direction, axis=1, keepdims=True) + 1.0001 * normals
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        free += ~_blocked(scene, start, direction, _SKY_REACH_M)
+    return 0.25 + 0.75 * free / _SKY_RAYS
+
+
+def _blocked(scene: Any, start: Array, direction: Array, reach: float) -> NDArray[np.bool_]:
+    o3d = load_open3d()
+    rays = np.concatenate([start, direction], axis=1).astype(np.float32)
+    blocked: NDArray[np.bool_] = scene.test_occlusions(
+        o3d.core.Tensor(rays), tnear=0.0, tfar=reach
+    ).numpy()
+    return blocked

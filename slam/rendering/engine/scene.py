@@ -1,0 +1,53 @@
+"""A furnished, lit scene that is ready to be drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.graph.geometry import Array
+from bmask_slam.rendering.engine.atlas import Atlas, build_atlas
+from bmask_slam.rendering.engine.builder import Part, SceneBuilder
+from bmask_slam.rendering.engine.lighting import Lighting, bake
+from bmask_slam.rendering.engine.raycast import Geometry, build_geometry
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the renderer needs of a scene.
+
+    Attributes:
+        atlas: every texture, those of moving things last.
+        static: the room.
+        categories: class name of each instance id, counting from 1.
+        moving: parts that move, in frames of their own; empty without people.
+        first_moving_texture: index in the atlas of the first part in ``moving``.
+    """
+
+    atlas: Atlas
+    static: Geometry
+    categories: tuple[str, ...]
+    moving: tuple[Part, ...]
+    first_moving_texture: int
+
+
+def build_scene(builder: SceneBuilder, lighting: Lighting, moving: list[Part], seed: int) -> Scene:
+    """Bake the light and pack the textures."""
+    parts = builder.parts
+    textures, lights = bake(parts, lighting, seed)
+    atlas = build_atlas(textures + [part.texture for part in moving])
+    static = assemble(parts, lights, 0)
+    return Scene(atlas, static, tuple(builder.categories), tuple(moving), len(parts))
+
+
+def assemble(parts: list[Part], lights: list[Array], first_texture: int) -> Geometry:
+    """One geometry of many parts, whose textures follow each other in the atlas."""
+    counts = [len(part.shape.corners) for part in parts]
+    return build_geometry(
+        np.concatenate([part.shape.corners for part in parts]),
+        np.concatenate([part.shape.uvs for part in parts]),
+        np.concatenate(lights),
+        np.repeat(np.arange(len(parts)) + first_texture, counts),
+        np.repeat([part.instance for part in parts], counts),
+    )

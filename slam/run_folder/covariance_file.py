@@ -1,0 +1,103 @@
+"""Covariances of keyframes: from the graph, to a file, and back by `read_covariances`."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.smoother.isam2 import SolverError
+from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.world.landmark_table import Ints
+
+logger = logging.getLogger(__name__)
+
+COVARIANCES = "covariances.txt"
+HEADER = """\
+# covariances of keyframe poses: keyframe_id timestamp_s c11 c12 .. c16 c22 .. c66 (upper triangle)
+# of xi = [rotation x y z rad, translation x y z m] in the camera's frame, on the right side:
+# T_world_camera_true = T_world_camera @ exp(xi); units rad^2, rad m, m^2
+# relative to the world, which the prior on the first keyframe fixes: that one's own is the prior's
+"""
+_UPPER = np.triu_indices(6)
+_COLUMNS = 2 + len(_UPPER[0])
+
+
+@dataclass(frozen=True)
+class KeyframeCovariances:
+    """Keyframe ids (K,), stamps (K,) in seconds, covariances (K, 6, 6) ``[rad, m]``."""
+
+    keyframe_ids: Ints
+    timestamps_s: Array
+    covariances: Array
+
+
+def find_covariances(smoother: Smoother, stamps_s: dict[int, float]) -> KeyframeCovariances:
+    """How sure the graph is of keyframes with these stamps; none, and a line in the log, if GTSAM
+    fails.
+    """
+    try:
+        found = smoother.marginals()
+    except SolverError as error:
+        logger.error("no covariances, the graph is singular (%s)", error)
+        return KeyframeCovariances(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 6, 6)))
+    rows = np.flatnonzero(np.isin(found.keyframe_ids, list(stamps_s)))
+    ids = found.keyframe_ids[rows]
+    stamps = np.array([stamps_s[i] for i in ids.tolist()])
+    return KeyframeCovariances(ids, stamps, found.keyframes[rows])
+
+
+def write_covariances(path: Path, found: KeyframeCovariances) -> None:
+    """Write the file, which appears whole or not at all."""
+    rows = zip(
+        found.keyframe_ids.tolist(),
+        found.timestamps_s.tolist(),
+        found.covariances[:, *_UPPER].tolist(),
+        strict=True,
+    )
+    lines = [
+        f"{i} {stamp:.6f} " + " ".join(f"{value:.9e}" for value in row) for i, stamp, row in rows
+    ]
+    with whole_file(path) as temporary:
+        temporary.write_text(HEADER + "\n".join(lines) + "\n", encoding="ascii", newline="\n")
+
+
+def read_covariances(path: Path) -> KeyframeCovariances:
+    """Read what `write_covariances` wrote.
+
+    Raises:
+        InputError: no file, no line, a wrong number of columns, a value that is no finite number,
+            an id that is no whole number, or a matrix that is no covariance.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; run with --covariances to get it")
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    numbered = enumerate(map(str.strip, text.splitlines()), start=1)
+    rows = [_row(s, f"{path}:{n}") for n, s in numbered if s and not s.startswith("#")]
+    if not rows:
+        raise InputError(f"{path}: no covariance in the file; run with --covariances again")
+    table = np.array(rows)
+    covariances = np.zeros((len(table), 6, 6))
+    covariances[:, *_UPPER] = table[:, 2:]
+    covariances += np.triu(covariances, 1).swapaxes(1, 2)
+    bad = np.linalg.eigvalsh(covariances)[:, 0] <= 0
+    if bad.any():
+        k = int(table[bad][0, 0])
+        raise InputError(
+            f"{path}: the matrix of keyframe {k} is no covariance; correct or remove its line"
+        )
+    return KeyframeCovariances(table[:, 0].astype(np.int64), table[:, 1], covariances)
+
+
+def _row(line: str, where: str) -> list[float]:
+    words = line.split()
+    if len(words) != _COLUMNS:
+        raise InputError(f"{where}: {len(words)} columns, expected {_COLUMNS}; correct the line")
+    if not words[0].isdigit():
+        raise InputError(f"{where}: {words[0][:40]!r} is no keyframe id; correct the line")
+    return [finite_number(word, where) for word in words]

@@ -1,0 +1,133 @@
+"""What a run, a trajectory or a graph holds, written for other programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.graph_update import IntArray
+from bmask_slam.graph.files.ply import read_ply, write_ply
+from bmask_slam.graph.g2o.landmark_graphs import has_landmarks, write_landmark_graph
+from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
+from bmask_slam.graph.smoother.storage import read_graph
+from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.graph.trajectory_formats import (
+    read_times,
+    read_trajectory,
+    write_euroc,
+    write_kitti,
+    write_times,
+)
+from bmask_slam.run_folder.landmark_file import LANDMARKS_COMMENT
+
+ExportFormat = Literal["tum", "kitti", "euroc", "g2o", "ply"]
+POSITIONS_COMMENT = "bmask-slam camera positions, world frame, metres, seconds"
+POINTS_COMMENT = "bmask-slam landmarks of a graph, world frame, metres"
+
+
+@dataclass(frozen=True)
+class Exported:
+    """The files written, and in words what is in them and what is not."""
+
+    files: tuple[Path, ...]
+    contents: str
+
+
+def export(source: Path, form: ExportFormat, out: Path, times: Path | None = None) -> Exported:
+    """Write a run folder, a trajectory or a g2o file with landmarks in another format.
+
+    ``times`` holds the stamps of a trajectory in the format of KITTI.
+
+    Raises:
+        InputError: broken input, a source that does not hold what the format needs, or an output
+            whose folder is not there or that is the input.
+    """
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
+    if out.is_dir():
+        raise InputError(f"{out}: a folder; give the name of a file to write")
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; give a run folder or a trajectory")
+    if source.resolve() == out.resolve() or out.resolve().parent == source.resolve():
+        raise InputError(f"{out}: is (in) the input, which stays as it is; choose another --out")
+    if form == "g2o":
+        return _graph(source, out)
+    if source.is_file() and has_landmarks(source):
+        return _points_of_graph(source, form, out)
+    if form == "ply" and source.is_dir():
+        return _landmarks(source, out)
+    return _trajectory(source, form, out, times)
+
+
+def _graph(source: Path, out: Path) -> Exported:
+    if not (source / "graph").is_file():
+        raise InputError(f"{source}: holds no graph, which g2o needs; give a run folder")
+    shadow, camera = read_graph(source / "graph")
+    write_landmark_graph(out, shadow, camera)
+    seen = shadow.observations.select(shadow.observations.all_rows())
+    flat = int(np.isnan(seen.measurements[:, 2]).sum())
+    edges = len(shadow.pose_factors)
+    return Exported(
+        (out,),
+        f"{len(shadow.keyframes.ids)} keyframes (VERTEX_SE3:QUAT), {len(shadow.landmarks.ids)} "
+        f"landmarks (VERTEX_TRACKXYZ), {len(seen)} observations (EDGE_PROJECT_DISPARITY; {flat} "
+        f"without depth: no information on 1/z), {edges} relative poses and priors.\n"
+        "Not in the format: the robust kernels of observations, and what is in comments.",
+    )
+
+
+def _points_of_graph(source: Path, form: ExportFormat, out: Path) -> Exported:
+    if form != "ply":
+        raise InputError(f"{source}: a graph has no stamps, which {form} needs; give a run folder")
+    shadow, _ = read_landmark_graph(source)
+    x, y, z = shadow.landmarks.values.T
+    write_ply(out, {"x": x, "y": y, "z": z, "id": _ids(shadow.landmarks.ids)}, POINTS_COMMENT)
+    return Exported((out,), f"{len(x)} landmarks: x y z in metres, id")
+
+
+def _ids(ids: IntArray) -> NDArray[np.int32]:
+    """Ids as PLY can hold them."""
+    if len(ids) and ids.max() > np.iinfo(np.int32).max:
+        raise InputError("landmark ids beyond 32 bits, which PLY has not; renumber them")
+    return ids.astype(np.int32)
+
+
+def _landmarks(source: Path, out: Path) -> Exported:
+    columns = read_ply(source / "landmarks.ply")
+    write_ply(out, columns, LANDMARKS_COMMENT)
+    count = len(next(iter(columns.values())))
+    return Exported((out,), f"{count} landmarks: {', '.join(columns)}")
+
+
+def _trajectory(source: Path, form: ExportFormat, out: Path, times: Path | None) -> Exported:
+    file, note = source, ""
+    if source.is_dir():
+        file = source / "trajectory.txt"
+        others = len(list(source.glob("trajectory_segment_*.txt")))
+        note = f"\n{others} more map segments have files of their own in {source}" if others else ""
+    trajectory = read_trajectory(file, None if times is None else read_times(times))
+    files, what = _write(trajectory, form, out)
+    return Exported(files, f"{len(trajectory)} poses T_world_camera: {what}{note}")
+
+
+def _write(trajectory: Trajectory, form: ExportFormat, out: Path) -> tuple[tuple[Path, ...], str]:
+    """The files written, and what is in a line of them."""
+    if form == "tum":
+        write_tum(out, trajectory)
+        return (out,), "stamp in seconds, position in metres, quaternion x y z w"
+    if form == "euroc":
+        write_euroc(out, trajectory)
+        return (out,), "stamp in nanoseconds, position in metres, quaternion w x y z"
+    if form == "kitti":
+        times = out.with_name(f"{out.stem}_times.txt")
+        write_kitti(out, trajectory.poses_world_camera)
+        write_times(times, trajectory.timestamps_s)
+        return (out, times), "the upper three rows of the matrix; the stamps are in the second file"
+    x, y, z = trajectory.positions_world.T
+    write_ply(out, {"x": x, "y": y, "z": z, "t": trajectory.timestamps_s}, POSITIONS_COMMENT)
+    return (out,), "x y z in metres and the stamp t in seconds"

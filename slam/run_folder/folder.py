@@ -1,0 +1,299 @@
+"""The run folder: a contract that other tools read, complete after a run and usable in the middle.
+
+====================  ============================================================================
+config.yaml           the resolved configuration; ``--config RUN/config.yaml`` repeats it
+trajectory.txt        TUM format, T_world_camera, every frame with a pose
+trajectory_segment_N  .txt: the same of map segment N, if it was never joined to the largest
+keyframes.txt         the keyframes, as trajectory.txt
+frames.csv            one line a frame: status, matches, inliers, milliseconds a stage, keyframe
+landmarks.ply         x y z (world, metres), red green blue, observations, id
+graph                 the saved factor graph and values, one file that loads again
+map                   keyframes, landmarks and graph, for ``run --continue`` and ``run --localise``
+labels.csv            with a segmenter: label, probability, entropy, views of every landmark
+objects.json, .ply    with a segmenter: objects with label, box, keyframes; the boxes as lines
+objects.png           with a segmenter: landmarks by label and objects, from above
+dense/                with ``--map``, run or live, or by ``bmask-slam map``: `dense.folder`
+covariances.txt       with ``--covariances``: of every keyframe's pose, see
+`run_folder.covariance_file`
+metrics.json          a list of {"name", "value", "unit"}
+trajectory.png        top view, and errors against the reference
+log.txt               what the program had to say
+health.json           of a live run: rates, delays, queues, what was dropped, every second
+checkpoint            while a run with ``--checkpoint-every`` is not finished: all it needs to
+                      be resumed (``run --resume``); it is gone when the run is complete
+====================  ============================================================================
+
+``frames.csv`` and ``log.txt`` grow line by line; everything else is written under a temporary name
+and renamed, so that a killed run leaves whole files.
+"""
+
+from __future__ import annotations
+
+import csv
+import errno
+import itertools
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.run_folder.covariance_file import COVARIANCES
+from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
+from bmask_slam.tracking.results import FrameResult
+
+STAGES = ("features", "moving", "tracking", "keyframe", "graph", "loops", "semantics")
+FILES = (
+    "config.yaml",
+    "trajectory.txt",
+    "keyframes.txt",
+    "frames.csv",
+    "landmarks.ply",
+    "graph",
+    "map",
+    "metrics.json",
+    "trajectory.png",
+    "log.txt",
+)
+CHECKPOINT = "checkpoint"
+HEALTH = "health.json"
+SOMETIMES = (CHECKPOINT, COVARIANCES, HEALTH, *SEMANTIC_FILES)
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+LOGGERS = ("bmask_slam",)
+COLUMNS = (
+    *("index", "timestamp", "status", "segment", "matches", "inliers"),
+    *("ignored", "mostly_moving"),
+    *(f"{stage}_ms" for stage in STAGES),
+    *("keyframe", "keyframe_reason"),
+)
+
+
+def free_run_path(stem: str, root: Path = Path("runs")) -> Path:
+    """``root/stem``, or with -2, -3, ... the first that does not exist yet."""
+    names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
+    return next(root / name for name in names if not os.path.lexists(root / name))
+
+
+class _LogFile(logging.FileHandler):
+    """A log whose own failure is quiet: a full disk is met, and told, by whoever writes data."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handleError(record)
+
+
+class RunFolder:
+    """An open run folder; a context manager that closes its files.
+
+    A run that is refused before its first frame leaves nothing: the folder is removed again.
+    While it is open no other process can write a run there.
+    """
+
+    def __init__(
+        self, path: Path, overwrite: bool = False, resume_bytes: int | None = None
+    ) -> None:
+        """Make the folder, with an empty frames.csv and log.txt; or go on with the run it holds,
+        frames.csv being cut to ``resume_bytes``.
+
+        Raises:
+            InputError: it cannot be written, or already holds a run and ``overwrite`` is not set,
+                or a process still writes there, or frames.csv is not that of the run to resume.
+        """
+        self.path = path
+        self._begun = resume_bytes is not None
+        self._made = [] if self._begun else _make_folder(path)
+        if resume_bytes is None:
+            _clear(path, overwrite)
+        else:
+            _check_frames(path / "frames.csv", resume_bytes)
+        try:
+            mode = "a" if self._begun else "x"
+            self._frames = (path / "frames.csv").open(mode, encoding="utf-8", newline="")
+            _lock(self._frames, path)
+            self._log = _LogFile(path / "log.txt", mode=mode, encoding="utf-8")
+            self._frames.truncate(resume_bytes or 0)
+        except OSError as error:
+            _remove_empty(self._made)
+            raise _unwritable(path, error) from error
+        self._rows = csv.DictWriter(self._frames, COLUMNS, lineterminator="\n")
+        if not self._begun:
+            self._rows.writeheader()
+            self._frames.flush()
+        self._levels: dict[str, int] = {}
+
+    def __enter__(self) -> RunFolder:
+        self._log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        for name in LOGGERS:
+            logger = logging.getLogger(name)
+            self._levels[name] = logger.level
+            logger.setLevel(logging.INFO)
+            logger.addHandler(self._log)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if error is not None:
+            details = None if isinstance(error, InputError) else (type(error), error, traceback)
+            self._log.handle(
+                logging.LogRecord(
+                    __name__, logging.ERROR, __file__, 0, "stopped: %s", (error,), details
+                )
+            )
+        for name, level in self._levels.items():
+            logging.getLogger(name).removeHandler(self._log)
+            logging.getLogger(name).setLevel(level)
+        for file in (self._log, self._frames):
+            try:
+                file.close()
+            except OSError as unwritten:
+                error = error or unwritten
+        if isinstance(error, InputError) and not self._begun:
+            _remove(self.path, (*SOMETIMES, *FILES))
+            _remove_empty(self._made)
+        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+            raise InputError(
+                f"{self.path}: {error.strerror}; free some space, what was written before is kept"
+            ) from error
+
+    def write_frame(self, result: FrameResult) -> None:
+        """Append a frame to frames.csv, at once on disk.
+
+        Raises:
+            ValueError: a stage that is no column.
+        """
+        keyframe = "" if result.keyframe_id is None else result.keyframe_id
+        row: dict[str, object] = {
+            "index": result.index,
+            "timestamp": f"{result.timestamp_s:.6f}",
+            "status": result.status.value,
+            "segment": result.segment,
+            "matches": result.matches,
+            "inliers": result.inliers,
+            "ignored": result.ignored,
+            "mostly_moving": int(result.mostly_moving),
+            "keyframe": keyframe,
+            "keyframe_reason": result.keyframe_reason,
+        }
+        row |= {f"{stage}_ms": f"{ms:.3f}" for stage, ms in result.stage_ms.items()}
+        self._rows.writerow(row)
+        self._frames.flush()
+        self._begun = True
+
+    def synced_bytes(self) -> int:
+        """The size of frames.csv, all of it on disk."""
+        os.fsync(self._frames.fileno())
+        return os.fstat(self._frames.fileno()).st_size
+
+    def complete(self) -> None:
+        """Say that the run is finished: there is nothing to resume."""
+        _remove(self.path, [CHECKPOINT])
+
+    def write_trajectory(self, trajectory: Trajectory, name: str = "trajectory.txt") -> None:
+        """Replace trajectory.txt (or keyframes.txt) by the poses of T_world_camera."""
+        write_tum(self.path / name, trajectory)
+
+    def write_text(self, name: str, text: str) -> None:
+        """Replace a text file."""
+        with self.replacing(name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    @contextmanager
+    def replacing(self, name: str) -> Iterator[Path]:
+        """A temporary path beside ``name``, a file or a folder, that takes its place at the end."""
+        path = self.path / name
+        temporary = path.with_name(f".partial-{name}")
+        try:
+            yield temporary
+            if path.is_dir():
+                shutil.rmtree(path)
+            os.replace(temporary, path)
+        finally:
+            _remove(self.path, [temporary.name])
+
+
+def _clear(path: Path, overwrite: bool) -> None:
+    """Remove the run that a folder holds, its checkpoint first. Raises InputError."""
+    held = [name for name in (*SOMETIMES, *FILES) if os.path.lexists(path / name)]
+    if held and not overwrite:
+        cure = "go on with --resume, " if held[0] == CHECKPOINT else ""
+        raise InputError(
+            f"{path}: already holds a run ({held[0]}); {cure}choose another --out or add "
+            "--overwrite"
+        )
+    try:
+        if "frames.csv" in held:
+            with (path / "frames.csv").open("rb") as file:
+                _lock(file, path)
+        _remove(path, held)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def _lock(file: IO[Any], path: Path) -> None:
+    """Keep other processes from writing here as long as the file is open, or refuse to."""
+    if sys.platform == "win32":
+        return
+    import fcntl  # noqa: PLC0415 - Unix only
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise InputError(
+            f"{path}: a process is writing a run there; wait for it, or choose another --out"
+        ) from error
+
+
+def _check_frames(frames: Path, size: int) -> None:
+    """Refuse a frames.csv that does not begin with the bytes of a checkpoint."""
+    header, found = ",".join(COLUMNS), b""
+    if frames.is_file():
+        found = frames.read_bytes()[: max(size, 0)]
+    if len(found) < size or found.partition(b"\n")[0] != header.encode():
+        raise InputError(
+            f"{frames}: not the file that the checkpoint knows, with {size} bytes or more and the "
+            f"columns {header}; start the run again with --overwrite"
+        )
+
+
+def _make_folder(path: Path) -> list[Path]:
+    """Make a folder and its parents; those that were made, the innermost first."""
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise InputError(f"{path}: is a file; choose another folder with --out") from error
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    return missing
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    reason = error.strerror or error
+    return InputError(f"{path}: cannot be written ({reason}); choose another folder with --out")
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders from the innermost on, as far as they are empty."""
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _remove(folder: Path, names: Iterable[str]) -> None:
+    """Remove these files and folders where they exist."""
+    for name in names:
+        path = folder / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)

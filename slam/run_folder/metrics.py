@@ -1,0 +1,116 @@
+"""What is known at the end of a run: its metrics and the files of the result."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bmask_slam.evaluation import Row, evaluate_trajectory, format_json
+from bmask_slam.evaluation.plot import plot_trajectory
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.run_folder.folder import RunFolder
+from bmask_slam.run_folder.landmark_file import write_landmarks
+from bmask_slam.runtime.memory import peak_rss_mb
+from bmask_slam.system_interface import System
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
+
+logger = logging.getLogger(__name__)
+
+EVALUATION_ROWS = (
+    "ate_rmse",
+    "rpe_trans_rmse_frame",
+    "rpe_trans_rmse_second",
+    "rpe_rot_rmse_second",
+)
+
+
+@dataclass
+class Tally:
+    """What is counted while frames go by.
+
+    Attributes:
+        tracking_ms: of each frame, features, what moves and tracking, without what a keyframe adds.
+        next_index: the first index of the sequence that was not reached.
+        keyframes: frames that became one.
+        lost: frames without a pose.
+        wall_s: time of the whole loop, without what a kill threw away.
+    """
+
+    tracking_ms: list[float] = field(default_factory=list)
+    next_index: int = 0
+    keyframes: int = 0
+    lost: int = 0
+    wall_s: float = 0.0
+
+    @property
+    def frames(self) -> int:
+        """Frames given to the system."""
+        return len(self.tracking_ms)
+
+    def count(self, result: FrameResult) -> None:
+        """Count a frame."""
+        stages = result.stage_ms
+        spent_ms = (stages.get(stage, 0.0) for stage in ("features", "moving", "tracking"))
+        self.tracking_ms.append(sum(spent_ms))
+        self.next_index = result.index + 1
+        self.keyframes += result.keyframe_id is not None
+        self.lost += result.status is TrackingStatus.LOST
+
+
+def measure(system: System, reference: Trajectory | None, tally: Tally, stride: int) -> list[Row]:
+    """The rows of metrics.json; errors only where there is a reference that covers the run."""
+    trajectory, statistics = system.trajectory(), system.statistics()
+    given = len(range(0, tally.next_index, stride))
+    rows = [row("tracked_share", len(trajectory) / max(given, 1), "1")]
+    if reference is not None:
+        try:
+            errors = evaluate_trajectory(trajectory, reference).rows
+            rows += [row for row in errors if row["name"] in EVALUATION_ROWS]
+        except InputError as error:
+            logger.warning("no comparison with the reference: %s", error)
+    rows += _percentiles("tracking_ms", tally.tracking_ms)
+    rows.append(row("frames_per_second", tally.frames / tally.wall_s, "Hz"))
+    rows.append(row("keyframes", int(statistics["keyframes"]), "keyframes"))
+    rows.append(row("landmarks", int(statistics["landmarks"]), "landmarks"))
+    rows.append(row("loops_closed", int(statistics["loops_closed"]), "loops"))
+    rows += _percentiles("isam2_update_ms", statistics["isam2_update_ms"])
+    rows.append(row("peak_rss_mb", peak_rss_mb(), "MB"))
+    return rows
+
+
+def row(name: str, value: float, unit: str) -> Row:
+    """A row of metrics.json."""
+    return {"name": name, "value": value, "unit": unit}
+
+
+def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
+    """Median and 95th percentile; nothing of nothing."""
+    if not values_ms:
+        return []
+    median, high = np.percentile(values_ms, (50, 95))
+    return [row(f"{name}_median", float(median), "ms"), row(f"{name}_p95", float(high), "ms")]
+
+
+def save(
+    system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
+) -> None:
+    """Write everything that is known only at the end."""
+    trajectory = system.trajectory()
+    folder.write_trajectory(trajectory)
+    folder.write_trajectory(system.keyframe_trajectory(), "keyframes.txt")
+    for number, segment in system.segments().items():
+        if segment.timestamps_s[0] not in trajectory.timestamps_s:
+            folder.write_trajectory(segment, f"trajectory_segment_{number}.txt")
+    write_landmarks(folder.path / "landmarks.ply", system.landmarks())
+    files = system.files()
+    for name, write in files.items():
+        with folder.replacing(name) as temporary:
+            write(temporary)
+    folder.write_text("metrics.json", format_json(rows))
+    plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title)
+    for name in files:
+        size_mb = (folder.path / name).stat().st_size / 1e6
+        logger.info("%s: %.1f MB", name, size_mb)

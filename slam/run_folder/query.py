@@ -1,0 +1,68 @@
+"""Asking a run where things are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.run_folder.semantic_files import SavedObject, read_objects
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Objects of one label, the surest first; ``counts`` says how many there are of each label."""
+
+    label: str
+    objects: tuple[SavedObject, ...]
+    counts: dict[str, int]
+
+
+def query(run: Path, label: str | None) -> Answer:
+    """The objects of a run whose likeliest label is this; all of them without a label.
+
+    Raises:
+        InputError: the run has no objects file, or does not know the label.
+    """
+    names, objects = read_objects(run)
+    counts = dict(sorted(Counter(o.label for o in objects).items()))
+    if label is not None and label not in names:
+        raise InputError(
+            f"{run}: its label set has no {label!r}; the run holds {_listed(counts)}; the set has "
+            f"{', '.join(names[1:])}"
+        )
+    chosen = [o for o in objects if label in (None, o.label)]
+    order = sorted(chosen, key=lambda o: (o.label, -o.probability, -len(o.keyframes), o.id))
+    return Answer(label or "", tuple(order), counts)
+
+
+def format_answer(answer: Answer) -> str:
+    """A line an object: position and size in metres, how sure, and the keyframes that saw it."""
+    if not answer.objects:
+        return f"no {answer.label or 'object'}; the run holds {_listed(answer.counts)}"
+    head = f"{'label':<16}{'id':>5}  {'x, y, z (world, m)':<24}{'size (m)':<19}{'sure':>5}"
+    lines = [f"{head}  keyframes"]
+    for o in answer.objects:
+        place = " ".join(f"{v:7.3f}" for v in o.centroid_world)
+        size = " ".join(f"{v:5.2f}" for v in (*-np.sort(-o.box.size_m[:2]), o.box.size_m[2]))
+        seen = _ranges(o.keyframes.tolist())
+        lines.append(f"{o.label:<16}{o.id:>5}  {place:<24}{size:<19}{o.probability:>5.2f}  {seen}")
+    return "\n".join(lines)
+
+
+def _listed(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} ({n})" for name, n in counts.items()) or "nothing"
+
+
+def _ranges(numbers: list[int]) -> str:
+    """Rising numbers as "1-4, 7"."""
+    parts: list[list[int]] = []
+    for n in numbers:
+        if parts and n == parts[-1][-1] + 1:
+            parts[-1] = [parts[-1][0], n]
+        else:
+            parts.append([n])
+    return ", ".join("-".join(map(str, p)) for p in parts)

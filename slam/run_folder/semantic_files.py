@@ -1,0 +1,211 @@
+"""What a run says about the things in its map, as files, and read back."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.labelling.results import MapObjects
+from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.run_folder.object_picture import draw_objects
+from bmask_slam.semantics.instances.overlay import class_colour
+from bmask_slam.semantics.objects.boxes3d import EDGES, OrientedBox
+from bmask_slam.semantics.objects.object_map import MapObject
+from bmask_slam.world.landmark_table import Ints
+
+LABELS = "labels.csv"
+OBJECTS = "objects.json"
+BOXES = "objects.ply"
+OBJECTS_PICTURE = "objects.png"
+SEMANTIC_FILES = (LABELS, OBJECTS, BOXES, OBJECTS_PICTURE)
+_COLUMNS = ("id", "label", "probability", "entropy", "views")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTable:
+    """The labels of a run's landmarks, in the order of landmarks.ply.
+
+    Attributes:
+        ids: (N,) of the landmarks.
+        labels: N class names, "unknown" for what is on no known object.
+        probability: (N,) of the label.
+        entropy: (N,) of the distribution over all labels, in nats.
+        views: (N,) keyframes that said something.
+    """
+
+    ids: Ints
+    labels: tuple[str, ...]
+    probability: Array
+    entropy: Array
+    views: Ints
+
+
+def semantic_writers(
+    cloud: LandmarkCloud, objects: MapObjects, trajectory: Trajectory
+) -> dict[str, Callable[[Path], None]]:
+    """A function that writes a file, by the file's name."""
+    return {
+        LABELS: lambda path: write_labels(path, cloud),
+        OBJECTS: lambda path: write_objects(path, objects),
+        BOXES: lambda path: write_boxes(path, objects),
+        OBJECTS_PICTURE: lambda path: draw_objects(path, cloud, objects, trajectory),
+    }
+
+
+def write_labels(path: Path, cloud: LandmarkCloud) -> None:
+    """Write a line a landmark."""
+    assert cloud.labels is not None
+    names, found = cloud.labels.names, cloud.labels.estimates
+    rows = zip(
+        cloud.ids.tolist(),
+        [names.of_thing(label) for label in found.labels.tolist()],
+        [f"{p:.5f}" for p in found.probability.tolist()],
+        [f"{h:.5f}" for h in found.entropy.tolist()],
+        found.views.tolist(),
+        strict=True,
+    )
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        writer.writerows(rows)
+
+
+def read_labels(run: Path) -> LabelTable:
+    """The label table of a run folder.
+
+    Raises:
+        InputError: no such file, other columns, or a value that is no number.
+    """
+    path = run / LABELS
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a run that had a segmenter")
+    with path.open(encoding="utf-8", newline="") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    if tuple(header) != _COLUMNS or any(len(row) != len(_COLUMNS) for row in rows):
+        raise InputError(f"{path}: needs the columns {', '.join(_COLUMNS)}; run again")
+    numbers = [
+        [finite_number(row[k], f"{path}: line {n}") for k in (0, 2, 3, 4)]
+        for n, row in enumerate(rows, 2)
+    ]
+    ids, probability, entropy, views = np.array(numbers, float).reshape(-1, 4).T
+    names = tuple(row[1] for row in rows)
+    return LabelTable(ids.astype(np.int64), names, probability, entropy, views.astype(np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class SavedObject:
+    """An object of a run, read back.
+
+    Attributes:
+        id, label, probability: its number, class name and how sure that is.
+        centroid_world: (3,) m. box: around it.
+        keyframes: (K,) that saw it. landmarks: (N,) on it.
+        first_seen_s, last_seen_s: stamps.
+    """
+
+    id: int
+    label: str
+    probability: float
+    centroid_world: Array
+    box: OrientedBox
+    keyframes: Ints
+    landmarks: Ints
+    first_seen_s: float
+    last_seen_s: float
+
+
+def write_objects(path: Path, found: MapObjects) -> None:
+    """Write objects as JSON: metres, in the run's world frame."""
+    content = {
+        "labels": [found.names.of_thing(k) for k in range(len(found.names))],
+        "up_world": _rounded(found.up_world),
+        "objects": [_as_json(o, found) for o in found.objects],
+    }
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _as_json(o: MapObject, found: MapObjects) -> dict[str, Any]:
+    likely = [k for k in np.argsort(-o.distribution).tolist()[:5] if o.distribution[k] >= 0.001]
+    return {
+        "id": o.id,
+        "label": found.names.of_thing(o.label),
+        "probability": round(float(o.distribution[o.label]), 5),
+        "distribution": {
+            found.names.of_thing(k): round(float(o.distribution[k]), 5) for k in likely
+        },
+        "centroid_world_m": _rounded(o.centroid_world),
+        "box": {
+            "centre_world_m": _rounded(o.box.T_world_box[:3, 3]),
+            "axes_world": [_rounded(axis) for axis in o.box.T_world_box[:3, :3].T],
+            "size_m": _rounded(o.box.size_m),
+        },
+        "keyframes": o.keyframe_ids.tolist(),
+        "landmarks": o.landmark_ids.tolist(),
+        "first_seen_s": round(o.first_seen_s, 6),
+        "last_seen_s": round(o.last_seen_s, 6),
+    }
+
+
+def _rounded(values: Array) -> list[float]:
+    return [round(float(v), 6) for v in values]
+
+
+def read_objects(run: Path) -> tuple[tuple[str, ...], list[SavedObject]]:
+    """The class names that a run knew, and its objects.
+
+    Raises:
+        InputError: no such file, or not as `write_objects` made it.
+    """
+    path = run / OBJECTS
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a run that had a segmenter")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return tuple(map(str, content["labels"])), [_from_json(o) for o in content["objects"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read ({error!r}); run again") from error
+
+
+def _from_json(o: dict[str, Any]) -> SavedObject:
+    T = np.eye(4)
+    T[:3, :3] = np.array(o["box"]["axes_world"], float).reshape(3, 3).T
+    T[:3, 3] = np.array(o["box"]["centre_world_m"], float).reshape(3)
+    return SavedObject(
+        int(o["id"]),
+        str(o["label"]),
+        float(o["probability"]),
+        np.array(o["centroid_world_m"], float).reshape(3),
+        OrientedBox(T, np.array(o["box"]["size_m"], float).reshape(3)),
+        np.array(o["keyframes"], np.int64),
+        np.array(o["landmarks"], np.int64),
+        float(o["first_seen_s"]),
+        float(o["last_seen_s"]),
+    )
+
+
+def write_boxes(path: Path, found: MapObjects) -> None:
+    """Write the boxes' edges as a line set in ASCII PLY, in the colours of the classes."""
+    corners = [o.box.corners_world for o in found.objects]
+    colours = [class_colour(o.label).round().astype(int).tolist() for o in found.objects]
+    count = len(found.objects)
+    lines = ["ply", "format ascii 1.0", "comment bmask-slam object boxes, world frame, metres"]
+    lines += [f"element vertex {8 * count}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    lines += ["property int object", f"element edge {len(EDGES) * count}"]
+    lines += ["property int vertex1", "property int vertex2", "end_header"]
+    for o, points, colour in zip(found.objects, corners, colours, strict=True):
+        rgb = " ".join(map(str, colour))
+        lines += [f"{x:.5f} {y:.5f} {z:.5f} {rgb} {o.id}" for x, y, z in points.tolist()]
+    for k in range(count):
+        lines += [f"{8 * k + a} {8 * k + b}" for a, b in EDGES.tolist()]
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")

@@ -1,0 +1,63 @@
+"""What the system returns for a frame: a value with a status, never an exception."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from bmask_slam.graph.geometry import Array
+
+
+class TrackingStatus(Enum):
+    """OK: enough inliers. WEAK: a pose from few inliers. LOST: no pose, and none is made up."""
+
+    OK = "OK"
+    WEAK = "WEAK"
+    LOST = "LOST"
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The outcome of one frame.
+
+    Attributes:
+        index: the frame's position in the sequence.
+        timestamp_s: its stamp in seconds.
+        status: see TrackingStatus.
+        T_world_camera: (4, 4) pose at the moment of tracking, None when LOST. The final
+            trajectory is composed at the end from the optimised keyframes.
+        segment: number of the map segment, from 0; a new one starts after tracking was lost
+            until the old one is recognised.
+        matches: landmarks matched in the frame before the robust pose estimate.
+        inliers: those that agree with the pose.
+        ignored: features on moving things, which were not used.
+        mostly_moving: too few features would have been left, so that all were used.
+        information: (6, 6) of the pose against a map taken for exact, in the camera's tangent
+            [rotation rad, translation m]; None without a pose, and where a frame begins a map.
+        keyframe_id: id of the keyframe made from this frame, or None.
+        keyframe_reason: why it was made ("" when it was not).
+        stage_ms: wall time of each stage in milliseconds, by name.
+    """
+
+    index: int
+    timestamp_s: float
+    status: TrackingStatus
+    T_world_camera: Array | None
+    segment: int = 0
+    matches: int = 0
+    inliers: int = 0
+    ignored: int = 0
+    mostly_moving: bool = False
+    information: Array | None = None
+    keyframe_id: int | None = None
+    keyframe_reason: str = ""
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def covariance(self) -> Array | None:
+        """(6, 6) of the pose against the map, ``[rad, m]`` on the right side; None without."""
+        if self.information is None:
+            return None
+        return np.asarray(np.linalg.inv(self.information), float)

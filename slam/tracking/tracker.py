@@ -1,0 +1,307 @@
+"""Frame tracking: predict, match the local map by projection, optimise the pose, judge it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from bmask_slam.features.brisk import Features, select, undistort
+from bmask_slam.features.matching import (
+    MatchConfig,
+    Matches,
+    WindowIndex,
+    consistent_rotation,
+    match_pairs,
+)
+from bmask_slam.features.patch_alignment import SubpixelConfig, register_patches
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.tracking.pose_optimisation import (
+    PoseEstimate,
+    PoseOptimisationConfig,
+    optimise_pose,
+)
+from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.tracking.rolling_shutter import (
+    Motion,
+    PreviousPose,
+    at_one_moment,
+    corrected,
+    motion_since,
+)
+from bmask_slam.world.landmark_table import Ints, LandmarkTable
+from bmask_slam.world.world_map import WorldMap
+
+COARSE_STEP = 1e-3
+"""Radians and metres: less than a pixel; nearer the first estimate need not come."""
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Search windows in pixels and the numbers of inliers that make a status.
+
+    The first search looks only for the landmarks of the last frame around their predicted
+    places; where that fails, for the whole local map, at last in windows of ``wide_radius_px``. The
+    second looks for the whole local map in windows of ``local_radius_px``.
+    """
+
+    search_radius_px: float = 20.0
+    wide_radius_px: float = 60.0
+    local_radius_px: float = 6.0
+    min_inliers: int = 30
+    weak_inliers: int = 15
+    max_view_angle_deg: float = 60.0
+    match: MatchConfig = field(default_factory=MatchConfig)
+    pose: PoseOptimisationConfig = field(default_factory=PoseOptimisationConfig)
+    subpixel: SubpixelConfig = field(default_factory=SubpixelConfig)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame against the map.
+
+    Attributes:
+        status: LOST means that the pose must not be used.
+        T_world_camera: (4, 4).
+        features: the frame's, with the registered pixels of the matches, and pixel sigmas that
+            agree with the frame's residuals.
+        keypoints, landmark_ids: (M,) inlier matches.
+        matches: number of matches before the robust estimate.
+        visible_ids: landmarks that should be in view.
+        information: (6, 6) of the pose.
+    """
+
+    status: TrackingStatus
+    T_world_camera: Array
+    features: Features
+    keypoints: Ints
+    landmark_ids: Ints
+    matches: int
+    visible_ids: Ints
+    information: Array
+
+
+class Tracker:
+    """Holds the camera and the gates; the map is the caller's."""
+
+    def __init__(self, camera: Camera, config: TrackingConfig):
+        self.camera = camera
+        self.config = config
+        self._narrow = replace(config.pose, kernel_widths=config.pose.kernel_widths[-2:])
+        self._coarse = replace(config.pose, final_rounds=1, step_tolerance=COARSE_STEP)
+
+    def track(
+        self,
+        features: Features,
+        T_predicted: Array,
+        recent_ids: Ints,
+        local_ids: Ints,
+        world: WorldMap,
+        previous: PreviousPose | None = None,
+    ) -> Tracked:
+        """The frame's pose from landmarks seen a moment ago, then from the whole local map.
+
+        The previous pose tells how fast the camera moves, which matters to a rolling shutter.
+        """
+        recent_ids = world.landmarks.living(recent_ids)
+        motion = motion_since(previous, T_predicted, self.camera)
+        estimate = self._first_estimate(
+            at_one_moment(features, self.camera, motion),
+            T_predicted,
+            recent_ids,
+            local_ids,
+            world.landmarks,
+        )
+        if estimate is None:
+            return lost(T_predicted, features)
+        return self.refine(features, estimate.T_world_camera, local_ids, world, previous)
+
+    def refine(
+        self,
+        features: Features,
+        T_world_camera: Array,
+        local_ids: Ints,
+        world: WorldMap,
+        previous: PreviousPose | None = None,
+    ) -> Tracked:
+        """The pose from all landmarks of the local map, given a good first one."""
+        radius, landmarks = self.config.local_radius_px, world.landmarks
+        motion = motion_since(previous, T_world_camera, self.camera)
+        still = at_one_moment(features, self.camera, motion)
+        visible, matches = self.search(
+            still, WindowIndex(still.pixels), T_world_camera, local_ids, radius, landmarks
+        )
+        if self.config.subpixel.enabled:
+            features = self._registered(
+                features, matches.train, visible[matches.query], T_world_camera[:3, 3], world
+            )
+        features, estimate = self._refined(
+            features, matches, visible, T_world_camera, landmarks, motion
+        )
+        inliers = int(estimate.inliers.sum())
+        if not estimate.ok or inliers < self.config.weak_inliers:
+            return lost(T_world_camera, features, len(matches))
+        status = TrackingStatus.OK if inliers >= self.config.min_inliers else TrackingStatus.WEAK
+        kept = matches[estimate.inliers]
+        noise = np.array([estimate.noise_scale, estimate.noise_scale, 1.0])
+        features = replace(features, sigmas_px=features.sigmas_px * noise)
+        return Tracked(
+            status=status,
+            T_world_camera=estimate.T_world_camera,
+            features=features,
+            keypoints=kept.train,
+            landmark_ids=visible[kept.query],
+            matches=len(matches),
+            visible_ids=visible,
+            information=estimate.information,
+        )
+
+    def _refined(
+        self,
+        features: Features,
+        matches: Matches,
+        ids: Ints,
+        T_world_camera: Array,
+        landmarks: LandmarkTable,
+        motion: Motion | None,
+    ) -> tuple[Features, PoseEstimate]:
+        """The pose, and the features as they are at one moment, by what they tell of the motion."""
+        still = at_one_moment(features, self.camera, motion)
+        estimate = self._optimise(still, matches, ids, T_world_camera, landmarks, self._narrow)
+        if motion is None or not estimate.ok:
+            return still, estimate
+        kept = matches[estimate.inliers]
+        points_world = landmarks.points_world[ids[kept.query]]
+        seen = select(still, kept.train)
+        motion = corrected(motion, estimate, points_world, seen, self.camera)
+        still = at_one_moment(features, self.camera, motion)
+        return still, self._optimise(
+            still, matches, ids, estimate.T_world_camera, landmarks, self._narrow
+        )
+
+    def _registered(
+        self,
+        features: Features,
+        keypoints: Ints,
+        ids: Ints,
+        centre_world: Array,
+        world: WorldMap,
+    ) -> Features:
+        """The features with the matched keypoints moved to where their landmarks' patches lie."""
+        config = self.config.subpixel
+        start = features.image_pixels[keypoints]
+        patches, zooms = world.landmarks.nearest_patches(ids, centre_world, config.limits)
+        refined, correlation = register_patches(
+            features.gray, start, patches, config.iterations, zooms
+        )
+        shift = np.linalg.norm(refined - start, axis=1)
+        limit = config.max_shift_px * np.sqrt(features.scales[keypoints])
+        good = (correlation > config.min_correlation) & (shift < limit)
+        rows = keypoints[good]
+        image_pixels, pixels = features.image_pixels.copy(), features.pixels.copy()
+        sigmas = features.sigmas_px.copy()
+        image_pixels[rows] = refined[good]
+        pixels[rows] = undistort(self.camera, refined[good])
+        sigmas[rows, :2] = config.sigma_px
+        return replace(features, image_pixels=image_pixels, pixels=pixels, sigmas_px=sigmas)
+
+    def search(
+        self,
+        features: Features,
+        index: WindowIndex,
+        T_world_camera: Array,
+        ids: Ints,
+        radius_px: float,
+        landmarks: LandmarkTable,
+    ) -> tuple[Ints, Matches]:
+        """Landmarks in view and their matches (query: position among those, train: keypoint).
+
+        A landmark is in view if it projects into the image, and is seen from within
+        ``max_view_angle_deg`` of the direction it was last seen from. The window grows with the
+        keypoint's scale; a keypoint of another scale than predicted is no candidate.
+        """
+        ids, pixels, z = self._in_view(T_world_camera, ids, landmarks)
+        scale = np.maximum(landmarks.extent[ids] / z, 1.0)
+        query, train = index.pairs(pixels, radius_px * np.minimum(np.sqrt(scale), 3.0))
+        ratio = features.scales[train] / scale[query]
+        limit = self.config.match.max_scale_ratio
+        fits = (ratio < limit) & (ratio > 1 / limit)
+        pairs = (query[fits], train[fits])
+        tables = (landmarks.descriptors[ids], features.descriptors)
+        matches = match_pairs(pairs, tables, self.config.match)
+        tolerance = self.config.match.max_angle_rad
+        if tolerance is None:
+            return ids, matches
+        turn = features.angles_rad[matches.train] - landmarks.angles_rad[ids[matches.query]]
+        return ids, consistent_rotation(matches, turn, tolerance)
+
+    def _in_view(
+        self, T_world_camera: Array, ids: Ints, landmarks: LandmarkTable
+    ) -> tuple[Ints, Array, Array]:
+        """Those of the landmarks that are in view, their pixels (N, 2) and z-depths (N,) in m."""
+        camera, points_world = self.camera, landmarks.points_world[ids]
+        points_camera = transform(inverse(T_world_camera), points_world)
+        front = np.flatnonzero(points_camera[:, 2] > 0.1)
+        points_camera = points_camera[front]
+        pixels = camera.project(points_camera)
+        u, v = pixels.T
+        inside = (u > 0) & (u < camera.width - 1) & (v > 0) & (v < camera.height - 1)
+        rows = front[inside]
+        towards = T_world_camera[:3, 3] - points_world[rows]
+        distance = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+        along = np.einsum("ij,ij->i", towards, landmarks.directions[ids[rows]])
+        seen = along > np.cos(np.deg2rad(self.config.max_view_angle_deg)) * distance
+        chosen = np.flatnonzero(inside)[seen]
+        return ids[rows[seen]], pixels[chosen], points_camera[chosen, 2]
+
+    def _first_estimate(
+        self,
+        features: Features,
+        T_predicted: Array,
+        recent_ids: Ints,
+        local_ids: Ints,
+        landmarks: LandmarkTable,
+    ) -> PoseEstimate | None:
+        """A pose near the prediction, from the last frame's landmarks or from the local map."""
+        index = WindowIndex(features.pixels)
+        near, wide = self.config.search_radius_px, self.config.wide_radius_px
+        for ids, radius in ((recent_ids, near), (local_ids, near), (local_ids, wide)):
+            visible, matches = self.search(features, index, T_predicted, ids, radius, landmarks)
+            estimate = self._optimise(
+                features, matches, visible, T_predicted, landmarks, self._coarse
+            )
+            if estimate.ok and estimate.inliers.sum() >= self.config.weak_inliers:
+                return estimate
+        return None
+
+    def _optimise(
+        self,
+        features: Features,
+        matches: Matches,
+        ids: Ints,
+        T_world_camera: Array,
+        landmarks: LandmarkTable,
+        config: PoseOptimisationConfig,
+    ) -> PoseEstimate:
+        return optimise_pose(
+            T_world_camera,
+            landmarks.points_world[ids[matches.query]],
+            features.measurements[matches.train],
+            features.sigmas_px[matches.train],
+            self.camera,
+            config,
+        )
+
+
+def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked:
+    """The outcome of a frame without a pose."""
+    begun = untracked(T_world_camera, features)
+    return replace(begun, status=TrackingStatus.LOST, matches=matches)
+
+
+def untracked(T_world_camera: Array, features: Features) -> Tracked:
+    """The outcome of a frame that begins a map at a given pose."""
+    none = np.zeros(0, np.int64)
+    information = np.zeros((6, 6))
+    return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information)

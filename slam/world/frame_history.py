@@ -1,0 +1,118 @@
+"""Poses of ordinary frames, kept relative to their reference keyframes and composed at the end."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.world.world_map import WorldMap
+
+ENTRY = np.dtype(
+    [("timestamp_s", float), ("keyframe_id", np.int64), ("T_keyframe_camera", float, (4, 4))]
+)
+"""A frame's stamp and its pose as seen from its reference keyframe."""
+Entries = NDArray[np.void]
+NOBODY = -1
+"""Heir of a keyframe that was lost with its place: its frames have no pose."""
+
+
+class FrameHistory:
+    """One entry a tracked frame; a keyframe that is culled hands its frames to another."""
+
+    def __init__(self) -> None:
+        self._store: Entries = np.zeros(1024, ENTRY)
+        self._size = 0
+        self._parent: dict[int, tuple[int, Array]] = {}
+
+    @property
+    def heirs(self) -> dict[int, tuple[int, Array]]:
+        """Of every culled keyframe the one that took its frames, and T_heir_culled."""
+        return self._parent
+
+    def append(
+        self, timestamp_s: float, keyframe_id: int, T_world_keyframe: Array, T_world_camera: Array
+    ) -> None:
+        """Remember a frame's pose as seen from a keyframe whose current pose is given."""
+        T_keyframe_camera = inverse(T_world_keyframe) @ T_world_camera
+        self.extend(np.array([(timestamp_s, keyframe_id, T_keyframe_camera)], ENTRY))
+
+    def since(self, count: int) -> Entries:
+        """What was appended after the first ``count`` frames."""
+        return self._store[count : self._size].copy()
+
+    def extend(self, entries: Entries) -> None:
+        """Append what another history holds of the frames that follow."""
+        size = self._size + len(entries)
+        if size > len(self._store):
+            bigger = np.zeros(max(2 * len(self._store), size), ENTRY)
+            bigger[: self._size] = self._store[: self._size]
+            self._store = bigger
+        self._store[self._size : size] = entries
+        self._size = size
+
+    def hand_over(self, keyframe_id: int, parent_id: int, T_parent_keyframe: Array) -> None:
+        """A keyframe leaves the map: its frames follow the parent from now on."""
+        self._parent[keyframe_id] = (parent_id, T_parent_keyframe)
+
+    def trajectories(self, world: WorldMap) -> dict[int, Trajectory]:
+        """Every tracked frame whose keyframe was not lost, by map segment, from current poses."""
+        entries = self._store[: self._size]
+        ids, which = np.unique(entries["keyframe_id"], return_inverse=True)
+        order = np.argsort(which, kind="stable")
+        groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(ids)))[:-1])
+        poses, segments = np.empty((len(entries), 4, 4)), np.full(len(entries), NOBODY)
+        for keyframe_id, rows in zip(ids.tolist(), groups, strict=False):
+            owner, T = self._resolve(keyframe_id, entries["T_keyframe_camera"][rows])
+            if owner == NOBODY:
+                continue
+            keyframe = world.keyframes[owner]
+            poses[rows], segments[rows] = keyframe.T_world_camera @ T, keyframe.segment
+        return {
+            segment: Trajectory(
+                entries["timestamp_s"][segments == segment], poses[segments == segment]
+            )
+            for segment in np.unique(segments[segments != NOBODY]).tolist()
+        }
+
+    def heir(self, keyframe_id: int) -> tuple[int, Array]:
+        """The keyframe that stands for one now, or NOBODY, and T_heir_keyframe.
+
+        One that has no heir stands for itself.
+        """
+        return self._resolve(keyframe_id, np.eye(4))
+
+    def state(self) -> Arrays:
+        """All entries, and who inherited whose frames, as arrays."""
+        entries, heirs = self._store[: self._size], list(self._parent.values())
+        return {
+            "timestamps_s": entries["timestamp_s"].copy(),
+            "keyframe_ids": entries["keyframe_id"].copy(),
+            "T_keyframe_camera": entries["T_keyframe_camera"].copy(),
+            "culled_ids": np.array(list(self._parent), np.int64),
+            "heir_ids": np.array([heir for heir, _ in heirs], np.int64),
+            "T_heir_culled": _stacked([T for _, T in heirs]),
+        }
+
+    def restore(self, state: Arrays) -> None:
+        """Become the history of a state."""
+        self._size = len(state["timestamps_s"])
+        self._store = np.zeros(max(self._size, 1024), ENTRY)
+        columns = ("timestamps_s", "keyframe_ids", "T_keyframe_camera")
+        for name, column in zip(ENTRY.names or (), columns, strict=True):
+            self._store[name][: self._size] = state[column]
+        heirs = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
+        self._parent = dict(zip(state["culled_ids"].tolist(), heirs, strict=True))
+
+    def _resolve(self, keyframe_id: int, T: Array) -> tuple[int, Array]:
+        """The keyframe that stands for one, and poses T (..., 4, 4) as seen from it."""
+        while keyframe_id in self._parent:
+            keyframe_id, T_parent_keyframe = self._parent[keyframe_id]
+            T = T_parent_keyframe @ T
+        return keyframe_id, T
+
+
+def _stacked(poses: list[Array]) -> Array:
+    return np.array(poses, float).reshape(-1, 4, 4)

@@ -1,0 +1,298 @@
+"""All landmarks of the map, one array a property; an id is a row and is never used twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.features.patch_alignment import PATCH_PX
+from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.geometry import Array, inverse, transform
+
+PATCHES = 4  # of a landmark: views from one walk past it, of which each patch serves a range
+
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_Columns = dict[str, tuple[tuple[int, ...], type, float]]
+
+_LOOKS: _Columns = {
+    "descriptors": ((8,), np.uint64, 0),
+    "directions": ((3,), np.float64, 0.0),
+    "extent": ((), np.float64, 0.0),
+    "angles_rad": ((), np.float64, 0.0),
+    "colours": ((3,), np.uint8, 0),
+    "patches": ((PATCHES, PATCH_PX, PATCH_PX), np.uint8, 0),
+    "patch_views": ((PATCHES, 3), np.float64, np.nan),
+}
+"""What only the living have: most landmarks die young, and a session has no end."""
+_OF_ALL: _Columns = {
+    "points_world": ((3,), np.float64, np.nan),
+    "host": ((), np.int64, -1),
+    "last_keyframe": ((), np.int64, -1),
+    "observations": ((), np.int64, 0),
+    "visible": ((), np.int64, 0),
+    "found": ((), np.int64, 0),
+    "replaced_by": ((), np.int64, -1),
+    "alive": ((), np.bool_, False),
+    "in_graph": ((), np.bool_, False),
+}
+_COLUMNS = _OF_ALL | _LOOKS
+_PLACE: _Columns = {"place": ((), np.int64, 0)}
+
+
+class Looks:
+    """A column over landmark ids that has rows for the living alone, at their places.
+
+    Place 0 is that of all the dead, who look like nothing: what is written about them is lost.
+    """
+
+    def __init__(self, rows: NDArray, place: Ints) -> None:
+        self._rows, self._place = rows, place
+
+    def __len__(self) -> int:
+        return len(self._place)
+
+    def __getitem__(self, ids: Any) -> NDArray:
+        return self._rows[self._place[ids]]
+
+    def __setitem__(self, ids: Any, values: Any) -> None:
+        nothing = self._rows[0].copy()
+        self._rows[self._place[ids]] = values
+        self._rows[0] = nothing
+
+    def pick(self, ids: Ints, which: Ints) -> NDArray:
+        """Entry which[k] of the row of ids[k]."""
+        return self._rows[self._place[ids], which]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
+        return np.array(self._rows[self._place], dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """What sub-pixel registration aligns some landmarks with, see LandmarkTable.
+
+    Attributes:
+        images: (N, PATCHES, 17, 17) uint8.
+        views: (N, PATCHES, 3) m, NaN where there is none.
+    """
+
+    images: NDArray[np.uint8]
+    views: Array
+
+    def __getitem__(self, rows: Any) -> Patches:
+        return Patches(self.images[rows], self.views[rows])
+
+
+class LandmarkTable:
+    """Columns over landmark ids; every attribute is an array view of the rows in use.
+
+    Attributes:
+        points_world: (N, 3) metres.
+        descriptors: (N, 8) uint64, BRISK's bits in the keyframe that saw it last.
+        directions: (N, 3) unit vector from the point towards that keyframe's camera.
+        extent: (N,) keypoint scale times z there, so that scale at depth z is extent / z.
+        angles_rad: (N,) the keypoint's orientation there.
+        colours: (N, 3) uint8.
+        host: (N,) keyframe that made it; it moves the landmark while it is not in the graph.
+        last_keyframe: (N,) newest keyframe that observes it.
+        patches: (N, PATCHES, 17, 17) uint8 image patches that sub-pixel registration aligns with.
+        patch_views: (N, PATCHES, 3) metres, from the point to the camera that took each, or NaN.
+        observations: (N,) keyframes that observe it.
+        visible, found: (N,) frames in which it should have been, and was, matched.
+        replaced_by: (N,) the landmark that this one was fused into, -1 for none.
+        alive, in_graph: (N,) bool.
+        place: (N,) where a living one's looks are kept, 0 for the dead.
+
+    Descriptors, directions, extent, angles, colours and patches are those of the living: a dead
+    landmark looks like nothing, and its place serves another.
+    """
+
+    points_world: Array
+    descriptors: Looks
+    directions: Looks
+    extent: Looks
+    angles_rad: Looks
+    colours: Looks
+    host: Ints
+    last_keyframe: Ints
+    patches: Looks
+    patch_views: Looks
+    observations: Ints
+    visible: Ints
+    found: Ints
+    replaced_by: Ints
+    alive: Mask
+    in_graph: Mask
+    place: Ints
+
+    def __init__(self) -> None:
+        self._size = 0
+        self._store = {name: _filled(1024, column) for name, column in (_OF_ALL | _PLACE).items()}
+        self._looks = {name: _filled(1, column) for name, column in _LOOKS.items()}
+        self._free: list[int] = []
+        self._make_views()
+
+    def __len__(self) -> int:
+        return self._size
+
+    def add(self, columns: dict[str, NDArray]) -> Ints:
+        """New landmarks from columns by name; returns their ids (N,)."""
+        first = self._size
+        self.extend_to(first + len(columns["points_world"]))
+        ids = np.arange(first, self._size)
+        self._settle(ids)
+        for name, values in columns.items():
+            getattr(self, name)[ids] = values
+        self.alive[ids] = True
+        self.visible[ids] = self.found[ids] = 1
+        return ids
+
+    def extend_to(self, size: int) -> None:
+        """Rows up to a size, those that are new not alive: to be filled from another table."""
+        self._vacate(np.arange(size, self._size))
+        capacity, old = len(self._store["alive"]), self._size
+        for name, (shape, dtype, fill) in (_OF_ALL | _PLACE).items():
+            if size > capacity:
+                bigger: NDArray = np.empty((max(2 * capacity, size), *shape), dtype)
+                bigger[:old] = self._store[name][:old]
+                self._store[name] = bigger
+            self._store[name][old:size] = fill
+        self._size = size
+        self._make_views()
+
+    def set_alive(self, alive: Mask) -> None:
+        """Exactly these of all (N,) are alive; those that are new look like nothing yet."""
+        self._vacate(np.flatnonzero((self.place > 0) & ~alive))
+        self._settle(np.flatnonzero((self.place == 0) & alive))
+        self.alive[:] = alive
+
+    def living(self, ids: Ints) -> Ints:
+        """Those of the ids that are still in the map."""
+        ids = ids[ids >= 0]
+        return ids[self.alive[ids]]
+
+    def current(self, ids: Ints) -> Ints:
+        """The ids (N,) >= 0 that stand for these now, in their order, fused ones followed.
+
+        A late answer about landmarks may name some that were fused or culled meanwhile; those
+        that were culled stay as they are, not alive.
+        """
+        ids = ids.copy()
+        while len(fused := np.flatnonzero(self.replaced_by[ids] >= 0)):
+            ids[fused] = self.replaced_by[ids[fused]]
+        return ids
+
+    def remove(self, ids: Ints) -> None:
+        """Take landmarks out of the map; keyframes drop them when they next look."""
+        self.alive[ids] = False
+        self.in_graph[ids] = False
+        self._vacate(np.unique(ids))
+
+    def patch_distances(self, ids: Ints, views: Array, limits: tuple[float, float]) -> Array:
+        """How far (N, PATCHES) patches are from views (N, 3), as shares of the limits.
+
+        The limits are a turn in radians and a factor of distance, of which the larger share
+        counts. Infinite where there is no patch.
+        """
+        max_turn_rad, max_zoom = limits
+        there = self.patch_views[ids]
+        distance_there = np.linalg.norm(there, axis=-1)
+        distance_here = np.linalg.norm(views, axis=-1)[:, None]
+        cosine = np.einsum("nj,nvj->nv", views, there) / (distance_here * distance_there)
+        turn = np.arccos(np.clip(cosine, -1, 1)) / max_turn_rad
+        zoom = np.abs(np.log(distance_here / distance_there)) / np.log(max_zoom)
+        return np.nan_to_num(np.maximum(turn, zoom), nan=np.inf, posinf=np.inf)
+
+    def nearest_patches(
+        self, ids: Ints, centre_world: Array, limits: tuple[float, float]
+    ) -> tuple[NDArray[np.uint8], Array]:
+        """Of every landmark the patch (N, 17, 17) of the view most like that from a camera (3,).
+
+        Also its zoom (N,): how many times larger than in the patch things look from there.
+        """
+        views = centre_world - self.points_world[ids]
+        nearest = self.patch_distances(ids, views, limits).argmin(axis=1)
+        there = self.patch_views.pick(ids, nearest)
+        zooms = np.linalg.norm(there, axis=1) / np.linalg.norm(views, axis=1)
+        return self.patches.pick(ids, nearest), np.nan_to_num(zooms, nan=1.0)
+
+    def patches_of(self, ids: Ints) -> Patches:
+        """All patches of landmarks (N,); of an id of -1 none."""
+        images = np.zeros((len(ids), PATCHES, PATCH_PX, PATCH_PX), np.uint8)
+        views, known = np.full((len(ids), PATCHES, 3), np.nan), ids >= 0
+        images[known], views[known] = self.patches[ids[known]], self.patch_views[ids[known]]
+        return Patches(images, views)
+
+    def give_patches(self, ids: Ints, patches: Patches) -> None:
+        """Those of the landmarks (N,), each once, that have no patch have these now."""
+        without = np.isnan(self.patch_views[ids]).all(axis=(1, 2))
+        self.patches[ids[without]] = patches.images[without]
+        self.patch_views[ids[without]] = patches.views[without]
+
+    def put_patches(self, ids: Ints, slots: Ints, patches: NDArray[np.uint8], views: Array) -> None:
+        """Give landmarks (N,), each once, patches (N, 17, 17) and their views (N, 3) in slots."""
+        for column, values in ((self.patches, patches), (self.patch_views, views)):
+            all_slots = column[ids]
+            all_slots[np.arange(len(ids)), slots] = values
+            column[ids] = all_slots
+
+    def move_with_hosts(self, ids: Ints, keyframe_ids: Ints, T_old: Array, T_new: Array) -> None:
+        """Carry landmarks along with their host keyframes from poses T_old to T_new (K, 4, 4)."""
+        position = np.searchsorted(keyframe_ids, self.host[ids])
+        position = np.minimum(position, len(keyframe_ids) - 1)
+        known = keyframe_ids[position] == self.host[ids]
+        ids, position = ids[known], position[known]
+        T_move = (T_new @ inverse(T_old))[position]
+        self.points_world[ids] = transform(T_move, self.points_world[ids][:, None])[:, 0]
+
+    def state(self) -> Arrays:
+        """The living landmarks; of dead ones nothing but their number matters any more."""
+        ids = np.flatnonzero(self.alive)
+        columns = {name: getattr(self, name)[ids] for name in _COLUMNS if name != "alive"}
+        return {"size": np.array(self._size), "ids": ids, **columns}
+
+    def restore(self, state: Arrays) -> None:
+        """Become the table of a state; this one must be new."""
+        self.extend_to(int(state["size"]))
+        self._settle(state["ids"])
+        for name in _COLUMNS:
+            getattr(self, name)[state["ids"]] = True if name == "alive" else state[name]
+
+    def _settle(self, ids: Ints) -> None:
+        """Places for landmarks (N,) that have none."""
+        missing = len(ids) - len(self._free)
+        if missing > 0:
+            capacity = len(self._looks["extent"])
+            more = max(missing, capacity)
+            for name, column in _LOOKS.items():
+                self._looks[name] = np.concatenate([self._looks[name], _filled(more, column)])
+            self._free += range(capacity + more - 1, capacity - 1, -1)
+            self._make_views()
+        if len(ids):
+            self.place[ids] = self._free[-len(ids) :][::-1]
+            del self._free[-len(ids) :]
+
+    def _vacate(self, ids: Ints) -> None:
+        """Landmarks (N,), each once, give up their places, which look like nothing again."""
+        places = self.place[ids]
+        places = places[places > 0]
+        for name, (_, _, fill) in _LOOKS.items():
+            self._looks[name][places] = fill
+        self.place[ids] = 0
+        self._free += places[::-1].tolist()
+
+    def _make_views(self) -> None:
+        for name, array in self._store.items():
+            setattr(self, name, array[: self._size])
+        for name, rows in self._looks.items():
+            setattr(self, name, Looks(rows, self.place))
+
+
+def _filled(count: int, column: tuple[tuple[int, ...], type, float]) -> NDArray:
+    shape, dtype, fill = column
+    return np.full((count, *shape), fill, dtype)

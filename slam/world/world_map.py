@@ -1,0 +1,260 @@
+"""The map that the front end tracks against: keyframes, landmarks and who sees what."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bmask_slam.features.brisk import Features
+from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, transform
+from bmask_slam.world.landmark_table import Ints, LandmarkTable, Mask
+
+MAX_CULLED = 500
+
+
+@dataclass
+class Keyframe:
+    """A frame that stays in the map.
+
+    Attributes:
+        id: position among all keyframes ever made, from 0.
+        frame_index, timestamp_s: of the frame it was.
+        segment: map segment it belongs to.
+        T_world_camera: (4, 4), replaced whenever the graph was optimised.
+        features: its keypoints.
+        landmark_ids: (N,) landmark of every keypoint, -1 for none.
+        sent_ids: (N,) the landmark for which a keypoint's observation was sent to the graph, or -1.
+        masked: (N,) keypoints on something that moves: they observe no landmark and make none.
+    """
+
+    id: int
+    frame_index: int
+    timestamp_s: float
+    segment: int
+    T_world_camera: Array
+    features: Features
+    landmark_ids: Ints
+    sent_ids: Ints = field(init=False)
+    masked: Mask = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.sent_ids = np.full(len(self.landmark_ids), -1, np.int64)
+        self.masked = np.zeros(len(self.landmark_ids), bool)
+
+    @property
+    def free(self) -> Mask:
+        """Keypoints (N,) that observe nothing and may."""
+        return (self.landmark_ids < 0) & ~self.masked
+
+
+@dataclass(frozen=True)
+class CulledKeyframe:
+    """What late news about a culled keyframe need: image_pixels (N, 2) and landmark_ids (N,)."""
+
+    image_pixels: Array
+    landmark_ids: Ints
+
+
+@dataclass
+class WorldMap:
+    """Keyframes by id, in the order they were made, and the landmark table.
+
+    ``culled`` remembers the keyframes that left last.
+    """
+
+    keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    landmarks: LandmarkTable = field(default_factory=LandmarkTable)
+    next_keyframe_id: int = 0
+    culled: dict[int, CulledKeyframe] = field(default_factory=dict)
+
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        """Take a keyframe in; its id must be ``next_keyframe_id``."""
+        self.keyframes[keyframe.id] = keyframe
+        self.next_keyframe_id = keyframe.id + 1
+
+    def in_segment(self, segment: int) -> list[Keyframe]:
+        """The keyframes of one map segment, oldest first."""
+        return [k for k in self.keyframes.values() if k.segment == segment]
+
+    def largest_segment(self) -> int:
+        """The segment with most keyframes, the older of equal ones; 0 where there is none."""
+        counts = Counter(k.segment for k in self.keyframes.values())
+        return min(counts, key=lambda segment: (-counts[segment], segment), default=0)
+
+    def segment_of(self, landmark_ids: Ints) -> int:
+        """The segment whose keyframes made most of these landmarks."""
+        hosts = self.landmarks.host[landmark_ids]
+        segments = [self.keyframes[h].segment for h in hosts if h in self.keyframes]
+        return int(np.bincount(segments).argmax())
+
+    def observed(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
+        """Keypoint indices and ids of the living landmarks that a keyframe observes."""
+        keypoints = np.flatnonzero(keyframe.landmark_ids >= 0)
+        keypoints = keypoints[self.landmarks.alive[keyframe.landmark_ids[keypoints]]]
+        return keypoints, keyframe.landmark_ids[keypoints]
+
+    def make_landmarks(self, keyframe: Keyframe, keypoints: Ints, points_world: Array) -> Ints:
+        """Landmarks at points (N, 3), made and observed by keypoints (N,); returns their ids."""
+        ids = self.landmarks.add(
+            {
+                "points_world": points_world,
+                "colours": keyframe.features.colours[keypoints],
+                "host": np.full(len(keypoints), keyframe.id),
+            }
+        )
+        self.attach(keyframe, keypoints, ids)
+        return ids
+
+    def attach(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:
+        """Record that keypoints (N,) of a keyframe observe landmarks (N,), and refresh these.
+
+        Masked keypoints are passed over.
+        """
+        usable = ~keyframe.masked[keypoints]
+        keypoints, landmark_ids = keypoints[usable], landmark_ids[usable]
+        keyframe.landmark_ids[keypoints] = landmark_ids
+        self.landmarks.observations[landmark_ids] += 1
+        self._refresh(keyframe, keypoints, landmark_ids)
+
+    def mask(self, keyframe: Keyframe, keypoints: Ints) -> None:
+        """Record that keypoints (N,) of a keyframe lie on something that moves.
+
+        They observe nothing any more, unless they are unmasked.
+        """
+        keyframe.masked[keypoints] = True
+        self.detach(keyframe, keypoints)
+
+    def unmask(self, keyframe: Keyframe, keypoints: Ints) -> None:
+        """Keypoints (N,) of a keyframe lie on something that stands after all."""
+        keyframe.masked[keypoints] = False
+
+    def detach(self, keyframe: Keyframe, keypoints: Ints) -> None:
+        """Record that keypoints (N,) of a keyframe observe nothing after all.
+
+        Landmarks that looked as here take their looks from the newest keyframe that is left.
+        """
+        landmarks, ids = self.landmarks, keyframe.landmark_ids[keypoints]
+        keyframe.landmark_ids[keypoints] = keyframe.sent_ids[keypoints] = -1
+        ids = landmarks.living(ids)
+        landmarks.observations[ids] -= 1
+        stale = ids[landmarks.last_keyframe[ids] == keyframe.id]
+        landmarks.last_keyframe[stale] = -1
+        landmarks.patch_views[stale] = np.nan
+        for other in self.keyframes.values():
+            rows = np.flatnonzero(np.isin(other.landmark_ids, stale))
+            self._refresh(other, rows, other.landmark_ids[rows])
+
+    def split(self, landmark_ids: Ints, keyframes: list[Keyframe], camera: Camera) -> Ints:
+        """Undo a wrong fusion: what these keyframes see becomes landmarks of its own.
+
+        Each lies where the first of the keyframes that measures its depth sees it; without any,
+        its views are given up. Returns the new ids.
+        """
+        twin = np.full(len(self.landmarks) + 1, -1, np.int64)
+        for keyframe in keyframes:
+            rows = np.flatnonzero(np.isin(keyframe.landmark_ids, landmark_ids))
+            ids = keyframe.landmark_ids[rows]
+            self.detach(keyframe, rows)
+            known = twin[ids] >= 0
+            self.attach(keyframe, rows[known], twin[ids[known]])
+            first = ~known & np.isfinite(keyframe.features.depth_m[rows])
+            pixels, depth_m = keyframe.features.pixels, keyframe.features.depth_m
+            points = camera.backproject(pixels[rows[first]], depth_m[rows[first]])
+            points_world = transform(keyframe.T_world_camera, points)
+            twin[ids[first]] = self.make_landmarks(keyframe, rows[first], points_world)
+        return twin[twin >= 0]
+
+    def mask_landmarks(self, landmark_ids: Ints) -> None:
+        """Take landmarks out for good: the keypoints that observe them are masked."""
+        gone = np.zeros(len(self.landmarks) + 1, bool)  # the last entry answers for id -1
+        gone[landmark_ids] = True
+        for keyframe in self.keyframes.values():
+            rows = gone[keyframe.landmark_ids]
+            keyframe.masked |= rows
+            keyframe.landmark_ids[rows] = keyframe.sent_ids[rows] = -1
+        self.landmarks.observations[landmark_ids] = 0
+        self.landmarks.remove(landmark_ids)
+
+    def _refresh(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:
+        """Landmarks (N,) look as these keypoints (N,), where no newer keyframe sees them."""
+        landmarks, features = self.landmarks, keyframe.features
+        newest = landmarks.last_keyframe[landmark_ids] <= keyframe.id
+        ids, rows = landmark_ids[newest], keypoints[newest]
+        landmarks.last_keyframe[ids] = keyframe.id
+        landmarks.descriptors[ids] = features.descriptors[rows]
+        towards = keyframe.T_world_camera[:3, 3] - landmarks.points_world[ids]
+        landmarks.directions[ids] = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+        z = -towards @ keyframe.T_world_camera[:3, 2]
+        landmarks.angles_rad[ids] = features.angles_rad[rows]
+        landmarks.extent[ids] = features.scales[rows] * np.maximum(z, 0.05)
+
+    def remove_keyframe(self, keyframe: Keyframe, heir: Keyframe) -> None:
+        """Take a keyframe out of the map; the landmarks it made follow the heir from now on."""
+        _, ids = self.observed(keyframe)
+        self.landmarks.observations[ids] -= 1
+        self.landmarks.host[self.landmarks.host == keyframe.id] = heir.id
+        del self.keyframes[keyframe.id]
+        pixels = keyframe.features.image_pixels
+        self.culled[keyframe.id] = CulledKeyframe(pixels, keyframe.landmark_ids)
+        if len(self.culled) > MAX_CULLED:
+            del self.culled[next(iter(self.culled))]
+
+    def renew_patches(self, keyframe: Keyframe, config: SubpixelConfig) -> None:
+        """Give landmarks a patch of a keyframe that sees them unlike all that they have.
+
+        It takes the place of the least similar one. Every new patch moves the landmark's image a
+        little, so one is kept as long as it may serve: where a place is passed again, its
+        landmarks are what they were the first time.
+        """
+        landmarks, features = self.landmarks, keyframe.features
+        rows, ids = self.observed(keyframe)
+        views = keyframe.T_world_camera[:3, 3] - landmarks.points_world[ids]
+        apart = landmarks.patch_distances(ids, views, config.limits)
+        unlike = np.flatnonzero(apart.min(axis=1) > 1)
+        patches = cut_patches(features.gray, features.image_pixels[rows[unlike]])
+        slots = apart[unlike].argmax(axis=1)
+        landmarks.put_patches(ids[unlike], slots, patches, views[unlike])
+
+    def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
+        """(shared landmarks, keyframe) of all that share at least a minimum, most shared first."""
+        seen = np.zeros(len(self.landmarks) + 1, bool)  # the last entry answers for id -1
+        seen[landmark_ids] = True
+        shared = [(int(np.count_nonzero(seen[k.landmark_ids])), k) for k in self.keyframes.values()]
+        strong = [pair for pair in shared if pair[0] >= minimum]
+        return sorted(strong, key=lambda pair: (-pair[0], -pair[1].id))
+
+    def replace_landmarks(self, old_ids: Ints, new_ids: Ints) -> Ints:
+        """Fuse duplicates: every observation of old_ids[k] becomes one of new_ids[k].
+
+        Returns the ids that were removed. A keyframe that observes both keeps the new one's
+        keypoint, since one landmark has one place in an image.
+        """
+        remap = np.arange(len(self.landmarks) + 1)
+        remap[-1] = -1
+        remap[old_ids] = new_ids
+        while (remap[remap] != remap).any():  # a chain of duplicates ends in one landmark
+            remap = remap[remap]
+        new_ids = remap[old_ids]
+        involved = np.zeros(len(self.landmarks) + 1, bool)
+        involved[old_ids] = True
+        for keyframe in self.keyframes.values():
+            rows = np.flatnonzero(involved[keyframe.landmark_ids])
+            if len(rows) == 0:
+                continue
+            targets = remap[keyframe.landmark_ids[rows]]
+            taken = np.isin(targets, keyframe.landmark_ids)
+            _, first = np.unique(targets, return_index=True)
+            repeated = np.ones(len(targets), bool)
+            repeated[first] = False
+            keep = ~(taken | repeated)
+            keyframe.landmark_ids[rows[~keep]] = -1
+            self.attach(keyframe, rows[keep], targets[keep])
+        np.add.at(self.landmarks.found, new_ids, self.landmarks.found[old_ids])
+        np.add.at(self.landmarks.visible, new_ids, self.landmarks.visible[old_ids])
+        self.landmarks.replaced_by[old_ids] = new_ids
+        self.landmarks.remove(old_ids)
+        return old_ids
