@@ -130,7 +130,7 @@ def main() -> None:
     if not folder.is_dir():
         with new_folder(folder) as temporary:
             make(temporary, arguments.frames)
-    nothing, geometry = "dynamics.geometry=false", "dynamics.geometry=true"
+    nothing, geometry = "moving_objects.geometry=false", "moving_objects.geometry=true"
     variants = {
         "without him, nothing": (KITCHEN, nothing, "none"),
         "without him, geometry": (KITCHEN, geometry, "none"),

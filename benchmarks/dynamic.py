@@ -33,8 +33,8 @@ from report import table
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features, select
 from bmask_slam.graph.camera import Camera
-from bmask_slam.moving.feature_replenishment import Refill
-from bmask_slam.moving.moving_object_filter import Sifted
+from bmask_slam.moving.feature_replenishment import FeatureReplenishment
+from bmask_slam.moving.moving_object_filter import StaticFeatures
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
@@ -92,15 +92,19 @@ class Outcome:
 class IdealSystem(WatchedSystem):
     """Leaves out what the truth says, in every frame."""
 
-    def _sift(self, frame: Frame, features: Features) -> Sifted:
-        sifted, moving = super()._sift(frame, features), self._on_moving(frame, features)
-        return Sifted(select(features, np.flatnonzero(~moving)), moving, False, sifted.view)
+    def _static_features(self, frame: Frame, features: Features) -> StaticFeatures:
+        static, moving = super()._static_features(frame, features), self._on_moving(frame, features)
+        return StaticFeatures(select(features, np.flatnonzero(~moving)), moving, False, static.view)
 
-    def _fill_up(self, frame: Frame, features: Features, sifted: Sifted) -> Sifted:
-        super()._fill_up(frame, features, sifted)
-        refill = Refill(self.camera, self.config.features)
+    def _replenish(
+        self, frame: Frame, features: Features, static: StaticFeatures
+    ) -> StaticFeatures:
+        super()._replenish(frame, features, static)
+        replenishment = FeatureReplenishment(self.camera, self.config.features)
         judge = partial(self._on_moving, frame)
-        return replace(sifted, features=refill.filled_up(frame, features, sifted.moving, judge))
+        return replace(
+            static, features=replenishment.replenished(frame, features, static.moving, judge)
+        )
 
     def _on_moving(self, frame: Frame, features: Features) -> NDArray[np.bool_]:
         """Which features (N,) lie on or near what moves in truth."""

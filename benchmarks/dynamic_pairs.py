@@ -67,9 +67,9 @@ def moving_points(
     second = replace(pair[1], index=1, timestamp_s=1 / CAMERA.fps)
     features = system.prepare(second)
     pose = system.process(second, features).T_world_camera
-    views = system.dynamics.memory.posed(0, system.mapper)
-    sifted = system.dynamics.sift(second, features, pose, views)
-    return features.image_pixels, sifted.moving
+    views = system.moving_objects.memory.posed(0, system.mapper)
+    static = system.moving_objects.static_features_at(second, features, pose, views)
+    return features.image_pixels, static.moving
 
 
 def main() -> None:

@@ -42,8 +42,8 @@ def measured_mm(job: Job) -> float:
     torch.set_num_threads(1)
     labels, geometry = VARIANTS[variant]
     settings = [
-        f"dynamics.labels={labels}",
-        f"dynamics.geometry={geometry}",
+        f"moving_objects.labels={labels}",
+        f"moving_objects.geometry={geometry}",
         other_keypoints(repeat),
     ]
     segmenter = make_segmenter(SegmenterOptions("light" if labels else "none"), sequence)

@@ -107,7 +107,7 @@ def main() -> None:
     sequence = open_sequence(arguments.sequence, camera=run.camera)
     options = CalibrateOptions(arguments.run, sequence=arguments.sequence)
     problem, ids = make_problem(options, run, sequence)
-    stamps_s = run.keyframe_stamps_s[np.searchsorted(run.shadow.keyframes.ids, ids)]
+    stamps_s = run.keyframe_stamps_s[np.searchsorted(run.tables.keyframes.ids, ids)]
     matches = matches_of(problem.views, stamps_s)
     estimate, reference = associate(
         run.trajectories["trajectory.txt"], read_tum(arguments.sequence / "groundtruth.txt")

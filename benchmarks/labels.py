@@ -65,7 +65,7 @@ class RecordingStore(LabelStore):
 
 
 @dataclass
-class Tally:
+class RunCounters:
     """What was counted over all sequences; probabilities with whether they were right."""
 
     on_objects: int = 0
@@ -108,14 +108,14 @@ def main() -> None:
     parser.add_argument("--verbose", action="store_true", help="name what was missed")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    tally = Tally()
+    counters = RunCounters()
     for path in arguments.sequences:
         sequence = open_sequence(path)
         system = run_system(sequence, arguments)
-        measure(system, sequence, tally, arguments.verbose)
-        print(tally.per_sequence[-1], flush=True)
-    draw_reliability(arguments.out / "reliability.png", tally)
-    print(report(tally))
+        measure(system, sequence, counters, arguments.verbose)
+        print(counters.per_sequence[-1], flush=True)
+    draw_reliability(arguments.out / "reliability.png", counters)
+    print(report(counters))
 
 
 def run_system(sequence: Sequence, arguments: argparse.Namespace) -> SlamSystem:
@@ -133,18 +133,18 @@ def run_system(sequence: Sequence, arguments: argparse.Namespace) -> SlamSystem:
     return system
 
 
-def measure(system: SlamSystem, sequence: Sequence, tally: Tally, verbose: bool) -> None:
+def measure(system: SlamSystem, sequence: Sequence, counters: RunCounters, verbose: bool) -> None:
     """Compare a finished system with the truth of its sequence."""
     keyframes = list(system.mapper.world.keyframes.values())
     truths = {k.id: read_truth(sequence, k) for k in keyframes}
     T_truth_world = alignment(keyframes, truths)
     categories = true_categories(sequence.folder, system)
-    before = replace(tally)
-    measure_landmarks(system, truths, T_truth_world, categories, tally)
-    lines = measure_objects(system, sequence, (truths, T_truth_world, categories), tally)
-    told, objects = tally.told - before.told, tally.objects - before.objects
-    share = (tally.right - before.right) / max(tally.on_objects - before.on_objects, 1)
-    tally.per_sequence.append(
+    before = replace(counters)
+    measure_landmarks(system, truths, T_truth_world, categories, counters)
+    lines = measure_objects(system, sequence, (truths, T_truth_world, categories), counters)
+    told, objects = counters.told - before.told, counters.objects - before.objects
+    share = (counters.right - before.right) / max(counters.on_objects - before.on_objects, 1)
+    counters.per_sequence.append(
         f"{sequence.name}: {len(keyframes)} keyframes, landmarks on objects right {share:.3f}, "
         f"{objects} objects, {told} told\n" + ("\n".join(lines) if verbose else "")
     )
@@ -190,7 +190,7 @@ def measure_landmarks(
     truths: dict[int, Truth],
     T_truth_world: Array,
     categories: Array,
-    tally: Tally,
+    counters: RunCounters,
 ) -> None:
     """What landmarks are, by the majority of the keyframes in which they are not hidden."""
     cloud, camera = system.landmarks(), system.camera
@@ -212,16 +212,16 @@ def measure_landmarks(
     best_label, best_p = (np.array(column) for column in zip(*best, strict=True))
     right, best_right = found.labels[seen] == label, best_label == label
     on = label > 0
-    tally.on_objects += int(on.sum())
-    tally.right += int(right[on].sum())
-    tally.right_best_view += int(best_right[on].sum())
-    tally.background += int((~on).sum())
-    tally.background_right += int(right[~on].sum())
+    counters.on_objects += int(on.sum())
+    counters.right += int(right[on].sum())
+    counters.right_best_view += int(best_right[on].sum())
+    counters.background += int((~on).sum())
+    counters.background_right += int(right[~on].sum())
     spoken = found.views[seen] > 0
-    tally.sure.append(found.probability[seen][spoken])
-    tally.correct.append(right[spoken])
-    tally.sure_best_view.append(best_p[spoken])
-    tally.correct_best_view.append(best_right[spoken])
+    counters.sure.append(found.probability[seen][spoken])
+    counters.correct.append(right[spoken])
+    counters.sure_best_view.append(best_p[spoken])
+    counters.correct_best_view.append(best_right[spoken])
 
 
 def view_label(system: SlamSystem, landmark: int) -> tuple[int, float]:
@@ -237,20 +237,20 @@ def measure_objects(
     system: SlamSystem,
     sequence: Sequence,
     truth: tuple[dict[int, Truth], Array, Array],
-    tally: Tally,
+    counters: RunCounters,
 ) -> list[str]:
     truths, T_truth_world, categories = truth
     (visible, minor), (measurable, _) = (visible_boxes(system, truths, m) for m in (False, True))
     whole = whole_boxes(sequence.folder)
     told = [(o, moved(o, T_truth_world)) for o in system.objects().objects if o.label]
     lines, ids = [], sorted(visible)
-    tally.objects += len(ids)
+    counters.objects += len(ids)
     ignored: set[int] = set()
     for kind, boxes in (("whole", whole), ("visible", visible), ("measured", measurable)):
         ious = pair_ious(told, [(categories[i], boxes.get(i)) for i in ids])
         rows, columns = linear_sum_assignment(-ious)
         good = ious[rows, columns] >= MIN_IOU
-        tally.found[kind] += int(good.sum())
+        counters.found[kind] += int(good.sum())
     hit = set(rows[good].tolist())
     extra = pair_ious(told, [(categories[i], b) for i, b in sorted(minor.items())])
     for k, (o, box) in enumerate(told):
@@ -266,7 +266,7 @@ def measure_objects(
             name = system.semantics.names.names[categories[i]]
             size = visible[i].size_m.round(2)
             lines.append(f"  missed {name} {i} size {size} best iou {ious[:, j].max():.2f}")
-    tally.told += len(told) - len(ignored)
+    counters.told += len(told) - len(ignored)
     return lines
 
 
@@ -334,13 +334,13 @@ def calibration_error(sure: Array, correct: Array) -> tuple[float, list[tuple[fl
     return float(error), bins
 
 
-def draw_reliability(path: Path, tally: Tally) -> None:
+def draw_reliability(path: Path, counters: RunCounters) -> None:
     figure = Figure(figsize=(5.2, 5), dpi=120, layout="constrained")
     axes = figure.add_subplot()
     axes.plot([0, 1], [0, 1], color="#9a9a96", lw=1)
     rows = (
-        ("fused", tally.sure, tally.correct, "#1f5fa8"),
-        ("best single view", tally.sure_best_view, tally.correct_best_view, "#d6302a"),
+        ("fused", counters.sure, counters.correct, "#1f5fa8"),
+        ("best single view", counters.sure_best_view, counters.correct_best_view, "#d6302a"),
     )
     for name, sure, correct, colour in rows:
         error, bins = calibration_error(np.concatenate(sure), np.concatenate(correct))
@@ -355,21 +355,22 @@ def draw_reliability(path: Path, tally: Tally) -> None:
     figure.savefig(path)
 
 
-def report(tally: Tally) -> str:
-    fused = calibration_error(np.concatenate(tally.sure), np.concatenate(tally.correct))[0]
-    best = np.concatenate(tally.sure_best_view), np.concatenate(tally.correct_best_view)
-    on, told, objects = max(tally.on_objects, 1), max(tally.told, 1), max(tally.objects, 1)
+def report(counters: RunCounters) -> str:
+    fused = calibration_error(np.concatenate(counters.sure), np.concatenate(counters.correct))[0]
+    best = np.concatenate(counters.sure_best_view), np.concatenate(counters.correct_best_view)
+    on, told, objects = max(counters.on_objects, 1), max(counters.told, 1), max(counters.objects, 1)
+    behind = max(counters.background, 1)
     rows = [
-        f"landmarks on objects           {tally.on_objects}",
-        f"  right class                  {tally.right / on:.3f}",
-        f"  right by the best view alone {tally.right_best_view / on:.3f}",
-        f"landmarks on the background    {tally.background}",
-        f"  right ('unknown')            {tally.background_right / max(tally.background, 1):.3f}",
+        f"landmarks on objects           {counters.on_objects}",
+        f"  right class                  {counters.right / on:.3f}",
+        f"  right by the best view alone {counters.right_best_view / on:.3f}",
+        f"landmarks on the background    {counters.background}",
+        f"  right ('unknown')            {counters.background_right / behind:.3f}",
         f"calibration error              {fused:.3f}",
         f"  of the best view alone       {calibration_error(*best)[0]:.3f}",
-        f"objects to find, told          {tally.objects}, {tally.told}",
+        f"objects to find, told          {counters.objects}, {counters.told}",
     ]
-    for kind, found in tally.found.items():
+    for kind, found in counters.found.items():
         precision, recall = found / told, found / objects
         rows.append(f"  {kind:8} boxes: precision {precision:.3f}, recall {recall:.3f}")
     return "\n".join(rows)

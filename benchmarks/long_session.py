@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.building import CAMERA, landmarks, visible, walk
-from bmask_slam.back_end.factor_selection import GraphFeedConfig
+from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
@@ -40,7 +40,7 @@ SIGMAS_PX = np.array([1.0, 1.0, 0.2])
 """Of u, v and disparity: about what the red kitchen's frames ask for (docs/architecture.md)."""
 STEP_SIGMAS = np.array([0.001] * 3 + [0.003] * 3)
 LOOP_SIGMAS = np.array([0.002] * 3 + [0.01] * 3)
-FEED = GraphFeedConfig()
+FEED = FactorSelectionConfig()
 GAP = 40
 """Keyframes after which a landmark counts as seen before rather than tracked."""
 FOUND = 0.8
@@ -81,7 +81,7 @@ class FrontEnd:
             points,
             Observations(np.full(len(ids), k), ids, z, sigmas),
             relative_poses=loops,
-            retire_landmarks=self._outside_window(known) if self.retires else known[:0],
+            marginalise_landmarks=self._outside_window(known) if self.retires else known[:0],
         )
 
     def _measure(self, k: int) -> tuple[IntArray, Array]:
@@ -113,14 +113,14 @@ class FrontEnd:
         return (loop,), ids[~again], z[~again]
 
     def _outside_window(self, in_graph: IntArray) -> IntArray:
-        """As ``back_end.factor_selection.GraphFeed`` chooses what retires."""
+        """As ``back_end.factor_selection.FactorSelector`` chooses what retires."""
         mine = np.zeros(len(self.points), bool)
         mine[self.seen[-1]] = True
         shared = np.array([np.count_nonzero(mine[ids]) for ids in self.seen])
         near = np.lexsort((-np.arange(len(shared)), -shared))[: FEED.window_keyframes]
         active = [self.seen[i] for i in near.tolist() if shared[i] >= FEED.window_min_shared]
         waiting = np.setdiff1d(in_graph, np.concatenate([self.seen[-1], *active]))
-        return waiting if len(waiting) >= FEED.retire_batch else waiting[:0]
+        return waiting if len(waiting) >= FEED.marginalise_batch else waiting[:0]
 
     def _initial_pose(self, k: int, estimate: GraphEstimate | None) -> Array:
         if estimate is None:

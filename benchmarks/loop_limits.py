@@ -43,9 +43,9 @@ def true_poses(run: SavedRun, reference: Path) -> Array:
 
 def make_loops_exact(run: SavedRun, truth: Array) -> None:
     """Put the true relative poses in place of the loops, without a kernel."""
-    row = {k: i for i, k in enumerate(run.shadow.keyframes.ids.tolist())}
-    for number in loop_numbers(run.shadow):
-        entry = run.shadow.pose_factors[number]
+    row = {k: i for i, k in enumerate(run.tables.keyframes.ids.tolist())}
+    for number in loop_numbers(run.tables):
+        entry = run.tables.pose_factors[number]
         assert isinstance(entry.factor, RelativePose)
         a, b = (truth[row[k]] for k in (entry.factor.keyframe_a, entry.factor.keyframe_b))
         exact = replace(
@@ -54,7 +54,7 @@ def make_loops_exact(run: SavedRun, truth: Array) -> None:
             covariance=EXACT * entry.factor.covariance,
             robust=None,
         )
-        run.shadow.pose_factors[number] = replace(entry, factor=exact)
+        run.tables.pose_factors[number] = replace(entry, factor=exact)
 
 
 def aligned_errors_m(poses: Array, truth: Array) -> Array:
@@ -81,11 +81,11 @@ def without_deformation(errors_m: Array, truth: Array) -> Array:
 
 def expected_ate_mm(run: SavedRun) -> float:
     """ATE that the posterior of the run's graph promises, RMS of draws from it."""
-    shadow, maker = run.shadow, FactorMaker(run.camera, run.config)
-    seen = shadow.observations.select(shadow.observations.all_rows())
+    tables, maker = run.tables, FactorMaker(run.camera, run.config)
+    seen = tables.observations.select(tables.observations.all_rows())
     factors: list[Any] = maker.observations(seen)
-    factors += [maker.pose_factor(entry.factor) for entry in shadow.pose_factors.values()]
-    keyframes, landmarks = shadow.keyframes, shadow.landmarks
+    factors += [maker.pose_factor(entry.factor) for entry in tables.pose_factors.values()]
+    keyframes, landmarks = tables.keyframes, tables.landmarks
     values = make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
     x = _draws(make_graph(factors).linearize(values))
     keys = keyframe_keys(keyframes.ids)
@@ -120,8 +120,8 @@ def line(title: str, run: SavedRun, truth: Array, focal_error: float) -> None:
     """Adjust a run's graph with a camera, and print what became of its errors."""
     camera = run.camera
     camera = replace(camera, fx=camera.fx * (1 + focal_error), fy=camera.fy * (1 + focal_error))
-    adjust(run.shadow, camera, run.config, AdjustmentConfig(drop_observations=False))
-    poses = run.shadow.keyframes.values
+    adjust(run.tables, camera, run.config, AdjustmentConfig(drop_observations=False))
+    poses = run.tables.keyframes.values
     errors_m = aligned_errors_m(poses, truth)
     gap = se3_log(inverse(inverse(truth[0]) @ truth[-1]) @ inverse(poses[0]) @ poses[-1])
     gap_deg, gap_mm = np.degrees(np.linalg.norm(gap[:3])), 1e3 * np.linalg.norm(gap[3:])

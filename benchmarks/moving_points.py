@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.geometry import Array
-from bmask_slam.moving.moving_object_filter import Sifted
+from bmask_slam.moving.moving_object_filter import StaticFeatures
 from bmask_slam.rendering.classes import CATEGORY_IDS
 from bmask_slam.rendering.things.people import PULLED_S
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
@@ -93,13 +93,13 @@ def count(pixels: Array, moving: Mask, masks: Mapping[str, Mask]) -> dict[str, C
     return {kind: Count(int(o.sum()), int((o & moving).sum())) for kind, o in on.items()}
 
 
-def picture(frame: Frame, sifted: tuple[Array, Mask], masks: Mapping[str, Mask]) -> Image:
+def picture(frame: Frame, static: tuple[Array, Mask], masks: Mapping[str, Mask]) -> Image:
     """A frame with its keypoints and the outline of what moves, half size, BGR."""
     drawn = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
     moves = np.any(list(masks.values()), axis=0).astype(np.uint8)
     outlines, _ = cv2.findContours(moves, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     cv2.drawContours(drawn, outlines, -1, (0, 220, 255), 2)
-    for (u, v), moving in zip(*sifted, strict=True):
+    for (u, v), moving in zip(*static, strict=True):
         colour = (0, 0, 255) if moving else (0, 220, 0)
         cv2.circle(drawn, (round(u), round(v)), 3, colour, -1)
     return np.asarray(cv2.resize(drawn, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
@@ -130,27 +130,29 @@ class WatchedSystem(SlamSystem):
         """Of all frames but the first, which has nothing to be compared with."""
         return sum((c[kind] for c in self.counts[1:]), Count())
 
-    def _sift(self, frame: Frame, features: Features) -> Sifted:
+    def _static_features(self, frame: Frame, features: Features) -> StaticFeatures:
         begun_s = time.thread_time()
-        sifted = super()._sift(frame, features)
+        static = super()._static_features(frame, features)
         self.check_ms.append(1e3 * (time.thread_time() - begun_s))
         masks = self.truth.masks(frame)
-        seen = features.image_pixels, sifted.moving
+        seen = features.image_pixels, static.moving
         self.counts.append(count(*seen, masks))
         self.covered.append(float(np.any(list(masks.values()), axis=0).mean()))
         if frame.index % self.every == self.every // 2:
             self.pictures.append(picture(frame, seen, masks))
-        return sifted
+        return static
 
-    def _fill_up(self, frame: Frame, features: Features, sifted: Sifted) -> Sifted:
+    def _replenish(
+        self, frame: Frame, features: Features, static: StaticFeatures
+    ) -> StaticFeatures:
         begun_s = time.thread_time()
-        filled = super()._fill_up(frame, features, sifted)
+        filled = super()._replenish(frame, features, static)
         self.fill_ms.append(1e3 * (time.thread_time() - begun_s))
         return filled
 
-    def _watch(self, time_s: float, tracked: Tracked, sifted: Sifted) -> None:
+    def _watch(self, time_s: float, tracked: Tracked, static: StaticFeatures) -> None:
         begun_s = time.thread_time()
-        super()._watch(time_s, tracked, sifted)
+        super()._watch(time_s, tracked, static)
         self.check_ms[-1] += 1e3 * (time.thread_time() - begun_s)
 
 

@@ -136,7 +136,11 @@ class Job:
 def measured_mm(job: Job) -> float:
     """ATE of one run."""
     torch.set_num_threads(1)
-    off = ["dynamics.labels=false", "dynamics.geometry=false"] if job.variant == "nothing" else []
+    off = (
+        ["moving_objects.labels=false", "moving_objects.geometry=false"]
+        if job.variant == "nothing"
+        else []
+    )
     kind = "none" if job.variant == "nothing" else "light"
     segmenter = make_segmenter(SegmenterOptions(kind), job.sequence)
     if job.variant == "random":

@@ -13,13 +13,13 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import Arrays, check_like, nested, part
 from bmask_slam.graph.geometry import Array
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
-from bmask_slam.moving.moving_object_filter import Dynamics, Sifted
+from bmask_slam.moving.moving_object_filter import MovingObjectFilter, StaticFeatures
 from bmask_slam.runtime.stage_clock import StageClock
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_results import SystemResults, largest
-from bmask_slam.tracking.camera_tracker import Localiser
+from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.keyframe_decision import KeyframeEvidence, keyframe_reason
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 from bmask_slam.tracking.tracker import Tracked, Tracker, lost, untracked
@@ -44,9 +44,9 @@ class SlamSystem(SystemResults):
         tracker = Tracker(camera, config.tracking)
         self.mapper = self._make_mapper(tracker)
         rules = (config.relocalisation, config.mapping)
-        self.localiser = Localiser(tracker, self.mapper.places, rules)
-        self.dynamics = Dynamics(camera, config.dynamics, config.features)
-        self.semantics = SemanticMapper(camera, config.semantics, segmenter, self.dynamics)
+        self.camera_tracker = CameraTracker(tracker, self.mapper.places, rules)
+        self.moving_objects = MovingObjectFilter(camera, config.moving_objects, config.features)
+        self.semantics = SemanticMapper(camera, config.semantics, segmenter, self.moving_objects)
         self._segment = 0
         self._reference: Keyframe | None = None
         self._frames_since_keyframe = 0
@@ -54,7 +54,7 @@ class SlamSystem(SystemResults):
 
     def _make_mapper(self, tracker: Tracker) -> Mapper:
         c = self.config
-        return Mapper(self.camera, tracker, (c.mapping, c.feed, c.graph, c.loops))
+        return Mapper(self.camera, tracker, (c.mapping, c.factor_selection, c.graph, c.loops))
 
     def state(self) -> Arrays:
         """All that the past has left behind, as named arrays."""
@@ -65,9 +65,9 @@ class SlamSystem(SystemResults):
             "first_keyframe": np.array(self._first_keyframe),
             **nested(
                 mapper=self.mapper.state(),
-                localiser=self.localiser.state(),
+                localiser=self.camera_tracker.state(),
                 semantics=self.semantics.state(),
-                dynamics=self.dynamics.state(),
+                dynamics=self.moving_objects.state(),
             ),
         }
 
@@ -75,9 +75,9 @@ class SlamSystem(SystemResults):
         """Become the system of a state that was read from a file. Raises InputError."""
         check_like(state, self.state(), path)
         self.mapper.restore(part(state, "mapper"), path)
-        self.localiser.restore(part(state, "localiser"))
+        self.camera_tracker.restore(part(state, "localiser"))
         self.semantics.restore(part(state, "semantics"), path)
-        self.dynamics.restore(part(state, "dynamics"))
+        self.moving_objects.restore(part(state, "dynamics"))
         self._segment = int(state["segment"])
         self._reference = self.mapper.world.keyframes.get(int(state["reference"]))
         self._frames_since_keyframe = int(state["frames_since_keyframe"])
@@ -100,8 +100,8 @@ class SlamSystem(SystemResults):
         self._first_keyframe = world.next_keyframe_id
         self.mapper.begin_session()
         self.semantics.begin_session()
-        self.dynamics.begin_session()
-        self.localiser.forget(self.config.relocalisation.patience_frames)
+        self.moving_objects.begin_session()
+        self.camera_tracker.forget(self.config.relocalisation.patience_frames)
 
     def prepare(self, frame: Frame) -> Features:
         """The frame's features; pure, so that it may run ahead in another thread."""
@@ -110,21 +110,21 @@ class SlamSystem(SystemResults):
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Track a frame and, if it becomes a keyframe, extend and optimise the map."""
         clock, keyframe = StageClock(), None
-        self.localiser.expect(frame.timestamp_s)
+        self.camera_tracker.expect(frame.timestamp_s)
         with clock.stage("features"):
             features = features if features is not None else self.prepare(frame)
         with clock.stage("moving"):
-            sifted = self._sift(frame, features)
+            static = self._static_features(frame, features)
         with clock.stage("features"):
-            sifted = self._fill_up(frame, features, sifted)
+            static = self._replenish(frame, features, static)
         with clock.stage("tracking"):
-            tracked = self._track(sifted.features)
+            tracked = self._track(static.features)
         with clock.stage("moving"):
-            came_back = self._watch(frame.timestamp_s, tracked, sifted)
+            came_back = self._watch(frame.timestamp_s, tracked, static)
         with clock.stage("keyframe"):
             reason = self._keyframe_reason(tracked) if not came_back else ""
             if reason:
-                tracked, keyframe = self.insert(frame, tracked, self.localiser.local_ids)
+                tracked, keyframe = self.insert(frame, tracked, self.camera_tracker.local_ids)
         with clock.stage("graph"):
             if keyframe:
                 self.mapper.optimise(keyframe)
@@ -134,7 +134,7 @@ class SlamSystem(SystemResults):
                 self._refer_to(keyframe)
         with clock.stage("semantics"):
             if keyframe:
-                self.dynamics.remember(keyframe, sifted, self.mapper)
+                self.moving_objects.remember(keyframe, static, self.mapper)
                 self.semantics.observe(frame, keyframe, self.mapper)
         return FrameResult(
             index=frame.index,
@@ -144,8 +144,8 @@ class SlamSystem(SystemResults):
             segment=self._segment,
             matches=tracked.matches,
             inliers=len(tracked.landmark_ids),
-            ignored=sifted.ignored,
-            mostly_moving=sifted.mostly_moving,
+            ignored=static.ignored,
+            mostly_moving=static.mostly_moving,
             information=tracked.information if tracked.information.any() else None,
             keyframe_id=keyframe.id if keyframe else None,
             keyframe_reason=reason,
@@ -179,24 +179,28 @@ class SlamSystem(SystemResults):
         can_begin = np.isfinite(features.depth_m).sum() >= rules.min_new_points
         if self._reference is None:
             return untracked(np.eye(4), features) if can_begin else lost(np.eye(4), features)
-        tracked = self.localiser.track(features, self.mapper.world, self._reference)
-        if self.localiser.lost_frames <= rules.patience_frames or not can_begin:
+        tracked = self.camera_tracker.track(features, self.mapper.world, self._reference)
+        if self.camera_tracker.lost_frames <= rules.patience_frames or not can_begin:
             return tracked
         self._segment = 1 + max(k.segment for k in self.mapper.world.keyframes.values())
         self._reference = None
-        self.localiser.restart(np.eye(4))
+        self.camera_tracker.restart(np.eye(4))
         return untracked(np.eye(4), features)
 
-    def _sift(self, frame: Frame, features: Features) -> Sifted:
+    def _static_features(self, frame: Frame, features: Features) -> StaticFeatures:
         """The frame's features without those on moving things."""
-        localiser = self.localiser if self._reference is not None else None
-        return self.dynamics.leave_out(frame, features, localiser, self._segment, self.mapper)
+        camera_tracker = self.camera_tracker if self._reference is not None else None
+        return self.moving_objects.leave_out(
+            frame, features, camera_tracker, self._segment, self.mapper
+        )
 
-    def _fill_up(self, frame: Frame, features: Features, sifted: Sifted) -> Sifted:
+    def _replenish(
+        self, frame: Frame, features: Features, static: StaticFeatures
+    ) -> StaticFeatures:
         """With other keypoints in place of those on moving things."""
-        return self.dynamics.fill_up(frame, features, sifted, self._segment, self.mapper)
+        return self.moving_objects.replenish(frame, features, static, self._segment, self.mapper)
 
-    def _watch(self, time_s: float, tracked: Tracked, sifted: Sifted) -> bool:
+    def _watch(self, time_s: float, tracked: Tracked, static: StaticFeatures) -> bool:
         """Landmarks that are believed to move are not tracked against from now on.
 
         Returns whether some came back that stand: this frame was tracked without them, so that it
@@ -204,15 +208,15 @@ class SlamSystem(SystemResults):
         """
         if tracked.status is TrackingStatus.LOST:
             return False
-        moving = self.dynamics.watch(tracked, sifted.view, self.mapper.world)
-        self.localiser.leave_out(moving)
-        near, view = self._reference, sifted.view
+        moving = self.moving_objects.watch(tracked, static.view, self.mapper.world)
+        self.camera_tracker.leave_out(moving)
+        near, view = self._reference, static.view
         if near is None or view is None:
             return False
         pose = tracked.T_world_camera
-        came_back = self.dynamics.acquit(time_s, pose, view, near, self.mapper)
+        came_back = self.moving_objects.reinstate(time_s, pose, view, near, self.mapper)
         if came_back:
-            self.localiser.new_local_map(self.mapper.world, near)
+            self.camera_tracker.new_local_map(self.mapper.world, near)
         return came_back
 
     def _keyframe_reason(self, tracked: Tracked) -> str:
@@ -244,25 +248,25 @@ class SlamSystem(SystemResults):
         if not strong or strong[0][1] is self._reference:
             return False
         self._reference = strong[0][1]
-        self.localiser.new_local_map(world, self._reference)
+        self.camera_tracker.new_local_map(world, self._reference)
         return True
 
     def _join_segments(self, tracked: Tracked) -> Tracked:
         """Where other segments exist, look for this frame in them; found, they become one map."""
         world = self.mapper.world
         others = [k for k in world.keyframes.values() if k.segment != self._segment]
-        recognised = self.localiser.find(tracked.features, others, world) if others else None
+        recognised = self.camera_tracker.find(tracked.features, others, world) if others else None
         if recognised is None or not world.in_segment(self._segment):
             return tracked
         joined = self.mapper.join(self._segment, tracked, recognised)
         self._segment = world.segment_of(recognised.landmark_ids)
-        self.localiser.restart(joined.T_world_camera)
+        self.camera_tracker.restart(joined.T_world_camera)
         return joined
 
     def _refer_to(self, keyframe: Keyframe) -> None:
         self._reference = keyframe
         self._frames_since_keyframe = 0
-        self.localiser.new_local_map(self.mapper.world, keyframe)
+        self.camera_tracker.new_local_map(self.mapper.world, keyframe)
 
     def _remember(self, frame: Frame, tracked: Tracked, keyframe: Keyframe | None) -> Array | None:
         reference = self._reference
@@ -272,7 +276,7 @@ class SlamSystem(SystemResults):
         if keyframe:
             T_world_camera = keyframe.T_world_camera
             _, seen_ids = self.mapper.world.observed(keyframe)
-        self.localiser.moved_on(tracked.T_world_camera, T_world_camera, seen_ids)
+        self.camera_tracker.moved_on(tracked.T_world_camera, T_world_camera, seen_ids)
         T_world_reference = reference.T_world_camera
         self.mapper.history.append(
             frame.timestamp_s, reference.id, T_world_reference, T_world_camera

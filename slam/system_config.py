@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from bmask_slam.back_end.factor_selection import GraphFeedConfig
+from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.labelling.semantic_mapper import SemanticsConfig
 from bmask_slam.loops.closing import LoopClosingConfig
-from bmask_slam.moving.config import DynamicsConfig
+from bmask_slam.moving.config import MovingObjectConfig
 from bmask_slam.tracking.keyframe_decision import KeyframeConfig
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.tracker import TrackingConfig
@@ -29,10 +29,10 @@ class SystemConfig:
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
-    feed: GraphFeedConfig = field(default_factory=GraphFeedConfig)
+    factor_selection: FactorSelectionConfig = field(default_factory=FactorSelectionConfig)
     graph: SmootherConfig = field(default_factory=SmootherConfig)
     loops: LoopClosingConfig = field(default_factory=LoopClosingConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
-    dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
+    moving_objects: MovingObjectConfig = field(default_factory=MovingObjectConfig)
     final_adjustment: bool = True
     covariances: bool = False

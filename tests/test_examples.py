@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import runpy
 import subprocess
 import sys
@@ -13,13 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from recorded_bags import image
+from repository import ROOT
 from scipy.spatial.transform import Rotation
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.cli import main
 from bmask_slam.graph.geometry import inverse, se3_exp
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +31,6 @@ def test_live(recording, tmp_path) -> None:
     done = subprocess.run(
         [sys.executable, str(ROOT / "examples" / "live.py"), str(recording)],
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=True,

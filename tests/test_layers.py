@@ -10,8 +10,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from repository import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 LAYERS = ("graph", "semantics", "mapping", "slam")  # each imports only from its left
 NUMPY_ONLY = ("geometry", "camera", "errors", "trajectory", "metrics", "updates", "ply")
 MAX_LINES = 330

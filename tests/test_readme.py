@@ -8,10 +8,10 @@ import shlex
 from pathlib import Path
 
 import pytest
+from repository import ROOT
 
 from bmask_slam.cli import make_parser
 
-ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 MAX_LINES = 150

@@ -22,7 +22,7 @@ from bmask_slam.graph.batch.iteration import Progress, iterate
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.checks import OBSERVATION_PROBABILITY, wrong_observations
-from bmask_slam.graph.factors.factor_tables import Shadow, ids_array
+from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.gnc import first_mu, graduate
 from bmask_slam.graph.factors.graph_update import GraphUpdate, IntArray, RelativePose
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
@@ -104,7 +104,7 @@ class Adjustment:
 
 
 def adjust(
-    shadow: Shadow,
+    tables: FactorTables,
     camera: Camera,
     smoother_config: SmootherConfig | None = None,
     config: AdjustmentConfig | None = None,
@@ -116,13 +116,13 @@ def adjust(
         InputError: the graph is empty or cannot be solved, with GTSAM's reason.
     """
     begin_s = time.perf_counter()
-    if not len(shadow.keyframes.ids):
+    if not len(tables.keyframes.ids):
         raise InputError("the graph holds no keyframe; nothing to optimise")
-    observations = len(shadow.observations)
-    adjuster = _Adjuster(shadow, camera, smoother_config or SmootherConfig(), config, progress)
+    observations = len(tables.observations)
+    adjuster = _Adjuster(tables, camera, smoother_config or SmootherConfig(), config, progress)
     try:
         adjuster.optimise("robust")
-        loops = loop_numbers(shadow)
+        loops = loop_numbers(tables)
         wrong_loops = adjuster.drop_wrong_loops() if loops else np.zeros((0, 2), np.int64)
         wrong, dropped = adjuster.drop_wrong_observations()
     except RuntimeError as error:  # GTSAM's exceptions all arrive as this
@@ -139,15 +139,15 @@ def adjust(
     )
 
 
-def loop_edges(shadow: Shadow) -> IntArray:
+def loop_edges(tables: FactorTables) -> IntArray:
     """Keyframe ids (N, 2) of the loop edges."""
-    edges = [shadow.pose_factors[number].keyframes for number in loop_numbers(shadow)]
+    edges = [tables.pose_factors[number].keyframes for number in loop_numbers(tables)]
     return np.array(edges, np.int64).reshape(-1, 2)
 
 
-def loop_numbers(shadow: Shadow) -> list[int]:
+def loop_numbers(tables: FactorTables) -> list[int]:
     """Numbers of the loop edges."""
-    factors = shadow.pose_factors
+    factors = tables.pose_factors
     return sorted(n for n in factors if getattr(factors[n].factor, "kind", "") == LOOP)
 
 
@@ -156,13 +156,13 @@ class _Adjuster:
 
     def __init__(
         self,
-        shadow: Shadow,
+        tables: FactorTables,
         camera: Camera,
         smoother_config: SmootherConfig,
         config: AdjustmentConfig | None,
         progress: Progress,
     ) -> None:
-        self._shadow, self._camera = shadow, camera
+        self._tables, self._camera = tables, camera
         self._smoother_config, self._config = smoother_config, config or AdjustmentConfig()
         self._progress = progress
         self._maker = FactorMaker(camera, smoother_config)
@@ -171,7 +171,7 @@ class _Adjuster:
 
     def optimise(self, name: str) -> None:
         """A stage: every factor that is in the shadow, to convergence."""
-        graph = self._graph(sorted(self._shadow.pose_factors))
+        graph = self._graph(sorted(self._tables.pose_factors))
         before = float(graph.error(self._values()))
         done = self._done
         after = self._run(graph, self._config.max_iterations)
@@ -183,10 +183,10 @@ class _Adjuster:
         The right ones stay without a kernel until the end of this stage, so that the solution
         follows them whole.
         """
-        numbers = loop_numbers(self._shadow)
+        numbers = loop_numbers(self._tables)
         loops = [self._loop(number) for number in numbers]
         plain = make_graph([self._maker.pose_factor(loop) for loop in loops])
-        others = self._graph(sorted(set(self._shadow.pose_factors) - set(numbers)))
+        others = self._graph(sorted(set(self._tables.pose_factors) - set(numbers)))
         limit = float(chi2.ppf(self._config.loop_probability, 6))
 
         def chi_squares() -> Array:
@@ -209,9 +209,9 @@ class _Adjuster:
         before = self.stages[-1].cost_after
         weights, _ = graduate(now, limit, first_mu(now, limit), self._config.gnc_step, steps, solve)
         wrong = [number for number, weight in zip(numbers, weights, strict=True) if weight < 0.5]
-        edges = np.array([self._shadow.pose_factors[n].keyframes for n in wrong], np.int64)
-        self._shadow.remove_pose_factors(wrong)
-        graph = self._graph(sorted(self._shadow.pose_factors))
+        edges = np.array([self._tables.pose_factors[n].keyframes for n in wrong], np.int64)
+        self._tables.remove_pose_factors(wrong)
+        graph = self._graph(sorted(self._tables.pose_factors))
         after = self._run(graph, steps)
         self.stages.append(Stage("loops", graph.size(), before, after, self._done - done))
         return edges.reshape(-1, 2)
@@ -219,29 +219,29 @@ class _Adjuster:
     def drop_wrong_observations(self) -> tuple[IntArray, IntArray]:
         """Pairs (N, 2) of the observations that left, and the landmarks (N,) with them."""
         probability = self._config.observation_probability
-        pairs = wrong_observations(self._shadow, self._camera, probability)
+        pairs = wrong_observations(self._tables, self._camera, probability)
         if not (len(pairs) and self._config.drop_observations):
             return np.zeros((0, 2), np.int64), ids_array([])
         update = GraphUpdate(remove_observations=pairs)
-        removal = remove(update, self._shadow, self._smoother_config)
+        removal = remove(update, self._tables, self._smoother_config)
         self.optimise("inliers")
         return pairs, removal.dropped_landmarks
 
     def _loop(self, number: int) -> RelativePose:
         """A loop edge without its kernel."""
-        factor = self._shadow.pose_factors[number].factor
+        factor = self._tables.pose_factors[number].factor
         assert isinstance(factor, RelativePose)
         return replace(factor, robust=None)
 
     def _graph(self, numbers: list[int]) -> gtsam.NonlinearFactorGraph:
         """All observations, and the pose factors of these numbers."""
-        table = self._shadow.observations
+        table = self._tables.observations
         factors = self._maker.observations(table.select(table.all_rows()))
-        chosen = [self._shadow.pose_factors[number].factor for number in numbers]
+        chosen = [self._tables.pose_factors[number].factor for number in numbers]
         return make_graph(factors + [self._maker.pose_factor(factor) for factor in chosen])
 
     def _values(self) -> gtsam.Values:
-        keyframes, landmarks = self._shadow.keyframes, self._shadow.landmarks
+        keyframes, landmarks = self._tables.keyframes, self._tables.landmarks
         return make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
 
     def _run(self, graph: gtsam.NonlinearFactorGraph, max_iterations: int) -> float:
@@ -259,5 +259,5 @@ class _Adjuster:
             raise RuntimeError(f"the cost is {cost}")
         self._done += steps
         poses, points = read_values(optimiser.values())
-        self._shadow.keyframes.values, self._shadow.landmarks.values = poses, points
+        self._tables.keyframes.values, self._tables.landmarks.values = poses, points
         return cost

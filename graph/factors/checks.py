@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.factor_tables import Shadow, ValueTable
+from bmask_slam.graph.factors.factor_tables import FactorTables, ValueTable
 from bmask_slam.graph.factors.graph_update import (
     GraphUpdate,
     IntArray,
@@ -42,24 +42,24 @@ class Candidates:
     new_poses: Array
     new_landmarks: IntArray
     new_points: Array
-    shadow: Shadow
+    tables: FactorTables
 
     def has_keyframes(self, ids: IntArray) -> Mask:
         """Which of these are new or in the graph."""
-        return self.shadow.keyframes.contains(ids) | np.isin(ids, self.new_keyframes)
+        return self.tables.keyframes.contains(ids) | np.isin(ids, self.new_keyframes)
 
     def has_landmarks(self, ids: IntArray) -> Mask:
         """Which of these are new or in the graph."""
-        return self.shadow.landmarks.contains(ids) | np.isin(ids, self.new_landmarks)
+        return self.tables.landmarks.contains(ids) | np.isin(ids, self.new_landmarks)
 
     def poses(self, ids: IntArray) -> Array:
         """Poses (N, 4, 4) of ids that must exist."""
-        table = self.shadow.keyframes
+        table = self.tables.keyframes
         return _lookup(ids, (table.ids, table.values), (self.new_keyframes, self.new_poses))
 
     def points(self, ids: IntArray) -> Array:
         """Points (N, 3) of ids that must exist."""
-        table = self.shadow.landmarks
+        table = self.tables.landmarks
         return _lookup(ids, (table.ids, table.values), (self.new_landmarks, self.new_points))
 
 
@@ -140,14 +140,14 @@ def check_observations(
         candidates.points(observations.landmark_ids),
         camera,
     )
-    is_new = ~candidates.shadow.landmarks.contains(observations.landmark_ids)
+    is_new = ~candidates.tables.landmarks.contains(observations.landmark_ids)
     with np.errstate(invalid="ignore"):
         disparity_ratio = (z[:, 0] - z[:, 2]) * depth_m / camera.stereo_bf_px_m
     checks = (
         (bad_z | bad_sigma, RefusalReason.NOT_FINITE),
         (~candidates.has_keyframes(observations.keyframe_ids), RefusalReason.UNKNOWN_KEYFRAME),
         (~candidates.has_landmarks(observations.landmark_ids), RefusalReason.UNKNOWN_LANDMARK),
-        (_repeated(observations, candidates.shadow), RefusalReason.DUPLICATE),
+        (_repeated(observations, candidates.tables), RefusalReason.DUPLICATE),
         (~(depth_m >= config.min_depth_m), RefusalReason.BEHIND_CAMERA),
         (~(depth_m <= config.max_range_m), RefusalReason.OUT_OF_RANGE),
         (~(chi2 <= config.gate_sigmas**2), RefusalReason.REPROJECTION),
@@ -180,24 +180,24 @@ def reprojection(
         return points_camera[:, 2], np.sum(whitened**2, axis=1)
 
 
-def observation_errors(shadow: Shadow, camera: Camera) -> ObservationErrors:
+def observation_errors(tables: FactorTables, camera: Camera) -> ObservationErrors:
     """Chi-square of every observation at the shadow's values."""
-    seen = shadow.observations.select(shadow.observations.all_rows())
-    poses = shadow.keyframes.get(seen.keyframe_ids)
-    points = shadow.landmarks.get(seen.landmark_ids)
+    seen = tables.observations.select(tables.observations.all_rows())
+    poses = tables.keyframes.get(seen.keyframe_ids)
+    points = tables.landmarks.get(seen.landmark_ids)
     depth_m, chi_squares = reprojection(seen, poses, points, camera)
     is_stereo = np.isfinite(seen.measurements[:, 2])
     return ObservationErrors(seen.keyframe_ids, seen.landmark_ids, chi_squares, depth_m, is_stereo)
 
 
 def wrong_observations(
-    shadow: Shadow, camera: Camera, probability: float = OBSERVATION_PROBABILITY
+    tables: FactorTables, camera: Camera, probability: float = OBSERVATION_PROBABILITY
 ) -> IntArray:
     """Keyframe and landmark ids (N, 2) of observations beyond their chi-square bound.
 
     3 degrees of freedom with depth, 2 without; taken without the kernel.
     """
-    errors = observation_errors(shadow, camera)
+    errors = observation_errors(tables, camera)
     wrong = ~(errors.chi2 <= chi2.ppf(probability, np.where(errors.is_stereo, 3, 2)))
     return np.stack([errors.keyframe_ids[wrong], errors.landmark_ids[wrong]], axis=1)
 
@@ -220,7 +220,7 @@ def mahalanobis(r: Array, covariances: Array) -> Array:
     return np.sum(r * np.linalg.solve(covariances, r[..., None])[..., 0], axis=1)
 
 
-def _repeated(observations: Observations, shadow: Shadow) -> Mask:
+def _repeated(observations: Observations, tables: FactorTables) -> Mask:
     """Observations of a (keyframe, landmark) pair that the graph or an earlier row has."""
     seen: set[tuple[int, int]] = set()
     repeated = np.zeros(len(observations), bool)
@@ -228,8 +228,8 @@ def _repeated(observations: Observations, shadow: Shadow) -> Mask:
     for i, pair in enumerate(pairs):
         repeated[i] = (
             pair in seen
-            or shadow.observations.row(*pair) is not None
-            or shadow.archive.holds(*pair)
+            or tables.observations.row(*pair) is not None
+            or tables.marginalised.holds(*pair)
         )
         seen.add(pair)
     return repeated

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
-from bmask_slam.graph.factors.marginalised_landmarks import Archive
+from bmask_slam.graph.factors.marginalised_landmarks import MarginalisedLandmarks
 from bmask_slam.graph.geometry import Array
 
 NO_SLOT = -1
@@ -181,7 +181,7 @@ class PoseFactor:
         return isinstance(self.factor, PosePrior)
 
 
-class Shadow:
+class FactorTables:
     """Values, observations and pose factors (relative poses and priors, by running number).
 
     Observations of retired landmarks are in the archive; the pose factors stand for them.
@@ -193,7 +193,7 @@ class Shadow:
         self.observations = ObservationTable()
         self.pose_factors: dict[int, PoseFactor] = {}
         self.pose_factors_of: dict[int, set[int]] = {}
-        self.archive = Archive()
+        self.marginalised = MarginalisedLandmarks()
         self._next_number = 0
 
     def __len__(self) -> int:

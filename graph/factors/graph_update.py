@@ -176,7 +176,7 @@ class GraphUpdate:
     remove_relative_poses: tuple[RelativePoseName, ...] = ()
     removal_policy: RemovalPolicy = RemovalPolicy.DROP
     max_iterations: int = 0
-    retire_landmarks: IntArray = field(default_factory=_no_ids)
+    marginalise_landmarks: IntArray = field(default_factory=_no_ids)
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ class GraphEstimate:
     removal: RemovalReport = field(default_factory=RemovalReport)
     dropped_landmarks: IntArray = field(default_factory=_no_ids)
     dropped_keyframes: IntArray = field(default_factory=_no_ids)
-    bridged_keyframes: IntArray = field(default_factory=_no_ids)
+    anchored_keyframes: IntArray = field(default_factory=_no_ids)
     rebuilt: bool = False
     failed_variable: str = ""
     cost_before: float = math.nan

@@ -44,7 +44,7 @@ class Summary:
 
 
 @dataclass
-class Archive:
+class MarginalisedLandmarks:
     """Chunks by number, and the summary of every landmark that is out or came back.
 
     Attributes:

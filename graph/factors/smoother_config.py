@@ -54,8 +54,8 @@ class SmootherConfig:
     min_shared_observations: int = 6
     prior_sigma_rotation_rad: float = 1e-4
     prior_sigma_translation_m: float = 1e-4
-    bridge_sigma_rotation_rad: float = 0.05
-    bridge_sigma_translation_m: float = 0.1
+    anchor_sigma_rotation_rad: float = 0.05
+    anchor_sigma_translation_m: float = 0.1
     marginal_keyframes: int = 24
     base_share: float = 0.25
-    max_recoveries: int = 10
+    max_repairs: int = 10

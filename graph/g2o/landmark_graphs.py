@@ -34,7 +34,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
 from bmask_slam.graph.g2o.lines import (
     Tag,
@@ -77,9 +77,9 @@ def has_landmarks(path: Path) -> bool:
         return any(line.split(maxsplit=1)[:1] == [VIEW] for line in file)
 
 
-def write_landmark_graph(path: Path, shadow: Shadow, camera: Camera) -> None:
+def write_landmark_graph(path: Path, tables: FactorTables, camera: Camera) -> None:
     """Write a graph as ``read_landmark_graph`` reads it; it appears whole or not at all."""
-    offset = 1 + int(shadow.keyframes.ids.max(initial=-1))
+    offset = 1 + int(tables.keyframes.ids.max(initial=-1))
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
     rest = [camera.width, camera.height, camera.stereo_bf_px_m, camera.depth_scale, camera.fps]
     lines = [
@@ -90,12 +90,12 @@ def write_landmark_graph(path: Path, shadow: Shadow, camera: Camera) -> None:
         f"{STEREO} 1 {numbers_text(np.array([*_NO_OFFSET, *intrinsics, camera.baseline_m]))}",
         f"{OFFSET} 2 {numbers_text(_NO_OFFSET)}",
     ]
-    keyframes, landmarks = shadow.keyframes, shadow.landmarks
+    keyframes, landmarks = tables.keyframes, tables.landmarks
     lines += _lines(POSE, keyframes.ids, pose_columns(keyframes.values))
     lines += _lines(POINT, offset + landmarks.ids, landmarks.values)
-    for number in sorted(shadow.pose_factors):
-        lines += _pose_factor_lines(shadow.pose_factors[number].factor)
-    seen = shadow.observations.select(shadow.observations.all_rows())
+    for number in sorted(tables.pose_factors):
+        lines += _pose_factor_lines(tables.pose_factors[number].factor)
+    seen = tables.observations.select(tables.observations.all_rows())
     names = np.stack([seen.keyframe_ids, offset + seen.landmark_ids, 0 * seen.keyframe_ids], axis=1)
     write_lines(path, [*lines, *_lines(VIEW, names, _view_columns(seen, camera))])
 

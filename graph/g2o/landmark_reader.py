@@ -10,7 +10,7 @@ import numpy as np
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.observability import component_labels
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -70,7 +70,9 @@ class _Notes:
             ) from error
 
 
-def read_landmark_graph(path: Path, config: SmootherConfig | None = None) -> tuple[Shadow, Camera]:
+def read_landmark_graph(
+    path: Path, config: SmootherConfig | None = None
+) -> tuple[FactorTables, Camera]:
     """Read a graph with landmarks; of parts that nothing connects, those that are held.
 
     Keyframes that are fixed get a very firm prior. If nothing is held the largest part is taken and
@@ -96,24 +98,24 @@ def read_landmark_graph(path: Path, config: SmootherConfig | None = None) -> tup
     names = np.array(rows[VIEW].ids, np.int64)
     indices_of(names[:, 0], rows[VIEW].lines, keyframe_ids, path)
     indices_of(names[:, 1], rows[VIEW].lines, landmark_ids, path)
-    shadow = Shadow()
+    tables = FactorTables()
     poses = poses_of_columns(np.array(rows[POSE].numbers)[keyframe_rows])
-    shadow.keyframes.insert(keyframe_ids, poses)
+    tables.keyframes.insert(keyframe_ids, poses)
     seen = np.isin(landmark_ids, names[:, 1])
     if not seen.all():
         logger.warning("%s: %d landmarks that nothing sees left out", path, np.sum(~seen))
     points = np.array(rows[POINT].numbers)[landmark_rows]
     offset = notes.landmark_offset
-    shadow.landmarks.insert(landmark_ids[seen] - offset, points[seen])
-    shadow.observations.add(_views(rows[VIEW], names, offset, camera, path))
-    shadow.add_pose_factors(_pose_factors(rows, notes, keyframe_ids, path))
+    tables.landmarks.insert(landmark_ids[seen] - offset, points[seen])
+    tables.observations.add(_views(rows[VIEW], names, offset, camera, path))
+    tables.add_pose_factors(_pose_factors(rows, notes, keyframe_ids, path))
     check_fixed(fixed, keyframe_ids, path)
-    held = shadow.keyframes.get(np.array(sorted(fixed), np.int64))
+    held = tables.keyframes.get(np.array(sorted(fixed), np.int64))
     priors = zip(sorted(fixed), held, strict=True)
-    shadow.add_pose_factors([PosePrior(k, T, _FIXED_COVARIANCE) for k, T in priors])
-    _keep_held_parts(shadow, path)
-    anchor_components(shadow, config or SmootherConfig())
-    return shadow, camera
+    tables.add_pose_factors([PosePrior(k, T, _FIXED_COVARIANCE) for k, T in priors])
+    _keep_held_parts(tables, path)
+    anchor_components(tables, config or SmootherConfig())
+    return tables, camera
 
 
 def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:
@@ -215,23 +217,23 @@ def _measured(rows: Rows, path: Path) -> tuple[Array, Array]:
     return poses_of_columns(numbers[:, :7]), covariances
 
 
-def _keep_held_parts(shadow: Shadow, path: Path) -> None:
+def _keep_held_parts(tables: FactorTables, path: Path) -> None:
     """Of several parts keep those with a prior; if there is none, the largest."""
-    ids = shadow.keyframes.ids
-    edges = [factor.keyframes for factor in shadow.pose_factors.values()]
-    seen = shadow.observations.select(shadow.observations.used_rows())
+    ids = tables.keyframes.ids
+    edges = [factor.keyframes for factor in tables.pose_factors.values()]
+    seen = tables.observations.select(tables.observations.used_rows())
     labels = component_labels(ids, seen, edges)
     held = labels[np.searchsorted(ids, [edge[0] for edge in edges if len(edge) == 1])]
     keep = np.isin(labels, held) if len(held) else labels == np.argmax(np.bincount(labels))
     if keep.all():
         return
     gone = ids[~keep].tolist()
-    rows = shadow.observations.rows_of_keyframes(gone)
-    landmarks = np.unique(shadow.observations.select(rows).landmark_ids)
-    shadow.observations.remove(rows)
-    shadow.landmarks.remove(landmarks)
-    shadow.remove_pose_factors(shadow.numbers_of_keyframes(gone))
-    shadow.keyframes.remove(ids[~keep])
+    rows = tables.observations.rows_of_keyframes(gone)
+    landmarks = np.unique(tables.observations.select(rows).landmark_ids)
+    tables.observations.remove(rows)
+    tables.landmarks.remove(landmarks)
+    tables.remove_pose_factors(tables.numbers_of_keyframes(gone))
+    tables.keyframes.remove(ids[~keep])
     logger.warning(
         "%s: %d parts that no edge connects; the %s taken, %d keyframes and %d landmarks are left "
         "out",

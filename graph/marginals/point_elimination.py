@@ -100,7 +100,7 @@ def _huber_weights(r: Array, stereo: Array, config: SmootherConfig) -> Array:
     return k / np.maximum(np.linalg.norm(r, axis=1), k)
 
 
-def marginalise(
+def eliminate_points(
     observations: Observations,
     keyframes: tuple[IntArray, Array],
     landmarks: tuple[IntArray, Array],

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
 from bmask_slam.graph.factors.keys import (
@@ -65,37 +65,37 @@ class Solver:
         """Throw ISAM2 away; the next update builds it from the shadow."""
         self._isam = None
 
-    def update(self, shadow: Shadow, change: Change) -> None:
+    def update(self, tables: FactorTables, change: Change) -> None:
         """Apply a change that the shadow already has, and read all values back into it.
 
         Raises SolverError; the shadow's values are then those of before.
         """
         if self._isam is None:
-            self.rebuild(shadow)
+            self.rebuild(tables)
             return
-        self._apply(shadow, change)
+        self._apply(tables, change)
 
-    def rebuild(self, shadow: Shadow) -> None:
+    def rebuild(self, tables: FactorTables) -> None:
         """A new ISAM2 of the whole shadow, linearised at its current values."""
         self._isam = None
-        if not len(shadow.keyframes.ids):
+        if not len(tables.keyframes.ids):
             return
         self._isam = gtsam.ISAM2(_parameters(self._config))
         everything = Change(
-            shadow.observations.all_rows(),
-            sorted(shadow.pose_factors),
-            shadow.keyframes.ids,
-            shadow.landmarks.ids,
+            tables.observations.all_rows(),
+            sorted(tables.pose_factors),
+            tables.keyframes.ids,
+            tables.landmarks.ids,
         )
-        self._apply(shadow, everything)
+        self._apply(tables, everything)
 
-    def optimise_batch(self, shadow: Shadow, max_iterations: int) -> tuple[float, float]:
+    def optimise_batch(self, tables: FactorTables, max_iterations: int) -> tuple[float, float]:
         """Levenberg-Marquardt on everything; the cost before and after.
 
         Raises SolverError; the shadow's values are then those of before.
         """
         self._isam = None
-        graph, values = self._everything(shadow)
+        graph, values = self._everything(tables)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(max_iterations)
         parameters.setRelativeErrorTol(1e-7)
@@ -110,12 +110,12 @@ class Solver:
             raise SolverError(f"the cost is {after}", None)
         poses, points = read_values(values)
         self.elapsed_s += time.perf_counter() - started_s
-        self._check_finite(shadow, poses, points)
-        shadow.keyframes.values, shadow.landmarks.values = poses, points
+        self._check_finite(tables, poses, points)
+        tables.keyframes.values, tables.landmarks.values = poses, points
         return before, after
 
     def marginal_covariance(
-        self, shadow: Shadow, keyframes: IntArray, landmarks: IntArray
+        self, tables: FactorTables, keyframes: IntArray, landmarks: IntArray
     ) -> Array:
         """Joint covariance of keyframes (6 each, ``[rad, m]``), then landmarks (3 each, m).
 
@@ -123,7 +123,7 @@ class Solver:
         """
         keys = keyframe_keys(keyframes) + landmark_keys(landmarks)
         try:
-            source = self._isam or gtsam.Marginals(*self._everything(shadow))
+            source = self._isam or gtsam.Marginals(*self._everything(tables))
             if len(keys) == 1:
                 return np.asarray(source.marginalCovariance(keys[0]))
             joint = source.jointMarginalCovariance(keys)
@@ -131,45 +131,45 @@ class Solver:
         except RuntimeError as error:
             raise self._failure(error) from error
 
-    def marginals(self, shadow: Shadow, landmarks: IntArray) -> Marginals:
+    def marginals(self, tables: FactorTables, landmarks: IntArray) -> Marginals:
         """Covariances of every keyframe and of some landmarks at the shadow's current values."""
-        if not len(shadow.keyframes.ids):
-            return Marginals(shadow.keyframes.ids, np.zeros((0, 6, 6)))
+        if not len(tables.keyframes.ids):
+            return Marginals(tables.keyframes.ids, np.zeros((0, 6, 6)))
         try:
-            return marginals_of(*self._everything(shadow), shadow.keyframes.ids, landmarks)
+            return marginals_of(*self._everything(tables), tables.keyframes.ids, landmarks)
         except RuntimeError as error:
             raise SolverError(str(error).strip(), variable_named_in(str(error))) from error
 
-    def _everything(self, shadow: Shadow) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    def _everything(self, tables: FactorTables) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """All factors and values, in an order that depends on the shadow's contents alone."""
-        numbers = sorted(shadow.pose_factors)
-        graph = make_graph(self._factors(shadow, shadow.observations.all_rows(), numbers))
-        keyframes, landmarks = shadow.keyframes, shadow.landmarks
+        numbers = sorted(tables.pose_factors)
+        graph = make_graph(self._factors(tables, tables.observations.all_rows(), numbers))
+        keyframes, landmarks = tables.keyframes, tables.landmarks
         return graph, make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
 
-    def _factors(self, shadow: Shadow, rows: IntArray, numbers: list[int]) -> list:
-        factors = self._maker.observations(shadow.observations.select(rows))
+    def _factors(self, tables: FactorTables, rows: IntArray, numbers: list[int]) -> list:
+        factors = self._maker.observations(tables.observations.select(rows))
         return factors + [
-            self._maker.pose_factor(shadow.pose_factors[number].factor) for number in numbers
+            self._maker.pose_factor(tables.pose_factors[number].factor) for number in numbers
         ]
 
-    def _apply(self, shadow: Shadow, change: Change) -> None:
-        graph = make_graph(self._factors(shadow, change.rows, change.numbers))
+    def _apply(self, tables: FactorTables, change: Change) -> None:
+        graph = make_graph(self._factors(tables, change.rows, change.numbers))
         values = make_values(
             change.keyframe_ids,
-            shadow.keyframes.get(change.keyframe_ids),
+            tables.keyframes.get(change.keyframe_ids),
             change.landmark_ids,
-            shadow.landmarks.get(change.landmark_ids),
+            tables.landmarks.get(change.landmark_ids),
         )
         slots, poses, points = self._run(graph, values, change)
-        if len(poses) != len(shadow.keyframes.ids) or len(points) != len(shadow.landmarks.ids):
+        if len(poses) != len(tables.keyframes.ids) or len(points) != len(tables.landmarks.ids):
             self._isam = None
             raise SolverError("ISAM2 and the shadow hold different variables", None)
-        self._check_finite(shadow, poses, points)
-        shadow.observations.set_slots(change.rows, np.array(slots[: len(change.rows)], np.int64))
+        self._check_finite(tables, poses, points)
+        tables.observations.set_slots(change.rows, np.array(slots[: len(change.rows)], np.int64))
         for number, slot in zip(change.numbers, slots[len(change.rows) :], strict=True):
-            shadow.pose_factors[number].slot = slot
-        shadow.keyframes.values, shadow.landmarks.values = poses, points
+            tables.pose_factors[number].slot = slot
+        tables.keyframes.values, tables.landmarks.values = poses, points
 
     def _run(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, change: Change
@@ -199,10 +199,10 @@ class Solver:
         first_line = str(error).strip().split("\n\n")[0].replace("\n", " ")
         return SolverError(first_line, variable_named_in(str(error)))
 
-    def _check_finite(self, shadow: Shadow, poses: Array, points: Array) -> None:
+    def _check_finite(self, tables: FactorTables, poses: Array, points: Array) -> None:
         for name, ids, values in (
-            ("landmark", shadow.landmarks.ids, points),
-            ("keyframe", shadow.keyframes.ids, poses),
+            ("landmark", tables.landmarks.ids, points),
+            ("keyframe", tables.keyframes.ids, poses),
         ):
             bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
             if bad.any():

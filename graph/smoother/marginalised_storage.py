@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, concatenate
-from bmask_slam.graph.factors.marginalised_landmarks import Archive, Chunk, Summary
+from bmask_slam.graph.factors.marginalised_landmarks import Chunk, MarginalisedLandmarks, Summary
 
 SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "archived_chunks": ("archived observation", ()),
@@ -29,17 +29,17 @@ SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
 pose factor stands for, or -1."""
 
 
-def archive_arrays(shadow: Shadow) -> dict[str, Any]:
+def marginalised_arrays(tables: FactorTables) -> dict[str, Any]:
     """The archive's arrays; what concerns keyframes that are gone is left out."""
-    archive, known = shadow.archive, shadow.keyframes
-    chunks = sorted(archive.chunks.items())
+    marginalised, known = tables.marginalised, tables.keyframes
+    chunks = sorted(marginalised.chunks.items())
     seen = concatenate([chunk.observations for _, chunk in chunks])
     number = np.repeat([n for n, _ in chunks], [len(c.observations) for _, c in chunks])
     is_summary = np.concatenate([np.zeros(0, bool), *(c.is_summary for _, c in chunks)])
     keep = known.contains(seen.keyframe_ids)
     seen = seen.select(keep)
     chunk_of = {n: number for number, chunk in chunks for n in chunk.numbers}
-    summaries = sorted({**archive.summaries, **archive.returned}.items())
+    summaries = sorted({**marginalised.summaries, **marginalised.returned}.items())
     hosts = np.array([s.keyframe_id for _, s in summaries], np.int64)
     ids = np.array([j for j, _ in summaries], np.int64)
     alive = known.contains(hosts)
@@ -56,17 +56,17 @@ def archive_arrays(shadow: Shadow) -> dict[str, Any]:
             alive
         ],
         "summary_sigmas_px": np.array([s.sigmas_px for _, s in summaries]).reshape(-1, 3)[alive],
-        "summary_returned": np.isin(ids, sorted(archive.returned))[alive],
-        "base_ids": np.array(sorted(archive.bases), np.int64),
+        "summary_returned": np.isin(ids, sorted(marginalised.returned))[alive],
+        "base_ids": np.array(sorted(marginalised.bases), np.int64),
         "pose_factor_chunks": np.array(
-            [chunk_of.get(n, -1) for n in sorted(shadow.pose_factors)], np.int64
+            [chunk_of.get(n, -1) for n in sorted(tables.pose_factors)], np.int64
         ),
     }
 
 
-def read_archive(arrays: dict[str, Any]) -> Archive:
+def read_marginalised(arrays: dict[str, Any]) -> MarginalisedLandmarks:
     """The archive of arrays that were checked; the shadow's pose factors have numbers 0, 1, ..."""
-    archive = Archive(bases=set(arrays["base_ids"].tolist()))
+    marginalised = MarginalisedLandmarks(bases=set(arrays["base_ids"].tolist()))
     seen = Observations(
         arrays["archived_keyframe_ids"],
         arrays["archived_landmark_ids"],
@@ -77,7 +77,7 @@ def read_archive(arrays: dict[str, Any]) -> Archive:
         rows = np.flatnonzero(arrays["archived_chunks"] == number)
         edges = np.flatnonzero(arrays["pose_factor_chunks"] == number)
         chunk = Chunk(seen.select(rows), arrays["archived_is_summary"][rows], tuple(edges.tolist()))
-        archive.put(chunk, number)
+        marginalised.put(chunk, number)
     columns = (
         arrays["summary_landmark_ids"].tolist(),
         arrays["summary_keyframe_ids"].tolist(),
@@ -86,6 +86,6 @@ def read_archive(arrays: dict[str, Any]) -> Archive:
         arrays["summary_returned"].tolist(),
     )
     for landmark, keyframe, measurement, sigmas_px, returned in zip(*columns, strict=True):
-        there = archive.returned if returned else archive.summaries
+        there = marginalised.returned if returned else marginalised.summaries
         there[landmark] = Summary(keyframe, measurement, sigmas_px)
-    return archive
+    return marginalised

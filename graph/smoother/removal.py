@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bmask_slam.graph.factors.factor_tables import NO_SLOT, Shadow, ids_array
+from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, ids_array
 from bmask_slam.graph.factors.graph_update import (
     NO_KEYFRAME,
     NO_LANDMARK,
@@ -30,7 +30,7 @@ from bmask_slam.graph.factors.graph_update import (
 from bmask_slam.graph.factors.observability import constrained_landmarks, firm_parts
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.smoother.anchoring import (
-    hold_loose,
+    anchor_loose,
     keyframes_held_by,
     loose_among,
     rows_in_front,
@@ -56,7 +56,7 @@ class Removal:
     slots: list[int] = field(default_factory=list)
     dropped_landmarks: IntArray = field(default_factory=_no_ids)
     pose_factors: list[int] = field(default_factory=list)
-    bridged_keyframes: IntArray = field(default_factory=_no_ids)
+    anchored_keyframes: IntArray = field(default_factory=_no_ids)
     report: RemovalReport = field(default_factory=RemovalReport)
 
     def __bool__(self) -> bool:
@@ -80,29 +80,29 @@ class _Plan:
     loose: IntArray = field(default_factory=_no_ids)
 
 
-def remove(update: GraphUpdate, shadow: Shadow, config: SmootherConfig) -> Removal:
+def remove(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) -> Removal:
     """Carry out an update's removals on the shadow, or refuse them as its policy says."""
-    plan = _plan(update, shadow, config)
+    plan = _plan(update, tables, config)
     if not (len(plan.keyframes) or len(plan.landmarks) or plan.numbers or len(plan.rows)):
         return Removal()
     if update.removal_policy is RemovalPolicy.REFUSE and (len(plan.dropped) or len(plan.loose)):
-        return Removal(report=RemovalReport(refused=_reasons(plan, shadow)))
-    gone = shadow.observations.select(plan.rows)
-    edges = [shadow.pose_factors[number].keyframes for number in plan.numbers]
-    report = _report(plan, update, shadow)
-    slots = _take_out(plan, shadow)
-    added = hold_loose(plan.loose, gone, edges, shadow, config)
-    return Removal(slots, plan.dropped, added, keyframes_held_by(added, shadow), report)
+        return Removal(report=RemovalReport(refused=_reasons(plan, tables)))
+    gone = tables.observations.select(plan.rows)
+    edges = [tables.pose_factors[number].keyframes for number in plan.numbers]
+    report = _report(plan, update, tables)
+    slots = _take_out(plan, tables)
+    added = anchor_loose(plan.loose, gone, edges, tables, config)
+    return Removal(slots, plan.dropped, added, keyframes_held_by(added, tables), report)
 
 
-def _plan(update: GraphUpdate, shadow: Shadow, config: SmootherConfig) -> _Plan:
-    table = shadow.observations
-    keyframes = np.intersect1d(update.remove_keyframes, shadow.keyframes.ids)
-    landmarks = np.intersect1d(update.remove_landmarks, shadow.landmarks.ids)
+def _plan(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) -> _Plan:
+    table = tables.observations
+    keyframes = np.intersect1d(update.remove_keyframes, tables.keyframes.ids)
+    landmarks = np.intersect1d(update.remove_landmarks, tables.landmarks.ids)
     numbers = sorted(
         {
-            *_numbers_of(update.remove_relative_poses, shadow),
-            *shadow.numbers_of_keyframes(keyframes.tolist()),
+            *_numbers_of(update.remove_relative_poses, tables),
+            *tables.numbers_of_keyframes(keyframes.tolist()),
         }
     )
     pairs = (table.row(k, j) for k, j in update.remove_observations.tolist())
@@ -111,33 +111,33 @@ def _plan(update: GraphUpdate, shadow: Shadow, config: SmootherConfig) -> _Plan:
         table.rows_of_keyframes(keyframes.tolist()), table.rows_of_landmarks(landmarks.tolist())
     )
     rows = np.union1d(single, whole)
-    dropped = _left_underconstrained(rows, landmarks, shadow, config)
+    dropped = _left_underconstrained(rows, landmarks, tables, config)
     rows = np.union1d(rows, table.rows_of_landmarks(dropped.tolist()))
-    loose = _left_loose(rows, keyframes, numbers, shadow, config)
+    loose = _left_loose(rows, keyframes, numbers, tables, config)
     return _Plan(landmarks, keyframes, numbers, rows, single, dropped, loose)
 
 
-def _numbers_of(names: Iterable[RelativePoseName], shadow: Shadow) -> list[int]:
+def _numbers_of(names: Iterable[RelativePoseName], tables: FactorTables) -> list[int]:
     wanted = set(names)
-    numbers = shadow.numbers_of_keyframes({k for name in wanted for k in name[:2]})
-    return [number for number in numbers if _name(number, shadow) in wanted]
+    numbers = tables.numbers_of_keyframes({k for name in wanted for k in name[:2]})
+    return [number for number in numbers if _name(number, tables) in wanted]
 
 
-def _name(number: int, shadow: Shadow) -> RelativePoseName | None:
-    factor = shadow.pose_factors[number].factor
+def _name(number: int, tables: FactorTables) -> RelativePoseName | None:
+    factor = tables.pose_factors[number].factor
     if isinstance(factor, PosePrior):
         return None
     return factor.keyframe_a, factor.keyframe_b, factor.kind
 
 
 def _left_underconstrained(
-    rows: IntArray, landmarks: IntArray, shadow: Shadow, config: SmootherConfig
+    rows: IntArray, landmarks: IntArray, tables: FactorTables, config: SmootherConfig
 ) -> IntArray:
     """Landmarks that lose some of these rows and are not held by what remains."""
-    table = shadow.observations
+    table = tables.observations
     hit = np.setdiff1d(table.select(rows).landmark_ids, landmarks)
     remaining = np.setdiff1d(table.rows_of_landmarks(hit.tolist()), rows)
-    observations, poses, points = rows_in_front(remaining, shadow, config)
+    observations, poses, points = rows_in_front(remaining, tables, config)
     held = constrained_landmarks(observations, poses, points, config.min_parallax_deg)
     return np.setdiff1d(hit, held)
 
@@ -146,23 +146,23 @@ def _left_loose(
     rows: IntArray,
     keyframes: IntArray,
     numbers: list[int],
-    shadow: Shadow,
+    tables: FactorTables,
     config: SmootherConfig,
 ) -> IntArray:
     """Keyframes without a hold once rows, keyframes and pose factors are gone."""
-    if _still_linked(rows, keyframes, numbers, shadow, config):
+    if _still_linked(rows, keyframes, numbers, tables, config):
         return np.zeros(0, np.int64)
-    table = shadow.observations
-    left = np.setdiff1d(shadow.keyframes.ids, keyframes)
-    others = set(shadow.pose_factors) - set(numbers)
-    return loose_among(left, np.setdiff1d(table.used_rows(), rows), others, shadow, config)
+    table = tables.observations
+    left = np.setdiff1d(tables.keyframes.ids, keyframes)
+    others = set(tables.pose_factors) - set(numbers)
+    return loose_among(left, np.setdiff1d(table.used_rows(), rows), others, tables, config)
 
 
 def _still_linked(
     rows: IntArray,
     keyframes: IntArray,
     numbers: list[int],
-    shadow: Shadow,
+    tables: FactorTables,
     config: SmootherConfig,
 ) -> bool:
     """Whether those who shared what leaves still hang firmly together, a look nearby.
@@ -170,7 +170,7 @@ def _still_linked(
     Then nothing has become loose: the first of them on the way from a prior hung on others,
     with which it shares as much as before, and the rest hang on it. A prior must not leave.
     """
-    table, factors = shadow.observations, shadow.pose_factors
+    table, factors = tables.observations, tables.pose_factors
     if any(factors[number].is_prior for number in numbers):
         return False
     sharers = table.select(table.rows_of_landmarks(np.unique(table.select(rows).landmark_ids)))
@@ -186,7 +186,7 @@ def _still_linked(
     left = ~np.isin(touched, keyframes)
     touched, group = touched[left], group[left]
     near = np.unique(touched)
-    edges = set(shadow.numbers_of_keyframes(near.tolist())) - set(numbers)
+    edges = set(tables.numbers_of_keyframes(near.tolist())) - set(numbers)
     part = firm_parts(
         near,
         table.select(np.setdiff1d(table.rows_of_keyframes(near.tolist()), rows)),
@@ -196,9 +196,9 @@ def _still_linked(
     return len(np.unique(group)) == len(np.unique(np.stack([group, part]), axis=1).T)
 
 
-def _reasons(plan: _Plan, shadow: Shadow) -> Refusals:
+def _reasons(plan: _Plan, tables: FactorTables) -> Refusals:
     """One line for each landmark and keyframe that a refused removal would leave loose."""
-    unfixed = any(shadow.pose_factors[number].is_prior for number in plan.numbers)
+    unfixed = any(tables.pose_factors[number].is_prior for number in plan.numbers)
     reason = RefusalReason.PART_UNFIXED if unfixed else RefusalReason.KEYFRAME_UNDERCONSTRAINED
     count_l, count_k = len(plan.dropped), len(plan.loose)
     return Refusals(
@@ -208,10 +208,10 @@ def _reasons(plan: _Plan, shadow: Shadow) -> Refusals:
     )
 
 
-def _report(plan: _Plan, update: GraphUpdate, shadow: Shadow) -> RemovalReport:
-    single = shadow.observations.select(plan.single)
+def _report(plan: _Plan, update: GraphUpdate, tables: FactorTables) -> RemovalReport:
+    single = tables.observations.select(plan.single)
     wanted = set(update.remove_relative_poses)
-    names = (_name(number, shadow) for number in plan.numbers)
+    names = (_name(number, tables) for number in plan.numbers)
     return RemovalReport(
         plan.landmarks,
         plan.keyframes,
@@ -220,11 +220,11 @@ def _report(plan: _Plan, update: GraphUpdate, shadow: Shadow) -> RemovalReport:
     )
 
 
-def _take_out(plan: _Plan, shadow: Shadow) -> list[int]:
-    slots = shadow.observations.slots(plan.rows).tolist()
-    slots += [shadow.pose_factors[number].slot for number in plan.numbers]
-    shadow.observations.remove(plan.rows)
-    shadow.remove_pose_factors(plan.numbers)
-    shadow.landmarks.remove(np.union1d(plan.landmarks, plan.dropped))
-    shadow.keyframes.remove(plan.keyframes)
+def _take_out(plan: _Plan, tables: FactorTables) -> list[int]:
+    slots = tables.observations.slots(plan.rows).tolist()
+    slots += [tables.pose_factors[number].slot for number in plan.numbers]
+    tables.observations.remove(plan.rows)
+    tables.remove_pose_factors(plan.numbers)
+    tables.landmarks.remove(np.union1d(plan.landmarks, plan.dropped))
+    tables.keyframes.remove(plan.keyframes)
     return sorted(slot for slot in slots if slot != NO_SLOT)

@@ -13,7 +13,7 @@ import numpy as np
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import reprojection
-from bmask_slam.graph.factors.factor_tables import Shadow, ids_array
+from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.graph_update import GraphUpdate, IntArray
 from bmask_slam.graph.factors.observability import constrained_landmarks
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -33,7 +33,7 @@ class Repair:
 
     dropped_landmarks: IntArray
     dropped_keyframes: IntArray
-    bridged_keyframes: IntArray
+    anchored_keyframes: IntArray
 
     @property
     def changed(self) -> bool:
@@ -41,79 +41,79 @@ class Repair:
         return bool(
             len(self.dropped_landmarks)
             or len(self.dropped_keyframes)
-            or len(self.bridged_keyframes)
+            or len(self.anchored_keyframes)
         )
 
 
 def repair(
     named: Variable | None,
     new_keyframes: IntArray,
-    shadow: Shadow,
+    tables: FactorTables,
     camera: Camera,
     config: SmootherConfig,
 ) -> Repair:
     """Take out what makes the system singular; ``new_keyframes`` go rather than be bridged."""
-    held = keyframes_held_by(anchor_components(shadow, config), shadow)
-    pairs = _broken_observations(shadow, camera)
-    broken = remove(GraphUpdate(remove_observations=pairs), shadow, config)
-    landmarks = _loose_landmarks(shadow, camera, config)
-    keyframes = loose_in(shadow, config)
+    held = keyframes_held_by(anchor_components(tables, config), tables)
+    pairs = _broken_observations(tables, camera)
+    broken = remove(GraphUpdate(remove_observations=pairs), tables, config)
+    landmarks = _loose_landmarks(tables, camera, config)
+    keyframes = loose_in(tables, config)
     if named is not None and not (len(held) or broken or len(landmarks) or len(keyframes)):
         landmarks = ids_array([named[1]] if named[0] == "landmark" else [])
         keyframes = ids_array([named[1]] if named[0] == "keyframe" else [])
     leaving = ids_array(
-        k for k in keyframes.tolist() if k in new_keyframes or _is_bridged(k, shadow)
+        k for k in keyframes.tolist() if k in new_keyframes or _is_anchored(k, tables)
     )
     update = GraphUpdate(remove_landmarks=landmarks, remove_keyframes=leaving)
-    removal = remove(update, shadow, config)
-    tied = _tie(np.setdiff1d(keyframes, leaving), shadow, config)
-    bridged = (held, broken.bridged_keyframes, removal.bridged_keyframes, tied)
+    removal = remove(update, tables, config)
+    tied = _tie(np.setdiff1d(keyframes, leaving), tables, config)
+    anchored = (held, broken.anchored_keyframes, removal.anchored_keyframes, tied)
     dropped = (landmarks, broken.dropped_landmarks, removal.dropped_landmarks)
     return Repair(
         np.unique(np.concatenate(dropped)),
         leaving,
-        np.intersect1d(np.concatenate(bridged), shadow.keyframes.ids),
+        np.intersect1d(np.concatenate(anchored), tables.keyframes.ids),
     )
 
 
-def _is_bridged(keyframe: int, shadow: Shadow) -> bool:
-    factors = (shadow.pose_factors[n].factor for n in shadow.numbers_of_keyframes([keyframe]))
+def _is_anchored(keyframe: int, tables: FactorTables) -> bool:
+    factors = (tables.pose_factors[n].factor for n in tables.numbers_of_keyframes([keyframe]))
     return any(getattr(factor, "kind", "") == "bridge" for factor in factors)
 
 
-def _broken_observations(shadow: Shadow, camera: Camera) -> IntArray:
+def _broken_observations(tables: FactorTables, camera: Camera) -> IntArray:
     """Pairs (N, 2) of observations without a finite error; a NaN spoils every value."""
-    seen = shadow.observations.select(shadow.observations.all_rows())
-    poses = shadow.keyframes.get(seen.keyframe_ids)
-    points = shadow.landmarks.get(seen.landmark_ids)
+    seen = tables.observations.select(tables.observations.all_rows())
+    poses = tables.keyframes.get(seen.keyframe_ids)
+    points = tables.landmarks.get(seen.landmark_ids)
     _, chi2 = reprojection(seen, poses, points, camera)
     bad = ~np.isfinite(chi2)
     return np.stack([seen.keyframe_ids[bad], seen.landmark_ids[bad]], axis=1)
 
 
-def _loose_landmarks(shadow: Shadow, camera: Camera, config: SmootherConfig) -> IntArray:
+def _loose_landmarks(tables: FactorTables, camera: Camera, config: SmootherConfig) -> IntArray:
     """Landmarks that the views in front of a camera do not constrain."""
-    seen = shadow.observations.select(shadow.observations.all_rows())
-    poses = shadow.keyframes.get(seen.keyframe_ids)
-    points = shadow.landmarks.get(seen.landmark_ids)
+    seen = tables.observations.select(tables.observations.all_rows())
+    poses = tables.keyframes.get(seen.keyframe_ids)
+    points = tables.landmarks.get(seen.landmark_ids)
     depth_m, _ = reprojection(seen, poses, points, camera)
     useful = depth_m >= config.min_depth_m
     held = constrained_landmarks(
         seen.select(useful), poses[useful], points[useful], config.min_parallax_deg
     )
-    return np.setdiff1d(shadow.landmarks.ids, held)
+    return np.setdiff1d(tables.landmarks.ids, held)
 
 
-def _tie(loose: IntArray, shadow: Shadow, config: SmootherConfig) -> IntArray:
+def _tie(loose: IntArray, tables: FactorTables, config: SmootherConfig) -> IntArray:
     """Bridge loose keyframes to firm ones, one at a time: one bridge may hold a whole part."""
-    bridged: list[int] = []
+    anchored: list[int] = []
     while len(loose):
-        firm = np.setdiff1d(shadow.keyframes.ids, loose)
+        firm = np.setdiff1d(tables.keyframes.ids, loose)
         if not len(firm):
             break
         k = int(loose[0])
         nearest = int(firm[np.argmin(np.abs(firm - k))])
-        shadow.add_pose_factors([bridge(nearest, k, shadow, config)])
-        bridged.append(k)
-        loose = np.intersect1d(loose[1:], loose_in(shadow, config))
-    return ids_array(bridged)
+        tables.add_pose_factors([bridge(nearest, k, tables, config)])
+        anchored.append(k)
+        loose = np.intersect1d(loose[1:], loose_in(tables, config))
+    return ids_array(anchored)

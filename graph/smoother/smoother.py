@@ -17,7 +17,7 @@ from bmask_slam.graph.factors.checks import (
     relative_pose_errors,
     wrong_observations,
 )
-from bmask_slam.graph.factors.factor_tables import Shadow, ValueTable, ids_array
+from bmask_slam.graph.factors.factor_tables import FactorTables, ValueTable, ids_array
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
@@ -34,21 +34,26 @@ from bmask_slam.graph.files.array_file import Arrays
 from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.marginals.covariances import Marginals
 from bmask_slam.graph.marginals.landmark_marginalisation import (
-    Retirement,
+    Marginalisation,
     forget,
+    marginalise_landmarks,
     note_retracted,
     note_returned,
     reinstate,
-    retire,
     returning,
 )
-from bmask_slam.graph.smoother.anchoring import anchor_components, release_bridges
+from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors
 from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError
 from bmask_slam.graph.smoother.removal import Removal, remove
 from bmask_slam.graph.smoother.repair import repair
-from bmask_slam.graph.smoother.storage import graph_arrays, read_graph, shadow_of, write_graph
+from bmask_slam.graph.smoother.storage import (
+    factor_tables_of,
+    graph_arrays,
+    read_graph,
+    write_graph,
+)
 from bmask_slam.graph.smoother.update_report import UpdateReport
-from bmask_slam.graph.smoother.validation import Admitted, admit
+from bmask_slam.graph.smoother.validation import Validated, validate
 
 __all__ = ["Smoother", "SmootherConfig"]
 logger = logging.getLogger(__name__)
@@ -65,29 +70,29 @@ class Smoother:
     def __init__(self, camera: Camera, config: SmootherConfig | None = None) -> None:
         self._camera = camera
         self._config = config or SmootherConfig()
-        self._shadow = Shadow()
+        self._tables = FactorTables()
         self._solver = Solver(camera, self._config)
 
     def update(self, update: GraphUpdate) -> GraphEstimate:
         """Remove, add, optimise one step, and read everything back."""
         started_s = time.perf_counter()
         self._solver.elapsed_s = 0.0
-        model = self._shadow, self._camera, self._config
+        model = self._tables, self._camera, self._config
         update = self._with_first_prior(update)
         forgotten, removal = self._remove(update)
-        note_retracted(removal.dropped_landmarks, self._shadow.archive)
-        retired = retire(update.retire_landmarks, *model)
-        admitted = admit(returning(update, self._shadow, self._camera), *model)
-        report = UpdateReport(admitted.refused, admitted.refused_factors, removal.report)
+        note_retracted(removal.dropped_landmarks, self._tables.marginalised)
+        marginalised = marginalise_landmarks(update.marginalise_landmarks, *model)
+        validated = validate(returning(update, self._tables, self._camera), *model)
+        report = UpdateReport(validated.refused, validated.refused_factors, removal.report)
         report.add_removal(removal)
-        entered = self._enter(admitted, [forgotten, removal, retired], report)
+        entered = self._enter(validated, [forgotten, removal, marginalised], report)
         change = dataclasses.replace(entered, max_iterations=update.max_iterations)
         try:
-            self._solver.update(self._shadow, change)
+            self._solver.update(self._tables, change)
         except SolverError as failure:
-            ids = admitted.keyframe_ids
+            ids = validated.keyframe_ids
             if not self._recover(failure, ids, report, self._solver.rebuild):
-                self._retract(admitted, change, report)
+                self._retract(validated, change, report)
         return self._estimate(report, started_s)
 
     def optimise_batch(
@@ -104,23 +109,23 @@ class Smoother:
         """
         started_s = time.perf_counter()
         self._solver.elapsed_s = 0.0
-        reinstate(self._shadow, self._camera, self._config)
+        reinstate(self._tables, self._camera, self._config)
         report, costs = UpdateReport(), [(math.nan, math.nan)]
 
-        def solve(shadow: Shadow) -> None:
-            costs.append(self._solver.optimise_batch(shadow, max_iterations))
+        def solve(tables: FactorTables) -> None:
+            costs.append(self._solver.optimise_batch(tables, max_iterations))
 
         for last in (False, True) if drop_outliers else (True,):
             try:
-                solve(self._shadow)
+                solve(self._tables)
             except SolverError as failure:
                 if not self._recover(failure, ids_array([]), report, solve):
                     logger.error("batch optimisation failed; the values stay as they were")
                     break
             if not last:
-                wrong = wrong_observations(self._shadow, self._camera)
+                wrong = wrong_observations(self._tables, self._camera)
                 update = GraphUpdate(remove_observations=wrong)
-                report.add_removal(remove(update, self._shadow, self._config))
+                report.add_removal(remove(update, self._tables, self._config))
         before, after = costs[-1]
         estimate = self._estimate(report, started_s)
         return dataclasses.replace(estimate, cost_before=before, cost_after=after)
@@ -131,16 +136,16 @@ class Smoother:
 
     def observation_errors(self) -> ObservationErrors:
         """Chi-square of every observation at the current estimate, to find outliers by."""
-        return observation_errors(self._shadow, self._camera)
+        return observation_errors(self._tables, self._camera)
 
     def relative_pose_errors(self, kind: str) -> RelativePoseErrors:
         """Chi-square of every relative pose of a kind at the current estimate."""
         factors = [
             entry.factor
-            for _, entry in sorted(self._shadow.pose_factors.items())
+            for _, entry in sorted(self._tables.pose_factors.items())
             if isinstance(entry.factor, RelativePose) and entry.factor.kind == kind
         ]
-        return relative_pose_errors(factors, self._shadow.keyframes)
+        return relative_pose_errors(factors, self._tables.keyframes)
 
     def marginal_covariance(self, keyframe_id: int) -> Array:
         """Covariance (6, 6) of a pose's ``[rotation rad, translation m]`` on its right side.
@@ -155,9 +160,9 @@ class Smoother:
     ) -> Array:
         """Joint covariance (6K + 3L square): keyframes in the given order, then landmarks."""
         landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
-        _check_known(self._shadow.keyframes, keyframe_ids)
-        _check_known(self._shadow.landmarks, landmarks)
-        return self._solver.marginal_covariance(self._shadow, keyframe_ids, landmarks)
+        _check_known(self._tables.keyframes, keyframe_ids)
+        _check_known(self._tables.landmarks, landmarks)
+        return self._solver.marginal_covariance(self._tables, keyframe_ids, landmarks)
 
     def marginals(self, landmark_ids: IntArray | None = None) -> Marginals:
         """Covariances of every keyframe, and of some landmarks, from one factorisation.
@@ -165,8 +170,8 @@ class Smoother:
         Raises KeyError for an unknown id, SolverError for a graph that cannot be solved.
         """
         landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
-        _check_known(self._shadow.landmarks, landmarks)
-        return self._solver.marginals(self._shadow, landmarks)
+        _check_known(self._tables.landmarks, landmarks)
+        return self._solver.marginals(self._tables, landmarks)
 
     def restart(self) -> None:
         """Throw ISAM2 away; the next update makes it from the current values.
@@ -178,27 +183,27 @@ class Smoother:
 
     def state(self) -> Arrays:
         """Graph, values and ids as named arrays; ISAM2 is not among them, see ``restart``."""
-        return graph_arrays(self._shadow)
+        return graph_arrays(self._tables)
 
     def restore(self, state: Arrays, path: Path) -> None:
         """Become the smoother of a state that was read from a file. Raises InputError."""
-        self._shadow = shadow_of(state, path)
+        self._tables = factor_tables_of(state, path)
         self.restart()
 
     def save(self, path: Path) -> None:
         """Write the graph, its values and ids into one file, atomically."""
-        write_graph(path, self._shadow, self._camera)
+        write_graph(path, self._tables, self._camera)
 
     @classmethod
     def load(cls, path: Path, config: SmootherConfig | None = None) -> Smoother:
         """A smoother that goes on from a saved graph. Raises InputError for a bad file."""
-        shadow, camera = read_graph(path)
+        tables, camera = read_graph(path)
         smoother = cls(camera, config)
-        smoother._shadow = shadow
+        smoother._tables = tables
         return smoother
 
     def _with_first_prior(self, update: GraphUpdate) -> GraphUpdate:
-        if len(self._shadow.keyframes.ids) or update.priors or not len(update.keyframe_ids):
+        if len(self._tables.keyframes.ids) or update.priors or not len(update.keyframe_ids):
             return update
         covariance = diagonal_covariance(
             self._config.prior_sigma_rotation_rad, self._config.prior_sigma_translation_m
@@ -209,35 +214,35 @@ class Smoother:
         )
         return dataclasses.replace(update, priors=(prior,))
 
-    def _remove(self, update: GraphUpdate) -> tuple[Retirement, Removal]:
+    def _remove(self, update: GraphUpdate) -> tuple[Marginalisation, Removal]:
         """Carry out the removals on the archive and on the graph, or refuse them on both.
 
         The archive comes first, so that what stands for the rest of it holds the keyframes.
         """
-        model = self._shadow, self._camera, self._config
+        model = self._tables, self._camera, self._config
         if update.removal_policy is RemovalPolicy.DROP:
-            return forget(update, *model), remove(update, self._shadow, self._config)
-        removal = remove(update, self._shadow, self._config)
+            return forget(update, *model), remove(update, self._tables, self._config)
+        removal = remove(update, self._tables, self._config)
         refused = len(removal.report.refused) > 0
-        return (Retirement() if refused else forget(update, *model)), removal
+        return (Marginalisation() if refused else forget(update, *model)), removal
 
     def _enter(
-        self, admitted: Admitted, left: Sequence[Removal | Retirement], report: UpdateReport
+        self, validated: Validated, left: Sequence[Removal | Marginalisation], report: UpdateReport
     ) -> Change:
         """Put what was admitted into the shadow, and say what ISAM2 must be told."""
-        self._shadow.keyframes.insert(admitted.keyframe_ids, admitted.poses_world_camera)
-        self._shadow.landmarks.insert(admitted.landmark_ids, admitted.points_world)
-        rows = self._shadow.observations.add(admitted.observations)
-        note_returned(admitted.landmark_ids, self._shadow.archive)
+        self._tables.keyframes.insert(validated.keyframe_ids, validated.poses_world_camera)
+        self._tables.landmarks.insert(validated.landmark_ids, validated.points_world)
+        rows = self._tables.observations.add(validated.observations)
+        note_returned(validated.landmark_ids, self._tables.marginalised)
         numbers = [number for done in left for number in done.pose_factors]
-        numbers += self._shadow.add_pose_factors(admitted.pose_factors)
-        free, slots = release_bridges(admitted.observations, self._shadow, self._config)
-        report.bridged.difference_update(free.tolist())
+        numbers += self._tables.add_pose_factors(validated.pose_factors)
+        free, slots = release_anchors(validated.observations, self._tables, self._config)
+        report.anchored.difference_update(free.tolist())
         return Change(
             rows,
-            [number for number in numbers if number in self._shadow.pose_factors],
-            admitted.keyframe_ids,
-            admitted.landmark_ids,
+            [number for number in numbers if number in self._tables.pose_factors],
+            validated.keyframe_ids,
+            validated.landmark_ids,
             sorted([*slots, *(slot for done in left for slot in done.slots)]),
         )
 
@@ -246,22 +251,22 @@ class Smoother:
         failure: SolverError,
         new_keyframes: IntArray,
         report: UpdateReport,
-        solve: Callable[[Shadow], None],
+        solve: Callable[[FactorTables], None],
     ) -> bool:
         """Repair the shadow and solve anew until it works; whether it did.
 
         The first attempt drops only what is visibly loose, later ones the named variable too.
         """
         report.rebuilt = True
-        for attempt in range(self._config.max_recoveries):
+        for attempt in range(self._config.max_repairs):
             report.failed = failure.variable or report.failed
             logger.warning("GTSAM failed near %s (%s)", report.failed_variable or "?", failure)
             named = failure.variable if attempt else None
-            done = repair(named, new_keyframes, self._shadow, self._camera, self._config)
+            done = repair(named, new_keyframes, self._tables, self._camera, self._config)
             report.add_repair(done)
-            note_retracted(done.dropped_landmarks, self._shadow.archive)
+            note_retracted(done.dropped_landmarks, self._tables.marginalised)
             try:
-                solve(self._shadow)
+                solve(self._tables)
                 return True
             except SolverError as again:
                 failure = again
@@ -269,43 +274,43 @@ class Smoother:
                     break
         return False
 
-    def _retract(self, admitted: Admitted, change: Change, report: UpdateReport) -> None:
+    def _retract(self, validated: Validated, change: Change, report: UpdateReport) -> None:
         """Take the whole update out again, refused as SOLVER_FAILED."""
-        seen = admitted.observations
+        seen = validated.observations
         pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
         undo = GraphUpdate(
-            remove_keyframes=admitted.keyframe_ids,
-            remove_landmarks=admitted.landmark_ids,
+            remove_keyframes=validated.keyframe_ids,
+            remove_landmarks=validated.landmark_ids,
             remove_observations=pairs,
         )
-        report.add_removal(remove(undo, self._shadow, self._config))
-        note_retracted(admitted.landmark_ids, self._shadow.archive)
-        present = [n for n in change.numbers if n in self._shadow.pose_factors]
-        self._shadow.remove_pose_factors(present)
-        anchor_components(self._shadow, self._config)
-        report.refuse_all(admitted)
+        report.add_removal(remove(undo, self._tables, self._config))
+        note_retracted(validated.landmark_ids, self._tables.marginalised)
+        present = [n for n in change.numbers if n in self._tables.pose_factors]
+        self._tables.remove_pose_factors(present)
+        anchor_components(self._tables, self._config)
+        report.refuse_all(validated)
         try:
-            self._solver.rebuild(self._shadow)
+            self._solver.rebuild(self._tables)
         except SolverError as failure:
             logger.error("ISAM2 cannot solve the graph (%s); values stay as they were", failure)
 
     def _estimate(self, report: UpdateReport, started_s: float) -> GraphEstimate:
         return GraphEstimate(
-            self._shadow.keyframes.ids,
-            self._shadow.keyframes.values,
-            self._shadow.landmarks.ids,
-            self._shadow.landmarks.values,
+            self._tables.keyframes.ids,
+            self._tables.keyframes.values,
+            self._tables.landmarks.ids,
+            self._tables.landmarks.values,
             report.refused,
             report.refused_factors,
             report.removal,
             dropped_landmarks=ids_array(report.landmarks),
             dropped_keyframes=ids_array(report.keyframes),
-            bridged_keyframes=ids_array(report.bridged),
+            anchored_keyframes=ids_array(report.anchored),
             rebuilt=report.rebuilt,
             failed_variable=report.failed_variable,
             update_ms=1e3 * (time.perf_counter() - started_s),
             solver_ms=1e3 * self._solver.elapsed_s,
-            factors=len(self._shadow),
+            factors=len(self._tables),
         )
 
 

@@ -14,10 +14,14 @@ import numpy as np
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.files.array_file import Arrays, FileKind, Header, read_arrays, write_arrays
-from bmask_slam.graph.smoother.marginalised_storage import SHAPES, archive_arrays, read_archive
+from bmask_slam.graph.smoother.marginalised_storage import (
+    SHAPES,
+    marginalised_arrays,
+    read_marginalised,
+)
 
 GRAPH_FILE = FileKind("graph", 3)
 _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -39,26 +43,26 @@ _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
 _PRIOR = "prior"
 
 
-def write_graph(path: Path, shadow: Shadow, camera: Camera) -> None:
+def write_graph(path: Path, tables: FactorTables, camera: Camera) -> None:
     """Save a shadow and its camera in one file, atomically. Raises InputError if it cannot."""
-    write_arrays(path, GRAPH_FILE, {"camera": dataclasses.asdict(camera)}, graph_arrays(shadow))
+    write_arrays(path, GRAPH_FILE, {"camera": dataclasses.asdict(camera)}, graph_arrays(tables))
 
 
-def read_graph(path: Path) -> tuple[Shadow, Camera]:
+def read_graph(path: Path) -> tuple[FactorTables, Camera]:
     """Load what write_graph saved. Raises InputError for a missing, foreign or broken file."""
     header, arrays = read_arrays(path, GRAPH_FILE)
-    return shadow_of(arrays, path), read_camera(header, path)
+    return factor_tables_of(arrays, path), read_camera(header, path)
 
 
-def graph_arrays(shadow: Shadow) -> Arrays:
+def graph_arrays(tables: FactorTables) -> Arrays:
     """Everything a shadow knows, but for the places of its factors in ISAM2."""
-    seen = shadow.observations.select(shadow.observations.all_rows())
-    factors = [shadow.pose_factors[number].factor for number in sorted(shadow.pose_factors)]
+    seen = tables.observations.select(tables.observations.all_rows())
+    factors = [tables.pose_factors[number].factor for number in sorted(tables.pose_factors)]
     return {
-        "keyframe_ids": shadow.keyframes.ids,
-        "poses_world_camera": np.ascontiguousarray(shadow.keyframes.values),
-        "landmark_ids": shadow.landmarks.ids,
-        "points_world": np.ascontiguousarray(shadow.landmarks.values),
+        "keyframe_ids": tables.keyframes.ids,
+        "poses_world_camera": np.ascontiguousarray(tables.keyframes.values),
+        "landmark_ids": tables.landmarks.ids,
+        "points_world": np.ascontiguousarray(tables.landmarks.values),
         "observation_keyframe_ids": seen.keyframe_ids,
         "observation_landmark_ids": seen.landmark_ids,
         "measurements": seen.measurements,
@@ -72,7 +76,7 @@ def graph_arrays(shadow: Shadow) -> Arrays:
         ).reshape(-1, 6, 6),
         "pose_factor_kinds": np.array([getattr(f, "kind", _PRIOR) for f in factors], np.str_),
         "pose_factor_robust": np.array([getattr(f, "robust", "") or "" for f in factors], np.str_),
-        **archive_arrays(shadow),
+        **marginalised_arrays(tables),
     }
 
 
@@ -115,17 +119,17 @@ def _check(arrays: Arrays, path: Path) -> None:
                 raise InputError(f"{path}: {name} has unknown id {unknown[0]}; save it again")
 
 
-def shadow_of(arrays: Arrays, path: Path) -> Shadow:
+def factor_tables_of(arrays: Arrays, path: Path) -> FactorTables:
     """The shadow of ``graph_arrays``, read from a file.
 
     Raises:
         InputError: they do not fit together.
     """
     _check(arrays, path)
-    shadow = Shadow()
-    shadow.keyframes.insert(arrays["keyframe_ids"], arrays["poses_world_camera"])
-    shadow.landmarks.insert(arrays["landmark_ids"], arrays["points_world"])
-    shadow.observations.add(
+    tables = FactorTables()
+    tables.keyframes.insert(arrays["keyframe_ids"], arrays["poses_world_camera"])
+    tables.landmarks.insert(arrays["landmark_ids"], arrays["points_world"])
+    tables.observations.add(
         Observations(
             arrays["observation_keyframe_ids"],
             arrays["observation_landmark_ids"],
@@ -144,9 +148,9 @@ def shadow_of(arrays: Arrays, path: Path) -> Shadow:
         factor: RelativePose | PosePrior = PosePrior(a, T, covariance)
         if kind != _PRIOR:
             factor = RelativePose(a, b, T, covariance, robust or None, kind)
-        shadow.add_pose_factors([factor])
-    shadow.archive = read_archive(arrays)
-    return shadow
+        tables.add_pose_factors([factor])
+    tables.marginalised = read_marginalised(arrays)
+    return tables
 
 
 def read_camera(header: Header, path: Path) -> Camera:

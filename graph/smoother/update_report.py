@@ -17,7 +17,7 @@ from bmask_slam.graph.factors.graph_update import (
 from bmask_slam.graph.smoother.isam2 import Variable
 from bmask_slam.graph.smoother.removal import Removal
 from bmask_slam.graph.smoother.repair import Repair
-from bmask_slam.graph.smoother.validation import Admitted
+from bmask_slam.graph.smoother.validation import Validated
 
 
 @dataclass
@@ -29,7 +29,7 @@ class UpdateReport:
     removal: RemovalReport = field(default_factory=RemovalReport)
     landmarks: set[int] = field(default_factory=set)
     keyframes: set[int] = field(default_factory=set)
-    bridged: set[int] = field(default_factory=set)
+    anchored: set[int] = field(default_factory=set)
     rebuilt: bool = False
     failed: Variable | None = None
 
@@ -40,11 +40,11 @@ class UpdateReport:
 
     def add_removal(self, removal: Removal) -> None:
         self.landmarks.update(removal.dropped_landmarks.tolist())
-        self.bridged.update(removal.bridged_keyframes.tolist())
+        self.anchored.update(removal.anchored_keyframes.tolist())
 
-    def refuse_all(self, admitted: Admitted) -> None:
+    def refuse_all(self, validated: Validated) -> None:
         """Refuse everything that had been admitted, as SOLVER_FAILED."""
-        seen, keyframes = admitted.observations, admitted.keyframe_ids
+        seen, keyframes = validated.observations, validated.keyframe_ids
         nothing = np.full(len(keyframes), NO_LANDMARK)
         self.refused = Refusals(
             np.concatenate([self.refused.keyframe_ids, seen.keyframe_ids, keyframes]),
@@ -58,10 +58,10 @@ class UpdateReport:
         )
         self.refused_factors += tuple(
             RefusedFactor(*describe(factor), RefusalReason.SOLVER_FAILED)
-            for factor in admitted.pose_factors
+            for factor in validated.pose_factors
         )
 
     def add_repair(self, repair: Repair) -> None:
         self.landmarks.update(repair.dropped_landmarks.tolist())
         self.keyframes.update(repair.dropped_keyframes.tolist())
-        self.bridged.update(repair.bridged_keyframes.tolist())
+        self.anchored.update(repair.anchored_keyframes.tolist())

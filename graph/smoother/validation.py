@@ -20,7 +20,7 @@ from bmask_slam.graph.factors.checks import (
     check_variables,
     describe,
 )
-from bmask_slam.graph.factors.factor_tables import Shadow, ids_array
+from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.graph_update import (
     NO_LANDMARK,
     GraphUpdate,
@@ -38,7 +38,7 @@ from bmask_slam.graph.geometry import Array
 
 
 @dataclass(frozen=True)
-class Admitted:
+class Validated:
     """The part of an update that may enter, and what may not."""
 
     keyframe_ids: IntArray
@@ -51,20 +51,22 @@ class Admitted:
     refused_factors: tuple[RefusedFactor, ...]
 
 
-def admit(update: GraphUpdate, shadow: Shadow, camera: Camera, config: SmootherConfig) -> Admitted:
+def validate(
+    update: GraphUpdate, tables: FactorTables, camera: Camera, config: SmootherConfig
+) -> Validated:
     """Sort an update into what may enter and what is refused; removals are already done."""
     keyframe_rows, keyframe_reasons = check_variables(
-        update.keyframe_ids, update.poses_world_camera, shadow.keyframes.ids
+        update.keyframe_ids, update.poses_world_camera, tables.keyframes.ids
     )
     landmark_rows, _ = check_variables(
-        update.landmark_ids, update.points_world, shadow.landmarks.ids
+        update.landmark_ids, update.points_world, tables.landmarks.ids
     )
     candidates = Candidates(
         update.keyframe_ids[keyframe_rows],
         update.poses_world_camera[keyframe_rows],
         update.landmark_ids[landmark_rows],
         update.points_world[landmark_rows],
-        shadow,
+        tables,
     )
     pose_factors, refused_factors = check_pose_factors(update, candidates)
     reasons = check_observations(update.observations, candidates, camera, config)
@@ -73,7 +75,7 @@ def admit(update: GraphUpdate, shadow: Shadow, camera: Camera, config: SmootherC
     fell = candidates.new_keyframes[~np.isin(candidates.new_keyframes, keyframes)]
     in_keyframes = np.isin(candidates.new_keyframes, keyframes)
     in_landmarks = np.isin(candidates.new_landmarks, landmarks)
-    return Admitted(
+    return Validated(
         candidates.new_keyframes[in_keyframes],
         candidates.new_poses[in_keyframes],
         candidates.new_landmarks[in_landmarks],
@@ -130,9 +132,9 @@ def _anchored(
     Grown from the graph's keyframes: a keyframe joins by a prior, by a relative pose to one
     that is in, or by enough observations of landmarks that the graph or one that is in sees.
     """
-    inside = set(candidates.shadow.keyframes.ids.tolist())
+    inside = set(candidates.tables.keyframes.ids.tolist())
     waiting = keyframes.tolist()
-    old = candidates.shadow.landmarks.contains(accepted.landmark_ids)
+    old = candidates.tables.landmarks.contains(accepted.landmark_ids)
     while True:
         seen = accepted.landmark_ids[np.isin(accepted.keyframe_ids, ids_array(inside))]
         shared = accepted.keyframe_ids[old | np.isin(accepted.landmark_ids, seen)]
@@ -163,7 +165,7 @@ def _split_by_keyframes(
     keyframes: IntArray,
     candidates: Candidates,
 ) -> tuple[tuple[RelativePose | PosePrior, ...], list[RefusedFactor]]:
-    inside = {*keyframes.tolist(), *candidates.shadow.keyframes.ids.tolist()}
+    inside = {*keyframes.tolist(), *candidates.tables.keyframes.ids.tolist()}
     kept = tuple(f for f in pose_factors if inside.issuperset(describe(f)[1]))
     lost = [
         RefusedFactor(*describe(f), RefusalReason.KEYFRAME_UNDERCONSTRAINED)

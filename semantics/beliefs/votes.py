@@ -59,7 +59,7 @@ class VoteConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Claims:
+class PixelAssignment:
     """Who owns the pixels of a keyframe.
 
     Attributes:
@@ -133,13 +133,13 @@ def check_instances(
             )
 
 
-def claim_pixels(
+def assign_pixels(
     instances: Sequence[Instance],
     depth_m: NDArray[np.float32],
     size: tuple[int, int],
     config: VoteConfig,
     in_boxes: bool = False,
-) -> Claims:
+) -> PixelAssignment:
     """Give each pixel to the instance with the best mask score that covers it, or is in front.
 
     ``size`` is the image's (H, W); ``depth_m`` (H / s, W / s) may be every s-th pixel of the
@@ -161,10 +161,12 @@ def claim_pixels(
         near = cv2.dilate(covered, _disc(config.background_border_px)) > covered
         inner &= ~near
     surfaces = _surfaces(owner, inner, depth_m, len(ranked), config)
-    return Claims(ranked, owner, under, inner, depth_m, surfaces)
+    return PixelAssignment(ranked, owner, under, inner, depth_m, surfaces)
 
 
-def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteConfig) -> Votes:
+def vote(
+    assignment: PixelAssignment, pixels: Array, z_m: Array, classes: int, config: VoteConfig
+) -> Votes:
     """The votes of a keyframe about the landmarks that it sees (paper, Algorithm 3).
 
     For each landmark, at ``pixels`` (N, 2) in the image and with z-depth ``z_m`` (N,) in the
@@ -173,26 +175,26 @@ def vote(claims: Claims, pixels: Array, z_m: Array, classes: int, config: VoteCo
     that leaves, the one under it. Near a border it is the instance that alone has surface at the
     landmark's depth. Where there is no instance, it is missed.
     """
-    height, width = claims.owner.shape
+    height, width = assignment.owner.shape
     columns, rows = np.rint(pixels).astype(np.int64).reshape(-1, 2).T
     columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
-    owners = claims.owner[rows, columns].astype(np.int64)
-    inner = claims.inner[rows, columns]
+    owners = assignment.owner[rows, columns].astype(np.int64)
+    inner = assignment.inner[rows, columns]
     sure, alone = inner.copy(), inner.copy()
     edge = np.flatnonzero(~inner)
-    if claims.instances and config.edge_px and len(edge):
-        found, one = _at_edges(claims, rows[edge], columns[edge], z_m[edge], config)
+    if assignment.instances and config.edge_px and len(edge):
+        found, one = _at_edges(assignment, rows[edge], columns[edge], z_m[edge], config)
         told = found != NOBODY
         owners[edge[told]], alone[edge], sure[edge] = found[told], one & told, told
     covered = owners != NOBODY
     votes = np.ones(len(owners), bool)
-    votes[covered] = claims.on_surface(owners[covered], z_m[covered])
+    votes[covered] = assignment.on_surface(owners[covered], z_m[covered])
     votes &= sure | (config.border_weight > 0)
     chosen = np.flatnonzero(votes)
     speakers = owners[chosen]
-    same = speakers == claims.owner[rows[chosen], columns[chosen]]
-    behind = np.where(same, claims.under[rows[chosen], columns[chosen]], NOBODY)
-    distributions, weights = _mixed(claims.instances, speakers, behind, classes)
+    same = speakers == assignment.owner[rows[chosen], columns[chosen]]
+    behind = np.where(same, assignment.under[rows[chosen], columns[chosen]], NOBODY)
+    distributions, weights = _mixed(assignment.instances, speakers, behind, classes)
     missed = speakers == NOBODY
     weights[missed] = 1.0
     sure = sure[chosen]
@@ -217,26 +219,26 @@ def _mixed(
 
 
 def _at_edges(
-    claims: Claims, rows: Ints, columns: Ints, z_m: Array, config: VoteConfig
+    assignment: PixelAssignment, rows: Ints, columns: Ints, z_m: Array, config: VoteConfig
 ) -> tuple[Ints, Mask]:
     """Whose surface landmarks (N,) at rows and columns (N,) near a border are on, by their depth.
 
     The instance (N,) with the worst score of those of one class that have surface there, NOBODY
     where classes differ or some of the surface is nobody's; whether it is the only one (N,).
     """
-    step = max(claims.owner.shape[0] // max(claims.depth_m.shape[0], 1), 1)
-    limits = np.minimum(claims.depth_m.shape, np.array(claims.owner.shape) // step) - 1
+    step = max(assignment.owner.shape[0] // max(assignment.depth_m.shape[0], 1), 1)
+    limits = np.minimum(assignment.depth_m.shape, np.array(assignment.owner.shape) // step) - 1
     reach = np.arange(-(config.edge_px // step), config.edge_px // step + 1)
     shifts = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
     around = np.stack([rows, columns], axis=1)[:, None] // step + shifts
     rows, columns = np.moveaxis(np.clip(around, 0, limits), -1, 0)
-    apart_m = np.abs(claims.depth_m[rows, columns] - z_m[:, None])
+    apart_m = np.abs(assignment.depth_m[rows, columns] - z_m[:, None])
     there = apart_m < config.edge_depth * z_m[:, None]
-    owners = claims.owner[rows * step, columns * step].astype(np.int64)
-    count = len(claims.instances)
+    owners = assignment.owner[rows * step, columns * step].astype(np.int64)
+    count = len(assignment.instances)
     first = np.where(there, owners, count).min(axis=1, initial=count)
     last = np.where(there, owners, NOBODY).max(axis=1, initial=NOBODY)
-    classes = np.array([i.label for i in claims.instances])
+    classes = np.array([i.label for i in assignment.instances])
     of_class = np.where(owners == NOBODY, 0, classes[owners])
     one = (~there | (of_class == classes[last][:, None])).all(axis=1) & there.any(axis=1)
     return np.where(one, last, NOBODY), first == last

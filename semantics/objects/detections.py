@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.geometry import Array
-from bmask_slam.semantics.beliefs.votes import NOBODY, Claims, Ints
+from bmask_slam.semantics.beliefs.votes import NOBODY, Ints, PixelAssignment
 
 _COARSE = 4
 """Of masks every so many pixels each way are counted."""
@@ -61,41 +61,41 @@ class Detections:
 
 
 def detect(
-    claims: Claims, depth_m: NDArray[np.float32], rays: Array, config: DetectionConfig
+    assignment: PixelAssignment, depth_m: NDArray[np.float32], rays: Array, config: DetectionConfig
 ) -> Detections:
     """The surface points of each instance.
 
     ``depth_m`` (h, w) is every s-th pixel of the image both ways, ``rays`` (h, w, 3) are the
     points at depth 1 m that those pixels see.
     """
-    step = claims.owner.shape[0] // depth_m.shape[0]
+    step = assignment.owner.shape[0] // depth_m.shape[0]
     height, width = depth_m.shape
-    owner = _without_border(claims, config)[::step, ::step][:height, :width]
+    owner = _without_border(assignment, config)[::step, ::step][:height, :width]
     rows, columns = np.nonzero((owner != NOBODY) & np.isfinite(depth_m))
     owners, z_m = owner[rows, columns].astype(np.int64), depth_m[rows, columns].astype(float)
-    good = claims.on_surface(owners, z_m)
+    good = assignment.on_surface(owners, z_m)
     order = np.argsort(owners[good], kind="stable")
     rows, columns, owners = (a[good][order] for a in (rows, columns, owners))
-    sizes = np.bincount(owners, minlength=len(claims.instances))
-    sizes[_doubles(claims, config.double)] = 0
+    sizes = np.bincount(owners, minlength=len(assignment.instances))
+    sizes[_doubles(assignment, config.double)] = 0
     kept = _evenly(owners, sizes, config.max_points) & (sizes >= config.min_points)[owners]
     rows, columns, owners = rows[kept], columns[kept], owners[kept]
     instances = np.flatnonzero(sizes >= config.min_points)
-    number = np.full(len(claims.instances) + 1, -1)
+    number = np.full(len(assignment.instances) + 1, -1)
     number[instances] = np.arange(len(instances))
     z_m = _smoothed((owner, depth_m), rows, columns, config.smooth_px // step, config)
     points = rays[rows, columns] * z_m[:, None]
     return Detections(instances, points, number[owners], number)
 
 
-def _doubles(claims: Claims, share: float) -> list[int]:
+def _doubles(assignment: PixelAssignment, share: float) -> list[int]:
     """Instances of whose masks others of their class own more than a share."""
-    labels = np.array([*(i.label for i in claims.instances), 0])
-    owned = labels[claims.owner[::_COARSE, ::_COARSE]]
+    labels = np.array([*(i.label for i in assignment.instances), 0])
+    owned = labels[assignment.owner[::_COARSE, ::_COARSE]]
     found = []
-    for k, instance in enumerate(claims.instances):
+    for k, instance in enumerate(assignment.instances):
         mask = instance.mask[::_COARSE, ::_COARSE]
-        others = (owned[mask] == labels[k]) & (claims.owner[::_COARSE, ::_COARSE][mask] != k)
+        others = (owned[mask] == labels[k]) & (assignment.owner[::_COARSE, ::_COARSE][mask] != k)
         if np.count_nonzero(others) > share * np.count_nonzero(mask):
             found.append(k)
     return found
@@ -123,10 +123,10 @@ def _smoothed(
     return np.asarray(alike.sum(axis=(1, 2)) / inverse.sum(axis=(1, 2)))
 
 
-def _without_border(claims: Claims, config: DetectionConfig) -> NDArray[np.int16]:
+def _without_border(assignment: PixelAssignment, config: DetectionConfig) -> NDArray[np.int16]:
     """Owners of pixels (H, W), nobody where another is near and either may be wrong."""
-    owner, reach = claims.owner, config.border_px
-    vague = np.array([*(i.mask_score < config.exact_score for i in claims.instances), False])
+    owner, reach = assignment.owner, config.border_px
+    vague = np.array([*(i.mask_score < config.exact_score for i in assignment.instances), False])
     if reach == 0 or not vague.any():
         return owner
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)

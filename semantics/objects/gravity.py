@@ -13,7 +13,7 @@ _MAX_STEP = 0.05  # of the depth
 _UP_CAMERA = np.array([0.0, -1.0, 0.0])
 
 
-class Upright:
+class GravityEstimator:
     """Surface normals of each keyframe, in its frame, so that they turn with the graph."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import Arrays, nested, part
 from bmask_slam.graph.geometry import Array, inverse, transform
 from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
-from bmask_slam.semantics.beliefs.votes import NOBODY, Claims, Ints
+from bmask_slam.semantics.beliefs.votes import NOBODY, Ints, PixelAssignment
 from bmask_slam.semantics.objects.association import (
     AssociationConfig,
     Evidence,
@@ -25,7 +25,7 @@ from bmask_slam.semantics.objects.association import (
 from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around, supported, without_noise
 from bmask_slam.semantics.objects.detections import DetectionConfig, Detections, detect
 from bmask_slam.semantics.objects.points import ObjectPoints
-from bmask_slam.semantics.objects.revision import Balance, RevisionConfig, merges, splits
+from bmask_slam.semantics.objects.revision import MergeEvidence, RevisionConfig, merges, splits
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class KeyframeView:
     T_world_camera: Array
     depth_m: NDArray[np.float32]
     rays: Array
-    claims: Claims
+    assignment: PixelAssignment
     poses: dict[int, Array]
 
 
@@ -124,13 +124,13 @@ class ObjectMap:
         self.config = config
         self.labels = LabelStore(classes, labels)
         self.points = ObjectPoints()
-        self._merging = Balance(config.revision)
-        self._splitting = Balance(config.revision)
+        self._merging = MergeEvidence(config.revision)
+        self._splitting = MergeEvidence(config.revision)
 
     def add(self, view: KeyframeView) -> Ints:
         """Take a keyframe's instances in; returns the object (K,) of each, -1 for none."""
-        found = detect(view.claims, view.depth_m, view.rays, self.config.detections)
-        instances = [view.claims.instances[k] for k in found.instances.tolist()]
+        found = detect(view.assignment, view.depth_m, view.rays, self.config.detections)
+        instances = [view.assignment.instances[k] for k in found.instances.tolist()]
         rows = [i.distribution for i in instances]
         detected = np.array(rows, np.float32).reshape(-1, self.labels.classes)
         seen = self._associate(view, found, detected.astype(float))
@@ -234,7 +234,7 @@ class ObjectMap:
         depth_m = view.depth_m[rows, columns].astype(float)
         reach_m = self.config.association.reach_m(points[:, 2])
         visible = np.abs(points[:, 2] - depth_m) <= reach_m
-        owners = view.claims.owner[pixels[:, 1], pixels[:, 0]].astype(np.int64)
+        owners = view.assignment.owner[pixels[:, 1], pixels[:, 0]].astype(np.int64)
         detections = found.number[np.where(visible, owners, NOBODY)]
         return detections, visible
 

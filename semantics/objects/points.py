@@ -100,11 +100,11 @@ class ObjectPoints:
         """The keyframes whose frames hold points."""
         return list(np.unique(self._anchors).tolist())
 
-    def hand_over(self, keyframe_id: int, heir_id: int, T_heir_keyframe: Array) -> None:
+    def hand_over(self, keyframe_id: int, parent_id: int, T_parent_keyframe: Array) -> None:
         """A keyframe leaves the map: its points are in the frame of another from now on."""
         rows = self._anchors == keyframe_id
-        self._points[rows] = transform(T_heir_keyframe, self._points[rows].astype(float))
-        self._anchors[rows] = heir_id
+        self._points[rows] = transform(T_parent_keyframe, self._points[rows].astype(float))
+        self._anchors[rows] = parent_id
 
     def sightings(self, object_id: int) -> tuple[Ints, Array]:
         """Keyframes (K,), rising, that saw an object, and their stamps (K,)."""

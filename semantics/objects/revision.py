@@ -32,7 +32,7 @@ class RevisionConfig:
     most: int = 4
 
 
-class Balance:
+class MergeEvidence:
     """Keyframes for a revision less those against, by key."""
 
     def __init__(self, config: RevisionConfig) -> None:

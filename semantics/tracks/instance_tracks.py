@@ -106,7 +106,7 @@ class InstanceTracks:
         tracks = [replace(t, missed=t.missed + (t.id in unseen)) for t in self.tracks]
         self.tracks = [t for t in tracks if t.missed < self.config.max_missed]
 
-    def acquit(self, track_id: int, prior: float) -> None:
+    def reinstate(self, track_id: int, prior: float) -> None:
         """A thing was found to stand: its class does not count, its log odds begin at a prior."""
         self.tracks = [
             replace(t, prior=min(t.prior, prior), evidence=min(t.evidence, 0.0), stood=True)

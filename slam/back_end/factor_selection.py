@@ -21,15 +21,15 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
 @dataclass(frozen=True)
-class GraphFeedConfig:
+class FactorSelectionConfig:
     """The graph's size decides its cost: measurements are capped per keyframe.
 
     A landmark enters when ``min_views`` keyframes see it, with all its observations so far. It
     retires (`graph.marginals.landmark_marginalisation`) when none of the ``window_keyframes`` that
-    share most with the
-    newest one sees it, and as soon as ``retire_batch`` wait for it, at most twice as many at once;
-    it comes back when it is seen again. A map of up to ``full_keyframes`` keeps every landmark in
-    the graph: that is more accurate, and fast enough. 0 window keyframes: so does every map.
+    share most with the newest one sees it, and as soon as ``marginalise_batch`` wait for it, at
+    most twice as many at once; it comes back when it is seen again. A map of up to
+    ``full_keyframes`` keeps every landmark in the graph: that is more accurate, and fast enough. 0
+    window keyframes: so does every map.
     """
 
     max_observations: int = 200
@@ -38,13 +38,13 @@ class GraphFeedConfig:
     full_keyframes: int = 300
     window_keyframes: int = 20
     window_min_shared: int = 15
-    retire_batch: int = 100
+    marginalise_batch: int = 100
 
 
-class GraphFeed:
+class FactorSelector:
     """Turns changes of the map into updates of the graph and estimates back into the map."""
 
-    def __init__(self, config: GraphFeedConfig):
+    def __init__(self, config: FactorSelectionConfig):
         self.config = config
         self._removed: list[Ints] = []
         self._removed_keyframes: list[int] = []
@@ -85,7 +85,7 @@ class GraphFeed:
             landmark_ids=new_ids,
             points_world=world.landmarks.points_world[new_ids],
             priors=(segment_prior(keyframe),) if begins else (),
-            retire_landmarks=retired,
+            marginalise_landmarks=retired,
         )
 
     def map_update(self, world: WorldMap) -> GraphUpdate:
@@ -154,7 +154,7 @@ class GraphFeed:
         for keyframe in near:
             active[keyframe.landmark_ids] = True
         waiting = np.flatnonzero(landmarks.in_graph & landmarks.alive & ~active[:-1])
-        batch = self.config.retire_batch
+        batch = self.config.marginalise_batch
         if len(waiting) < batch:
             return waiting[:0]
         oldest = np.argsort(landmarks.last_keyframe[waiting], kind="stable")[: 2 * batch]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bmask_slam.back_end.factor_selection import GraphFeed, GraphFeedConfig, read_back
+from bmask_slam.back_end.factor_selection import FactorSelectionConfig, FactorSelector, read_back
 from bmask_slam.back_end.landmark_management import (
     MappingConfig,
     create_landmarks,
@@ -51,7 +51,7 @@ class Mapper:
         self,
         camera: Camera,
         tracker: Tracker,
-        config: tuple[MappingConfig, GraphFeedConfig, SmootherConfig, LoopClosingConfig],
+        config: tuple[MappingConfig, FactorSelectionConfig, SmootherConfig, LoopClosingConfig],
     ):
         self.camera = camera
         self.world = WorldMap()
@@ -61,7 +61,7 @@ class Mapper:
         self.update_ms: list[float] = []
         self._tracker = tracker
         self._mapping, self._graph_config = config[0], config[2]
-        self._feed = GraphFeed(config[1])
+        self._factor_selector = FactorSelector(config[1])
 
     @property
     def places(self) -> DescriptorIndex:
@@ -81,7 +81,7 @@ class Mapper:
                 world=world_state(self.world),
                 history=self.history.state(),
                 graph=self.smoother.state(),
-                feed=self._feed.state(),
+                feed=self._factor_selector.state(),
                 loops=self.loops.state(),
             ),
         }
@@ -92,7 +92,7 @@ class Mapper:
         self.world = world_of(part(state, "world"))
         self.history.restore(part(state, "history"))
         self.smoother.restore(part(state, "graph"), path)
-        self._feed.restore(part(state, "feed"))
+        self._factor_selector.restore(part(state, "feed"))
         self.loops.restore(part(state, "loops"), self.world)
 
     def restart(self) -> None:
@@ -115,14 +115,16 @@ class Mapper:
         triangulate_landmarks(world, keyframe, self.camera, self._mapping.triangulation)
         world.renew_patches(keyframe, self._tracker.config.subpixel)
         keyframe.features = without_image(keyframe.features)
-        self._feed.forget_landmarks(fused)
-        self._feed.forget_landmarks(cull_landmarks(world, local_ids, self._mapping))
+        self._factor_selector.forget_landmarks(fused)
+        self._factor_selector.forget_landmarks(cull_landmarks(world, local_ids, self._mapping))
         self.loops.add(keyframe)
         return keyframe
 
     def optimise(self, keyframe: Keyframe) -> None:
         """Put a keyframe into the graph, read all poses and points back, cull a redundant one."""
-        self._apply(self.smoother.update(self._feed.keyframe_update(self.world, keyframe)))
+        self._apply(
+            self.smoother.update(self._factor_selector.keyframe_update(self.world, keyframe))
+        )
         self._cull_keyframe(keyframe)
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
@@ -152,14 +154,14 @@ class Mapper:
         """
         joined = join_segment(self.world, segment, tracked, recognised)
         self.smoother = Smoother(self.camera, self._graph_config)
-        self._apply(self.smoother.update(self._feed.whole_update(self.world)))
+        self._apply(self.smoother.update(self._factor_selector.whole_update(self.world)))
         return joined
 
     def pruner(self) -> MapPruner:
         """Takes things out of map and graph, such as what a mask covers, at any time."""
         return MapPruner(self.world, self.smoother, self.camera)
 
-    def take_back(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
+    def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """Keypoints (N,) of a keyframe that were masked observe landmarks after all.
 
         Those that the map has by now, or new ones; either have the patches (N) of what the
@@ -174,7 +176,7 @@ class Mapper:
         known = np.setdiff1d(local_landmarks(world, seen, self._mapping), seen)
         radius_px = self._mapping.fuse_radius_px
         fused = fuse_into(world, [keyframe], known, self._tracker, radius_px)
-        self._feed.forget_landmarks(fused)
+        self._factor_selector.forget_landmarks(fused)
         create_landmarks(world, keyframe, self.camera)
         ids = keyframe.landmark_ids[keypoints]
         world.landmarks.give_patches(ids[ids >= 0], patches[ids >= 0])
@@ -194,7 +196,9 @@ class Mapper:
     def _change_graph(self, **changes: Any) -> None:
         """An update that moves much of the graph: ISAM2 goes on until nothing moves any more."""
         rounds = self.loops.config.max_iterations
-        update = replace(self._feed.map_update(self.world), max_iterations=rounds, **changes)
+        update = replace(
+            self._factor_selector.map_update(self.world), max_iterations=rounds, **changes
+        )
         self._apply(self.smoother.update(update))
 
     def _refuted_loops(self) -> set[tuple[int, int]]:
@@ -238,8 +242,10 @@ class Mapper:
         for loop in loops:
             pairs = np.sort(loop.landmark_pairs, axis=1)
             pairs = pairs[world.landmarks.alive[pairs].all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
-            self._feed.forget_landmarks(world.replace_landmarks(pairs[:, 1], pairs[:, 0]))
-        self._feed.forget_landmarks(
+            self._factor_selector.forget_landmarks(
+                world.replace_landmarks(pairs[:, 1], pairs[:, 0])
+            )
+        self._factor_selector.forget_landmarks(
             fuse_into(world, new_side, old_ids, self._tracker, self._mapping.fuse_radius_px)
         )
         self._change_graph()
@@ -270,12 +276,12 @@ class Mapper:
         if redundant is None:
             return
         _, ids = self.world.observed(redundant)
-        heir = next(k for _, k in self.world.covisible(ids, 0) if k is not redundant)
-        T_heir_keyframe = inverse(heir.T_world_camera) @ redundant.T_world_camera
-        self.history.hand_over(redundant.id, heir.id, T_heir_keyframe)
-        self.world.remove_keyframe(redundant, heir)
-        self._feed.forget_keyframe(redundant.id)
-        self._feed.forget_landmarks(cull_landmarks(self.world, ids, self._mapping))
+        parent = next(k for _, k in self.world.covisible(ids, 0) if k is not redundant)
+        T_parent_keyframe = inverse(parent.T_world_camera) @ redundant.T_world_camera
+        self.history.hand_over(redundant.id, parent.id, T_parent_keyframe)
+        self.world.remove_keyframe(redundant, parent)
+        self._factor_selector.forget_keyframe(redundant.id)
+        self._factor_selector.forget_landmarks(cull_landmarks(self.world, ids, self._mapping))
         self.loops.remove(redundant.id)
 
 

@@ -77,7 +77,7 @@ class PruneReport:
     refused: str = ""
     refused_variables: Refusals = field(default_factory=Refusals)
     dropped_landmarks: Ints = field(default_factory=_no_ids)
-    bridged_keyframes: Ints = field(default_factory=_no_ids)
+    anchored_keyframes: Ints = field(default_factory=_no_ids)
 
 
 def covered(mask: Mask, image_pixels: Array, border_px: int) -> Ints:
@@ -248,7 +248,7 @@ class MapPruner:
             landmark_ids=ids,
             observations=pairs,
             dropped_landmarks=estimate.dropped_landmarks,
-            bridged_keyframes=estimate.bridged_keyframes,
+            anchored_keyframes=estimate.anchored_keyframes,
         ), estimate
 
 

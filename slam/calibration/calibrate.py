@@ -184,9 +184,9 @@ def make_problem(
     options: CalibrateOptions, run: SavedRun, sequence: Sequence
 ) -> tuple[CalibrationProblem, IntArray]:
     """What the solver needs, and the ids (K,) of the keyframes in it."""
-    stamps_s = dict(zip(run.shadow.keyframes.ids.tolist(), run.keyframe_stamps_s, strict=True))
+    stamps_s = dict(zip(run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s, strict=True))
     frames = _frames_of(stamps_s, sequence)
-    seen = connected_views(run.shadow, np.array(sorted(frames), np.int64), MAX_KEYFRAMES)
+    seen = connected_views(run.tables, np.array(sorted(frames), np.int64), MAX_KEYFRAMES)
     count = len(np.unique(seen.keyframe_ids))
     if count < MIN_KEYFRAMES:
         raise InputError(
@@ -195,8 +195,8 @@ def make_problem(
         )
     motion = seen_motion(seen, run)
     views, keyframe_ids, landmark_ids = make_views(seen, frames, sequence, motion)
-    poses = run.shadow.keyframes.get(keyframe_ids)
-    points = run.shadow.landmarks.get(landmark_ids)
+    poses = run.tables.keyframes.get(keyframe_ids)
+    points = run.tables.landmarks.get(landmark_ids)
     stamps = np.array([stamps_s[k] for k in keyframe_ids.tolist()])
     positions, gauge = np.full((len(poses), 3), np.nan), GAUGE_SIGMAS
     if options.reference is not None:
@@ -258,7 +258,7 @@ def _with_distance(
             f"{run.path / 'trajectory.txt'} and a positive distance in metres"
         )
     ends = nearest_indices(stamps_s, np.array(moments_s))
-    T_world_keyframe = run.shadow.keyframes.get(keyframe_ids[ends])
+    T_world_keyframe = run.tables.keyframes.get(keyframe_ids[ends])
     T_keyframe_then = inverse(T_world_keyframe) @ trajectory.poses_world_camera[at]
     return dataclasses.replace(
         anchors,

@@ -35,10 +35,10 @@ def seen_motion(seen: Observations, run: SavedRun) -> tuple[Array, Array]:
     In metres and m/s, of still landmarks, by the run's trajectory.
     """
     keyframes, rows = np.unique(seen.keyframe_ids, return_inverse=True)
-    stamps_s = run.keyframe_stamps_s[np.searchsorted(run.shadow.keyframes.ids, keyframes)]
+    stamps_s = run.keyframe_stamps_s[np.searchsorted(run.tables.keyframes.ids, keyframes)]
     twists = twists_at(run.trajectories["trajectory.txt"], stamps_s)
-    T_camera_world = inverse(run.shadow.keyframes.get(keyframes))[rows]
-    points_world = run.shadow.landmarks.get(seen.landmark_ids)
+    T_camera_world = inverse(run.tables.keyframes.get(keyframes))[rows]
+    points_world = run.tables.landmarks.get(seen.landmark_ids)
     points = transform(T_camera_world, points_world[:, None])[:, 0]
     return points, velocities(points, twists[rows])
 

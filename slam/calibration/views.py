@@ -11,7 +11,7 @@ import numpy as np
 from bmask_slam.calibration.motion import as_exposed
 from bmask_slam.graph.calibration.model import CalibrationViews, distort, parameters_of
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import IntArray, Observations
 from bmask_slam.graph.geometry import Array
 from bmask_slam.sequences import Sequence
@@ -27,14 +27,14 @@ MAX_STEP_SIGMAS = 4.0
 MAX_RATE_STEP_S = 0.2
 
 
-def connected_views(shadow: Shadow, keyframe_ids: IntArray, most: int) -> Observations:
+def connected_views(tables: FactorTables, keyframe_ids: IntArray, most: int) -> Observations:
     """Of these keyframes, the observations by which the largest connected set hangs together.
 
     Of more than ``most`` keyframes those with most observations are taken.
     Landmarks seen once and keyframes that see few others say nothing of the calibration. Loops and
     other relative poses are left out too: they were measured with the calibration in question.
     """
-    table = shadow.observations
+    table = tables.observations
     seen = table.select(table.all_rows())
     seen = seen.select(np.isin(seen.keyframe_ids, keyframe_ids))
     ids, count = np.unique(seen.keyframe_ids, return_counts=True)

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "comparing": ("compare",),
-    "options": ("CompareOptions",),
-    "result": ("Cell", "CellStatus", "Comparison", "Kind", "Method", "read_results"),
+    "experiment.options": ("CompareOptions",),
+    "experiment.result": ("Cell", "CellStatus", "Comparison", "Kind", "Method", "read_results"),
     "statistics": ("Summary", "Verdict", "summarise", "verdicts"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

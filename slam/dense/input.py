@@ -63,9 +63,9 @@ class SavedMap:
         nothing = np.zeros((len(ids), len(names))), np.zeros(len(ids), bool)
         if self.labels is None or self.labels.names != names or not len(ids):
             return nothing
-        heirs = self.world.landmarks.current(ids)
+        parents = self.world.landmarks.current(ids)
         store = self.labels.store
-        return store.probabilities(heirs), store.estimates(heirs).views > 0
+        return store.probabilities(parents), store.estimates(parents).views > 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

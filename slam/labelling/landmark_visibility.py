@@ -35,16 +35,18 @@ class Observed:
     def T_world_camera(self) -> Array:
         return self.anchor.T_world_camera @ self.T_anchor_camera
 
-    def located(self, mapper: Mapper) -> Located:
+    def located(self, mapper: Mapper) -> VisibleLandmarks:
         """The landmarks where the keyframe is."""
         T_world_camera = self.T_world_camera
         points = mapper.world.landmarks.points_world[self.landmark_ids]
         z_m = transform(inverse(T_world_camera), points)[:, 2]
-        return Located(self.pixels, z_m, self.landmark_ids, T_world_camera, self.anchor.segment)
+        return VisibleLandmarks(
+            self.pixels, z_m, self.landmark_ids, T_world_camera, self.anchor.segment
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Located:
+class VisibleLandmarks:
     """Landmarks in a keyframe's image: pixels (N, 2), depth (N,), ids (N,).
 
     It stands at ``T_world_camera`` in a map segment.
@@ -56,11 +58,11 @@ class Located:
     T_world_camera: Array
     segment: int
 
-    def among(self, wanted: Mask) -> Located:
+    def among(self, wanted: Mask) -> VisibleLandmarks:
         """Those of the ``wanted`` landmarks, a mask over all."""
         keep = wanted[self.landmark_ids]
         kept = self.pixels[keep], self.z_m[keep], self.landmark_ids[keep]
-        return Located(*kept, self.T_world_camera, self.segment)
+        return VisibleLandmarks(*kept, self.T_world_camera, self.segment)
 
     def with_visible(
         self,
@@ -68,7 +70,7 @@ class Located:
         camera: Camera,
         mapper: Mapper,
         wanted: Mask | None = None,
-    ) -> Located:
+    ) -> VisibleLandmarks:
         """These and all others of the segment that lie where the keyframe's depth shows surface.
 
         It need not be at the very pixel: at the rim of a thing, where many landmarks are, colour
@@ -94,7 +96,7 @@ class Located:
         v, u = np.moveaxis(np.clip(nearest[:, None] + _NINE, 0, limits), -1, 0)
         z_m = local[rows, 2]
         there = (np.abs(depth_m[v, u] - z_m[:, None]) < _REACH * z_m[:, None]).any(axis=1)
-        return Located(
+        return VisibleLandmarks(
             np.concatenate([self.pixels, pixels[there]]),
             np.concatenate([self.z_m, z_m[there]]),
             np.concatenate([self.landmark_ids, ids[rows[there]]]),
@@ -111,11 +113,11 @@ def observed_by(keyframe_id: int, mapper: Mapper) -> Observed | None:
         rows, ids = world.observed(keyframe)
         return Observed(keyframe.features.image_pixels[rows], ids, keyframe, np.eye(4))
     culled = world.culled.get(keyframe_id)
-    heir_id, T_heir_keyframe = mapper.history.heir(keyframe_id)
-    heir = world.keyframes.get(heir_id)
-    if culled is None or heir is None:
+    parent_id, T_parent_keyframe = mapper.history.parent(keyframe_id)
+    parent = world.keyframes.get(parent_id)
+    if culled is None or parent is None:
         return None
     rows = np.flatnonzero(culled.landmark_ids >= 0)
     ids = world.landmarks.current(culled.landmark_ids[rows])
     alive = world.landmarks.alive[ids]
-    return Observed(culled.image_pixels[rows[alive]], ids[alive], heir, T_heir_keyframe)
+    return Observed(culled.image_pixels[rows[alive]], ids[alive], parent, T_parent_keyframe)

@@ -10,9 +10,9 @@ import numpy as np
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.labelling.landmark_visibility import Located, Observed, observed_by
+from bmask_slam.labelling.landmark_visibility import Observed, VisibleLandmarks, observed_by
 from bmask_slam.semantics.beliefs.label_store import LabelStore
-from bmask_slam.semantics.beliefs.votes import Claims, VoteConfig, vote
+from bmask_slam.semantics.beliefs.votes import PixelAssignment, VoteConfig, vote
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.world.landmark_table import Ints
 
@@ -28,7 +28,7 @@ class LabelVotes:
     voted on by the last RECENT keyframes whose masks came before it, as if it had been there.
     """
 
-    _recent: dict[int, Claims]
+    _recent: dict[int, PixelAssignment]
 
     def __init__(self, camera: Camera, config: VoteConfig) -> None:
         self._camera, self._config = camera, config
@@ -37,7 +37,7 @@ class LabelVotes:
     def take(
         self,
         keyframe_id: int,
-        claims: Claims,
+        assignment: PixelAssignment,
         observed: Observed,
         mapper: Mapper,
         store: LabelStore,
@@ -51,16 +51,16 @@ class LabelVotes:
                 matched = seen.located(mapper).among(new)
                 located = matched.with_visible(earlier.depth_m, self._camera, mapper, new)
                 self._vote(earlier, located, store)
-        located = observed.located(mapper).with_visible(claims.depth_m, self._camera, mapper)
-        ids = self._vote(claims, located, store)
-        without = [replace(i, mask=_NO_MASK) for i in claims.instances]
-        self._recent[keyframe_id] = replace(claims, instances=tuple(without))
+        located = observed.located(mapper).with_visible(assignment.depth_m, self._camera, mapper)
+        ids = self._vote(assignment, located, store)
+        without = [replace(i, mask=_NO_MASK) for i in assignment.instances]
+        self._recent[keyframe_id] = replace(assignment, instances=tuple(without))
         if len(self._recent) > RECENT:
             del self._recent[min(self._recent)]
         return ids
 
-    def _vote(self, claims: Claims, seen: Located, store: LabelStore) -> Ints:
-        votes = vote(claims, seen.pixels, seen.z_m, store.classes, self._config)
+    def _vote(self, assignment: PixelAssignment, seen: VisibleLandmarks, store: LabelStore) -> Ints:
+        votes = vote(assignment, seen.pixels, seen.z_m, store.classes, self._config)
         ids, hit = seen.landmark_ids[votes.rows], ~votes.missed
         store.update(ids[hit], votes.distributions[hit], votes.weights[hit])
         store.miss(ids[~hit], votes.weights[~hit])
@@ -98,7 +98,7 @@ class LabelVotes:
         for k, keyframe_id in enumerate(state["keyframes"].tolist()):
             mine = slice(ends[k] - state["counts"][k], ends[k])
             owner, under, inner = (images[n][k] for n in ("owner", "under", "inner"))
-            self._recent[keyframe_id] = Claims(
+            self._recent[keyframe_id] = PixelAssignment(
                 tuple(instances[mine]), owner, under, inner, depths_m[k], ranges_m[mine]
             )
 

@@ -18,18 +18,18 @@ from bmask_slam.labelling.landmark_visibility import Observed, observed_by
 from bmask_slam.labelling.landmark_votes import LabelVotes
 from bmask_slam.labelling.results import LandmarkLabels, MapObjects
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
-from bmask_slam.moving.moving_object_filter import Dynamics
+from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
 from bmask_slam.semantics.beliefs.votes import (
-    Claims,
+    PixelAssignment,
     VoteConfig,
+    assign_pixels,
     check_instances,
-    claim_pixels,
     vote,
 )
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.labels import LabelSet
-from bmask_slam.semantics.objects.gravity import Upright
+from bmask_slam.semantics.objects.gravity import GravityEstimator
 from bmask_slam.semantics.objects.object_map import (
     KeyframeView,
     ObjectConfig,
@@ -96,8 +96,8 @@ class _Waiting:
 class SemanticMapper:
     """Segments keyframes and keeps what their masks say about the map, also when they come late.
 
-    Without a segmenter and without masks it does nothing. The map is changed by ``dynamics`` alone,
-    which is told what the masks say.
+    Without a segmenter and without masks it does nothing. The map is changed by
+    ``moving_objects`` alone, which is told what the masks say.
     """
 
     _done: set[int]
@@ -108,9 +108,9 @@ class SemanticMapper:
         camera: Camera,
         config: SemanticsConfig,
         segmenter: Segmenter | None = None,
-        dynamics: Dynamics | None = None,
+        moving_objects: MovingObjectFilter | None = None,
     ) -> None:
-        self._dynamics = dynamics
+        self._moving_objects = moving_objects
         self.camera = camera
         self.config = config
         self.segmenter = segmenter or NoSegmenter()
@@ -143,7 +143,7 @@ class SemanticMapper:
     def expect(self, keyframe: Keyframe, depth_m: NDArray[np.float32]) -> None:
         """Keep of a keyframe what its masks will need, its ``kept_depth``, until they come."""
         self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, depth_m)
-        self._upright.add(keyframe.id, depth_m, self._rays)
+        self._gravity.add(keyframe.id, depth_m, self._rays)
         if len(self._waiting) > MAX_WAITING:
             del self._waiting[min(self._waiting)]
 
@@ -168,21 +168,21 @@ class SemanticMapper:
         nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
         waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
         strong = [i for i in instances if i.class_score >= self.config.object_score]
-        claims = claim_pixels(strong, waiting.depth_m, size, self.config.votes)
+        assignment = assign_pixels(strong, waiting.depth_m, size, self.config.votes)
         seen = observed.located(mapper)
-        votes = vote(claims, seen.pixels, seen.z_m, len(self.names), self.config.votes)
+        votes = vote(assignment, seen.pixels, seen.z_m, len(self.names), self.config.votes)
         ids = observed.landmark_ids[votes.rows[votes.sure]]
         on = votes.instances[votes.sure]
-        everything = claim_pixels(instances, waiting.depth_m, size, self.config.votes, True)
+        everything = assign_pixels(instances, waiting.depth_m, size, self.config.votes, True)
         spoken = self._label_votes.take(keyframe_id, everything, observed, mapper, self.labels)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
-            objects = self._add_objects((keyframe_id, waiting), claims, observed, mapper)[on]
+            objects = self._add_objects((keyframe_id, waiting), assignment, observed, mapper)[on]
             self.objects.place_landmarks(ids[objects >= 0], objects[objects >= 0])
-        if self._dynamics is not None:
+        if self._moving_objects is not None:
             about = (ids, on, self.labels.probabilities(ids))
-            view = (claims, waiting.depth_m, observed.T_world_camera)
+            view = (assignment, waiting.depth_m, observed.T_world_camera)
             masks = KeyframeMasks(keyframe_id, self.names, *view, *about)
-            self._dynamics.see(masks, mapper)
+            self._moving_objects.see(masks, mapper)
         return Attachment(keyframe_id, len(instances), spoken)
 
     def follow(self, mapper: Mapper) -> None:
@@ -195,15 +195,15 @@ class SemanticMapper:
         known = np.union1d(self.labels.known(), self.objects.points.landmarks())
         gone = known[~landmarks.alive[known]]
         if len(gone):
-            heirs = landmarks.current(gone)
-            alive = landmarks.alive[heirs]
-            self.labels.move(gone[alive], heirs[alive])
+            parents = landmarks.current(gone)
+            alive = landmarks.alive[parents]
+            self.labels.move(gone[alive], parents[alive])
             self.labels.drop(gone[~alive])
-            self.objects.points.rename_landmarks(gone, np.where(alive, heirs, -1))
+            self.objects.points.rename_landmarks(gone, np.where(alive, parents, -1))
         for keyframe_id in self.objects.points.anchors():
             if keyframe_id not in keyframes:
-                self.objects.points.hand_over(keyframe_id, *mapper.history.heir(keyframe_id))
-        self._upright.keep(keyframes.keys() | self._waiting.keys())
+                self.objects.points.hand_over(keyframe_id, *mapper.history.parent(keyframe_id))
+        self._gravity.keep(keyframes.keys() | self._waiting.keys())
 
     def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
         """What landmarks (N,) are; None where nothing tells labels apart."""
@@ -212,7 +212,7 @@ class SemanticMapper:
     def map_objects(self, keyframes: Sequence[Keyframe]) -> MapObjects:
         """The objects that these keyframes, all of one map segment, saw."""
         poses = {k.id: k.T_world_camera for k in keyframes}
-        up_world = self._upright.up_world(poses)
+        up_world = self._gravity.up_world(poses)
         return MapObjects(self.names, self.objects.objects(poses, up_world), up_world)
 
     def state(self) -> Arrays:
@@ -229,7 +229,7 @@ class SemanticMapper:
                 labels=self.labels.state(),
                 votes=self._label_votes.state(),
                 objects=self.objects.state(),
-                upright=self._upright.state(),
+                upright=self._gravity.state(),
             ),
         }
 
@@ -252,7 +252,7 @@ class SemanticMapper:
         if votes := part(state, "votes"):
             self._label_votes.restore(votes)
         self.objects.restore(part(state, "objects"))
-        self._upright.restore(part(state, "upright"))
+        self._gravity.restore(part(state, "upright"))
         self._done = set(state["done"].tolist())
         shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
         depths_m = state["waiting_depth_m"].reshape(len(state["waiting"]), *shape)
@@ -269,12 +269,16 @@ class SemanticMapper:
         self.labels = LabelStore(len(names), self.config.labels)
         self._label_votes = LabelVotes(self.camera, self.config.votes)
         self.objects = ObjectMap(self.camera, len(names), self.config.objects, self.config.labels)
-        self._upright = Upright()
+        self._gravity = GravityEstimator()
         self._done = set()
         self._waiting = {}
 
     def _add_objects(
-        self, waited: tuple[int, _Waiting], claims: Claims, observed: Observed, mapper: Mapper
+        self,
+        waited: tuple[int, _Waiting],
+        assignment: PixelAssignment,
+        observed: Observed,
+        mapper: Mapper,
     ) -> Ints:
         """The object of each of the claims' instances (K,) and -1 for the last, "none"."""
         keyframe_id, waiting = waited
@@ -286,13 +290,13 @@ class SemanticMapper:
             T_world_camera,
             waiting.depth_m,
             self._rays,
-            claims,
+            assignment,
             {k.id: k.T_world_camera for k in here} | {keyframe_id: T_world_camera},
         )
         objects = self.objects.add(view)
         if keyframe_id != observed.anchor.id:
-            heir = observed.anchor.id, observed.T_anchor_camera
-            self.objects.points.hand_over(keyframe_id, *heir)
+            parent = observed.anchor.id, observed.T_anchor_camera
+            self.objects.points.hand_over(keyframe_id, *parent)
         return np.append(objects, -1)
 
 

@@ -31,7 +31,7 @@ from bmask_slam.live.sources.counts import SourceCounts
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
 from bmask_slam.run_folder.landmark_file import LandmarkCloud
-from bmask_slam.run_folder.metrics import Tally, measure, row, save
+from bmask_slam.run_folder.metrics import RunCounters, measure, row, save
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -86,7 +86,7 @@ class LiveSlam:
         self.source_counts = SourceCounts()
         self.rows: list[Row] = []
         self.dense: MapWritten | None = None
-        self._tally, self._meter = Tally(), FrameMeter()
+        self._counters, self._meter = RunCounters(), FrameMeter()
         self._refused = 0
         self._closed = False
         self._last_s = -np.inf
@@ -164,7 +164,7 @@ class LiveSlam:
         result = self._system.process(frame, prepared.features if prepared else None)
         if prepared is not None:
             result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
-        self._tally.count(result)
+        self._counters.count(result)
         self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
         if self._recorder is not None:
             self._recorder.frame(result, self.health, self.trajectory)
@@ -234,7 +234,7 @@ class LiveSlam:
             return
         self._closed = True
         health = self.health()
-        self._tally.wall_s = max(time.monotonic() - self._begin_s, 1e-9)
+        self._counters.wall_s = max(time.monotonic() - self._begin_s, 1e-9)
         failure: InputError | None = None
         try:
             self._conclude(health)
@@ -266,17 +266,17 @@ class LiveSlam:
         if self._recorder is None:
             return
         folder = self._recorder.folder
-        if self._tally.frames:
+        if self._counters.frames:
             folder.write_trajectory(self.trajectory())
         folder.write_text(HEALTH, health.as_json())
-        if not self._tally.frames:
+        if not self._counters.frames:
             return
         try:
             self._system.finish()
         except InputError as error:
             logger.error("the map is lost, the trajectory is saved: %s", error)
             return
-        rows = measure(self._system, self.options.reference, self._tally, 1)
+        rows = measure(self._system, self.options.reference, self._counters, 1)
         median, high = self._meter.percentiles_ms()
         rows += [row("latency_ms_median", median, "ms"), row("latency_ms_p95", high, "ms")]
         rows.append(row("frames_dropped", health.frames_dropped, "frames"))

@@ -69,8 +69,8 @@ class LostKeyframe:
     """
 
     id: int
-    heir_id: int
-    T_heir_lost: Array
+    parent_id: int
+    T_parent_lost: Array
     history: Entries
     landmarks: int = 0
 
@@ -125,7 +125,7 @@ class PruneMask:
 
 
 @dataclass(frozen=True, eq=False)
-class TakeBack:
+class RestoreObservations:
     """To the map: masked keypoints (N,) of a keyframe lie on what stands after all.
 
     ``patches`` (N) are those of what they observed before.

@@ -64,7 +64,7 @@ class WorldDelta:
     poses: Array
     segments: Ints
     rows: dict[int, KeyframeRow]
-    heirs: dict[int, tuple[int, Array]]
+    parents: dict[int, tuple[int, Array]]
 
 
 @dataclass
@@ -76,7 +76,7 @@ class _Sent:
     fused: int = 0
     observations: dict[int, Ints] = field(default_factory=dict)
     masked: dict[int, Mask] = field(default_factory=dict)
-    heirs: set[int] = field(default_factory=set)
+    parents: set[int] = field(default_factory=set)
 
 
 class DeltaMaker:
@@ -111,7 +111,7 @@ class DeltaMaker:
             poses=np.array([k.T_world_camera for k in keyframes], float).reshape(-1, 4, 4),
             segments=np.array([k.segment for k in keyframes], np.int64),
             rows={k.id: self._row(k) for k in keyframes if self._has_changed(k)},
-            heirs=self._new_heirs(history),
+            parents=self._new_parents(history),
         )
 
     def _changed_landmarks(self, world: WorldMap) -> Ints:
@@ -142,9 +142,9 @@ class DeltaMaker:
         self._features.add(keyframe.id)
         return KeyframeRow(ids, masked, keyframe.frame_index, keyframe.timestamp_s, features)
 
-    def _new_heirs(self, history: FrameHistory) -> dict[int, tuple[int, Array]]:
-        fresh = {k: heir for k, heir in history.heirs.items() if k not in self._sent.heirs}
-        self._sent.heirs |= fresh.keys()
+    def _new_parents(self, history: FrameHistory) -> dict[int, tuple[int, Array]]:
+        fresh = {k: parent for k, parent in history.parents.items() if k not in self._sent.parents}
+        self._sent.parents |= fresh.keys()
         return fresh
 
 
@@ -172,8 +172,8 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
         keyframe.segment = segments[keyframe.id]
     world.keyframes = kept | {k.id: k for k in pending}
     world.next_keyframe_id = max(world.next_keyframe_id, delta.next_keyframe_id)
-    for keyframe_id, (heir, T_heir_culled) in delta.heirs.items():
-        history.hand_over(keyframe_id, heir, T_heir_culled)
+    for keyframe_id, (parent, T_parent_culled) in delta.parents.items():
+        history.hand_over(keyframe_id, parent, T_parent_culled)
 
 
 def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:

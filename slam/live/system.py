@@ -95,7 +95,7 @@ class LiveSystem(SlamSystem):
         reference, changes = self._reference, self.remote.changes
         T_before = None if reference is None else reference.T_world_camera
         for masks in self.remote.catch_up():
-            self.dynamics.see(masks, self.mapper)
+            self.moving_objects.see(masks, self.mapper)
         for found in self.segmenter.answers() if self.segmenter else ():
             self.remote.tell(found)
             if self.dense is not None:
@@ -110,16 +110,16 @@ class LiveSystem(SlamSystem):
 
         If the keyframe was lost with its place, the next frame begins the segment anew.
         """
-        heir_id, T_heir_reference = self.remote.history.heir(reference.id)
-        if heir_id == NOBODY:
+        parent_id, T_parent_reference = self.remote.history.parent(reference.id)
+        if parent_id == NOBODY:
             self._reference = None
-            self.localiser.forget(0)
+            self.camera_tracker.forget(0)
             return
-        heir = self.remote.world.keyframes[heir_id]
-        T_now = heir.T_world_camera @ T_heir_reference
-        self.localiser.moved(T_before, T_now, self.remote.world)
-        self.localiser.new_local_map(self.remote.world, heir)
-        self._reference, self._segment = heir, heir.segment
+        parent = self.remote.world.keyframes[parent_id]
+        T_now = parent.T_world_camera @ T_parent_reference
+        self.camera_tracker.moved(T_before, T_now, self.remote.world)
+        self.camera_tracker.new_local_map(self.remote.world, parent)
+        self._reference, self._segment = parent, parent.segment
 
     def _follow(self, dense: RemoteDenseMapper, moved: bool) -> None:
         """Let the dense map follow the map."""
@@ -157,11 +157,11 @@ class LiveSystem(SlamSystem):
             self.catch_up()
         path = self.remote.finish(FINISH_S)
         state = read_arrays(path, STATE_FILE)[1]
-        own = nested(dynamics=self.dynamics.state())
+        own = nested(dynamics=self.moving_objects.state())
         whole = SlamSystem(self.camera, self.config, LabelledNothing(self._names))
         whole.restore({**state, **own}, path)
-        self.mapper, self.localiser = whole.mapper, whole.localiser
-        self.semantics, self.dynamics = whole.semantics, whole.dynamics
+        self.mapper, self.camera_tracker = whole.mapper, whole.camera_tracker
+        self.semantics, self.moving_objects = whole.semantics, whole.moving_objects
         self._end()
 
     def close(self) -> None:

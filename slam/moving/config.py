@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from bmask_slam.moving.depth_segments import DepthRegionConfig
-from bmask_slam.moving.free_space_check import StaticCheckConfig
-from bmask_slam.moving.static_verification import SuspectConfig
+from bmask_slam.moving.depth_segments import DepthSegmentConfig
+from bmask_slam.moving.free_space_check import FreeSpaceCheckConfig
+from bmask_slam.moving.static_verification import StaticVerificationConfig
 from bmask_slam.semantics.beliefs.movability import MovabilityConfig
 from bmask_slam.semantics.tracks.instance_tracks import TrackConfig
 
 
 @dataclass(frozen=True)
-class DynamicsConfig:
+class MovingObjectConfig:
     """Which evidence of motion counts: that of masks by their ``labels``, that of ``geometry``.
 
     ``priors`` is a YAML file of P(moving) by class, or the name of one in ``data/labels``. With
@@ -31,10 +31,10 @@ class DynamicsConfig:
     mask_border_px: int = 5
     min_judged: int = 20
     movability: MovabilityConfig = field(default_factory=MovabilityConfig)
-    check: StaticCheckConfig = field(default_factory=StaticCheckConfig)
-    regions: DepthRegionConfig = field(default_factory=DepthRegionConfig)
+    check: FreeSpaceCheckConfig = field(default_factory=FreeSpaceCheckConfig)
+    regions: DepthSegmentConfig = field(default_factory=DepthSegmentConfig)
     tracks: TrackConfig = field(default_factory=TrackConfig)
-    suspects: SuspectConfig = field(default_factory=SuspectConfig)
+    static_verification: StaticVerificationConfig = field(default_factory=StaticVerificationConfig)
 
     def __post_init__(self) -> None:
         if self.min_static < 0 or self.mask_border_px < 0 or self.min_judged < 1:

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.geometry import Array
-from bmask_slam.moving.free_space_check import Depths, Verdicts
+from bmask_slam.moving.free_space_check import Depths, PointMotions
 from bmask_slam.world.landmark_table import Ints, Mask
 
 _FAR_M = np.float32(1e6)
 
 
 @dataclass(frozen=True)
-class DepthRegionConfig:
+class DepthSegmentConfig:
     """When samples belong together, and when their region moves.
 
     Samples lie ``step_px`` apart both ways; neighbours whose depths differ by less than ``jump``
@@ -52,7 +52,7 @@ class DepthRegionConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class DepthRegions:
+class DepthSegments:
     """The regions of a depth image at every ``step``-th pixel both ways.
 
     Attributes:
@@ -62,29 +62,29 @@ class DepthRegions:
 
     labels: NDArray[np.int32]
     depth_m: Depths
-    config: DepthRegionConfig
+    config: DepthSegmentConfig
 
-    def moving(self, verdicts: Verdicts) -> Mask:
+    def moving(self, point_motions: PointMotions) -> Mask:
         """Which samples (h, w) are of moving regions, by what views say about each (h, w)."""
         count = int(self.labels.max()) + 1
         labels = self.labels.ravel()
         free, surface, size = (
             np.bincount(labels, weights=chosen.ravel(), minlength=count)
-            for chosen in (verdicts < 0, verdicts > 0, np.ones(verdicts.shape))
+            for chosen in (point_motions < 0, point_motions > 0, np.ones(point_motions.shape))
         )
         moves = (free >= self.config.least) & (free >= self.config.share * (free + surface))
         moves &= size <= self.config.largest * len(labels)
         moves[0] = False
         return np.asarray(moves[self.labels])
 
-    def held(self, moving: Mask, verdicts: Verdicts) -> Mask:
+    def held(self, moving: Mask, point_motions: PointMotions) -> Mask:
         """Which samples (h, w) moving ones (h, w) take along, as a man does a box before him.
 
         Only samples that no view speaks of: a table that he touches was seen to stand. They and
         the moving ones fall into pieces; in each the load must not be too large for its holder,
         nor both together for a single thing, as all of a space that was never seen would be.
         """
-        free_to_go = ~moving & (verdicts == 0) & (self.labels > 0)
+        free_to_go = ~moving & (point_motions == 0) & (self.labels > 0)
         pieces = _joined_up(self.depth_m, moving | free_to_go, self.config.held_jump)
         count = int(pieces.max()) + 1
         holder, load = (np.bincount(pieces[k], minlength=count) for k in (moving, free_to_go))
@@ -136,10 +136,10 @@ class MovingSpace:
         return np.asarray((low_m < high_m) & ~((depth_m < low_m) | (depth_m > high_m)))
 
 
-def depth_regions(depth_m: Depths, config: DepthRegionConfig) -> DepthRegions:
+def depth_segments(depth_m: Depths, config: DepthSegmentConfig) -> DepthSegments:
     """The regions of a depth image (H, W) in metres, NaN where missing."""
     few = depth_m[:: config.step_px, :: config.step_px]
-    return DepthRegions(_joined_up(few, np.isfinite(few), config.jump), few, config)
+    return DepthSegments(_joined_up(few, np.isfinite(few), config.jump), few, config)
 
 
 def _joined_up(depth_m: Depths, chosen: Mask, jump: float) -> NDArray[np.int32]:

@@ -43,7 +43,7 @@ THINNED = 2
 """Of a view that is remembered every second pixel each way is kept."""
 
 
-class ViewMemory:
+class DepthViewBuffer:
     """The depth of the last ``count`` keyframes, or frames, at least ``interval_s`` apart."""
 
     def __init__(self, count: int, interval_s: float) -> None:
@@ -76,10 +76,10 @@ class ViewMemory:
         """What is remembered of a map segment, with poses as optimised since."""
         found = []
         for kept in self.views:
-            heir_id, T_heir_keyframe = mapper.history.heir(kept.keyframe_id)
-            heir = mapper.world.keyframes.get(heir_id)
-            if heir is not None and heir.segment == segment:
-                pose = heir.T_world_camera @ T_heir_keyframe @ kept.T_keyframe_camera
+            parent_id, T_parent_keyframe = mapper.history.parent(kept.keyframe_id)
+            parent = mapper.world.keyframes.get(parent_id)
+            if parent is not None and parent.segment == segment:
+                pose = parent.T_world_camera @ T_parent_keyframe @ kept.T_keyframe_camera
                 when = kept.keyframe_id, kept.timestamp_s
                 found.append(PosedView(*when, kept.view, kept.seen, pose))
         return found

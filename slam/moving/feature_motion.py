@@ -10,9 +10,9 @@ import numpy as np
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import Array, inverse, transform
-from bmask_slam.moving.depth_segments import DepthRegionConfig, MovingSpace, depth_regions
+from bmask_slam.moving.depth_segments import DepthSegmentConfig, MovingSpace, depth_segments
 from bmask_slam.moving.depth_view_buffer import PosedView
-from bmask_slam.moving.free_space_check import StaticCheck, Verdict, Verdicts, distorted
+from bmask_slam.moving.free_space_check import FreeSpaceCheck, PointMotion, PointMotions, distorted
 from bmask_slam.semantics.objects.object_map import pixel_rays
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.world.landmark_table import Mask
@@ -26,17 +26,17 @@ Boxes = tuple[Array, Array]
 the depth."""
 
 
-class Judged(NamedTuple):
+class FeatureMotions(NamedTuple):
     """What is said about features (N,), and where the frame moves; None if no view says it."""
 
-    verdicts: Verdicts
+    point_motions: PointMotions
     space: MovingSpace | None
 
 
-class FeatureCheck:
+class FeatureMotion:
     """Judges keypoints and the depth regions that they lie on: pure functions of a camera."""
 
-    def __init__(self, camera: Camera, check: StaticCheck, config: DepthRegionConfig) -> None:
+    def __init__(self, camera: Camera, check: FreeSpaceCheck, config: DepthSegmentConfig) -> None:
         self.camera = camera
         self.config = config
         self._check = check
@@ -51,17 +51,19 @@ class FeatureCheck:
         T_world_camera: Array,
         views: Sequence[PosedView],
         moving: Boxes,
-    ) -> Judged:
+    ) -> FeatureMotions:
         """What earlier keyframes and boxes that move say about features, at a predicted pose.
 
         What was seen to be static stays so in a box.
         """
-        judged = Judged(np.zeros(len(features), np.int8), None)
+        judged = FeatureMotions(np.zeros(len(features), np.int8), None)
         if views:
             judged = self._by_views(frame, features, T_world_camera, views, moving)
         where = features.image_pixels, features.depth_m
         in_boxes = self.in_boxes(where, moving, T_world_camera)
-        judged.verdicts[in_boxes & (judged.verdicts != Verdict.STATIC)] = Verdict.MOVING
+        judged.point_motions[in_boxes & (judged.point_motions != PointMotion.STATIC)] = (
+            PointMotion.MOVING
+        )
         return judged
 
     def _by_views(
@@ -71,29 +73,31 @@ class FeatureCheck:
         T_world_camera: Array,
         views: Sequence[PosedView],
         boxes_world: Boxes,
-    ) -> Judged:
+    ) -> FeatureMotions:
         """What views say about features; ``boxes_world`` move, and what they hold.
 
         A region that was seen to move does so with all that is on it.
         """
-        regions = depth_regions(frame.depth_m, self.config)
+        regions = depth_segments(frame.depth_m, self.config)
         samples = (self._rays * regions.depth_m[..., None]).reshape(-1, 3)
         points = self.camera.backproject(features.pixels, features.depth_m)
         points_world = transform(T_world_camera, np.concatenate([points, samples]))
         told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
-        verdicts = self._check.agree(told)
-        by_sample = verdicts[len(features) :].reshape(regions.labels.shape)
+        point_motions = self._check.agree(told)
+        by_sample = point_motions[len(features) :].reshape(regions.labels.shape)
         where = self._samples, regions.depth_m.ravel().astype(float)
         moving = regions.moving(by_sample)
         taken = self.in_boxes(where, boxes_world, T_world_camera).reshape(by_sample.shape)
-        taken &= (by_sample != Verdict.STATIC) & (regions.labels > 0)
+        taken &= (by_sample != PointMotion.STATIC) & (regions.labels > 0)
         taken |= regions.held(moving | taken, by_sample)
         seen, space = regions.space(moving), regions.space(moving | taken)
-        verdicts = self._check.spread(features.pixels, features.depth_m, verdicts[: len(features)])
+        point_motions = self._check.spread(
+            features.pixels, features.depth_m, point_motions[: len(features)]
+        )
         where = features.image_pixels, features.depth_m
-        verdicts[space.on(*where) & (verdicts != Verdict.STATIC)] = Verdict.MOVING
-        verdicts[seen.on(*where)] = Verdict.MOVING
-        return Judged(verdicts, space)
+        point_motions[space.on(*where) & (point_motions != PointMotion.STATIC)] = PointMotion.MOVING
+        point_motions[seen.on(*where)] = PointMotion.MOVING
+        return FeatureMotions(point_motions, space)
 
     def in_boxes(
         self, where: tuple[Array, Array], boxes_world: Boxes, T_world_camera: Array

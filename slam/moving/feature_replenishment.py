@@ -17,13 +17,13 @@ MOST_SHARE = 0.8
 """The search is no wider than where so many were left out."""
 
 
-class Refill:
+class FeatureReplenishment:
     """Searches a frame once more; holds a detector of its own, so that it may run in any thread."""
 
     def __init__(self, camera: Camera, config: FeatureConfig) -> None:
         self._extractor = BriskExtractor(camera, config)
 
-    def filled_up(
+    def replenished(
         self,
         frame: Frame,
         features: Features,

@@ -19,10 +19,10 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import Array, inverse
 
 Depths = NDArray[np.float32]
-Verdicts = NDArray[np.int8]
+PointMotions = NDArray[np.int8]
 
 
-class Verdict(IntEnum):
+class PointMotion(IntEnum):
     """What views say about a point."""
 
     MOVING = -1
@@ -34,7 +34,7 @@ class Verdict(IntEnum):
 
 
 @dataclass(frozen=True)
-class StaticCheckConfig:
+class FreeSpaceCheckConfig:
     """When a point lies in free space, and how much is remembered.
 
     A view saw through a point if every depth within ``window_px`` of it is farther by
@@ -100,30 +100,34 @@ def thinned_view(depth_m: Depths, step: int, window_px: int) -> DepthView:
     return DepthView(cv2.erode(depth_m, window), cv2.dilate(depth_m, window), step)
 
 
-class StaticCheck:
+class FreeSpaceCheck:
     """Compares points with views: pure functions of a camera and its depth noise."""
 
-    def __init__(self, camera: Camera, disparity_sigma_px: float, config: StaticCheckConfig):
+    def __init__(self, camera: Camera, disparity_sigma_px: float, config: FreeSpaceCheckConfig):
         self.camera = camera
         self.config = config
         both = np.sqrt(2.0) * disparity_sigma_px / camera.stereo_bf_px_m
         self._sigmas_per_m2 = config.depth_sigmas * both
 
-    def judge(self, points_world: Array, view: DepthView, T_world_camera: Array) -> Verdicts:
+    def judge(self, points_world: Array, view: DepthView, T_world_camera: Array) -> PointMotions:
         """What one view says about points (N, 3); nothing about those that are NaN."""
         return self.judge_all(points_world, [(view, T_world_camera)])[0]
 
-    def judge_all(self, points_world: Array, views: Sequence[tuple[DepthView, Array]]) -> Verdicts:
+    def judge_all(
+        self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
+    ) -> PointMotions:
         """What views, each with T_world_camera (4, 4), say about points (N, 3): (K, N).
 
         The views have one size and step.
         """
         z, ahead, nearest, farthest = self._seen(points_world, views)
         margin = self._margin_m(z)
-        verdicts = ((np.abs(nearest - z) < margin) | (np.abs(farthest - z) < margin)).view(np.int8)
-        verdicts[nearest - z > self._margin_m(nearest)] = Verdict.MOVING
-        verdicts *= ahead
-        return verdicts
+        point_motions = ((np.abs(nearest - z) < margin) | (np.abs(farthest - z) < margin)).view(
+            np.int8
+        )
+        point_motions[nearest - z > self._margin_m(nearest)] = PointMotion.MOVING
+        point_motions *= ahead
+        return point_motions
 
     def offsets(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
@@ -138,22 +142,22 @@ class StaticCheck:
         off_m[~ahead | (nearest == 0) | (np.abs(off_m) > self._margin_m(z))] = np.nan
         return off_m, ahead
 
-    def agree(self, verdicts: Verdicts) -> Verdicts:
+    def agree(self, point_motions: PointMotions) -> PointMotions:
         """What several views (K, N) say together (N,): the majority of those that say anything."""
-        return np.asarray(np.sign(verdicts.sum(axis=0, dtype=np.int8)))
+        return np.asarray(np.sign(point_motions.sum(axis=0, dtype=np.int8)))
 
-    def stood_still(self, verdicts: Verdicts, apart_s: Array, at_least: int) -> bool:
+    def stood_still(self, point_motions: PointMotions, apart_s: Array, at_least: int) -> bool:
         """Whether views (K, N) of a thing's points, taken ``apart_s`` (K,) from it, show it there.
 
         A view that speaks of fewer than ``at_least`` points does not count.
         """
-        known = np.count_nonzero(verdicts, axis=1)
+        known = np.count_nonzero(point_motions, axis=1)
         asked = (np.abs(apart_s) >= self.config.still_s) & (known >= at_least)
-        there = np.count_nonzero(verdicts == Verdict.STATIC, axis=1)
+        there = np.count_nonzero(point_motions == PointMotion.STATIC, axis=1)
         good = there[asked] >= self.config.still_share * known[asked]
         return bool(len(good) >= 2 and good.all())
 
-    def spread(self, pixels: Array, depth_m: Array, verdicts: Verdicts) -> Verdicts:
+    def spread(self, pixels: Array, depth_m: Array, point_motions: PointMotions) -> PointMotions:
         """Verdicts (N,) with those of keypoints that have none taken from their neighbours.
 
         Args:
@@ -161,9 +165,9 @@ class StaticCheck:
             depth_m: (N,) NaN where missing, and then of no matter.
             verdicts: (N,).
         """
-        open_, known = np.flatnonzero(verdicts == 0), np.flatnonzero(verdicts)
-        if not len(open_) or not (verdicts[known] < 0).any():
-            return verdicts
+        open_, known = np.flatnonzero(point_motions == 0), np.flatnonzero(point_motions)
+        if not len(open_) or not (point_motions[known] < 0).any():
+            return point_motions
         tree, count = cKDTree(pixels[known]), min(self.config.neighbours, len(known))
         distance, near = tree.query(
             pixels[open_], count, distance_upper_bound=self.config.neighbour_px
@@ -173,8 +177,8 @@ class StaticCheck:
         apart = np.abs(depth_m[there] - depth_m[open_, None])
         differs = apart > self.config.same_depth * depth_m[open_, None]
         speaks = np.isfinite(distance) & ~differs
-        spread = verdicts.copy()
-        spread[open_] = np.sign((verdicts[there] * speaks).sum(axis=1))
+        spread = point_motions.copy()
+        spread[open_] = np.sign((point_motions[there] * speaks).sum(axis=1))
         return spread
 
     def _seen(

@@ -11,15 +11,15 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.feature_motion import NEAREST_M
-from bmask_slam.moving.free_space_check import StaticCheck, distorted
+from bmask_slam.moving.free_space_check import FreeSpaceCheck, distorted
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
-from bmask_slam.moving.motion_state import Stance, stance
+from bmask_slam.moving.motion_state import MotionState, motion_state
 from bmask_slam.semantics.beliefs.movability import MovabilityPriors, log_odds
 from bmask_slam.semantics.tracks.instance_track import Sighting, Track
 
 
 @dataclass(frozen=True, eq=False)
-class Witness:
+class InstanceMotion:
     """Tells of instances by their masks, their classes' priors and what other keyframes saw.
 
     Attributes:
@@ -28,7 +28,7 @@ class Witness:
     """
 
     camera: Camera
-    check: StaticCheck
+    check: FreeSpaceCheck
     priors: MovabilityPriors
     step: float
     min_judged: int
@@ -54,7 +54,9 @@ class Witness:
                 continue
             points_world = transform(masks.T_world_camera, surface.points)
             rules = self.check, self.min_judged
-            known = Stance.STILL if stood[k] else stance(points_world, now_s, others, *rules)
+            known = (
+                MotionState.STILL if stood[k] else motion_state(points_world, now_s, others, *rules)
+            )
             found.append(self._sighting(k, surface, masks, known))
         return found
 
@@ -71,9 +73,11 @@ class Witness:
         there_m = depth_m[min(int(row / step), height - 1), min(int(column / step), width - 1)]
         return bool(there_m > centre[2] - track.half_size[2] - self.check.config.margin_m)
 
-    def _sighting(self, k: int, surface: Surface, masks: KeyframeMasks, found: Stance) -> Sighting:
+    def _sighting(
+        self, k: int, surface: Surface, masks: KeyframeMasks, found: MotionState
+    ) -> Sighting:
         low, centroid, high = np.percentile(surface.points, (4, 50, 96), axis=0)
-        distribution, still = masks.claims.instances[k].distribution, found is Stance.STILL
+        distribution, still = masks.assignment.instances[k].distribution, found is MotionState.STILL
         prior = float(distribution @ self.priors.of(masks.names))
         prior = min(prior, self.priors.unknown) if still else prior
         return Sighting(
@@ -81,6 +85,6 @@ class Witness:
             half_size=np.maximum(high - centroid, centroid - low),
             distribution=distribution,
             prior=float(log_odds(np.clip(prior, 0.01, 0.99))),
-            evidence=self.step * (int(found is Stance.MOVING) - int(found.is_static)),
+            evidence=self.step * (int(found is MotionState.MOVING) - int(found.is_static)),
             still=still,
         )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import Array
 from bmask_slam.moving.free_space_check import thinned_view
-from bmask_slam.semantics.beliefs.votes import Claims
+from bmask_slam.semantics.beliefs.votes import PixelAssignment
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.world.landmark_table import Ints, Mask
 
@@ -32,7 +32,7 @@ class KeyframeMasks:
 
     keyframe_id: int
     names: LabelSet
-    claims: Claims
+    assignment: PixelAssignment
     depth_m: NDArray[np.float32]
     T_world_camera: Array
     landmark_ids: Ints
@@ -42,7 +42,7 @@ class KeyframeMasks:
     @property
     def step(self) -> int:
         """Every how many pixels there is a depth."""
-        return max(self.claims.owner.shape[0] // max(self.depth_m.shape[0], 1), 1)
+        return max(self.assignment.owner.shape[0] // max(self.depth_m.shape[0], 1), 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ def surfaces(
 ) -> list[Surface | None]:
     """The surface of each of a keyframe's instances; None where fewer pixels have depth."""
     view = thinned_view(masks.depth_m.copy(), masks.step, window_px)
-    instances = range(len(masks.claims.instances))
+    instances = range(len(masks.assignment.instances))
     return [_surface(camera, masks, k, view.nearest_m > 0, at_least) for k in instances]
 
 
@@ -71,10 +71,10 @@ def _surface(
     camera: Camera, masks: KeyframeMasks, k: int, complete: Mask, at_least: int
 ) -> Surface | None:
     depth_m, step = masks.depth_m, masks.step
-    owner = masks.claims.owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
+    owner = masks.assignment.owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
     rows, columns = np.nonzero((owner == k) & np.isfinite(depth_m))
     z_m = depth_m[rows, columns].astype(float)
-    surface = np.flatnonzero(masks.claims.on_surface(np.full(len(rows), k), z_m))
+    surface = np.flatnonzero(masks.assignment.on_surface(np.full(len(rows), k), z_m))
     if len(surface) < at_least:
         return None
     some = np.linspace(0, len(surface) - 1, min(len(surface), _SAMPLES)).astype(np.int64)

@@ -9,10 +9,10 @@ import numpy as np
 
 from bmask_slam.graph.geometry import Array
 from bmask_slam.moving.depth_view_buffer import PosedView
-from bmask_slam.moving.free_space_check import StaticCheck
+from bmask_slam.moving.free_space_check import FreeSpaceCheck
 
 
-class Stance(Enum):
+class MotionState(Enum):
     """What views say about a thing."""
 
     MOVING = "moving"
@@ -26,31 +26,31 @@ class Stance(Enum):
     @property
     def is_static(self) -> bool:
         """Whether it stands, for long or not."""
-        return self in (Stance.STATIC, Stance.STILL)
+        return self in (MotionState.STATIC, MotionState.STILL)
 
 
-def stance(
+def motion_state(
     points_world: Array,
     time_s: float,
     views: Sequence[PosedView],
-    check: StaticCheck,
+    check: FreeSpaceCheck,
     at_least: int,
-) -> Stance:
+) -> MotionState:
     """What views say about a thing at points (N, 3) at a time; nothing if of too few points.
 
     That it is still is asked of all that was seen, things that were believed to move included: a
     thing with a wrong name would hide its own traces.
     """
     if not views:
-        return Stance.UNKNOWN
+        return MotionState.UNKNOWN
     apart_s = np.array([v.timestamp_s - time_s for v in views])
     seen = check.judge_all(points_world, [(v.seen, v.T_world_camera) for v in views])
     if check.stood_still(seen, apart_s, at_least):
-        return Stance.STILL
+        return MotionState.STILL
     told = check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
-    verdicts = check.agree(told)
-    known = np.count_nonzero(verdicts)
+    point_motions = check.agree(told)
+    known = np.count_nonzero(point_motions)
     if known < at_least:
-        return Stance.UNKNOWN
-    moves = np.count_nonzero(verdicts < 0) > known / 2
-    return Stance.MOVING if moves else Stance.STATIC
+        return MotionState.UNKNOWN
+    moves = np.count_nonzero(point_motions < 0) > known / 2
+    return MotionState.MOVING if moves else MotionState.STATIC

@@ -13,25 +13,25 @@ from bmask_slam.features.brisk import FeatureConfig, Features, select
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import Arrays, nested, part
 from bmask_slam.graph.geometry import Array, inverse
-from bmask_slam.moving.config import DynamicsConfig
+from bmask_slam.moving.config import MovingObjectConfig
 from bmask_slam.moving.depth_segments import MovingSpace
-from bmask_slam.moving.depth_view_buffer import PosedView, ViewMemory
-from bmask_slam.moving.feature_motion import FeatureCheck, Judged
-from bmask_slam.moving.feature_replenishment import Refill
+from bmask_slam.moving.depth_view_buffer import DepthViewBuffer, PosedView
+from bmask_slam.moving.feature_motion import FeatureMotion, FeatureMotions
+from bmask_slam.moving.feature_replenishment import FeatureReplenishment
 from bmask_slam.moving.free_space_check import (
     DepthView,
-    StaticCheck,
-    Verdict,
+    FreeSpaceCheck,
+    PointMotion,
     depth_view,
 )
-from bmask_slam.moving.instance_motion import Witness
+from bmask_slam.moving.instance_motion import InstanceMotion
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, surfaces
-from bmask_slam.moving.static_verification import Suspects
+from bmask_slam.moving.static_verification import StaticVerification
 from bmask_slam.semantics.beliefs.movability import MovabilityFilter, log_odds, read_priors
 from bmask_slam.semantics.tracks.instance_track import Sighting, Track
 from bmask_slam.semantics.tracks.instance_tracks import InstanceTracks
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.tracking.camera_tracker import Localiser
+from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.tracker import Tracked
 from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import Keyframe, WorldMap
@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Sifted:
+class StaticFeatures:
     """A frame without what moves.
 
     Attributes:
@@ -68,11 +68,11 @@ class Sifted:
         return 0 if self.mostly_moving else int(np.count_nonzero(self.moving))
 
 
-class Dynamics:
+class MovingObjectFilter:
     """Keeps which landmarks and instances move; map and graph belong to the caller."""
 
     def __init__(
-        self, camera: Camera, config: DynamicsConfig, features: FeatureConfig | None = None
+        self, camera: Camera, config: MovingObjectConfig, features: FeatureConfig | None = None
     ) -> None:
         features = features or FeatureConfig()
         self.camera = camera
@@ -80,79 +80,83 @@ class Dynamics:
         self.priors = read_priors(config.priors)
         self.movability = MovabilityFilter(self.priors.unknown, config.movability)
         self.tracks = InstanceTracks(config.tracks)
-        self.memory = ViewMemory(config.check.views, config.check.interval_s)
-        self.recent = ViewMemory(config.suspects.recent, config.suspects.interval_s)
-        self._check = StaticCheck(camera, features.disparity_sigma_px, config.check)
+        self.memory = DepthViewBuffer(config.check.views, config.check.interval_s)
+        self.recent = DepthViewBuffer(
+            config.static_verification.recent, config.static_verification.interval_s
+        )
+        self._check = FreeSpaceCheck(camera, features.disparity_sigma_px, config.check)
         watched = config.min_judged, config.mask_border_px
-        self.suspects = Suspects(self._check, config.suspects, *watched)
-        self._features = FeatureCheck(camera, self._check, config.regions)
-        self._refill = Refill(camera, features)
+        self.static_verification = StaticVerification(
+            self._check, config.static_verification, *watched
+        )
+        self._features = FeatureMotion(camera, self._check, config.regions)
+        self._replenishment = FeatureReplenishment(camera, features)
         rules = config.movability.step, config.min_judged
-        self._witness = Witness(camera, self._check, self.priors, *rules)
+        self._instance_motion = InstanceMotion(camera, self._check, self.priors, *rules)
 
     def leave_out(
         self,
         frame: Frame,
         features: Features,
-        localiser: Localiser | None,
+        camera_tracker: CameraTracker | None,
         segment: int,
         mapper: Mapper,
-    ) -> Sifted:
+    ) -> StaticFeatures:
         """Leave out the features on moving things, by the predicted pose, if there is one.
 
         If most seem to move, all are tracked first, and used if even they give no pose.
         """
         self.tracks.expire(frame.timestamp_s)
         views = self.memory.posed(segment, mapper)
-        predicted = localiser.prediction() if localiser is not None else None
-        sifted = self.sift(frame, features, predicted, views)
-        doubted = sifted.moving.sum() > self.config.doubt_share * len(features)
+        predicted = camera_tracker.prediction() if camera_tracker is not None else None
+        static = self.static_features_at(frame, features, predicted, views)
+        doubted = static.moving.sum() > self.config.doubt_share * len(features)
         settled = max(self.config.min_static, self.config.settled_share * len(features))
-        if localiser is None or not doubted or sifted.standing >= settled:
-            return sifted
-        found = localiser.preview(features, mapper.world)
+        if camera_tracker is None or not doubted or static.standing >= settled:
+            return static
+        found = camera_tracker.preview(features, mapper.world)
         if found is None:
-            return replace(sifted, features=features, mostly_moving=True)
-        return self.sift(frame, features, found, views)
+            return replace(static, features=features, mostly_moving=True)
+        return self.static_features_at(frame, features, found, views)
 
-    def sift(
+    def static_features_at(
         self,
         frame: Frame,
         features: Features,
         T_world_camera: Array | None,
         views: list[PosedView],
-    ) -> Sifted:
+    ) -> StaticFeatures:
         """Leave out the features on moving things, given a pose; none without it."""
         geometry = self.config.geometry
         view = depth_view(frame.depth_m, self.config.check.window_px) if geometry else None
         if T_world_camera is None:
-            return Sifted(features, np.zeros(len(features), bool), False, view)
-        verdicts, space = self._judge(frame, features, T_world_camera, views)
-        moving = verdicts == Verdict.MOVING
+            return StaticFeatures(features, np.zeros(len(features), bool), False, view)
+        point_motions, space = self._judge(frame, features, T_world_camera, views)
+        moving = point_motions == PointMotion.MOVING
         if not moving.any():
-            return Sifted(features, moving, False, view, space=space)
+            return StaticFeatures(features, moving, False, view, space=space)
         if np.count_nonzero(~moving) < self.config.min_static:
             logger.info("frame %d: nearly everything moves; all is used", frame.index)
-            return Sifted(features, moving, True, view)
+            return StaticFeatures(features, moving, True, view)
 
-        standing = int(np.count_nonzero(verdicts == Verdict.STATIC))
+        standing = int(np.count_nonzero(point_motions == PointMotion.STATIC))
         left = select(features, np.flatnonzero(~moving))
-        return Sifted(left, moving, False, view, standing, T_world_camera, space)
+        return StaticFeatures(left, moving, False, view, standing, T_world_camera, space)
 
-    def fill_up(
-        self, frame: Frame, features: Features, sifted: Sifted, segment: int, mapper: Mapper
-    ) -> Sifted:
+    def replenish(
+        self, frame: Frame, features: Features, static: StaticFeatures, segment: int, mapper: Mapper
+    ) -> StaticFeatures:
         """With further keypoints of the frame in place of its features that were left out."""
-        pose = sifted.T_world_camera
-        if pose is None or sifted.mostly_moving:
-            return sifted
+        pose = static.T_world_camera
+        if pose is None or static.mostly_moving:
+            return static
         views = self.memory.posed(segment, mapper)
 
         def moving(others: Features) -> Mask:
-            return self._judge(frame, others, pose, views).verdicts == Verdict.MOVING
+            return self._judge(frame, others, pose, views).point_motions == PointMotion.MOVING
 
-        found = self._refill.filled_up(frame, features, sifted.moving, moving)
-        return replace(sifted, features=found)
+        found = self._replenishment.replenished(frame, features, static.moving, moving)
+        return replace(static, features=found)
 
     def watch(self, tracked: Tracked, view: DepthView | None, world: WorldMap) -> Ints:
         """Evidence of a tracked frame about landmarks; returns those in view believed moving."""
@@ -160,7 +164,7 @@ class Dynamics:
         if view is None or not len(ids):
             return ids[self.movability.moving(ids)]
         points = world.landmarks.points_world[ids]
-        gone = self._check.judge(points, view, tracked.T_world_camera) == Verdict.MOVING
+        gone = self._check.judge(points, view, tracked.T_world_camera) == PointMotion.MOVING
         tracked_now = np.zeros(len(world.landmarks), bool)
         tracked_now[tracked.landmark_ids] = True
         found = tracked_now[ids]
@@ -169,15 +173,15 @@ class Dynamics:
         self.movability.update(ids[told], gone[told], self.config.movability.frame_power)
         return ids[self.movability.moving(ids)]
 
-    def remember(self, keyframe: Keyframe, sifted: Sifted, mapper: Mapper) -> None:
+    def remember(self, keyframe: Keyframe, static: StaticFeatures, mapper: Mapper) -> None:
         """A keyframe was made: landmarks that move leave map and graph, its depth is kept.
 
         Not that of what moves: it would be a surface that the same thing is found at next.
         """
         self._follow(mapper.world)
         self._remove(self.movability.known(), mapper)
-        if sifted.view is not None:
-            self.memory.add(keyframe.id, keyframe.timestamp_s, sifted.view, sifted.space)
+        if static.view is not None:
+            self.memory.add(keyframe.id, keyframe.timestamp_s, static.view, static.space)
 
     def see(self, masks: KeyframeMasks, mapper: Mapper) -> None:
         """A keyframe's masks, now or late: what is on moving things leaves map and graph."""
@@ -192,28 +196,28 @@ class Dynamics:
         now_s = np.nan if keyframe is None else keyframe.timestamp_s
         rules = self.config.check.window_px, self.config.min_judged
         seen = surfaces(self.camera, masks, *rules)
-        stood = self.suspects.stood(masks, seen, recent, now_s)
-        sightings = self._witness.sightings(masks, seen, stood, views, now_s)
+        stood = self.static_verification.stood(masks, seen, recent, now_s)
+        sightings = self._instance_motion.sightings(masks, seen, stood, views, now_s)
         moving, tracks = self._tracked(masks, sightings, now_s)
         still = [
             s is not None and (s.still or (track is not None and track.stood))
             for s, track in zip(sightings, tracks, strict=True)
         ]
         self._believe(masks, sightings, still)
-        standing = np.isin(masks.claims.owner, np.flatnonzero(still))
+        standing = np.isin(masks.assignment.owner, np.flatnonzero(still))
         self.memory.recall_space(masks.keyframe_id, standing)
         if not moving.any():
             return
-        moves = np.isin(masks.claims.owner, np.flatnonzero(moving))
+        moves = np.isin(masks.assignment.owner, np.flatnonzero(moving))
         self.memory.forget_space(masks.keyframe_id, moves)
         pruner = replace(mapper.pruner(), border_px=-self.config.mask_border_px)
         if keyframe is not None and self.config.geometry:
             by_class = [t if _by_class(t) else None for t in tracks]
-            self.suspects.add(masks, seen, by_class, mapper.world)
+            self.static_verification.add(masks, seen, by_class, mapper.world)
         pruner.prune_mask(masks.keyframe_id, moves)
         self._remove(masks.landmark_ids, mapper)
 
-    def acquit(
+    def reinstate(
         self, time_s: float, T_world_camera: Array, view: DepthView, near: Keyframe, mapper: Mapper
     ) -> bool:
         """What was left out for its class alone, and stands, comes back; whether anything did.
@@ -222,20 +226,20 @@ class Dynamics:
         """
         T_keyframe_camera = inverse(near.T_world_camera) @ T_world_camera
         self.recent.add(near.id, time_s, view, T_keyframe_camera=T_keyframe_camera)
-        standing = self.suspects.watch(time_s, view, T_world_camera, mapper.world)
-        for suspect in standing:
-            logger.info("track %d stands: its class does not count", suspect.track_id)
-            self.tracks.acquit(suspect.track_id, float(log_odds(self.priors.unknown)))
-            for removed in suspect.removed:
+        standing = self.static_verification.watch(time_s, view, T_world_camera, mapper.world)
+        for pending in standing:
+            logger.info("track %d stands: its class does not count", pending.track_id)
+            self.tracks.reinstate(pending.track_id, float(log_odds(self.priors.unknown)))
+            for removed in pending.removed:
                 self.memory.recall_space(removed.keyframe_id, removed.mask.unpacked())
-                free = self.suspects.without_watched(removed)
+                free = self.static_verification.without_watched(removed)
                 back = removed.keypoints[free], removed.patches[free]
-                mapper.take_back(removed.keyframe_id, *back)
+                mapper.restore_observations(removed.keyframe_id, *back)
         return bool(standing)
 
     def begin_session(self) -> None:
         """Forget what moved in an earlier recording; landmarks stay what they are."""
-        self.suspects.clear()
+        self.static_verification.clear()
         self.memory.clear()
         self.recent.clear()
         self.tracks.clear()
@@ -247,7 +251,7 @@ class Dynamics:
             tracks=self.tracks.state(),
             memory=self.memory.state(),
             recent=self.recent.state(),
-            suspects=self.suspects.state(),
+            suspects=self.static_verification.state(),
         )
 
     def restore(self, state: Arrays) -> None:
@@ -256,11 +260,11 @@ class Dynamics:
         self.tracks.restore(part(state, "tracks"))
         self.memory.restore(part(state, "memory"))
         self.recent.restore(part(state, "recent"))
-        self.suspects.restore(part(state, "suspects"))
+        self.static_verification.restore(part(state, "suspects"))
 
     def _judge(
         self, frame: Frame, features: Features, T_world_camera: Array, views: list[PosedView]
-    ) -> Judged:
+    ) -> FeatureMotions:
         """What views and the tracks' boxes say about features (N,)."""
         boxes_world = self.tracks.moving_boxes(frame.timestamp_s)
         views = views if self.config.geometry else []
@@ -285,7 +289,9 @@ class Dynamics:
         for k, track_id in zip(movable, ids, strict=False):
             tracks[k] = by_id[track_id]
             moving[k] = by_id[track_id].moving
-        self.tracks.miss(now_s, [track for track in ahead if self._witness.shows(masks, track)])
+        self.tracks.miss(
+            now_s, [track for track in ahead if self._instance_motion.shows(masks, track)]
+        )
         return moving, tracks
 
     def _believe(
@@ -316,9 +322,9 @@ class Dynamics:
         """Landmarks that were fused take what was known of them along; culled ones lose it."""
         known = self.movability.known()
         gone = known[~world.landmarks.alive[known]]
-        heirs = world.landmarks.current(gone)
-        alive = world.landmarks.alive[heirs]
-        self.movability.move(gone[alive], heirs[alive])
+        parents = world.landmarks.current(gone)
+        alive = world.landmarks.alive[parents]
+        self.movability.move(gone[alive], parents[alive])
         self.movability.drop(gone[~alive])
 
 

@@ -15,7 +15,7 @@ from bmask_slam.back_end.pruning import covered
 from bmask_slam.graph.files.array_file import Arrays
 from bmask_slam.graph.geometry import Array, transform
 from bmask_slam.moving.depth_view_buffer import PosedView
-from bmask_slam.moving.free_space_check import DepthView, StaticCheck
+from bmask_slam.moving.free_space_check import DepthView, FreeSpaceCheck
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.semantics.tracks.instance_track import Track
@@ -24,7 +24,7 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
 @dataclass(frozen=True)
-class SuspectConfig:
+class StaticVerificationConfig:
     """When a thing stands: what a keyframe saw of it is where it was ``stands_s`` later, or more.
 
     A frame says so if ``share`` of its points in view lie on a surface and the median of their
@@ -32,7 +32,7 @@ class SuspectConfig:
     of those that say anything. Someone who walks has left a third of his own place after 0.3 s. A
     thing is watched for ``patience_s``. One that was there as long before is not left out at all:
     so say, by the same rule, ``recent`` frames, remembered ``interval_s`` apart. With ``stands_s``
-    of 0 there is neither: only what stood for ``StaticCheckConfig.still_s`` is structure.
+    of 0 there is neither: only what stood for ``FreeSpaceCheckConfig.still_s`` is structure.
     """
 
     stands_s: float = 0.4
@@ -74,7 +74,7 @@ class Removed:
 
 
 @dataclass(frozen=True, eq=False)
-class Suspect:
+class PendingMovable:
     """A thing as a keyframe saw it.
 
     Attributes:
@@ -94,7 +94,7 @@ class Suspect:
     gone: int = 0
 
 
-class Suspects:
+class StaticVerification:
     """All things that are watched; map and graph belong to the caller.
 
     ``at_least`` so many of a thing's points have to be in view. ``border_px`` are those by which
@@ -102,10 +102,10 @@ class Suspects:
     """
 
     def __init__(
-        self, check: StaticCheck, config: SuspectConfig, at_least: int, border_px: int
+        self, check: FreeSpaceCheck, config: StaticVerificationConfig, at_least: int, border_px: int
     ) -> None:
         self.config = config
-        self.watched: list[Suspect] = []
+        self.watched: list[PendingMovable] = []
         self._check = check
         self._at_least, self._border_px = at_least, border_px
 
@@ -126,15 +126,15 @@ class Suspects:
         for k, (surface, track) in enumerate(zip(seen, tracks, strict=True)):
             if surface is None or track is None:
                 continue
-            mask = masks.claims.owner == k
+            mask = masks.assignment.owner == k
             removed = _about_to_be_removed(mask, keyframe, world.landmarks, self._border_px)
             points = surface.points[surface.complete]
             when = keyframe.id, keyframe.timestamp_s
-            suspect = Suspect(track.id, *when, points, (removed,))
+            pending = PendingMovable(track.id, *when, points, (removed,))
             before = [s for s in self.watched if s.track_id == track.id and s.gone <= s.there]
             if before:
-                suspect = replace(before[0], removed=(*before[0].removed, removed))
-            self.watched = [s for s in self.watched if s.track_id != track.id] + [suspect]
+                pending = replace(before[0], removed=(*before[0].removed, removed))
+            self.watched = [s for s in self.watched if s.track_id != track.id] + [pending]
 
     def stood(
         self,
@@ -162,7 +162,7 @@ class Suspects:
 
     def watch(
         self, time_s: float, view: DepthView, T_world_camera: Array, world: WorldMap
-    ) -> list[Suspect]:
+    ) -> list[PendingMovable]:
         """What a tracked frame's depth says; returns the things that stand, not watched further."""
         oldest_s = time_s - self.config.patience_s
         recent = [s for s in self.watched if s.time_s >= oldest_s]
@@ -222,17 +222,19 @@ class Suspects:
         rows = zip(state["counts"].tolist(), state["times_s"].tolist(), points, strict=False)
         for (track_id, keyframe_id, there, gone, count), time_s, of_one in rows:
             mine, removed = tuple(removed[:count]), removed[count:]
-            self.watched.append(Suspect(track_id, keyframe_id, time_s, of_one, mine, there, gone))
+            self.watched.append(
+                PendingMovable(track_id, keyframe_id, time_s, of_one, mine, there, gone)
+            )
 
     def _told(
-        self, suspect: Suspect, view: DepthView, T_world_camera: Array, world: WorldMap
-    ) -> Suspect:
+        self, pending: PendingMovable, view: DepthView, T_world_camera: Array, world: WorldMap
+    ) -> PendingMovable:
         """A suspect with what a frame says of it counted."""
-        pose = world.keyframes[suspect.keyframe_id].T_world_camera
-        points_world = transform(pose, suspect.points)
+        pose = world.keyframes[pending.keyframe_id].T_world_camera
+        points_world = transform(pose, pending.points)
         now = [(view, T_world_camera)]
         there, gone = self._there_or_gone(points_world, now)
-        return replace(suspect, there=suspect.there + there, gone=suspect.gone + gone)
+        return replace(pending, there=pending.there + there, gone=pending.gone + gone)
 
     def _there_or_gone(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]

@@ -30,7 +30,7 @@ from bmask_slam.graph.files.array_file import (
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
-from bmask_slam.run_folder.metrics import Tally
+from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.sequences import Sequence
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_interface import System
@@ -59,7 +59,7 @@ class Checkpoint:
     stamps: str
     skipped: list[tuple[int, str]]
     frames_bytes: int
-    tally: Tally
+    counters: RunCounters
     state: Arrays
 
     def check_sequence(self, sequence: Sequence) -> None:
@@ -90,21 +90,21 @@ class Checkpoints:
         self._every = options.checkpoint_every
         self._frames = -1  # of the last one
 
-    def after_frame(self, system: System, tally: Tally) -> None:
+    def after_frame(self, system: System, counters: RunCounters) -> None:
         """Write one if it is due."""
-        if self._every is not None and tally.frames % self._every == 0:
-            self.write(system, tally)
+        if self._every is not None and counters.frames % self._every == 0:
+            self.write(system, counters)
 
-    def write(self, system: System, tally: Tally) -> None:
+    def write(self, system: System, counters: RunCounters) -> None:
         """Write one now, over the last, which stays until the new one is whole.
 
         Nothing is written where the last one is of the same frame.
         """
-        if self._every is None or tally.frames == self._frames:
+        if self._every is None or counters.frames == self._frames:
             return
         start_s = time.perf_counter()
         system.restart()
-        skipped = [(i, reason) for i, reason in self._sequence.skipped if i < tally.next_index]
+        skipped = [(i, reason) for i, reason in self._sequence.skipped if i < counters.next_index]
         path = self._folder.path / CHECKPOINT
         checkpoint = Checkpoint(
             self._options,
@@ -112,18 +112,18 @@ class Checkpoints:
             digest(self._sequence),
             skipped,
             self._folder.synced_bytes(),
-            tally,
+            counters,
             system.state(),
         )
         write_checkpoint(path, checkpoint)
-        self._frames = tally.frames
+        self._frames = counters.frames
         megabytes, ms = path.stat().st_size / 1e6, 1e3 * (time.perf_counter() - start_s)
-        logger.info("checkpoint after %d frames: %.1f MB, %.0f ms", tally.frames, megabytes, ms)
+        logger.info("checkpoint after %d frames: %.1f MB, %.0f ms", counters.frames, megabytes, ms)
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Save a checkpoint in one file, atomically. Raises InputError if it cannot."""
-    tally = dataclasses.asdict(checkpoint.tally)
+    counters = dataclasses.asdict(checkpoint.counters)
     header = {
         "bmask-slam": __version__,
         "options": checkpoint.options.recorded(),
@@ -132,9 +132,9 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "stamps": checkpoint.stamps,
         "skipped": checkpoint.skipped,
         "frames_bytes": checkpoint.frames_bytes,
-        "tally": {name: value for name, value in tally.items() if name != "tracking_ms"},
+        "tally": {name: value for name, value in counters.items() if name != "tracking_ms"},
     }
-    tracking_ms = np.array(checkpoint.tally.tracking_ms, float)
+    tracking_ms = np.array(checkpoint.counters.tracking_ms, float)
     arrays = nested(run={"tracking_ms": tracking_ms}, system=checkpoint.state)
     write_arrays(path, CHECKPOINT_FILE, header, arrays)
 
@@ -169,7 +169,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             header["stamps"],
             [(int(i), str(reason)) for i, reason in header["skipped"]],
             int(header["frames_bytes"]),
-            Tally(tracking_ms=tracking_ms, **header["tally"]),
+            RunCounters(tracking_ms=tracking_ms, **header["tally"]),
             part(arrays, "system"),
         )
     except (KeyError, TypeError, ValueError) as error:

@@ -35,12 +35,12 @@ class MapLocalisation(SlamSystem):
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Find a frame in the map."""
         clock = StageClock()
-        self.localiser.expect(frame.timestamp_s)
+        self.camera_tracker.expect(frame.timestamp_s)
         with clock.stage("features"):
             features = features if features is not None else self.prepare(frame)
         with clock.stage("tracking"):
             assert self._reference is not None, "restore a map and begin a session first"
-            tracked = self.localiser.track(features, self.mapper.world, self._reference)
+            tracked = self.camera_tracker.track(features, self.mapper.world, self._reference)
             T_world_camera = self._follow(frame, tracked)
         return FrameResult(
             index=frame.index,
@@ -69,12 +69,12 @@ class MapLocalisation(SlamSystem):
         if tracked.status is TrackingStatus.LOST:
             return None
         T, ids, world = tracked.T_world_camera, tracked.landmark_ids, self.mapper.world
-        self.localiser.moved_on(T, T, ids)
+        self.camera_tracker.moved_on(T, T, ids)
         self._found.append((frame.timestamp_s, T))
         self._frames_since_refresh += 1
-        elsewhere = not np.isin(ids, self.localiser.local_ids).all()
+        elsewhere = not np.isin(ids, self.camera_tracker.local_ids).all()
         if elsewhere or self._frames_since_refresh >= REFRESH_FRAMES:
             self._frames_since_refresh = 0
             self._reference = world.covisible(ids, 1)[0][1]
-            self.localiser.new_local_map(world, self._reference)
+            self.camera_tracker.new_local_map(world, self._reference)
         return T

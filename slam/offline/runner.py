@@ -28,7 +28,7 @@ from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder, free_run_path
 from bmask_slam.run_folder.map_file import read_map
-from bmask_slam.run_folder.metrics import Tally, measure, save
+from bmask_slam.run_folder.metrics import RunCounters, measure, save
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
@@ -91,9 +91,9 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
     ):
         describe_run(folder, options, sequence)
         system = start_system(options, sequence, make_system or _with_segmenter(options, sequence))
-        tally = Tally()
-        track((system, tally), sequence, folder, options, stop)
-        return conclude((system, tally), (sequence, reference), folder, options, stop)
+        counters = RunCounters()
+        track((system, counters), sequence, folder, options, stop)
+        return conclude((system, counters), (sequence, reference), folder, options, stop)
 
 
 def resume(
@@ -116,16 +116,16 @@ def resume(
     checkpoint.check_sequence(sequence)
     reference = find_reference(options.reference, sequence)
     make = make_system or _with_segmenter(options, sequence)
-    system, tally = make(sequence.camera, options.config), checkpoint.tally
+    system, counters = make(sequence.camera, options.config), checkpoint.counters
     system.restore(checkpoint.state, path / CHECKPOINT)
     with RunFolder(path, resume_bytes=checkpoint.frames_bytes) as folder, StopRequest() as stop:
-        logger.info("resumed after %d frames: %s", tally.frames, shlex.join(sys.argv))
-        if not tally.frames:
+        logger.info("resumed after %d frames: %s", counters.frames, shlex.join(sys.argv))
+        if not counters.frames:
             logger.warning("%s: no checkpoint was reached; starting from the beginning", path)
         for index, reason in checkpoint.skipped:
             sequence.skip(index, reason)
-        track((system, tally), sequence, folder, options, stop)
-        return conclude((system, tally), (sequence, reference), folder, options, stop)
+        track((system, counters), sequence, folder, options, stop)
+        return conclude((system, counters), (sequence, reference), folder, options, stop)
 
 
 def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
@@ -194,7 +194,7 @@ def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSyste
 
 
 def track(
-    progress: tuple[System, Tally],
+    progress: tuple[System, RunCounters],
     sequence: Sequence,
     folder: RunFolder,
     options: RunOptions,
@@ -204,55 +204,55 @@ def track(
 
     The system and what is counted of it go on from where they are.
     """
-    system, tally = progress
+    system, counters = progress
     end = len(sequence)
     if options.max_frames is not None:
         end = min(end, options.max_frames * options.stride)
     indices = range(0, end, options.stride)
-    begin = -(-tally.next_index // options.stride)
+    begin = -(-counters.next_index // options.stride)
     frames = sequence.frames(
         begin * options.stride, end, options.stride, prepare=_timed(system.prepare)
     )
     checkpoints = Checkpoints(folder, options, sequence)
     follow = _dense_follower(system, sequence, folder) if options.dense else None
-    start_s = time.perf_counter() - tally.wall_s
+    start_s = time.perf_counter() - counters.wall_s
     with (
         closing(frames),  # type: ignore[type-var]
         Progress(len(indices), options.quiet, begin) as bar,
-        _snapshots(system, folder, tally) as snapshot,
+        _snapshots(system, folder, counters) as snapshot,
     ):
-        if not tally.frames:
-            checkpoints.write(system, tally)
+        if not counters.frames:
+            checkpoints.write(system, counters)
         for frame, (features, features_ms) in frames:
             result = system.process(frame, features)
             result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
             folder.write_frame(result)
-            tally.count(result)
+            counters.count(result)
             if follow is not None:
                 follow(result)
-            tally.wall_s = time.perf_counter() - start_s
-            bar.update(result.status, tally.keyframes, tally.lost)
+            counters.wall_s = time.perf_counter() - start_s
+            bar.update(result.status, counters.keyframes, counters.lost)
             snapshot()
             if stop.signal is not None:
                 break
-            checkpoints.after_frame(system, tally)
+            checkpoints.after_frame(system, counters)
         else:
-            tally.next_index = end
-            checkpoints.write(system, tally)
-    logger.info("%d frames in %.1f s", tally.frames, tally.wall_s)
+            counters.next_index = end
+            checkpoints.write(system, counters)
+    logger.info("%d frames in %.1f s", counters.frames, counters.wall_s)
 
 
 def conclude(
-    progress: tuple[System, Tally],
+    progress: tuple[System, RunCounters],
     inputs: tuple[Sequence, Trajectory | None],
     folder: RunFolder,
     options: RunOptions,
     stop: StopRequest,
 ) -> RunSummary:
     """Finish the system, measure and save; a run that was not stopped is complete then."""
-    (system, tally), (sequence, reference) = progress, inputs
+    (system, counters), (sequence, reference) = progress, inputs
     system.finish()
-    rows = measure(system, reference, tally, options.stride)
+    rows = measure(system, reference, counters, options.stride)
     title = "-".join(filter(None, (sequence.name, options.config_name)))
     save(system, folder, rows, reference, title)
     if options.dense:
@@ -262,9 +262,9 @@ def conclude(
         map_run(MapOptions(folder.path))
     if stop.signal is None:
         folder.complete()
-    skipped = sum(index < tally.next_index for index, _ in sequence.skipped)
+    skipped = sum(index < counters.next_index for index, _ in sequence.skipped)
     resumable = stop.signal is not None and options.checkpoint_every is not None
-    return RunSummary(folder.path, rows, tally.frames, skipped, stop.signal, resumable)
+    return RunSummary(folder.path, rows, counters.frames, skipped, stop.signal, resumable)
 
 
 def _dense_follower(
@@ -277,24 +277,26 @@ def _dense_follower(
 
 
 @contextmanager
-def _snapshots(system: System, folder: RunFolder, tally: Tally) -> Iterator[Callable[[], None]]:
+def _snapshots(
+    system: System, folder: RunFolder, counters: RunCounters
+) -> Iterator[Callable[[], None]]:
     """A function, called after every frame, that saves the trajectory now and then.
 
     It grows rarer with the trajectory, so that the cost of a frame does not grow. Whatever ends
     the block, the trajectory is saved once more if there were any frames.
     """
-    due = tally.frames + SNAPSHOT_FRAMES
+    due = counters.frames + SNAPSHOT_FRAMES
 
     def snapshot() -> None:
         nonlocal due
-        if tally.frames >= due:
+        if counters.frames >= due:
             folder.write_trajectory(system.trajectory())
-            due = int(tally.frames * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
+            due = int(counters.frames * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
 
     try:
         yield snapshot
     finally:
-        if tally.frames:
+        if counters.frames:
             folder.write_trajectory(system.trajectory())
 
 

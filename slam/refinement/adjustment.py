@@ -23,7 +23,7 @@ from bmask_slam.evaluation.plot import plot_trajectory
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, AdjustmentConfig, adjust
 from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.files.ply import write_ply
 from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
@@ -101,11 +101,11 @@ def adjust_run(
     truth = None
     if options.reference is not None:
         truth = read_reference(options.reference, frame_stamps(path / "trajectory.txt"))
-    before = Placed.of(run.shadow)
+    before = Placed.of(run.tables)
     with RunFolder(out, options.overwrite) as folder:
         logger.info("bundle adjustment of %s", path)
         try:
-            adjustment = adjust(run.shadow, run.camera, run.config, config, progress)
+            adjustment = adjust(run.tables, run.camera, run.config, config, progress)
         except InputError as error:
             raise InputError(f"{path / 'graph'}: {error}") from error
         return _write(run, before, adjustment, folder, truth, plot)
@@ -120,8 +120,8 @@ def _write(
     plot: Path | None,
 ) -> RunAdjustment:
     """Fill the new run folder."""
-    after = Placed.of(run.shadow)
-    moved = run.shadow.keyframes.get(before.keyframe_ids)
+    after = Placed.of(run.tables)
+    moved = run.tables.keyframes.get(before.keyframe_ids)
     places = run.keyframe_stamps_s, before.poses_world_camera, moved
     carried = {name: carry_along(old, *places) for name, old in run.trajectories.items()}
     for name, trajectory in carried.items():
@@ -135,13 +135,13 @@ def _write(
         if (run.path / name).is_file():
             with folder.replacing(name) as temporary:
                 shutil.copyfile(run.path / name, temporary)
-    columns = moved_landmarks(run.landmarks, before, run.shadow, adjustment)
+    columns = moved_landmarks(run.landmarks, before, run.tables, adjustment)
     write_ply(folder.path / "landmarks.ply", columns, LANDMARKS_COMMENT)
     with folder.replacing("graph") as graph:
-        write_graph(graph, run.shadow, run.camera)
+        write_graph(graph, run.tables, run.camera)
     if (run.path / MAP).is_file():
         state, camera = read_map(run.path)
-        state = optimised_map(state, run.shadow, adjustment, camera, run.path / MAP)
+        state = optimised_map(state, run.tables, adjustment, camera, run.path / MAP)
         with folder.replacing(MAP) as file:
             write_map(file, state, camera)
     result = RunAdjustment(
@@ -188,7 +188,7 @@ def _microseconds(stamps_s: Array) -> IntArray:
 
 
 def moved_landmarks(
-    columns: dict[str, NDArray], before: Placed, shadow: Shadow, adjustment: Adjustment
+    columns: dict[str, NDArray], before: Placed, tables: FactorTables, adjustment: Adjustment
 ) -> dict[str, NDArray]:
     """Columns of landmarks.ply after the adjustment; landmarks that were dropped are left out.
 
@@ -198,12 +198,12 @@ def moved_landmarks(
     columns = {name: column.copy() for name, column in columns.items()}
     ids = columns["id"].astype(np.int64)
     points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(float)
-    inside = shadow.landmarks.contains(ids)
+    inside = tables.landmarks.contains(ids)
     dropped = np.isin(ids, adjustment.dropped_landmarks)
     outside = np.flatnonzero(~inside & ~dropped)
     if inside.any() and len(outside):
-        points[outside] = _moved_with_neighbours(points[outside], before, shadow)
-    points[inside] = shadow.landmarks.get(ids[inside])
+        points[outside] = _moved_with_neighbours(points[outside], before, tables)
+    points[inside] = tables.landmarks.get(ids[inside])
     for axis, values in zip("xyz", points.T, strict=True):
         columns[axis] = values.astype(columns[axis].dtype)
     left, views = np.unique(adjustment.wrong_observations[:, 1], return_counts=True)
@@ -212,16 +212,16 @@ def moved_landmarks(
     return {name: column[~dropped] for name, column in columns.items()}
 
 
-def _moved_with_neighbours(points: Array, before: Placed, shadow: Shadow) -> Array:
+def _moved_with_neighbours(points: Array, before: Placed, tables: FactorTables) -> Array:
     """Points (N, 3) moved with the first observer of the nearest landmark of the graph."""
-    seen = shadow.observations.select(shadow.observations.all_rows())  # by keyframe
+    seen = tables.observations.select(tables.observations.all_rows())  # by keyframe
     landmark_ids, first = np.unique(seen.landmark_ids, return_index=True)
     observer = seen.keyframe_ids[first]
     where = before.points_world[np.searchsorted(before.landmark_ids, landmark_ids)]
     _, nearest = KDTree(where).query(points)
     keyframes = observer[nearest]
     T_old = before.poses_world_camera[np.searchsorted(before.keyframe_ids, keyframes)]
-    T_new_old = shadow.keyframes.get(keyframes) @ inverse(T_old)
+    T_new_old = tables.keyframes.get(keyframes) @ inverse(T_old)
     return (T_new_old[:, :3, :3] @ points[..., None])[..., 0] + T_new_old[:, :3, 3]
 
 

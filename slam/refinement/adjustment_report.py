@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.evaluation.plot import view_plane
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, Stage, loop_edges
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.geometry import Array
 from bmask_slam.refinement.adjustment_plot import View, draw_before_after
@@ -26,15 +26,15 @@ class Placed:
     loops: IntArray
 
     @classmethod
-    def of(cls, shadow: Shadow) -> Placed:
+    def of(cls, tables: FactorTables) -> Placed:
         """A copy that stays when the graph changes."""
-        keyframes, landmarks = shadow.keyframes, shadow.landmarks
+        keyframes, landmarks = tables.keyframes, tables.landmarks
         return cls(
             keyframes.ids.copy(),
             keyframes.values.copy(),
             landmarks.ids.copy(),
             landmarks.values.copy(),
-            loop_edges(shadow),
+            loop_edges(tables),
         )
 
 

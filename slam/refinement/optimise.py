@@ -66,14 +66,14 @@ def adjust_file(
     _check_output(out)
     if plot is not None:
         check_picture(plot)
-    shadow, camera = read_landmark_graph(file)
-    before = Placed.of(shadow)
+    tables, camera = read_landmark_graph(file)
+    before = Placed.of(tables)
     try:
-        adjustment = adjust(shadow, camera, progress=progress)
+        adjustment = adjust(tables, camera, progress=progress)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
-    after = Placed.of(shadow)
-    write_landmark_graph(out, shadow, camera)
+    after = Placed.of(tables)
+    write_landmark_graph(out, tables, camera)
     if plot is not None:
         draw_adjustment(plot, before, after, adjustment)
     return adjustment, after

@@ -7,7 +7,7 @@ from pathlib import Path
 from bmask_slam.back_end.factor_selection import read_back
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.files.array_file import Arrays, nested, part
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.graph.smoother.storage import graph_arrays
@@ -17,7 +17,7 @@ _WORLD, _GRAPH, _LOOPS = "mapper.world.", "mapper.graph.", "mapper.loops."
 
 
 def optimised_map(
-    state: Arrays, shadow: Shadow, adjustment: Adjustment, camera: Camera, path: Path
+    state: Arrays, tables: FactorTables, adjustment: Adjustment, camera: Camera, path: Path
 ) -> Arrays:
     """A map's state, as ``read_map`` gives it, with the adjusted graph in place of its own.
 
@@ -27,7 +27,7 @@ def optimised_map(
     Raises:
         InputError: the graph does not fit the map; ``path`` names it.
     """
-    graph = graph_arrays(shadow)
+    graph = graph_arrays(tables)
     smoother = Smoother(camera)
     smoother.restore(graph, path)
     world = world_of(part(state, _WORLD[:-1]))

@@ -67,14 +67,14 @@ def export(source: Path, form: ExportFormat, out: Path, times: Path | None = Non
 def _graph(source: Path, out: Path) -> Exported:
     if not (source / "graph").is_file():
         raise InputError(f"{source}: holds no graph, which g2o needs; give a run folder")
-    shadow, camera = read_graph(source / "graph")
-    write_landmark_graph(out, shadow, camera)
-    seen = shadow.observations.select(shadow.observations.all_rows())
+    tables, camera = read_graph(source / "graph")
+    write_landmark_graph(out, tables, camera)
+    seen = tables.observations.select(tables.observations.all_rows())
     flat = int(np.isnan(seen.measurements[:, 2]).sum())
-    edges = len(shadow.pose_factors)
+    edges = len(tables.pose_factors)
     return Exported(
         (out,),
-        f"{len(shadow.keyframes.ids)} keyframes (VERTEX_SE3:QUAT), {len(shadow.landmarks.ids)} "
+        f"{len(tables.keyframes.ids)} keyframes (VERTEX_SE3:QUAT), {len(tables.landmarks.ids)} "
         f"landmarks (VERTEX_TRACKXYZ), {len(seen)} observations (EDGE_PROJECT_DISPARITY; {flat} "
         f"without depth: no information on 1/z), {edges} relative poses and priors.\n"
         "Not in the format: the robust kernels of observations, and what is in comments.",
@@ -84,9 +84,9 @@ def _graph(source: Path, out: Path) -> Exported:
 def _points_of_graph(source: Path, form: ExportFormat, out: Path) -> Exported:
     if form != "ply":
         raise InputError(f"{source}: a graph has no stamps, which {form} needs; give a run folder")
-    shadow, _ = read_landmark_graph(source)
-    x, y, z = shadow.landmarks.values.T
-    write_ply(out, {"x": x, "y": y, "z": z, "id": _ids(shadow.landmarks.ids)}, POINTS_COMMENT)
+    tables, _ = read_landmark_graph(source)
+    x, y, z = tables.landmarks.values.T
+    write_ply(out, {"x": x, "y": y, "z": z, "id": _ids(tables.landmarks.ids)}, POINTS_COMMENT)
     return Exported((out,), f"{len(x)} landmarks: x y z in metres, id")
 
 

@@ -28,7 +28,7 @@ EVALUATION_ROWS = (
 
 
 @dataclass
-class Tally:
+class RunCounters:
     """What is counted while frames go by.
 
     Attributes:
@@ -60,10 +60,12 @@ class Tally:
         self.lost += result.status is TrackingStatus.LOST
 
 
-def measure(system: System, reference: Trajectory | None, tally: Tally, stride: int) -> list[Row]:
+def measure(
+    system: System, reference: Trajectory | None, counters: RunCounters, stride: int
+) -> list[Row]:
     """The rows of metrics.json; errors only where there is a reference that covers the run."""
     trajectory, statistics = system.trajectory(), system.statistics()
-    given = len(range(0, tally.next_index, stride))
+    given = len(range(0, counters.next_index, stride))
     rows = [row("tracked_share", len(trajectory) / max(given, 1), "1")]
     if reference is not None:
         try:
@@ -71,8 +73,8 @@ def measure(system: System, reference: Trajectory | None, tally: Tally, stride: 
             rows += [row for row in errors if row["name"] in EVALUATION_ROWS]
         except InputError as error:
             logger.warning("no comparison with the reference: %s", error)
-    rows += _percentiles("tracking_ms", tally.tracking_ms)
-    rows.append(row("frames_per_second", tally.frames / tally.wall_s, "Hz"))
+    rows += _percentiles("tracking_ms", counters.tracking_ms)
+    rows.append(row("frames_per_second", counters.frames / counters.wall_s, "Hz"))
     rows.append(row("keyframes", int(statistics["keyframes"]), "keyframes"))
     rows.append(row("landmarks", int(statistics["landmarks"]), "landmarks"))
     rows.append(row("loops_closed", int(statistics["loops_closed"]), "loops"))

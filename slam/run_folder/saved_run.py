@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.ply import read_ply
@@ -40,7 +40,7 @@ class SavedRun:
     """
 
     path: Path
-    shadow: Shadow
+    tables: FactorTables
     camera: Camera
     config: SmootherConfig
     keyframe_stamps_s: Array
@@ -57,17 +57,17 @@ def read_run(path: Path) -> SavedRun:
     """
     if not (path / "graph").is_file():
         raise InputError(f"{path}: holds no graph; give the folder of a run that came to its end")
-    shadow, camera = read_graph(path / "graph")
+    tables, camera = read_graph(path / "graph")
     config = path / "config.yaml"
     graph_config = resolve(SmootherConfig, config if config.is_file() else None, section="graph")
-    reinstate(shadow, camera, graph_config)
+    reinstate(tables, camera, graph_config)
     names = ["trajectory.txt", *sorted(p.name for p in path.glob("trajectory_segment_*.txt"))]
     run = SavedRun(
         path,
-        shadow,
+        tables,
         camera,
         graph_config,
-        _keyframe_stamps(path / "frames.csv", shadow.keyframes.ids),
+        _keyframe_stamps(path / "frames.csv", tables.keyframes.ids),
         {name: read_tum(path / name) for name in names},
         read_tum(path / "keyframes.txt"),
         read_ply(path / "landmarks.ply"),
@@ -95,7 +95,7 @@ def _check_same_run(run: SavedRun) -> None:
     if (at < len(known)).all():
         at = known[at]
         late_s = np.abs(run.keyframe_stamps_s[at] - written.timestamps_s)
-        error = np.abs(run.shadow.keyframes.values[at] - written.poses_world_camera)
+        error = np.abs(run.tables.keyframes.values[at] - written.poses_world_camera)
         if (late_s < MAX_STAMP_ERROR_S).all() and error.max() < MAX_POSE_ERROR:
             return
     raise InputError(

@@ -32,7 +32,7 @@ MAX_AGO_S = 0.2
 """An older pose tells too little of the velocity."""
 
 
-class Localiser:
+class CameraTracker:
     """Keeps what one frame hands to the next; the map belongs to the caller.
 
     ``lost_frames`` counts the frames since the last pose, 0 while tracking.

@@ -83,7 +83,7 @@ def landmark_colours(landmarks: dict[str, NDArray]) -> NDArray[np.uint8]:
 
 def _loops(run: SavedRun) -> Array:
     """Positions (N, 2, 3) of the ends of the loops in the graph."""
-    graph = run.shadow
+    graph = run.tables
     position = dict(
         zip(graph.keyframes.ids.tolist(), graph.keyframes.values[:, :3, 3], strict=True)
     )

@@ -28,7 +28,7 @@ class FrameHistory:
         self._parent: dict[int, tuple[int, Array]] = {}
 
     @property
-    def heirs(self) -> dict[int, tuple[int, Array]]:
+    def parents(self) -> dict[int, tuple[int, Array]]:
         """Of every culled keyframe the one that took its frames, and T_heir_culled."""
         return self._parent
 
@@ -77,7 +77,7 @@ class FrameHistory:
             for segment in np.unique(segments[segments != NOBODY]).tolist()
         }
 
-    def heir(self, keyframe_id: int) -> tuple[int, Array]:
+    def parent(self, keyframe_id: int) -> tuple[int, Array]:
         """The keyframe that stands for one now, or NOBODY, and T_heir_keyframe.
 
         One that has no heir stands for itself.
@@ -86,14 +86,14 @@ class FrameHistory:
 
     def state(self) -> Arrays:
         """All entries, and who inherited whose frames, as arrays."""
-        entries, heirs = self._store[: self._size], list(self._parent.values())
+        entries, parents = self._store[: self._size], list(self._parent.values())
         return {
             "timestamps_s": entries["timestamp_s"].copy(),
             "keyframe_ids": entries["keyframe_id"].copy(),
             "T_keyframe_camera": entries["T_keyframe_camera"].copy(),
             "culled_ids": np.array(list(self._parent), np.int64),
-            "heir_ids": np.array([heir for heir, _ in heirs], np.int64),
-            "T_heir_culled": _stacked([T for _, T in heirs]),
+            "heir_ids": np.array([parent for parent, _ in parents], np.int64),
+            "T_heir_culled": _stacked([T for _, T in parents]),
         }
 
     def restore(self, state: Arrays) -> None:
@@ -103,8 +103,8 @@ class FrameHistory:
         columns = ("timestamps_s", "keyframe_ids", "T_keyframe_camera")
         for name, column in zip(ENTRY.names or (), columns, strict=True):
             self._store[name][: self._size] = state[column]
-        heirs = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
-        self._parent = dict(zip(state["culled_ids"].tolist(), heirs, strict=True))
+        parents = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
+        self._parent = dict(zip(state["culled_ids"].tolist(), parents, strict=True))
 
     def _resolve(self, keyframe_id: int, T: Array) -> tuple[int, Array]:
         """The keyframe that stands for one, and poses T (..., 4, 4) as seen from it."""

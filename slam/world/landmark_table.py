@@ -44,7 +44,7 @@ _COLUMNS = _OF_ALL | _LOOKS
 _PLACE: _Columns = {"place": ((), np.int64, 0)}
 
 
-class Looks:
+class Appearance:
     """A column over landmark ids that has rows for the living alone, at their places.
 
     Place 0 is that of all the dead, who look like nothing: what is written about them is lost.
@@ -113,15 +113,15 @@ class LandmarkTable:
     """
 
     points_world: Array
-    descriptors: Looks
-    directions: Looks
-    extent: Looks
-    angles_rad: Looks
-    colours: Looks
+    descriptors: Appearance
+    directions: Appearance
+    extent: Appearance
+    angles_rad: Appearance
+    colours: Appearance
     host: Ints
     last_keyframe: Ints
-    patches: Looks
-    patch_views: Looks
+    patches: Appearance
+    patch_views: Appearance
     observations: Ints
     visible: Ints
     found: Ints
@@ -133,7 +133,7 @@ class LandmarkTable:
     def __init__(self) -> None:
         self._size = 0
         self._store = {name: _filled(1024, column) for name, column in (_OF_ALL | _PLACE).items()}
-        self._looks = {name: _filled(1, column) for name, column in _LOOKS.items()}
+        self._appearance = {name: _filled(1, column) for name, column in _LOOKS.items()}
         self._free: list[int] = []
         self._make_views()
 
@@ -267,10 +267,12 @@ class LandmarkTable:
         """Places for landmarks (N,) that have none."""
         missing = len(ids) - len(self._free)
         if missing > 0:
-            capacity = len(self._looks["extent"])
+            capacity = len(self._appearance["extent"])
             more = max(missing, capacity)
             for name, column in _LOOKS.items():
-                self._looks[name] = np.concatenate([self._looks[name], _filled(more, column)])
+                self._appearance[name] = np.concatenate(
+                    [self._appearance[name], _filled(more, column)]
+                )
             self._free += range(capacity + more - 1, capacity - 1, -1)
             self._make_views()
         if len(ids):
@@ -282,15 +284,15 @@ class LandmarkTable:
         places = self.place[ids]
         places = places[places > 0]
         for name, (_, _, fill) in _LOOKS.items():
-            self._looks[name][places] = fill
+            self._appearance[name][places] = fill
         self.place[ids] = 0
         self._free += places[::-1].tolist()
 
     def _make_views(self) -> None:
         for name, array in self._store.items():
             setattr(self, name, array[: self._size])
-        for name, rows in self._looks.items():
-            setattr(self, name, Looks(rows, self.place))
+        for name, rows in self._appearance.items():
+            setattr(self, name, Appearance(rows, self.place))
 
 
 def _filled(count: int, column: tuple[tuple[int, ...], type, float]) -> NDArray:

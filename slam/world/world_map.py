@@ -192,11 +192,11 @@ class WorldMap:
         landmarks.angles_rad[ids] = features.angles_rad[rows]
         landmarks.extent[ids] = features.scales[rows] * np.maximum(z, 0.05)
 
-    def remove_keyframe(self, keyframe: Keyframe, heir: Keyframe) -> None:
+    def remove_keyframe(self, keyframe: Keyframe, parent: Keyframe) -> None:
         """Take a keyframe out of the map; the landmarks it made follow the heir from now on."""
         _, ids = self.observed(keyframe)
         self.landmarks.observations[ids] -= 1
-        self.landmarks.host[self.landmarks.host == keyframe.id] = heir.id
+        self.landmarks.host[self.landmarks.host == keyframe.id] = parent.id
         del self.keyframes[keyframe.id]
         pixels = keyframe.features.image_pixels
         self.culled[keyframe.id] = CulledKeyframe(pixels, keyframe.landmark_ids)

@@ -1,12 +1,12 @@
 """Trajectory errors: against evo, published figures, and planted errors."""
 
 import copy
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from repository import SHARED
 
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
 from bmask_slam.graph.metrics import (
@@ -20,8 +20,10 @@ from bmask_slam.graph.metrics import (
 )
 from bmask_slam.graph.trajectory import Trajectory, associate, read_tum
 
-SHARED = Path(__file__).resolve().parents[2] / "../shared/data/trajectories"
-needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data/trajectories here")
+TRAJECTORIES = SHARED / "trajectories"
+needs_shared = pytest.mark.skipif(
+    not TRAJECTORIES.is_dir(), reason="no ../shared/data/trajectories here"
+)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -208,7 +210,9 @@ def test_no_pair_is_no_number():
     ],
 )
 def test_published_trajectories(estimate, reference, with_scale, ate_cm):
-    e, g = associate(read_tum(SHARED / f"{estimate}.txt"), read_tum(SHARED / f"{reference}.txt"))
+    e, g = associate(
+        read_tum(TRAJECTORIES / f"{estimate}.txt"), read_tum(TRAJECTORIES / f"{reference}.txt")
+    )
     rmse_cm = 100 * absolute_error(e, g, with_scale).translation_m.rmse
     assert rmse_cm == pytest.approx(ate_cm, abs=0.006)
 
@@ -227,11 +231,11 @@ def example(name: str) -> tuple[Trajectory, Trajectory]:
     if name == "synthetic":
         reference = walk(200)
         return noisy(reference.moved(random_pose(5))), reference
-    if not SHARED.is_dir():
+    if not TRAJECTORIES.is_dir():
         pytest.skip("no ../shared/data/trajectories here")
     return associate(
-        read_tum(SHARED / "freiburg1_xyz-rgbdslam.txt"),
-        read_tum(SHARED / "freiburg1_xyz-groundtruth.txt"),
+        read_tum(TRAJECTORIES / "freiburg1_xyz-rgbdslam.txt"),
+        read_tum(TRAJECTORIES / "freiburg1_xyz-groundtruth.txt"),
     )
 
 

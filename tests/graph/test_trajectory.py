@@ -1,17 +1,16 @@
 """TUM files and association by time."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from repository import SHARED
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.trajectory import Trajectory, associate, associate_stamps, read_tum, write_tum
 
-SHARED = Path(__file__).resolve().parents[2] / "../shared/data/trajectories"
+TRAJECTORIES = SHARED / "trajectories"
 
 stamps = st.lists(
     st.integers(0, 400).map(lambda k: k / 100), min_size=0, max_size=25, unique=True
@@ -157,10 +156,10 @@ def test_associate_takes_the_nearest_within_the_limit():
     assert len(e) == len(r) == 2
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data/trajectories here")
+@pytest.mark.skipif(not TRAJECTORIES.is_dir(), reason="no ../shared/data/trajectories here")
 def test_tum_files():
-    truth = read_tum(SHARED / "freiburg1_xyz-groundtruth.txt")
-    estimate = read_tum(SHARED / "freiburg1_xyz-rgbdslam.txt")
+    truth = read_tum(TRAJECTORIES / "freiburg1_xyz-groundtruth.txt")
+    estimate = read_tum(TRAJECTORIES / "freiburg1_xyz-rgbdslam.txt")
     e, r = associate(estimate, truth)
     assert (len(truth), len(estimate), len(e)) == (3000, 788, 786)
     assert np.abs(e.timestamps_s - r.timestamps_s).max() < 0.02

@@ -15,14 +15,14 @@ from synthetic_view import CAMERA, render_plane
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.patch_alignment import PATCH_PX
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.factor_tables import Shadow
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
 from bmask_slam.graph.files.array_file import Arrays
 from bmask_slam.graph.geometry import Array, se3_exp
 from bmask_slam.graph.smoother.storage import graph_arrays
 from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.loops.verification import LoopConstraint
-from bmask_slam.moving.static_verification import Removed, Suspect
+from bmask_slam.moving.static_verification import PendingMovable, Removed
 from bmask_slam.semantics.instances.instances import Instance, PackedMask, certain, mask_box
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.segmenters.segmenter import Image
@@ -80,10 +80,12 @@ def system() -> SlamSystem:
     loop = RelativePose(first, second, np.eye(4), np.eye(6), robust="dcs", kind="loop")
     smoother = system.mapper.smoother
     old = smoother.estimate().landmark_ids[:40]
-    smoother.update(GraphUpdate(relative_poses=(loop,), retire_landmarks=old))
+    smoother.update(GraphUpdate(relative_poses=(loop,), marginalise_landmarks=old))
     smoother.update(GraphUpdate(landmark_ids=old[:5], points_world=np.zeros((5, 3))))
     smoother.restart()
-    system.mapper._feed.forget_landmarks(np.array([5, 8]))  # none wait between two frames so far
+    system.mapper._factor_selector.forget_landmarks(
+        np.array([5, 8])
+    )  # none wait between two frames so far
     loops, pairs = system.mapper.loops, np.array([[3, 7], [4, 9]])
     loops.waiting = [
         LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
@@ -91,16 +93,16 @@ def system() -> SlamSystem:
     ]
     system.semantics.expect(system.mapper.world.keyframes[first], kept_depth(FRAMES[3].depth_m))
     sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
-    system.dynamics.tracks.see(FRAMES[19].timestamp_s, [sighting])
+    system.moving_objects.tracks.see(FRAMES[19].timestamp_s, [sighting])
     removed = [
         Removed(
             k, np.arange(k, 4 + 2 * k), some_patches(4 + k), PackedMask.of(FRAMES[k].depth_m > 2)
         )
         for k in (first, second)
     ]
-    system.dynamics.suspects.watched = [
-        Suspect(1, first, 0.25, np.ones((4, 3)), tuple(removed), 2, 1),
-        Suspect(2, second, 0.5, np.full((3, 3), 0.5), (removed[1],), 1, 3),
+    system.moving_objects.static_verification.watched = [
+        PendingMovable(1, first, 0.25, np.ones((4, 3)), tuple(removed), 2, 1),
+        PendingMovable(2, second, 0.5, np.full((3, 3), 0.5), (removed[1],), 1, 3),
     ]
     loops.closed = {(first, second): True, (first, second + 1): False}
     loops.recogniser._previous = [(frozenset({first, second}), 1), (frozenset({second}), 2)]
@@ -144,7 +146,7 @@ def differences(a: Any, b: Any, where: str = "system") -> Iterator[str]:
         yield from differences(list(a), list(b), f"{where}.keys")
         for key in (a.keys() & b.keys()) - SCRATCH:
             yield from differences(a[key], b[key], f"{where}[{key}]")
-    elif isinstance(a, Shadow):  # rows and slots are its own affair
+    elif isinstance(a, FactorTables):  # rows and slots are its own affair
         yield from differences(graph_arrays(a), graph_arrays(b), where)
     elif isinstance(a, LandmarkTable):  # dead landmarks are not kept
         yield from differences(a.state(), b.state(), where)
@@ -205,14 +207,14 @@ def test_both_go_on_the_same() -> None:
 
 def test_what_is_compared_by_contents_has_no_other_attributes(system: SlamSystem) -> None:
     """One that is added here must be added to ``graph_arrays`` or the table's columns, too."""
-    shadow, table = system.mapper.smoother._shadow, system.mapper.world.landmarks
+    tables, table = system.mapper.smoother._tables, system.mapper.world.landmarks
     pose_factors = {"pose_factors", "pose_factors_of", "_next_number"}
-    assert vars(shadow).keys() == {
+    assert vars(tables).keys() == {
         *("keyframes", "landmarks", "observations", "archive"),
         *pose_factors,
     }
     rows = {"of_keyframe", "of_landmark", "_free", "_columns", "_slots", "_used"}
-    assert vars(shadow.observations).keys() == rows
-    columns = table._store.keys() | table._looks.keys()
+    assert vars(tables.observations).keys() == rows
+    columns = table._store.keys() | table._appearance.keys()
     assert vars(table).keys() == {"_size", "_store", "_looks", "_free", *columns}
     assert columns - {"alive", "place"} == table.state().keys() - {"size", "ids"}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from repository import KITCHEN
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
@@ -15,8 +16,6 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
-
-KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/redkitchen"
 
 
 def path(count: int, start_x_m: float = -0.6) -> list[Array]:
@@ -29,7 +28,9 @@ def path(count: int, start_x_m: float = -0.6) -> list[Array]:
     ]
 
 
-def feed(system: SlamSystem, poses: list[Array | None], first: int = 0) -> list[FrameResult]:
+def factor_selection(
+    system: SlamSystem, poses: list[Array | None], first: int = 0
+) -> list[FrameResult]:
     """Run the system along poses; None is a black frame without depth."""
     return [system.process(view(pose, first + i)) for i, pose in enumerate(poses)]
 
@@ -56,7 +57,7 @@ def largest_error_m(system: SlamSystem, poses: list[Array | None]) -> float:
 
 def test_pose_agrees_with_the_truth_in_frame_unit_and_sign() -> None:
     system, poses = SlamSystem(CAMERA), path(25)
-    results = feed(system, poses)
+    results = factor_selection(system, poses)
     assert all(r.status is TrackingStatus.OK for r in results)
     system.finish()
     assert len(system.trajectory()) == 25
@@ -69,7 +70,7 @@ def test_lost_frames_get_no_pose_and_tracking_comes_back() -> None:
     system = SlamSystem(CAMERA)
     there = path(15)
     poses = [*there, *[None] * 5, *there[5:10]]
-    results = feed(system, poses)
+    results = factor_selection(system, poses)
     assert [r.status for r in results[15:20]] == [TrackingStatus.LOST] * 5
     assert all(r.T_world_camera is None for r in results[15:20])
     assert all(r.status is not TrackingStatus.LOST for r in results[20:])
@@ -83,12 +84,12 @@ def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
     here, elsewhere = path(12, start_x_m=-1.6), path(14, start_x_m=1.4)
     back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.03)]
     poses = [*here, *[None] * 11, *elsewhere]
-    results = feed(system, poses)
+    results = factor_selection(system, poses)
     assert results[-1].segment == 1
     apart = system.segments()
     assert [len(apart[0]), len(apart[1])] == [12, sum(r.segment == 1 for r in results)]
     poses += [*elsewhere[::-1], *back]
-    results += feed(system, poses[len(results) :], first=len(results))
+    results += factor_selection(system, poses[len(results) :], first=len(results))
     assert results[-1].segment == 0
     joined = system.segments()
     assert list(joined) == [0]
@@ -97,7 +98,7 @@ def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
 
 
 def test_black_frames_before_the_first_keyframe_are_lost_not_fatal() -> None:
-    results = feed(SlamSystem(CAMERA), [None, None, *path(3)])
+    results = factor_selection(SlamSystem(CAMERA), [None, None, *path(3)])
     expected = [TrackingStatus.LOST] * 2 + [TrackingStatus.OK] * 3
     assert [r.status for r in results] == expected
     assert results[2].keyframe_reason == "first frame"
@@ -105,7 +106,7 @@ def test_black_frames_before_the_first_keyframe_are_lost_not_fatal() -> None:
 
 def test_a_frame_without_depth_is_tracked_from_the_map() -> None:
     system, poses = SlamSystem(CAMERA), path(6)
-    feed(system, poses[:5])
+    factor_selection(system, poses[:5])
     frame = render_plane(poses[5], 5)
     blind = Frame(5, frame.timestamp_s, frame.rgb, np.full((480, 640), np.nan, np.float32))
     result = system.process(blind)
@@ -128,7 +129,7 @@ def test_features_prepared_ahead_change_nothing_and_runs_repeat() -> None:
 def test_frames_of_culled_keyframes_keep_their_poses() -> None:
     every_frame = ["keyframes.max_shared=9.0", "keyframes.min_interval_frames=1"]
     system, poses = SlamSystem(CAMERA, resolve(SystemConfig, None, every_frame)), path(16)
-    results = feed(system, poses)
+    results = factor_selection(system, poses)
     assert len(system.mapper.world.keyframes) < sum(r.keyframe_id is not None for r in results)
     assert len(system.trajectory()) == 16
     assert largest_error_m(system, poses) < 0.003
@@ -137,7 +138,7 @@ def test_frames_of_culled_keyframes_keep_their_poses() -> None:
 def test_a_place_walked_again_needs_no_more_keyframes() -> None:
     system, there = SlamSystem(CAMERA), path(108)[::6]
     poses = [*there, *there[-2::-1]]
-    made = np.array([r.keyframe_id is not None for r in feed(system, poses)])
+    made = np.array([r.keyframe_id is not None for r in factor_selection(system, poses)])
     assert made[: len(there)].sum() == 6
     assert not made[len(there) :].any()
     assert largest_error_m(system, poses) < 0.003
@@ -161,7 +162,7 @@ def test_a_place_walked_again_needs_no_more_keyframes() -> None:
 def test_every_option_still_tracks(override: str) -> None:
     poses = path(8)
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, [override]))
-    results = feed(system, poses)
+    results = factor_selection(system, poses)
     system.finish()
     assert all(r.status is TrackingStatus.OK for r in results)
     assert largest_error_m(system, poses) < 0.006
@@ -171,7 +172,7 @@ def test_graph_is_saved_with_every_keyframe(tmp_path: Path) -> None:
     from bmask_slam.graph.smoother.smoother import Smoother
 
     system = SlamSystem(CAMERA)
-    feed(system, path(15))
+    factor_selection(system, path(15))
     system.files()["graph"](tmp_path / "graph")
     estimate = Smoother.load(tmp_path / "graph").estimate()
     keyframes = system.keyframe_trajectory().poses_world_camera

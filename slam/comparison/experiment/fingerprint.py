@@ -18,8 +18,8 @@ from bmask_slam.graph.data_files import data_path
 from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.system_config import SystemConfig
 
-SYSTEM = Path(bmask_slam.__file__).parent
-LAYERS = (*tuple(Path(layer.__file__).parent for layer in (graph, semantics, mapping)), SYSTEM)
+SYSTEM = Path(bmask_slam.__path__[0])
+LAYERS = (*tuple(Path(layer.__path__[0]) for layer in (graph, semantics, mapping)), SYSTEM)
 ELSEWHERE = (
     "comparison",
     "viewer",

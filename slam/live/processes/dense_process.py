@@ -53,7 +53,7 @@ def serve_dense(channel: Channel, order: DenseOrder) -> None:
         keeper.handle(message)
 
 
-class PatientFolder(DenseFolder):
+class RetryingFolder(DenseFolder):
     """The folder of a dense map, which outlives a full disk.
 
     Attributes:
@@ -80,7 +80,7 @@ class DenseKeeper:
         self._labels = LabelSet(order.labels)
         self._options = settled(MapOptions(order.run, masks=order.masks), self._labels)
         settings = folder_settings(self._options, self._labels)
-        self._folder = PatientFolder(order.run, settings)
+        self._folder = RetryingFolder(order.run, settings)
         self._folder.unwritten = {}
         self._fusion = KeyframeFusion(order.camera, self._labels, self._folder, self._options)
 

@@ -34,14 +34,14 @@ from bmask_slam.live.messages import (
     PruneLandmarks,
     PruneMask,
     Ready,
+    RestoreObservations,
     SaveState,
     Sightings,
     StateSaved,
-    TakeBack,
 )
 from bmask_slam.live.replica import DeltaMaker
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
-from bmask_slam.moving.moving_object_filter import Dynamics
+from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
@@ -65,11 +65,11 @@ class LabelledNothing(NoSegmenter):
         self.labels = LabelSet(names)
 
 
-class _Told(Dynamics):
+class _Told(MovingObjectFilter):
     """Passes what masks say on to tracking's side, where it is known what moves."""
 
     def __init__(self, channel: Channel, camera: Camera, config: SystemConfig) -> None:
-        super().__init__(camera, config.dynamics)
+        super().__init__(camera, config.moving_objects)
         self._channel = channel
 
     def see(self, masks: KeyframeMasks, mapper: Mapper) -> None:
@@ -126,9 +126,9 @@ class MapKeeper:
             case PruneMask():
                 pruner = replace(self.system.mapper.pruner(), border_px=message.border_px)
                 pruner.prune_mask(message.keyframe_id, message.mask.unpacked())
-            case TakeBack():
+            case RestoreObservations():
                 back = message.keypoints, message.patches
-                self.system.mapper.take_back(message.keyframe_id, *back)
+                self.system.mapper.restore_observations(message.keyframe_id, *back)
                 self.tell(-1, done=False)
             case SaveState():
                 self.save(number, message.path)
@@ -182,7 +182,7 @@ class MapKeeper:
         """Count a keyframe that could not be taken in; another has its frames."""
         mapper = self.system.mapper
         mapper.history.extend(message.history)
-        mapper.history.hand_over(message.id, message.heir_id, message.T_heir_lost)
+        mapper.history.hand_over(message.id, message.parent_id, message.T_parent_lost)
         mapper.world.next_keyframe_id = message.id + 1
         landmarks = mapper.world.landmarks
         landmarks.extend_to(max(message.landmarks, len(landmarks)))
@@ -191,7 +191,7 @@ class MapKeeper:
     def _has_place(self, message: NewKeyframe) -> bool:
         """Whether what its pose refers to is in the map; not if that was lost with its place."""
         reference, history = message.reference, self.system.mapper.history
-        return reference is None or history.heir(reference[0])[0] != NOBODY
+        return reference is None or history.parent(reference[0])[0] != NOBODY
 
     def attach(self, message: Masks) -> None:
         """Use a keyframe's masks; those that cannot be used are passed over."""
@@ -220,9 +220,9 @@ class MapKeeper:
         if message.reference is None:
             return tracked, message.segment
         reference_id, T_world_reference = message.reference
-        heir_id, T_heir_reference = mapper.history.heir(reference_id)
-        heir = mapper.world.keyframes[heir_id]
-        T_now = heir.T_world_camera @ T_heir_reference
+        parent_id, T_parent_reference = mapper.history.parent(reference_id)
+        parent = mapper.world.keyframes[parent_id]
+        T_now = parent.T_world_camera @ T_parent_reference
         landmarks = mapper.world.landmarks
         ids = landmarks.current(tracked.landmark_ids)
         _, first = np.unique(ids, return_index=True)
@@ -233,4 +233,4 @@ class MapKeeper:
             keypoints=tracked.keypoints[first],
             landmark_ids=ids[first],
             visible_ids=landmarks.living(tracked.visible_ids),
-        ), heir.segment
+        ), parent.segment

@@ -25,10 +25,10 @@ from bmask_slam.live.messages import (
     MapChanged,
     NewKeyframe,
     Ready,
+    RestoreObservations,
     SaveState,
     Sightings,
     StateSaved,
-    TakeBack,
 )
 from bmask_slam.live.processes.remote_pruner import RemotePruner
 from bmask_slam.live.processes.supervision import late_start
@@ -149,10 +149,10 @@ class RemoteMapper:
         """Takes things out of the map."""
         return RemotePruner(self.world, self.tell)
 
-    def take_back(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
-        """As ``Mapper.take_back``; the map is changed when the answer comes."""
+    def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
+        """As ``Mapper.restore_observations``; the map is changed when the answer comes."""
         if len(keypoints):
-            self.tell(TakeBack(keyframe_id, keypoints, patches))
+            self.tell(RestoreObservations(keyframe_id, keypoints, patches))
 
     def tell(self, message: Any) -> None:
         """Send a message, to be sent again to another process if this one dies."""
@@ -209,7 +209,7 @@ class RemoteMapper:
         deadline_s = time.monotonic() + timeout_s
         while len(self.world.observed(keyframe)[1]) == 0 and not self.given_up:
             left_s = deadline_s - time.monotonic()
-            if left_s <= 0 or self.history.heir(keyframe.id)[0] == NOBODY:
+            if left_s <= 0 or self.history.parent(keyframe.id)[0] == NOBODY:
                 return False
             self.catch_up(min(left_s, 0.05))
         return True
@@ -264,10 +264,10 @@ class RemoteMapper:
         logger.error("message %d, %s, is passed over", number, type(message).__name__)
         match message:
             case NewKeyframe():
-                heir_id, T_heir_lost = _heir(message)
-                self.history.hand_over(message.id, heir_id, T_heir_lost)
+                parent_id, T_parent_lost = _parent(message)
+                self.history.hand_over(message.id, parent_id, T_parent_lost)
                 known = len(self.world.landmarks)
-                about = (message.id, heir_id, T_heir_lost, message.history, known)
+                about = (message.id, parent_id, T_parent_lost, message.history, known)
                 self._journal[number] = LostKeyframe(*about)
 
     def _apply(self, message: MapChanged) -> None:
@@ -300,9 +300,9 @@ class RemoteMapper:
         return entries
 
 
-def _heir(lost: NewKeyframe) -> tuple[int, Array]:
+def _parent(lost: NewKeyframe) -> tuple[int, Array]:
     """The keyframe that takes the frames of one that cannot be in the map, and T_heir_lost."""
     if lost.reference is None:
         return NOBODY, np.eye(4)
-    heir_id, T_world_heir = lost.reference
-    return heir_id, inverse(T_world_heir) @ lost.tracked.T_world_camera
+    parent_id, T_world_parent = lost.reference
+    return parent_id, inverse(T_world_parent) @ lost.tracked.T_world_camera

@@ -90,8 +90,8 @@ def _in_shadow(depth_m: Floats, camera: Camera) -> NDArray[np.bool_]:
     u = np.arange(depth_m.shape[1], dtype=np.float32)
     column = u - np.float32(camera.stereo_bf_px_m) / np.nan_to_num(depth_m, nan=1e3)
     nearest = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
-    shadow: NDArray[np.bool_] = column > nearest + _SHADOW_PX
-    return shadow
+    tables: NDArray[np.bool_] = column > nearest + _SHADOW_PX
+    return tables
 
 
 def _ragged(depth_m: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:

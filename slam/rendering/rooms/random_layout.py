@@ -109,11 +109,11 @@ class Layout:
             u = self.rng.uniform(0.02 - low, length - high - 0.02)
             if length < high - low + 0.1:
                 continue
-            shadow = (u + kind.rects[0][0], 0.0, u + kind.rects[0][2], kind.height_m)
-            if any(overlap(shadow, other, _GAP_M) for other in self._walls[wall]):
+            tables = (u + kind.rects[0][0], 0.0, u + kind.rects[0][2], kind.height_m)
+            if any(overlap(tables, other, _GAP_M) for other in self._walls[wall]):
                 continue
             if self._stand(kind, wall_poses(self.room)[wall] @ pose(u, 0)):
-                self._walls[wall].append(shadow)
+                self._walls[wall].append(tables)
                 return True
         return False
 

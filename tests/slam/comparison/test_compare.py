@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from repository import ROOT
 
 from bmask_slam.cli import main
 from bmask_slam.comparison import CellStatus, CompareOptions, Comparison, compare, read_results
@@ -21,7 +22,6 @@ from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.trajectory import read_tum, write_tum
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 
-ROOT = Path(__file__).resolve().parents[3]
 EXPERIMENT = """\
 sequences: {office: office}
 configurations:

@@ -52,7 +52,7 @@ class Page(html.parser.HTMLParser):
         self.tags: list[str] = []
         self.addresses: list[str] = []
         self.words: list[str] = []
-        self.feed(text)
+        self.factor_selection(text)
         self.text = " ".join(" ".join(self.words).split())
 
     def handle_starttag(self, tag, attrs):

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from repository import SHARED
 
 from bmask_slam.evaluation import evaluate, evaluate_trajectory, format_json, format_table
 from bmask_slam.evaluation.plot import plot_trajectory, view_plane
@@ -13,7 +14,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import make_pose, se3_exp, so3_exp
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 
-SHARED = Path(__file__).resolve().parents[3] / "../shared/data/trajectories"
+TRAJECTORIES = SHARED / "trajectories"
 
 
 def arc(count: int = 300, fps: float = 30.0) -> Trajectory:
@@ -162,7 +163,7 @@ def test_view_plane_is_the_plane_of_motion():
     assert view_plane(positions * [2, 3, 1]) == [0, 1]
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="no ../shared/data/trajectories here")
+@pytest.mark.skipif(not TRAJECTORIES.is_dir(), reason="no ../shared/data/trajectories here")
 @pytest.mark.parametrize(
     ("estimate", "reference", "ate_cm"),
     [
@@ -171,7 +172,7 @@ def test_view_plane_is_the_plane_of_motion():
     ],
 )
 def test_published_figures(estimate, reference, ate_cm):
-    result = evaluate(SHARED / estimate, SHARED / reference)
+    result = evaluate(TRAJECTORIES / estimate, TRAJECTORIES / reference)
     assert 100 * result.value("ate_rmse") == pytest.approx(ate_cm, abs=0.006)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -17,7 +16,6 @@ from scipy.spatial import cKDTree
 from bmask_slam.cli import main
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.trajectory import read_tum
-from bmask_slam.live.processes.worker import ROOT
 
 FRAMES = 24
 
@@ -41,10 +39,7 @@ def start(recording: Path, out: Path, *options: str) -> subprocess.Popen[str]:
         str(out),
         *options,
     ]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def frames_written(out: Path) -> int:

@@ -13,8 +13,8 @@ from bmask_slam.live.messages import (
     MapChanged,
     NewKeyframe,
     PruneMask,
+    RestoreObservations,
     Sightings,
-    TakeBack,
 )
 from bmask_slam.live.processes.map_process import MapKeeper
 from bmask_slam.semantics.instances.instances import PackedMask
@@ -62,8 +62,8 @@ def test_after_the_loss_of_its_first_keyframe_a_segment_begins_anew() -> None:
     assert not world.landmarks.alive[:500].any()
     assert world.landmarks.alive.sum() > 100
     deltas = [answer.delta for answer in answers if isinstance(answer, MapChanged)]
-    heirs = {k: heir for delta in deltas for k, (heir, _) in delta.heirs.items()}
-    assert heirs == {0: NOBODY, 1: NOBODY}
+    parents = {k: parent for delta in deltas for k, (parent, _) in delta.parents.items()}
+    assert parents == {0: NOBODY, 1: NOBODY}
     trajectory = system.trajectory()
     assert trajectory.timestamps_s.tolist() == [2 / 30]  # those of the lost ones have no pose
 
@@ -81,7 +81,7 @@ def test_what_was_taken_out_under_a_mask_comes_back() -> None:
     keeper.handle(3, PruneMask(1, PackedMask.of(mask), 0))
     under = np.flatnonzero(one.masked)
     assert len(under) > 20
-    keeper.handle(4, TakeBack(1, under, all_patches[under]))
+    keeper.handle(4, RestoreObservations(1, under, all_patches[under]))
     assert not one.masked.any()
     back = one.landmark_ids[under]
     with_depth = np.isfinite(one.features.depth_m[under])
@@ -93,6 +93,6 @@ def test_what_was_taken_out_under_a_mask_comes_back() -> None:
     assert np.isfinite(landmarks.patch_views[back[made]][:, 0]).all()
     told = [answer for answer in answers if isinstance(answer, MapChanged)][-1].delta
     assert np.isin(back[back >= 0], told.ids).all()
-    keeper.handle(5, TakeBack(7, under, all_patches[under]))  # culled meanwhile
+    keeper.handle(5, RestoreObservations(7, under, all_patches[under]))  # culled meanwhile
     keeper.handle(6, keyframe(system, 2, (1, one.T_world_camera)))
     assert list(system.mapper.world.keyframes) == [0, 1, 2]

@@ -60,11 +60,11 @@ def test_the_copy_went_through_everything(followed) -> None:
     system, copy, history, _ = followed
     assert len(copy.keyframes) >= 3
     assert (copy.landmarks.replaced_by >= 0).any(), "nothing was fused"
-    assert history.heirs, "no keyframe was culled"
-    for culled in history.heirs:
-        assert history.heir(culled)[0] == system.mapper.history.heir(culled)[0]
+    assert history.parents, "no keyframe was culled"
+    for culled in history.parents:
+        assert history.parent(culled)[0] == system.mapper.history.parent(culled)[0]
         np.testing.assert_array_equal(
-            history.heir(culled)[1], system.mapper.history.heir(culled)[1]
+            history.parent(culled)[1], system.mapper.history.parent(culled)[1]
         )
 
 
@@ -76,7 +76,7 @@ def test_a_delta_without_change_is_small(followed) -> None:
     assert len(first.ids) == system.mapper.world.landmarks.alive.sum()
     assert len(second.ids) == 0
     assert not second.rows
-    assert not second.heirs
+    assert not second.parents
     assert second.replaced_by is None
     assert len(pickle.dumps(second)) < 0.2 * len(pickle.dumps(first))
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from bmask_slam.live.channel import Channel
-from bmask_slam.live.processes.worker import ROOT, Failure, Worker
+from bmask_slam.live.processes.worker import Failure, Worker
 
 HERE = f"{__name__}"
 
@@ -142,7 +142,7 @@ def test_it_ends_with_its_owner_however_that_ends() -> None:
         f"w = Worker('echo', '{HERE}:echo', 'a'); w.send(1); w.receive(20)\n"
         "print(w.pid, flush=True); time.sleep(600)"
     )
-    paths = [str(ROOT), str(Path(__file__).parent)]
+    paths = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     owner = subprocess.Popen(
         [sys.executable, "-c", script],
         stdout=subprocess.PIPE,

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from repository import ROOT
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -376,5 +377,5 @@ def test_scenes_are_listed_without_open3d() -> None:
         "room",
     }
     code = "import sys, bmask_slam.rendering.sequence; assert 'open3d' not in sys.modules"
-    root = Path(__file__).resolve().parents[3]
+    root = ROOT
     subprocess.run([sys.executable, "-c", code], cwd=root, check=True)

@@ -3,16 +3,14 @@
 import re
 import threading
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from repository import KITCHEN
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences import format_info, open_sequence, sequence_info
-
-KITCHEN = Path(__file__).resolve().parents[3] / "../shared/data/redkitchen"
 
 
 def prefetch_threads() -> int:

@@ -1,0 +1,289 @@
+"""Landmarks that leave the graph: what they said of the keyframes must stay, once."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graph_checks import assert_isam_matches_tables
+from synthetic_room import CAMERA, Room, make_room
+
+from bmask_slam.graph.factors.graph_update import (
+    GraphEstimate,
+    GraphUpdate,
+    Observations,
+    RefusalReason,
+)
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.marginals.point_elimination import eliminate_points, linearise
+from bmask_slam.graph.marginals.sparsification import adjoint
+from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
+
+ROOM = make_room(keyframes=10, points=150, noise_px=0.5, seed=3)
+
+
+def filled(room: Room = ROOM, until: int = 99) -> Smoother:
+    smoother = Smoother(CAMERA)
+    for update in room.updates()[:until]:
+        smoother.update(update)
+    return smoother
+
+
+def marginalise_landmarks(smoother: Smoother, ids: Array) -> GraphEstimate:
+    return smoother.update(GraphUpdate(marginalise_landmarks=ids))
+
+
+def pose_differences(a: GraphEstimate, b: GraphEstimate) -> Array:
+    return se3_log(inverse(a.poses_world_camera) @ b.poses_world_camera)
+
+
+def relative_sigmas(smoother: Smoother, a: int, b: int) -> Array:
+    """Standard deviations (6,) of T_a^-1 T_b."""
+    pair = np.array([a, b])
+    Ta, Tb = (smoother.estimate().poses_world_camera[i] for i in (a, b))
+    J = np.hstack([-adjoint(inverse(Tb) @ Ta), np.eye(6)])
+    return np.sqrt(np.diag(J @ smoother.joint_covariance(pair) @ J.T))
+
+
+def test_jacobians_are_finite_differences() -> None:
+    seen, config = ROOM.observations, SmootherConfig(robust=False)
+    poses, points = ROOM.initial_poses[seen.keyframe_ids], ROOM.initial_points[seen.landmark_ids]
+    r, J_pose, J_point = linearise(seen, poses, points, CAMERA, config)
+    for i in range(6):
+        moved = poses @ se3_exp(1e-6 * np.eye(6)[i])
+        slope = (linearise(seen, moved, points, CAMERA, config)[0] - r) / 1e-6
+        np.testing.assert_allclose(slope, J_pose[:, :, i], rtol=1e-3, atol=1e-2)
+    for i in range(3):
+        moved = points + 1e-6 * np.eye(3)[i]
+        slope = (linearise(seen, poses, moved, CAMERA, config)[0] - r) / 1e-6
+        np.testing.assert_allclose(slope, J_point[:, :, i], rtol=1e-3, atol=1e-2)
+
+
+def test_the_schur_complement_is_that_of_the_whole_normal_matrix() -> None:
+    """Against the dense normal equations of all unknowns, and zero for a move of everything."""
+    seen = ROOM.observations.select(np.flatnonzero(ROOM.observations.landmark_ids < 20))
+    ids, kinds = np.unique(seen.landmark_ids), np.arange(10)
+    config = SmootherConfig()
+    poses, points = ROOM.initial_poses, ROOM.initial_points[ids]
+    information, left = eliminate_points(seen, (kinds, poses), (ids, points), CAMERA, config)
+    column = np.searchsorted(ids, seen.landmark_ids)
+    r, J_pose, J_point = linearise(seen, poses[seen.keyframe_ids], points[column], CAMERA, config)
+    J = np.zeros((len(seen), 3, 60 + 3 * len(ids)))
+    for m in range(len(seen)):
+        k, j = 6 * int(seen.keyframe_ids[m]), 60 + 3 * int(column[m])
+        J[m, :, k : k + 6], J[m, :, j : j + 3] = J_pose[m], J_point[m]
+    J = J.reshape(-1, J.shape[2])
+    N, g = J.T @ J, J.T @ r.ravel()
+    solved = np.linalg.solve(N[60:, 60:], np.column_stack([N[60:, :60], g[60:]]))
+    scale = np.abs(N).max()
+    H = information.H.reshape(60, 60)
+    np.testing.assert_allclose(H, N[:60, :60] - N[:60, 60:] @ solved[:, :60], atol=1e-9 * scale)
+    np.testing.assert_allclose(information.g.ravel(), g[:60] - N[:60, 60:] @ solved[:, 60])
+    np.testing.assert_allclose(left.covariances[3], np.linalg.inv(N[69:72, 69:72]), rtol=1e-6)
+    together = adjoint(inverse(poses)).reshape(60, 6)
+    assert np.abs(H @ together).max() < 1e-7 * scale
+
+
+def test_two_keyframes_lose_nothing() -> None:
+    """Between two poses one relative pose is all there is to say: it is exact."""
+    room = make_room(keyframes=2, points=60, noise_px=0.5)
+    full, sparse = filled(room), filled(room)
+    before = full.optimise_batch()
+    full.update(GraphUpdate())
+    sparse.optimise_batch()
+    after = marginalise_landmarks(sparse, before.landmark_ids)
+    assert len(after.landmark_ids) == 0
+    assert after.factors == 2
+    assert np.abs(pose_differences(before, after)).max() < 1e-6
+    np.testing.assert_allclose(
+        sparse.marginal_covariance(1), full.marginal_covariance(1), rtol=0.02, atol=1e-12
+    )
+
+
+def test_what_retires_leaves_the_estimate_and_its_covariance() -> None:
+    """The poses stay where they were, and how sure they are of each other stays nearly."""
+    full, sparse = filled(), filled()
+    before = full.optimise_batch()
+    full.update(GraphUpdate())
+    sparse.optimise_batch()
+    after = marginalise_landmarks(sparse, before.landmark_ids[::2])
+    assert_isam_matches_tables(sparse)
+    assert len(after.landmark_ids) == len(before.landmark_ids) - len(before.landmark_ids[::2])
+    sigmas = [np.sqrt(np.diag(full.marginal_covariance(k))) for k in range(10)]
+    assert np.abs(pose_differences(before, after) / sigmas).max() < 0.1
+    for a, b in ((0, 1), (0, 5), (2, 9), (4, 6)):
+        ratio = relative_sigmas(sparse, a, b) / relative_sigmas(full, a, b)
+        assert (ratio > 0.5).all()
+        assert (ratio < 1.6).all()
+
+
+def test_a_graph_of_relative_poses_alone_is_honest() -> None:
+    """Everything retires in groups: the error is what the covariance says (NEES)."""
+    nees = []
+    for seed in range(8):
+        room = make_room(keyframes=10, points=80, noise_px=0.7, seed=seed)
+        smoother = filled(room)
+        for group in np.array_split(smoother.optimise_batch().landmark_ids, 3):
+            estimate = marginalise_landmarks(smoother, group)
+        assert len(estimate.landmark_ids) == 0
+        for k in (4, 9):
+            xi = se3_log(inverse(estimate.poses_world_camera[k]) @ room.poses_world_camera[k])
+            nees.append(xi @ np.linalg.solve(smoother.marginal_covariance(k), xi))
+    assert 6 * 0.3 < np.mean(nees) < 6 * 1.7
+
+
+def test_a_landmark_comes_back_with_its_summary() -> None:
+    """Its place is where it was; its old observations are not taken a second time."""
+    smoother = filled(until=6)
+    before = smoother.optimise_batch()
+    ids = before.landmark_ids[:40]
+    marginalise_landmarks(smoother, ids)
+    new = ROOM.update_of(6)
+    old = ROOM.update_of(5).observations
+    again = old.select(np.flatnonzero(np.isin(old.landmark_ids, ids)))
+    marginalised = np.flatnonzero(~_last_view(again.landmark_ids, 5, until=6))
+    repeated = again.select(marginalised)
+    seen = Observations(
+        *(
+            np.concatenate([getattr(new.observations, n), getattr(repeated, n)])
+            for n in ("keyframe_ids", "landmark_ids", "measurements", "sigmas_px")
+        )
+    )
+    back = np.union1d(new.landmark_ids, ids)
+    estimate = smoother.update(
+        replace(new, landmark_ids=back, points_world=np.zeros((len(back), 3)), observations=seen)
+    )
+    assert estimate.refused.count(RefusalReason.DUPLICATE) == len(repeated)
+    both, at, was = np.intersect1d(estimate.landmark_ids, before.landmark_ids, return_indices=True)
+    assert np.isin(ids, both).all()
+    moved_m = np.linalg.norm(estimate.points_world[at] - before.points_world[was], axis=1)
+    assert np.median(moved_m) < 0.01
+    assert_isam_matches_tables(smoother)
+
+
+def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
+    """Retired, come back, retired again: every observation is there once in the end."""
+    smoother, full = Smoother(CAMERA), Smoother(CAMERA)
+    estimate = None
+    for k, update in enumerate(ROOM.updates()):
+        full.update(update)
+        known = np.zeros(0, np.int64) if estimate is None else estimate.landmark_ids
+        away = known[known % 5 == k % 5]
+        seen = _without(update.observations, away)
+        back = np.setdiff1d(seen.landmark_ids, known)
+        estimate = smoother.update(
+            replace(
+                update,
+                landmark_ids=back,
+                points_world=ROOM.initial_points[back],
+                observations=seen,
+                marginalise_landmarks=away,
+            )
+        )
+        assert len(estimate.refused) == 0
+        assert_isam_matches_tables(smoother)
+    assert len(estimate.landmark_ids) < 150
+    assert set(smoother._tables.marginalised.returned) & set(estimate.landmark_ids.tolist())
+    kept = _pairs(full) - _pairs(smoother) - _archived(smoother)
+    assert all(j % 5 == k % 5 for k, j in kept)
+    sparse, expected = smoother.optimise_batch(), full.optimise_batch()
+    assert smoother._tables.marginalised.chunks == {}
+    assert _pairs(smoother) == _pairs(full) - kept
+    assert sparse.landmark_ids.tolist() == expected.landmark_ids.tolist()
+
+
+def test_a_removed_observation_leaves_its_group() -> None:
+    """An outlier among what retired is taken out afterwards: as if it had never been there."""
+    room = make_room(keyframes=2, points=80, noise_px=0.3)
+    seen = room.observations
+    bad = int(np.flatnonzero(seen.keyframe_ids == 1)[5])
+    measurements = seen.measurements.copy()
+    measurements[bad] += [9.0, -7.0, 9.0]
+    pair = np.array([[1, seen.landmark_ids[bad]]])
+    without = seen.select(np.delete(np.arange(len(seen)), bad))
+    spoiled = filled(replace(room, observations=replace(seen, measurements=measurements)))
+    clean = filled(replace(room, observations=without))
+    everything = np.arange(80)
+    for smoother in (spoiled, clean):
+        smoother.optimise_batch()
+        marginalise_landmarks(smoother, everything)
+    before = spoiled.update(GraphUpdate())
+    after = spoiled.update(GraphUpdate(remove_observations=pair))
+    assert_isam_matches_tables(spoiled)
+    expected = clean.update(GraphUpdate())
+    assert (1, int(pair[0, 1])) not in _archived(spoiled)
+    off = np.abs(pose_differences(before, expected)).max()
+    assert np.abs(pose_differences(after, expected)).max() < 0.3 * off
+
+
+@pytest.mark.parametrize("what", ["landmark", "keyframe"])
+def test_what_is_removed_leaves_the_archive_too(what: str) -> None:
+    smoother = filled()
+    estimate = smoother.optimise_batch()
+    marginalise_landmarks(smoother, estimate.landmark_ids[:100])
+    gone = estimate.landmark_ids[:30] if what == "landmark" else np.array([4, 9])
+    after = smoother.update(
+        GraphUpdate(remove_landmarks=gone)
+        if what == "landmark"
+        else GraphUpdate(remove_keyframes=gone)
+    )
+    assert_isam_matches_tables(smoother)
+    column = 1 if what == "landmark" else 0
+    assert not {pair[column] for pair in _archived(smoother)} & set(gone.tolist())
+    assert len(after.anchored_keyframes) == 0
+    assert not after.rebuilt
+    full = smoother.optimise_batch()
+    left = np.setdiff1d(estimate.landmark_ids, gone if what == "landmark" else [])
+    assert full.landmark_ids.tolist() == left.tolist()
+
+
+def test_a_saved_graph_keeps_its_archive(tmp_path: Path) -> None:
+    """Save, load, and go on: as if the smoother had restarted there."""
+    smoother = filled(until=7)
+    ids = smoother.optimise_batch().landmark_ids
+    marginalise_landmarks(smoother, ids[::2])
+    smoother.update(GraphUpdate(landmark_ids=ids[:10:2], points_world=np.zeros((5, 3))))
+    smoother.restart()
+    smoother.save(tmp_path / "graph")
+    loaded = Smoother.load(tmp_path / "graph")
+    assert _archived(loaded) == _archived(smoother)
+    for k in (7, 8, 9):
+        update = ROOM.update_of(k)
+        back = np.setdiff1d(update.observations.landmark_ids, smoother.estimate().landmark_ids)
+        update = replace(update, landmark_ids=back, points_world=ROOM.initial_points[back])
+        a, b = smoother.update(update), loaded.update(update)
+        assert np.array_equal(a.poses_world_camera, b.poses_world_camera)
+    a, b = smoother.optimise_batch(), loaded.optimise_batch()
+    assert a.factors == b.factors
+    np.testing.assert_allclose(a.poses_world_camera, b.poses_world_camera, atol=1e-9)
+
+
+def _without(seen: Observations, landmarks: Array) -> Observations:
+    return seen.select(np.flatnonzero(~np.isin(seen.landmark_ids, landmarks)))
+
+
+def _pairs(smoother: Smoother) -> set[tuple[int, int]]:
+    table = smoother._tables.observations
+    seen = table.select(table.used_rows())
+    return set(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))
+
+
+def _archived(smoother: Smoother) -> set[tuple[int, int]]:
+    return {
+        (int(k), int(j))
+        for chunk in smoother._tables.marginalised.chunks.values()
+        for k, j, again in zip(
+            chunk.observations.keyframe_ids,
+            chunk.observations.landmark_ids,
+            chunk.is_summary,
+            strict=True,
+        )
+        if not again
+    }
+
+
+def _last_view(landmarks: Array, keyframe: int, until: int) -> Array:
+    """Which of the landmarks no keyframe after this one, and before ``until``, saw."""
+    seen = ROOM.observations
+    later = seen.landmark_ids[(seen.keyframe_ids > keyframe) & (seen.keyframe_ids < until)]
+    return ~np.isin(landmarks, later)

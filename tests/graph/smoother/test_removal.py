@@ -1,0 +1,277 @@
+"""Removal by id: nothing else may change, nothing may be left underconstrained."""
+
+import numpy as np
+import pytest
+from graph_checks import assert_isam_matches_tables, assert_same_optimum, filled
+from synthetic_room import CAMERA, Room, make_room
+
+from bmask_slam.graph.factors.graph_update import (
+    GraphUpdate,
+    Observations,
+    RefusalReason,
+    RelativePose,
+    RemovalPolicy,
+)
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.smoother.smoother import Smoother
+
+ROOM = make_room(keyframes=8, points=80, noise_px=0.3)
+
+
+def test_a_landmark_goes_with_all_its_factors() -> None:
+    smoother = filled(ROOM)
+    before = smoother.estimate()
+    victims = before.landmark_ids[[3, 10]]
+    views = np.isin(ROOM.observations.landmark_ids, victims).sum()
+    after = smoother.update(GraphUpdate(remove_landmarks=victims))
+    assert after.factors == before.factors - views
+    np.testing.assert_array_equal(after.landmark_ids, np.setdiff1d(before.landmark_ids, victims))
+    assert not after.rebuilt
+    assert_isam_matches_tables(smoother)
+    assert_same_optimum(smoother, ROOM)
+
+
+def test_a_keyframe_goes_with_all_its_factors() -> None:
+    smoother = filled(ROOM)
+    before = smoother.estimate()
+    after = smoother.update(GraphUpdate(remove_keyframes=np.array([4])))
+    assert after.keyframe_ids.tolist() == [0, 1, 2, 3, 5, 6, 7]
+    assert after.factors == before.factors - (ROOM.observations.keyframe_ids == 4).sum()
+    assert not after.rebuilt
+    assert_isam_matches_tables(smoother)
+    assert_same_optimum(smoother, ROOM)
+
+
+def test_an_observation_goes_and_comes_again() -> None:
+    smoother = filled(ROOM)
+    before = smoother.estimate()
+    row = int(np.flatnonzero(seen_often(ROOM))[40])
+    seen = ROOM.observations.select(np.array([row]))
+    pair = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+    after = smoother.update(GraphUpdate(remove_observations=pair))
+    assert after.factors == before.factors - 1
+    assert_isam_matches_tables(smoother)
+    again = smoother.update(GraphUpdate(observations=seen))
+    assert again.factors == before.factors
+    assert len(again.refused) == 0
+    twice = smoother.update(GraphUpdate(observations=seen))
+    assert twice.refused.count(RefusalReason.DUPLICATE) == 1
+    assert_isam_matches_tables(smoother)
+    assert_same_optimum(smoother, ROOM)
+
+
+@pytest.mark.parametrize("in_one_update", [False, True])
+def test_an_id_is_used_again(in_one_update: bool) -> None:
+    """Landmark 5 becomes another point, keyframe 7 is made anew."""
+    smoother = filled(ROOM)
+    seen = ROOM.observations
+    rows = (seen.landmark_ids == 5) | (seen.keyframe_ids == 7)
+    assert rows.sum() > 20
+    removal = {"remove_landmarks": np.array([5]), "remove_keyframes": np.array([7])}
+    if not in_one_update:
+        smoother.update(GraphUpdate(**removal))
+        removal = {}
+    estimate = smoother.update(
+        GraphUpdate(
+            np.array([7]),
+            ROOM.initial_poses[[7]],
+            np.array([5]),
+            ROOM.points_world[[5]] + 0.05,
+            seen.select(rows),
+            **removal,
+        )
+    )
+    assert not estimate.rebuilt
+    assert len(estimate.refused) == 0
+    assert {5} <= set(estimate.landmark_ids.tolist())
+    assert_isam_matches_tables(smoother)
+    assert_same_optimum(smoother, ROOM)
+
+
+def test_many_random_removals_and_returns() -> None:
+    """Slots are used again and again and always hold what the shadow says."""
+    rng = np.random.default_rng(5)
+    smoother = filled(ROOM)
+    seen = ROOM.observations
+    pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+    for _ in range(15):
+        estimate = smoother.update(
+            GraphUpdate(
+                remove_landmarks=rng.choice(80, 3, replace=False),
+                remove_keyframes=rng.choice(np.arange(1, 8), rng.integers(0, 2)),
+                remove_observations=rng.permutation(pairs)[:20],
+            )
+        )
+        assert not estimate.rebuilt
+        assert_isam_matches_tables(smoother)
+        keyframes = np.setdiff1d(np.arange(8), estimate.keyframe_ids)
+        landmarks = rng.permutation(np.setdiff1d(np.arange(80), estimate.landmark_ids))[:6]
+        estimate = smoother.update(
+            GraphUpdate(
+                keyframes,
+                ROOM.poses_world_camera[keyframes],
+                landmarks,
+                ROOM.points_world[landmarks],
+                rng_select(rng, seen),
+            )
+        )
+        assert not estimate.rebuilt
+        assert_isam_matches_tables(smoother)
+    assert_same_optimum(smoother, ROOM)
+
+
+def rng_select(rng: np.random.Generator, seen: Observations) -> Observations:
+    return seen.select(np.sort(rng.permutation(len(seen))[: len(seen) // 2]))
+
+
+def seen_often(room: Room) -> np.ndarray:
+    """Mask of the observations whose landmark has four views or more."""
+    ids, views = np.unique(room.observations.landmark_ids, return_counts=True)
+    return np.isin(room.observations.landmark_ids, ids[views >= 4])
+
+
+def test_what_is_not_there_is_passed_over() -> None:
+    nothing = GraphUpdate(
+        remove_landmarks=np.array([99999]),
+        remove_keyframes=np.array([77]),
+        remove_observations=np.array([[0, 99999], [77, 1]]),
+        remove_relative_poses=((0, 1, "loop"),),
+    )
+    empty = Smoother(CAMERA).update(nothing)
+    assert len(empty.keyframe_ids) == 0
+    smoother = filled(ROOM)
+    before = smoother.estimate()
+    assert smoother.update(nothing).factors == before.factors
+
+
+def test_a_landmark_left_with_one_monocular_view_goes_too() -> None:
+    room = make_room(keyframes=8, points=80, noise_px=0.3, mono_share=1.0)
+    stereo = make_room(keyframes=8, points=80, noise_px=0.3)
+    smoother = filled(stereo)
+    new = np.arange(1000, 1080)
+    seen = room.observations
+    seen = Observations(
+        seen.keyframe_ids, 1000 + seen.landmark_ids, seen.measurements, seen.sigmas_px
+    )
+    smoother.update(
+        GraphUpdate(landmark_ids=new, points_world=room.points_world, observations=seen)
+    )
+    before = smoother.estimate()
+    victim = int(before.landmark_ids[before.landmark_ids >= 1000][0])
+    views = seen.keyframe_ids[seen.landmark_ids == victim]
+    assert len(views) >= 3
+    all_but_two = np.stack([views[:-2], np.full(len(views) - 2, victim)], axis=1)
+    kept = smoother.update(GraphUpdate(remove_observations=all_but_two))
+    assert victim in kept.landmark_ids
+    gone = smoother.update(GraphUpdate(remove_observations=np.array([[views[-2], victim]])))
+    assert gone.dropped_landmarks.tolist() == [victim]
+    assert not gone.rebuilt
+    assert_isam_matches_tables(smoother)
+
+
+def test_a_keyframe_that_loses_its_landmarks_is_held_where_it_was() -> None:
+    smoother = filled(ROOM)
+    before = smoother.estimate()
+    seen = ROOM.observations
+    mine = seen.landmark_ids[seen.keyframe_ids == 7]
+    pairs = np.stack([np.full(len(mine) - 2, 7), mine[:-2]], axis=1)
+    after = smoother.update(GraphUpdate(remove_observations=pairs))
+    assert not after.rebuilt
+    assert after.anchored_keyframes.tolist() == [7]
+    np.testing.assert_allclose(after.poses_world_camera[7], before.poses_world_camera[7], atol=0.1)
+    assert_isam_matches_tables(smoother)
+    sigma_m = np.sqrt(np.diag(smoother.marginal_covariance(7))[3:])
+    assert (sigma_m > 0.01).any()  # and it says how badly it is known
+
+
+def test_two_keyframes_that_hold_only_each_other_are_tied_to_the_rest() -> None:
+    """Each shares enough with the other; what both share with the rest leaves a turn open."""
+    smoother, seen = filled(ROOM), ROOM.observations
+    last_two = np.isin(seen.keyframe_ids, [6, 7])
+    inside = np.isin(seen.landmark_ids, seen.landmark_ids[~last_two])
+    both = np.intersect1d(*(seen.landmark_ids[seen.keyframe_ids == k] for k in (6, 7)))
+    shared = np.intersect1d(both, seen.landmark_ids[~last_two])
+    rest = ~last_two & np.isin(seen.landmark_ids, shared[2:])
+    strangers = last_two & inside & ~np.isin(seen.landmark_ids, shared)
+    leaving = seen.select(rest | strangers)
+    pairs = np.stack([leaving.keyframe_ids, leaving.landmark_ids], axis=1)
+    careful = GraphUpdate(remove_observations=pairs, removal_policy=RemovalPolicy.REFUSE)
+    refused = smoother.update(careful).removal.refused
+    assert refused.count(RefusalReason.KEYFRAME_UNDERCONSTRAINED) == 2
+    assert set(refused.keyframe_ids.tolist()) == {6, 7}
+    after = smoother.update(GraphUpdate(remove_observations=pairs))
+    assert not after.rebuilt
+    assert len(after.anchored_keyframes) == 1  # it carries the other
+    assert after.keyframe_ids.tolist() == list(range(8))
+    again = smoother.update(GraphUpdate(observations=leaving))
+    assert again.factors == len(seen) + 1  # the bridge has gone: the observations and the prior
+    assert_isam_matches_tables(smoother)
+
+
+def test_a_removal_that_would_take_the_only_prior_is_refused_with_that_reason() -> None:
+    smoother = filled(ROOM)
+    update = GraphUpdate(
+        remove_keyframes=np.array([0]),
+        remove_landmarks=np.array([5]),
+        removal_policy=RemovalPolicy.REFUSE,
+    )
+    before = smoother.estimate()
+    answer = smoother.update(update)
+    assert answer.removal.refused.count(RefusalReason.PART_UNFIXED) == 7
+    assert len(answer.removal.landmark_ids) == len(answer.removal.keyframe_ids) == 0
+    assert answer.factors == before.factors
+
+
+def test_the_world_stays_when_the_first_keyframe_goes() -> None:
+    smoother = filled(ROOM)
+    before = smoother.optimise_batch()
+    after = smoother.update(GraphUpdate(remove_keyframes=np.array([0])))
+    assert not after.rebuilt
+    assert after.anchored_keyframes.tolist() == [1]
+    difference = se3_log(inverse(after.poses_world_camera) @ before.poses_world_camera[1:])
+    assert np.abs(difference).max() < 0.01
+    np.testing.assert_allclose(after.poses_world_camera[0], before.poses_world_camera[1], atol=1e-3)
+
+
+def test_everything_goes_and_a_new_graph_starts() -> None:
+    smoother = filled(ROOM)
+    empty = smoother.update(GraphUpdate(remove_keyframes=np.arange(8)))
+    assert empty.factors == 0
+    assert len(empty.landmark_ids) == 0
+    for update in ROOM.updates():
+        estimate = smoother.update(update)
+    assert not estimate.rebuilt
+    assert estimate.keyframe_ids.tolist() == list(range(8))
+    assert_same_optimum(smoother, ROOM)
+
+
+@pytest.mark.parametrize(("robust", "wrong_by"), [(None, 0.03), ("cauchy", 0.5), ("dcs", 0.5)])
+def test_a_wrong_loop_goes_by_its_name(robust: str | None, wrong_by: float) -> None:
+    smoother = filled(ROOM)
+    right = smoother.optimise_batch()
+    covariance = 1e-6 * np.eye(6)
+    T_a_b = inverse(right.poses_world_camera[0]) @ right.poses_world_camera[7]
+    odometry = RelativePose(0, 7, T_a_b, covariance)
+    wrong = RelativePose(
+        0, 7, T_a_b @ se3_exp(np.full(6, wrong_by)), covariance, robust, kind="loop"
+    )
+    smoother.update(GraphUpdate(relative_poses=(wrong, odometry)))
+    bent = smoother.update(GraphUpdate())
+    bend_m = np.linalg.norm(bent.poses_world_camera[7] - right.poses_world_camera[7])
+    assert bend_m > 0.01 if robust is None else bend_m < 0.005
+    removed = smoother.update(GraphUpdate(remove_relative_poses=((0, 7, "loop"),)))
+    assert removed.factors == bent.factors - 1
+    found = smoother.optimise_batch()
+    np.testing.assert_allclose(found.poses_world_camera, right.poses_world_camera, atol=2e-3)
+
+
+def test_removal_in_the_first_update_after_a_restart() -> None:
+    """ISAM2 refuses a removal in its very first update; here it is only a smaller graph."""
+    smoother = filled(ROOM)
+    smoother.restart()
+    estimate = smoother.update(
+        GraphUpdate(remove_landmarks=np.array([5]), remove_keyframes=np.array([3]))
+    )
+    assert not estimate.rebuilt
+    assert 3 not in estimate.keyframe_ids
+    assert_isam_matches_tables(smoother)

@@ -1,0 +1,159 @@
+"""Random graphs and random removals: nothing breaks, and nothing else changes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from graph_checks import assert_isam_matches_tables, filled, pairs_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic_room import Room, make_room
+
+from bmask_slam.graph.factors.graph_update import (
+    NO_KEYFRAME,
+    NO_LANDMARK,
+    GraphEstimate,
+    GraphUpdate,
+    RemovalPolicy,
+)
+from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.smoother.anchoring import loose_in
+from bmask_slam.graph.smoother.smoother import Smoother
+
+FEW = settings(max_examples=20, deadline=None, derandomize=True)
+SEEDS = st.integers(0, 10_000)
+KINDS = st.sampled_from(["landmarks", "keyframes", "observations", "mask"])
+
+
+def random_room(seed: int) -> Room:
+    """A walk along which each landmark is seen from a few keyframes only, many without depth."""
+    rng = np.random.default_rng(seed)
+    room = make_room(
+        keyframes=int(rng.integers(5, 10)),
+        points=int(rng.integers(30, 70)),
+        noise_px=0.3,
+        mono_share=float(rng.choice([0.0, 0.5, 0.9])),
+        seed=seed,
+    )
+    seen, reach = room.observations, rng.integers(1, 4)
+    home = rng.integers(0, 10, len(room.points_world))[seen.landmark_ids]
+    return dataclasses.replace(
+        room, observations=seen.select(np.abs(home - seen.keyframe_ids) <= reach)
+    )
+
+
+def random_removal(smoother: Smoother, kind: str, seed: int) -> GraphUpdate:
+    """Some of what the graph holds: up to a third of it, or nearly all that a keyframe sees."""
+    rng, estimate = np.random.default_rng(seed), smoother.estimate()
+    pairs = np.array(sorted(pairs_of(smoother)), np.int64).reshape(-1, 2)
+    if kind == "landmarks":
+        return GraphUpdate(remove_landmarks=some(rng, estimate.landmark_ids, 3))
+    if kind == "keyframes":
+        return GraphUpdate(remove_keyframes=some(rng, estimate.keyframe_ids[1:], 3))
+    if kind == "observations":
+        return GraphUpdate(remove_observations=some(rng, pairs, 3))
+    mine = pairs[pairs[:, 0] == rng.choice(estimate.keyframe_ids)]
+    return GraphUpdate(remove_observations=mine[rng.random(len(mine)) < 0.9])
+
+
+def some(rng: np.random.Generator, items: np.ndarray, share: int) -> np.ndarray:
+    return rng.permutation(items)[: rng.integers(1, 2 + len(items) // share)]
+
+
+def asked(update: GraphUpdate, pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    """The observations that an update's removals name, directly or by a variable."""
+    landmarks, keyframes = set(update.remove_landmarks.tolist()), set(update.remove_keyframes)
+    single = set(map(tuple, update.remove_observations.tolist()))
+    return {(k, j) for k, j in pairs if k in keyframes or j in landmarks or (k, j) in single}
+
+
+def assert_only_this_left(
+    smoother: Smoother, update: GraphUpdate, before: GraphEstimate, pairs: set[tuple[int, int]]
+) -> GraphEstimate:
+    """Carry out a removal and compare what is left with what was asked and reported."""
+    after = smoother.update(update)
+    assert not after.rebuilt
+    assert_isam_matches_tables(smoother)
+    assert len(loose_in(smoother._tables, smoother._config)) == 0  # the look nearby missed none
+    dropped = set(after.dropped_landmarks.tolist())
+    wanted = asked(update, pairs)
+    assert pairs_of(smoother) == {(k, j) for k, j in pairs - wanted if j not in dropped}
+    gone = np.union1d(update.remove_landmarks, after.dropped_landmarks)
+    np.testing.assert_array_equal(after.landmark_ids, np.setdiff1d(before.landmark_ids, gone))
+    kept = np.setdiff1d(before.keyframe_ids, update.remove_keyframes)
+    np.testing.assert_array_equal(after.keyframe_ids, kept)
+    removal = after.removal
+    np.testing.assert_array_equal(removal.landmark_ids, np.sort(update.remove_landmarks))
+    np.testing.assert_array_equal(removal.keyframe_ids, np.sort(update.remove_keyframes))
+    assert set(map(tuple, removal.observations)) == set(map(tuple, update.remove_observations))
+    assert dropped.issubset({j for _, j in wanted})
+    return after
+
+
+@FEW
+@given(room=SEEDS, steps=st.lists(st.tuples(KINDS, SEEDS), min_size=1, max_size=4))
+def test_only_what_is_asked_for_or_reported_leaves(room: int, steps: list[tuple[str, int]]) -> None:
+    smoother = filled(random_room(room))
+    for kind, seed in steps:
+        before, pairs = smoother.estimate(), pairs_of(smoother)
+        update = random_removal(smoother, kind, seed)
+        assert_only_this_left(smoother, update, before, pairs)
+
+
+@FEW
+@given(room=SEEDS, kind=KINDS, seed=SEEDS)
+def test_a_refusal_names_just_what_would_have_been_dropped_or_held(
+    room: int, kind: str, seed: int
+) -> None:
+    smoother = filled(random_room(room))
+    before, pairs = smoother.estimate(), pairs_of(smoother)
+    update = random_removal(smoother, kind, seed)
+    careful = dataclasses.replace(update, removal_policy=RemovalPolicy.REFUSE)
+    answer = smoother.update(careful)
+    refused = answer.removal.refused
+    if not len(refused):
+        assert len(answer.dropped_landmarks) == len(answer.anchored_keyframes) == 0
+        assert pairs_of(smoother) == pairs - asked(update, pairs)
+        return
+    assert pairs_of(smoother) == pairs
+    assert answer.factors == before.factors
+    assert len(answer.removal.observations) == len(answer.removal.landmark_ids) == 0
+    carried_out = assert_only_this_left(smoother, update, before, pairs)
+    landmarks = refused.landmark_ids[refused.keyframe_ids == NO_KEYFRAME]
+    keyframes = refused.keyframe_ids[refused.landmark_ids == NO_LANDMARK]
+    np.testing.assert_array_equal(carried_out.dropped_landmarks, landmarks)
+    assert set(carried_out.anchored_keyframes.tolist()) <= set(keyframes.tolist())
+    assert bool(len(carried_out.anchored_keyframes)) == bool(len(keyframes))
+
+
+@FEW
+@given(room=SEEDS, kind=KINDS, seed=SEEDS)
+def test_what_leaves_and_comes_again_gives_the_same_optimum(
+    room: int, kind: str, seed: int
+) -> None:
+    made = random_room(room)
+    smoother = filled(made)
+    before, pairs = smoother.optimise_batch(), pairs_of(smoother)
+    update = random_removal(smoother, kind, seed)
+    after = smoother.update(update)
+    new_keyframes = np.setdiff1d(before.keyframe_ids, after.keyframe_ids)
+    new_landmarks = np.setdiff1d(before.landmark_ids, after.landmark_ids)
+    seen = made.observations
+    lost = pairs - pairs_of(smoother)
+    rows = [(k, j) in lost for k, j in zip(seen.keyframe_ids, seen.landmark_ids, strict=True)]
+    again = smoother.update(
+        GraphUpdate(
+            new_keyframes,
+            made.initial_poses[new_keyframes],
+            new_landmarks,
+            made.initial_points[new_landmarks],
+            seen.select(np.array(rows, bool)),
+        )
+    )
+    assert not again.rebuilt
+    assert pairs_of(smoother) == pairs
+    assert again.factors == before.factors, "a bridge or a prior stayed"
+    found = smoother.optimise_batch()
+    difference = se3_log(inverse(before.poses_world_camera) @ found.poses_world_camera)
+    assert np.abs(difference).max() < 1e-4

@@ -1,0 +1,164 @@
+"""A saved graph comes back whole, and nothing broken or foreign is half-loaded."""
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from repository import ROOT
+from synthetic_room import CAMERA, make_room
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.smoother.smoother import Smoother
+
+ROOM = make_room(keyframes=8, noise_px=0.4, mono_share=0.2)
+
+
+@pytest.fixture
+def smoother() -> Smoother:
+    smoother = Smoother(CAMERA)
+    for update in ROOM.updates()[:6]:
+        smoother.update(update)
+    poses = ROOM.poses_world_camera
+    loop = RelativePose(
+        0, 5, inverse(poses[0]) @ poses[5], 1e-4 * np.eye(6), robust="dcs", kind="loop"
+    )
+    smoother.update(
+        GraphUpdate(
+            relative_poses=(loop,),
+            remove_landmarks=np.array([4]),
+            remove_keyframes=np.array([2]),
+        )
+    )
+    return smoother
+
+
+def test_a_loaded_graph_is_the_saved_one(smoother: Smoother, tmp_path: Path) -> None:
+    smoother.save(tmp_path / "graph")
+    loaded = Smoother.load(tmp_path / "graph")
+    before, after = smoother.estimate(), loaded.estimate()
+    assert after.factors == before.factors
+    np.testing.assert_array_equal(after.keyframe_ids, before.keyframe_ids)
+    np.testing.assert_array_equal(after.poses_world_camera, before.poses_world_camera)
+    np.testing.assert_array_equal(after.landmark_ids, before.landmark_ids)
+    np.testing.assert_array_equal(after.points_world, before.points_world)
+    loaded.save(tmp_path / "again")
+    assert (tmp_path / "graph").read_bytes() == (tmp_path / "again").read_bytes()
+    assert sorted(os.listdir(tmp_path)) == ["again", "graph"]
+    first, second = smoother.optimise_batch(), loaded.optimise_batch()
+    np.testing.assert_array_equal(first.poses_world_camera, second.poses_world_camera)
+    assert first.cost_after == second.cost_after
+
+
+def test_a_loaded_run_goes_on_like_one_that_restarted_there(
+    smoother: Smoother, tmp_path: Path
+) -> None:
+    smoother.save(tmp_path / "graph")
+    smoother.restart()
+    loaded = Smoother.load(tmp_path / "graph")
+    rest = [*ROOM.updates()[6:], GraphUpdate(remove_landmarks=np.array([9]))]
+    for update in rest:
+        undisturbed, resumed = smoother.update(update), loaded.update(update)
+        np.testing.assert_array_equal(undisturbed.points_world, resumed.points_world)
+        np.testing.assert_array_equal(undisturbed.poses_world_camera, resumed.poses_world_camera)
+    assert undisturbed.keyframe_ids.tolist() == [0, 1, 3, 4, 5, 6, 7]
+
+
+def test_the_loop_can_still_be_removed_by_name(smoother: Smoother, tmp_path: Path) -> None:
+    smoother.save(tmp_path / "graph")
+    loaded = Smoother.load(tmp_path / "graph")
+    before = loaded.estimate().factors
+    after = loaded.update(GraphUpdate(remove_relative_poses=((0, 5, "loop"),)))
+    assert after.factors == before - 1
+
+
+def test_an_empty_graph_is_saved_too(tmp_path: Path) -> None:
+    Smoother(CAMERA).save(tmp_path / "graph")
+    loaded = Smoother.load(tmp_path / "graph")
+    for update in ROOM.updates():
+        estimate = loaded.update(update)
+    assert len(estimate.keyframe_ids) == 8
+
+
+@pytest.mark.parametrize("cut", [0, 10, 1000, -30])
+def test_a_damaged_file_is_refused_by_name(smoother: Smoother, tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "graph"
+    smoother.save(path)
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(InputError, match=str(path)):
+        Smoother.load(path)
+
+
+def test_missing_foreign_and_newer_files_are_refused(smoother: Smoother, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no saved graph"):
+        Smoother.load(tmp_path / "nowhere")
+    (tmp_path / "text").write_text("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1")
+    with pytest.raises(InputError, match="not a saved graph"):
+        Smoother.load(tmp_path / "text")
+    with pytest.raises(InputError, match="not a saved graph"):
+        np.savez(tmp_path / "other.npz", a=np.zeros(3))
+        Smoother.load(tmp_path / "other.npz")
+    arrays = saved_arrays(smoother, tmp_path)
+    header = json.loads(str(arrays["header"]))
+    arrays["header"] = np.array(json.dumps({**header, "version": 99}))
+    with pytest.raises(InputError, match="version 99"):
+        load(arrays, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "word"),
+    [
+        ("measurements", lambda a: a[:-1], "rows"),
+        ("points_world", lambda a: a[:, :2], "misshapen"),
+        ("landmark_ids", lambda a: a[::-1].copy(), "ascending"),
+        ("observation_landmark_ids", lambda a: a + 100000, "unknown id"),
+        ("pose_factor_keyframes", lambda a: a + 100000, "unknown id"),
+    ],
+)
+def test_contents_that_do_not_fit_together_are_refused(
+    smoother: Smoother, tmp_path: Path, name: str, spoil: object, word: str
+) -> None:
+    arrays = saved_arrays(smoother, tmp_path)
+    arrays[name] = spoil(arrays[name])
+    with pytest.raises(InputError, match=word):
+        load(arrays, tmp_path)
+
+
+def saved_arrays(smoother: Smoother, folder: Path) -> dict[str, np.ndarray]:
+    smoother.save(folder / "graph")
+    with np.load(folder / "graph") as file:
+        return {key: file[key] for key in file.files}
+
+
+def load(arrays: dict[str, np.ndarray], folder: Path) -> Smoother:
+    with (folder / "graph").open("wb") as file:
+        np.savez(file, **arrays)
+    return Smoother.load(folder / "graph")
+
+
+def test_a_folder_that_does_not_exist_is_an_input_error(smoother: Smoother, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written"):
+        smoother.save(tmp_path / "missing" / "graph")
+
+
+def test_updates_and_estimates_cross_a_process_border() -> None:
+    update = ROOM.update_of(1)
+    copy = pickle.loads(pickle.dumps(update))
+    np.testing.assert_array_equal(copy.observations.measurements, update.observations.measurements)
+    smoother = Smoother(CAMERA)
+    estimate = smoother.update(ROOM.update_of(0))
+    assert pickle.loads(pickle.dumps(estimate)).factors == estimate.factors
+
+
+def test_what_the_front_end_needs_imports_without_gtsam() -> None:
+    """Updates are made, checked and saved in numpy; another process need not load GTSAM."""
+    modules = "updates, shadow, gates, admission, support, pruning, storage, smoother_config"
+    code = f"import sys; from graph import {modules}; sys.exit('gtsam' in sys.modules)"
+    root = ROOT
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0

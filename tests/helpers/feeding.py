@@ -1,0 +1,24 @@
+"""Frames into a live system, at a rate that a map on a busy machine can follow."""
+
+from __future__ import annotations
+
+import time
+
+from bmask_slam.live.live_slam import LiveSlam
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.results import TrackingStatus
+
+PATIENCE_S = 2
+
+
+def factor_selection(slam: LiveSlam, frames: list[Frame], waiting: int = 1) -> list[TrackingStatus]:
+    """Track frames, each after the map has taken all keyframes but so many; their statuses."""
+    statuses = []
+    for frame in frames:
+        tracked = slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, name="a.png")
+        statuses.append(tracked.status)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while slam.health().keyframes_waiting > waiting and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+            slam.catch_up()
+    return statuses

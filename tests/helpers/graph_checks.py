@@ -1,0 +1,77 @@
+"""Checks of a smoother against its own shadow and against a graph made from scratch."""
+
+from __future__ import annotations
+
+import numpy as np
+from synthetic_room import CAMERA, Room
+
+from bmask_slam.graph.factors.graph_update import (
+    GraphEstimate,
+    GraphUpdate,
+    PosePrior,
+    RelativePose,
+)
+from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
+from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.smoother.smoother import Smoother
+
+
+def filled(room: Room) -> Smoother:
+    smoother = Smoother(CAMERA)
+    for update in room.updates():
+        smoother.update(update)
+    return smoother
+
+
+def from_scratch(smoother: Smoother, room: Room) -> GraphEstimate:
+    """The optimum of a new graph that is given what this one holds, from the room's truth."""
+    tables = smoother._tables
+    seen = tables.observations.select(tables.observations.all_rows())
+    factors = [f.factor for f in tables.pose_factors.values()]
+    fresh = Smoother(CAMERA)
+    fresh.update(
+        GraphUpdate(
+            tables.keyframes.ids,
+            room.poses_world_camera[tables.keyframes.ids],
+            tables.landmarks.ids,
+            room.points_world[tables.landmarks.ids],
+            seen,
+            priors=tuple(f for f in factors if isinstance(f, PosePrior)),
+            relative_poses=tuple(f for f in factors if isinstance(f, RelativePose)),
+        )
+    )
+    return fresh.optimise_batch()
+
+
+def assert_isam_matches_tables(smoother: Smoother) -> None:
+    """Every slot holds just the factor that the shadow believes to be there."""
+    tables, isam = smoother._tables, smoother._solver._isam
+    graph = isam.getFactorsUnsafe()
+    rows = tables.observations.all_rows()
+    seen = tables.observations.select(rows)
+    expected = dict(
+        zip(
+            tables.observations.slots(rows).tolist(),
+            zip(keyframe_keys(seen.keyframe_ids), landmark_keys(seen.landmark_ids), strict=True),
+            strict=True,
+        )
+    )
+    for factor in tables.pose_factors.values():
+        expected[factor.slot] = tuple(keyframe_keys(np.array(factor.keyframes)))
+    held = {i: tuple(graph.at(i).keys()) for i in range(graph.size()) if graph.exists(i)}
+    assert held == expected
+    assert len(expected) == len(rows) + len(tables.pose_factors)
+
+
+def assert_same_optimum(smoother: Smoother, room: Room) -> None:
+    expected, found = from_scratch(smoother, room), smoother.optimise_batch()
+    difference = se3_log(inverse(found.poses_world_camera) @ expected.poses_world_camera)
+    assert np.abs(difference).max() < 1e-5
+    np.testing.assert_allclose(found.points_world, expected.points_world, atol=1e-4)
+
+
+def pairs_of(smoother: Smoother) -> set[tuple[int, int]]:
+    """(keyframe, landmark) of every observation in the graph."""
+    table = smoother._tables.observations
+    seen = table.select(table.all_rows())
+    return set(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))

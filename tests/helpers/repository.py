@@ -1,0 +1,9 @@
+"""Where the checkout and the data for tests lie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+SHARED = ROOT.parent / "shared" / "data"
+KITCHEN = SHARED / "redkitchen"

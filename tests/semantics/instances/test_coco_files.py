@@ -1,0 +1,103 @@
+"""COCO files: what is read, what is left out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from repository import SHARED
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import read_coco
+
+SQUARE = [2.0, 3.0, 6.0, 3.0, 6.0, 9.0, 2.0, 9.0]
+
+
+def write(path: Path, annotations: list[Any]) -> Path:
+    content = {
+        "images": [{"id": 7, "file_name": "a.png", "height": 12, "width": 10}],
+        "categories": [{"id": 40, "name": "cup"}, {"id": 5, "name": "mouse"}],
+        "annotations": annotations,
+    }
+    path.write_text(json.dumps(content))
+    return path
+
+
+def annotation(**changes: Any) -> dict[str, Any]:
+    return {"id": 1, "image_id": 7, "category_id": 40, "segmentation": [SQUARE], **changes}
+
+
+def test_polygons_and_both_kinds_of_run_lengths(tmp_path: Path) -> None:
+    plain = {"size": [12, 10], "counts": [0, 12, 12, 24, 72]}  # columns 0, 2 and 3
+    objects = [annotation(), annotation(segmentation=plain, category_id=5, iscrowd=1)]
+    content = read_coco(write(tmp_path / "c.json", objects))
+    assert content.labels.names == ("background", "mouse", "cup")
+    assert content.category_ids == (0, 5, 40)
+    (image,) = content.images
+    polygon, runs = image.objects
+    assert (polygon.label, runs.label) == (2, 1)
+    expected = np.zeros((12, 10), bool)
+    expected[3:9, 2:6] = True
+    assert np.array_equal(polygon.mask(), expected)
+    assert polygon.box == (2, 3, 6, 9)
+    columns = np.zeros((12, 10), bool)
+    columns[:, [0, 2, 3]] = True
+    assert np.array_equal(runs.mask(), columns)
+    assert runs.crowd and not polygon.crowd
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"segmentation": []}, "no valid polygon"),
+        ({"segmentation": [[1, 2, 3, 4]]}, "no valid polygon"),
+        ({"segmentation": [[1, 2, 3, 4, float("nan"), 5]]}, "no valid polygon"),
+        ({"segmentation": [[50, 50, 60, 50, 60, 60]]}, "mask is empty"),
+        ({"segmentation": None}, "no segmentation"),
+        ({"segmentation": {"size": [9, 9], "counts": [81]}}, "size"),
+        ({"segmentation": {"size": [12, 10], "counts": [5, 6]}}, "do not add up to 120"),
+        ({"image_id": 99}, "image_id 99"),
+        ({"category_id": 1}, "category_id 1"),
+    ],
+)
+def test_a_broken_object_is_named_and_the_rest_is_used(
+    tmp_path: Path, change: dict[str, Any], words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write(tmp_path / "c.json", [annotation(id=3, **change), annotation()])
+    content = read_coco(path)
+    assert len(content.images[0].objects) == 1
+    assert len(content.problems) >= 1
+    assert "annotation 3" in content.problems[-1]
+    assert words in content.problems[-1]
+    assert "c.json" in caplog.text
+
+
+def test_the_good_polygons_of_an_object_are_used(tmp_path: Path) -> None:
+    path = write(tmp_path / "c.json", [annotation(segmentation=[SQUARE, [1, 2]])])
+    content = read_coco(path)
+    assert content.images[0].objects[0].mask().sum() == 24
+    assert "1 invalid polygons" in content.problems[0]
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", '{"images":[],"annotations":[],"categories":[]}']
+)
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "bad.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"bad\.json"):
+        read_coco(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_coco(tmp_path / "none.json")
+
+
+def test_the_real_excerpt() -> None:
+    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    assert len(content.images) == 355
+    assert len(content.labels) == 81
+    found = sum(len(image.objects) for image in content.images)
+    assert found + len(content.problems) >= 2919
+    assert found > 2900

@@ -1,0 +1,133 @@
+"""YOLOX boxes: decoding against the definition, and the real network on real photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from repository import SHARED
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.coco_files import read_coco
+from bmask_slam.semantics.instances.image_files import read_colour
+from bmask_slam.semantics.labels import label_set, read_label_set
+from bmask_slam.semantics.network.boxes import iou
+from bmask_slam.semantics.segmenters.yolox import (
+    STRIDES,
+    YoloxConfig,
+    YoloxDetector,
+    decode,
+    letterbox,
+    voted,
+)
+
+ONNX = SHARED / "weights" / "yolox_nano.onnx"
+
+
+def test_decoding_against_a_loop_over_cells() -> None:
+    rng = np.random.default_rng(0)
+    side = 64
+    cells = [(s, r, c) for s in STRIDES for r in range(side // s) for c in range(side // s)]
+    output = rng.uniform(0, 1, (len(cells), 7)).astype(np.float32)
+    boxes, probabilities = decode(output, side)
+    for k, (stride, row, column) in enumerate(cells):
+        x, y, w, h, objectness = output[k, :5]
+        u, v = (x + column) * stride, (y + row) * stride
+        half = np.array([np.exp(w), np.exp(h)]) * stride / 2
+        assert boxes[k] == pytest.approx([u - half[0], v - half[1], u + half[0], v + half[1]])
+        assert probabilities[k] == pytest.approx(objectness * output[k, 5:])
+
+
+def test_the_letterbox_keeps_proportions() -> None:
+    image = np.zeros((30, 60, 3), np.uint8)
+    image[..., 0] = 200  # red
+    blob, factor = letterbox(image, 416)
+    assert factor == pytest.approx(416 / 60)
+    assert blob.shape == (1, 3, 416, 416)
+    assert blob[0, :, 100, 100].tolist() == [0, 0, 200]  # blue first
+    assert blob[0, :, 300, 100].tolist() == [114, 114, 114]
+
+
+def test_the_real_network_finds_large_objects_in_real_photographs() -> None:
+    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    detector = YoloxDetector(ONNX, YoloxConfig(mirror=False))
+    hits = total = 0
+    for image in content.images[:12]:
+        pixels = read_colour(SHARED / "coco_excerpt" / "images" / image.file_name)
+        found = detector.detect(pixels, content.labels)
+        torch.testing.assert_close(found.distributions.sum(1), torch.ones(len(found.boxes)))
+        large = [o for o in image.objects if not o.crowd and o.mask().mean() > 0.05]
+        for o in large:
+            total += 1
+            same = (found.labels == o.label) & (found.scores > 0.3)
+            overlap = iou(torch.tensor([o.box]), found.boxes[same])
+            hits += bool((overlap > 0.6).any())
+    assert total > 10
+    assert hits / total > 0.6
+
+
+def test_a_kept_box_is_the_mean_of_those_of_its_class_that_lie_on_it() -> None:
+    boxes = torch.tensor([
+        [0.0, 0.0, 100.0, 100.0],
+        [0.0, 0.0, 110.0, 100.0],  # IoU 0.91 with the first
+        [0.0, 0.0, 100.0, 98.0],  # of another class
+        [0.0, 0.0, 100.0, 60.0],  # 0.6
+    ])  # fmt: skip
+    labels, scores = torch.tensor([1, 1, 2, 1]), torch.tensor([0.6, 0.2, 0.9, 0.5])
+    found = voted(boxes, scores, labels, torch.tensor([2, 0]), 0.8)
+    mean = 0.75 * boxes[0] + 0.25 * boxes[1]
+    torch.testing.assert_close(found, torch.stack([boxes[2], mean]))
+
+
+def test_with_the_mirror_image_a_mirrored_scene_has_the_mirrored_boxes() -> None:
+    detector = YoloxDetector(ONNX, YoloxConfig(min_score=0.2))
+    labels = read_label_set("coco")
+    image = read_colour(sorted((SHARED / "coco_excerpt" / "images").iterdir())[0])
+    one = detector.detect(image, labels)
+    other = detector.detect(np.ascontiguousarray(image[:, ::-1]), labels)
+    assert len(one.boxes) > 0
+    x1, y1, x2, y2 = other.boxes.unbind(1)
+    width = image.shape[1]
+    back = torch.stack([width - x2, y1, width - x1, y2], dim=1)
+    torch.testing.assert_close(back, one.boxes, atol=0.01, rtol=1e-4)
+    torch.testing.assert_close(other.scores, one.scores, atol=1e-4, rtol=1e-4)
+
+
+def test_a_second_input_size_finds_more_small_objects() -> None:
+    content = read_coco(SHARED / "coco_excerpt" / "instances.json")
+    one, both = (
+        YoloxDetector(ONNX, YoloxConfig(0.2, mirror=False, sizes_px=sizes))
+        for sizes in ((416,), (416, 640))
+    )
+    hits = {one: 0, both: 0}
+    for image in content.images[:8]:
+        pixels = read_colour(SHARED / "coco_excerpt" / "images" / image.file_name)
+        small = [o for o in image.objects if not o.crowd and o.mask().sum() < 48**2]
+        for detector in hits:
+            found = detector.detect(pixels, content.labels)
+            for o in small:
+                overlap = iou(torch.tensor([o.box]), found.boxes[found.labels == o.label])
+                hits[detector] += bool((overlap > 0.5).any())
+    assert hits[both] > hits[one]
+
+
+def test_only_classes_of_the_label_set_are_found() -> None:
+    detector = YoloxDetector(ONNX)
+    image = read_colour(sorted((SHARED / "coco_excerpt" / "images").iterdir())[0])
+    assert len(detector.detect(image, label_set(["drone"])).boxes) == 0
+    paper = read_label_set("paper")
+    assert paper.number("tv") == 18
+    assert set(detector.detect(image, paper).labels.tolist()) <= set(range(1, 24))
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.onnx"
+    bad.write_bytes(b"no network")
+    with pytest.raises(InputError, match="cannot read it as ONNX"):
+        YoloxDetector(bad)
+    with pytest.raises(InputError, match="no such file"):
+        YoloxDetector(tmp_path / "none.onnx")
+    with pytest.raises(InputError, match="not a YOLOX network"):
+        YoloxDetector(ONNX, YoloxConfig(sizes_px=(100,)))

@@ -1,0 +1,121 @@
+"""``bmask-slam train`` on a few real photographs, and transfer to another label set."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from repository import SHARED
+
+from bmask_slam.cli import main
+from bmask_slam.semantics.labels import label_set, read_label_set
+from bmask_slam.semantics.network.config import LIGHT, AnchorConfig
+from bmask_slam.semantics.network.model import MaskRCNN
+from bmask_slam.semantics.training.transfer import transferred
+from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, load_network
+
+
+@pytest.fixture
+def few(tmp_path: Path) -> Path:
+    """The first four photographs of the excerpt that show a person."""
+    content = json.loads((SHARED / "coco_excerpt" / "instances.json").read_text())
+    people = {a["image_id"] for a in content["annotations"] if a["category_id"] == 1}
+    chosen = sorted(people)[:4]
+    content["images"] = [i for i in content["images"] if i["id"] in chosen]
+    content["annotations"] = [a for a in content["annotations"] if a["image_id"] in chosen]
+    (tmp_path / "few.json").write_text(json.dumps(content))
+    return tmp_path / "few.json"
+
+
+def test_a_light_network_is_trained_and_trained_on(
+    few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = str(SHARED / "coco_excerpt" / "images")
+    command = ["train", "--data", str(few), "--images", images, "--labels", "paper", "--quiet"]
+    command += [
+        "--steps",
+        "2",
+        "--batch",
+        "1",
+        "--rois",
+        "objects",
+        "--only",
+        "masks",
+        "--freeze",
+        "backbone.body",
+    ]
+    body = str(SHARED / "weights" / "mobilenet_v2_imagenet_folded.pth")
+    out = tmp_path / "first"
+    assert main([*command, "--backbone", body, "--out", str(out)]) == 0
+    weights = Path(capsys.readouterr().out.strip())
+    assert weights == out / "weights.safetensors"
+    assert weights.stat().st_size < 25e6
+    network = load_network(weights)
+    assert network.labels == read_label_set("paper")
+    assert (out / "losses.png").stat().st_size > 1000
+    again = [*command, "--weights", str(weights), "--only", "maskiou", "--out", str(tmp_path / "b")]
+    assert main(again) == 0
+    second = load_network(tmp_path / "b" / "weights.safetensors")
+    kept = "roi_heads.mask_head.0.0.weight"
+    assert torch.equal(second.model.state_dict()[kept], network.model.state_dict()[kept])
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ([], "give --weights to start from, or --backbone"),
+        (["--held-out", "1.5"], "--held-out 1.5"),
+        (["--steps", "0"], "steps and batch must be at least 1"),
+        (["--weights", "none.pth"], "none.pth: no such file"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: list[str], words: str
+) -> None:
+    images = str(SHARED / "coco_excerpt" / "images")
+    out = tmp_path / "out"
+    command = ["train", "--data", str(few), "--images", images, "--out", str(out), "--quiet"]
+    assert main([*command, *extra]) == 1
+    assert words in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_transfer_keeps_the_rows_of_classes_that_both_know() -> None:
+    torch.manual_seed(0)
+    config = replace(LIGHT, classes=4, class_agnostic=False)
+    old = TrainedNetwork(MaskRCNN(config), label_set(["person", "boat", "cup"]))
+    new = transferred(old, label_set(["cup", "drone", "person"]))
+    before, after = old.model.state_dict(), new.model.state_dict()
+    assert new.model.config.classes == 4
+    layers = {"box_predictor.cls_score": 1, "box_predictor.bbox_pred": 4}
+    layers |= {"mask_predictor.mask_fcn_logits": 1, "maskiou_head.maskiou": 1}
+    for layer, each in layers.items():
+        for end in ("weight", "bias"):
+            was = before[f"roi_heads.{layer}.{end}"].unflatten(0, (4, each))
+            now = after[f"roi_heads.{layer}.{end}"].unflatten(0, (4, each))
+            assert torch.equal(now[[0, 1, 3]], was[[0, 3, 1]])
+            assert end == "bias" or not torch.equal(now[2], was[2])
+    assert torch.equal(after["rpn.head.cls_logits.weight"], before["rpn.head.cls_logits.weight"])
+
+
+def test_transfer_to_more_anchors_keeps_what_was_said_of_the_old_ones() -> None:
+    torch.manual_seed(0)
+    config = replace(LIGHT, classes=3, anchors=AnchorConfig())
+    old = TrainedNetwork(MaskRCNN(config).eval(), label_set(["person", "cup"]))
+    new = transferred(old, old.labels, LIGHT)
+    assert new.model.config == replace(LIGHT, classes=3)
+    levels = [torch.randn(1, LIGHT.channels, 4 >> k, 4 >> k) for k in range(2)]
+    with torch.no_grad():
+        heads = [network.model.rpn.head(levels) for network in (old, new)]
+    for before, after in zip(*heads, strict=True):
+        for a, b in zip(before, after, strict=True):
+            cells = b.unflatten(1, (-1, LIGHT.anchors.count))
+            kept = cells[:, :, : config.anchors.count].flatten(1, 2)
+            torch.testing.assert_close(kept, a)
+    assert torch.equal(
+        new.model.state_dict()["rpn.head.conv.0.0.weight"],
+        old.model.state_dict()["rpn.head.conv.0.0.weight"],
+    )

@@ -1,0 +1,374 @@
+"""What enters the graph, and how its answer comes back, with the real smoother in between."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_view import (
+    CAMERA,
+    add_keyframe,
+    make_features,
+    points_before,
+    random_descriptors,
+)
+
+from bmask_slam.back_end.factor_selection import (
+    FactorSelectionConfig,
+    FactorSelector,
+    observations_of,
+    quantised,
+    read_back,
+    stereo_measurements,
+)
+from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.world.world_map import WorldMap
+
+RNG = np.random.default_rng(21)
+COUNT = 60
+EVERYTHING = FactorSelectionConfig(max_observations=1000, min_views=2)
+
+
+def pose_of(k: int) -> Array:
+    """True poses: sideways, with a slight turn."""
+    return se3_exp(np.array([0.01 * k, -0.02 * k, 0.0, 0.05 * k, 0.01 * k, 0.02 * k]))
+
+
+def make_world(keyframes: int, count: int = COUNT) -> tuple[WorldMap, Array]:
+    """Keyframe k sees point i with keypoint i; landmark i is made by the first; exact."""
+    points = points_before(np.eye(4), count, RNG)
+    world = WorldMap()
+    for k in range(keyframes):
+        features = make_features(pose_of(k), points, random_descriptors(count, RNG))
+        keyframe = add_keyframe(world, pose_of(k), features)
+        rows = np.arange(count)
+        if k == 0:
+            world.make_landmarks(keyframe, rows, points)
+        else:
+            world.attach(keyframe, rows, rows)
+    return world, points
+
+
+def pairs(update: GraphUpdate) -> set[tuple[int, int]]:
+    """(keyframe, landmark) of every observation; none may be sent twice."""
+    seen = update.observations
+    sent = list(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))
+    assert len(sent) == len(set(sent))
+    return set(sent)
+
+
+def pairs_of(world: WorldMap) -> set[tuple[int, int]]:
+    return {(k.id, i) for k in world.keyframes.values() for i in world.observed(k)[1].tolist()}
+
+
+def estimate_of(world: WorldMap, landmark_ids: Array, T_correction: Array) -> GraphEstimate:
+    """The map as it is, moved rigidly, as the graph's answer with these landmarks."""
+    poses = np.array([k.T_world_camera for k in world.keyframes.values()])
+    return GraphEstimate(
+        np.array(list(world.keyframes)),
+        T_correction @ poses,
+        landmark_ids,
+        transform(T_correction, world.landmarks.points_world[landmark_ids]),
+    )
+
+
+def test_measurements_are_those_of_the_stereo_camera() -> None:
+    """With noise, too: u_right is the noisy u less the noisy disparity."""
+    points = points_before(np.eye(4), 20, RNG)
+    noise = RNG.normal(size=(20, 3)) * [0.7, 0.7, 0.12]
+    features = make_features(np.eye(4), points, random_descriptors(20, RNG), noise)
+    rows = np.array([3, 1, 7])
+    expected = CAMERA.project_stereo(points[rows])
+    expected += np.column_stack([noise[rows, :2], noise[rows, 0] - noise[rows, 2]])
+    np.testing.assert_allclose(stereo_measurements(features, rows), expected, atol=1e-9)
+    features.disparity_px[1] = np.nan
+    assert np.isnan(stereo_measurements(features, rows)[:, 2]).tolist() == [False, True, False]
+
+
+def test_quantised_sigmas_are_few_and_near() -> None:
+    sigmas = np.exp(RNG.uniform(np.log(0.1), np.log(5), (500, 3)))
+    rounded = quantised(sigmas)
+    assert np.abs(np.log2(rounded / sigmas)).max() <= 1 / 6 + 1e-12
+    assert len(np.unique(rounded)) <= 18
+    np.testing.assert_allclose(quantised(np.array([1.0, 0.5, 2.0])), [1.0, 0.5, 2.0])
+
+
+def test_observations_belong_to_their_keypoints() -> None:
+    world, points = make_world(2)
+    keyframe = world.keyframes[1]
+    seen = observations_of(keyframe, np.array([9, 4]), np.array([9, 4]))
+    assert seen.keyframe_ids.tolist() == [1, 1]
+    assert seen.landmark_ids.tolist() == [9, 4]
+    expected = CAMERA.project_stereo(transform(inverse(pose_of(1)), points[[9, 4]]))
+    np.testing.assert_allclose(seen.measurements, expected, atol=1e-9)
+
+
+def test_a_landmark_enters_with_its_second_view_and_all_views_so_far() -> None:
+    world, _ = make_world(1)
+    factor_selection = FactorSelector(EVERYTHING)
+    first = factor_selection.keyframe_update(world, world.keyframes[0])
+    assert len(first.landmark_ids) == 0
+    assert [p.keyframe_id for p in first.priors] == [0]
+    features = make_features(pose_of(1), world.landmarks.points_world, random_descriptors(60, RNG))
+    keyframe = add_keyframe(world, pose_of(1), features)
+    world.attach(keyframe, np.arange(10), np.arange(10))
+    second = factor_selection.keyframe_update(world, keyframe)
+    assert second.landmark_ids.tolist() == list(range(10))
+    assert pairs(second) == {(k, i) for k in (0, 1) for i in range(10)}
+    assert second.priors == ()
+    np.testing.assert_array_equal(second.points_world, world.landmarks.points_world[:10])
+
+
+def test_nothing_is_sent_twice_and_in_the_end_everything_is_sent() -> None:
+    """Landmarks that come and go, one keyframe after the other."""
+    world, points = WorldMap(), points_before(np.eye(4), COUNT, RNG)
+    factor_selection, sent = FactorSelector(EVERYTHING), set()
+    for k in range(6):
+        features = make_features(pose_of(k), points, random_descriptors(COUNT, RNG))
+        keyframe = add_keyframe(world, pose_of(k), features)
+        if k == 0:
+            world.make_landmarks(keyframe, np.arange(COUNT), points)
+        else:
+            rows = RNG.permutation(COUNT)[:35]
+            world.attach(keyframe, rows, rows)
+        update = factor_selection.keyframe_update(world, keyframe)
+        assert not sent & pairs(update)
+        sent |= pairs(update)
+    twice = np.flatnonzero(world.landmarks.observations >= 2)
+    assert sent == {(k, i) for k, i in pairs_of(world) if i in twice}
+
+
+def test_observations_in_keyframes_older_than_the_landmark_are_sent() -> None:
+    """A new landmark found again in an older neighbour has its second view there."""
+    world, _ = make_world(3, count=40)
+    factor_selection = FactorSelector(EVERYTHING)
+    for k in (0, 1, 2):
+        world.landmarks.in_graph[:] = True
+        factor_selection.keyframe_update(world, world.keyframes[k])
+    points = points_before(np.eye(4), 20, RNG)
+    old, new = (
+        add_keyframe(
+            world, pose_of(k), make_features(pose_of(k), points, random_descriptors(20, RNG))
+        )
+        for k in (3, 4)
+    )
+    ids = world.make_landmarks(new, np.arange(20), points)
+    world.attach(old, np.arange(20), ids)
+    update = factor_selection.keyframe_update(world, new)
+    assert update.landmark_ids.tolist() == ids.tolist()
+    assert pairs(update) == {(k, i) for k in (old.id, new.id) for i in ids.tolist()}
+
+
+def test_observations_older_than_an_heir_are_sent() -> None:
+    """The keyframe that made a landmark is culled; its heir is newer than another observer."""
+    world, _ = make_world(4, count=20)
+    world.remove_keyframe(world.keyframes[0], parent=world.keyframes[2])
+    update = FactorSelector(EVERYTHING).keyframe_update(world, world.keyframes[3])
+    assert pairs(update) == pairs_of(world)
+
+
+def test_the_cap_bounds_landmarks_and_spreads_them() -> None:
+    world, _ = make_world(3, count=400)
+    config = FactorSelectionConfig(max_observations=50, min_views=2, bucket_px=80)
+    update = FactorSelector(config).keyframe_update(world, world.keyframes[2])
+    assert len(update.landmark_ids) == 50
+    assert np.array_equal(np.flatnonzero(world.landmarks.in_graph), update.landmark_ids)
+    buckets = world.keyframes[2].features.image_pixels // 80
+    taken = {tuple(b) for b in buckets[update.landmark_ids].tolist()}
+    occupied = {tuple(b) for b in buckets.tolist()}
+    assert len(taken) == min(len(occupied), 50)
+
+
+def test_landmarks_in_the_graph_count_towards_the_cap() -> None:
+    world, _ = make_world(3, count=100)
+    world.landmarks.in_graph[:45] = True
+    config = FactorSelectionConfig(max_observations=50)
+    update = FactorSelector(config).keyframe_update(world, world.keyframes[2])
+    assert len(update.landmark_ids) == 5
+    assert {(2, i) for i in range(45)} <= pairs(update)
+
+
+def test_what_is_forgotten_is_removed_once() -> None:
+    world, _ = make_world(3)
+    factor_selection = FactorSelector(EVERYTHING)
+    factor_selection.forget_landmarks(np.array([4, 5]))
+    factor_selection.forget_landmarks(np.array([8]))
+    factor_selection.forget_keyframe(1)
+    update = factor_selection.keyframe_update(world, world.keyframes[2])
+    assert update.remove_landmarks.tolist() == [4, 5, 8]
+    assert update.remove_keyframes.tolist() == [1]
+    update = factor_selection.keyframe_update(world, world.keyframes[2])
+    assert len(update.remove_landmarks) == len(update.remove_keyframes) == 0
+
+
+def test_a_segments_first_keyframe_has_a_prior() -> None:
+    world, points = make_world(2)
+    features = make_features(np.eye(4), points, random_descriptors(COUNT, RNG))
+    T = se3_exp(RNG.normal(size=6))
+    keyframe = add_keyframe(world, T, features, segment=1)
+    (prior,) = FactorSelector(EVERYTHING).keyframe_update(world, keyframe).priors
+    assert prior.keyframe_id == keyframe.id
+    np.testing.assert_array_equal(prior.T_world_camera, T)
+
+
+def test_poses_and_points_are_read_back() -> None:
+    world, _ = make_world(3)
+    before = world.landmarks.points_world.copy()
+    T_correction = se3_exp(np.array([0.02, -0.01, 0.03, 0.1, -0.2, 0.05]))
+    world.landmarks.in_graph[:20] = True
+    inside = np.arange(0, 20)
+    read_back(world, estimate_of(world, inside, T_correction))
+    for k, keyframe in world.keyframes.items():
+        np.testing.assert_allclose(keyframe.T_world_camera, T_correction @ pose_of(k), atol=1e-12)
+    # those in the graph come from it, the others move with their host: both rigidly here
+    moved = transform(T_correction, before)
+    np.testing.assert_allclose(world.landmarks.points_world, moved, atol=1e-12)
+    assert np.flatnonzero(world.landmarks.in_graph).tolist() == inside.tolist()
+
+
+def test_landmarks_outside_follow_their_host_alone() -> None:
+    world, _ = make_world(2)
+    world.landmarks.host[30:] = 1
+    before = world.landmarks.points_world.copy()
+    estimate = estimate_of(world, np.zeros(0, np.int64), np.eye(4))
+    T_step = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.3, 0.0]))
+    estimate.poses_world_camera[1] = T_step @ estimate.poses_world_camera[1]
+    read_back(world, estimate)
+    np.testing.assert_array_equal(world.landmarks.points_world[:30], before[:30])
+    np.testing.assert_allclose(
+        world.landmarks.points_world[30:], transform(T_step, before[30:]), atol=1e-12
+    )
+
+
+def test_landmarks_that_the_graph_refused_follow_their_host_too() -> None:
+    """They were sent (in_graph is set) but the estimate does not hold them."""
+    world, _ = make_world(3)
+    before = world.landmarks.points_world.copy()
+    world.landmarks.in_graph[:] = True
+    T_correction = se3_exp(np.array([0.02, -0.01, 0.03, 0.1, -0.2, 0.05]))
+    read_back(world, estimate_of(world, np.arange(40), T_correction))
+    moved = transform(T_correction, before)
+    np.testing.assert_allclose(world.landmarks.points_world, moved, atol=1e-12)
+    assert np.flatnonzero(world.landmarks.in_graph).tolist() == list(range(40))
+
+
+def test_the_dead_stay_where_they_are() -> None:
+    world, _ = make_world(2)
+    world.landmarks.remove(np.array([3]))
+    before = world.landmarks.points_world[3].copy()
+    T_correction = se3_exp(np.array([0, 0, 0, 0.1, 0, 0]))
+    read_back(world, estimate_of(world, np.arange(COUNT), T_correction))
+    np.testing.assert_array_equal(world.landmarks.points_world[3], before)
+    assert not world.landmarks.in_graph[3]
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_the_smoother_brings_spoiled_poses_back(whole: bool) -> None:
+    """Map, feed, graph, read-back with exact measurements: the truth comes out."""
+    world, points = make_world(1)
+    factor_selection, smoother = FactorSelector(EVERYTHING), Smoother(CAMERA)
+    read_back(world, smoother.update(factor_selection.keyframe_update(world, world.keyframes[0])))
+    for k in range(1, 5):
+        features = make_features(pose_of(k), points, random_descriptors(COUNT, RNG))
+        spoiled = pose_of(k) @ se3_exp(RNG.normal(0, [0.003] * 3 + [0.01] * 3))
+        keyframe = add_keyframe(world, spoiled, features)
+        world.attach(keyframe, np.arange(COUNT), np.arange(COUNT))
+        estimate = smoother.update(factor_selection.keyframe_update(world, keyframe))
+        assert len(estimate.refused) == 0
+        read_back(world, estimate)
+    if whole:
+        smoother = Smoother(CAMERA)
+        estimate = smoother.update(factor_selection.whole_update(world))
+        assert estimate.landmark_ids.tolist() == list(range(COUNT))
+    read_back(world, smoother.optimise_batch())
+    for k, keyframe in world.keyframes.items():
+        assert np.abs(se3_log(inverse(pose_of(k)) @ keyframe.T_world_camera)).max() < 1e-4
+    np.testing.assert_allclose(world.landmarks.points_world, points, atol=1e-3)
+
+
+def windowed_world(config: FactorSelectionConfig) -> tuple[WorldMap, FactorSelector, Smoother]:
+    """Six keyframes of one wall, then three that share nothing with them, through the graph."""
+    world, points = make_world(0)
+    factor_selection, smoother = FactorSelector(config), Smoother(CAMERA)
+    walls = [(points, 6), (points_before(np.eye(4), COUNT, RNG), 3)]
+    for wall, (points, keyframes) in enumerate(walls):
+        T_away = se3_exp(np.array([0, 0, 0, 30.0 * wall, 0, 0]))
+        for k in range(keyframes):
+            T = T_away @ pose_of(k)
+            features = make_features(pose_of(k), points, random_descriptors(COUNT, RNG))
+            keyframe = add_keyframe(world, T, features)
+            ids = wall * COUNT + np.arange(COUNT)
+            if k == 0:
+                world.make_landmarks(keyframe, np.arange(COUNT), transform(T_away, points))
+            else:
+                world.attach(keyframe, np.arange(COUNT), ids)
+            keyframe.segment = wall
+            read_back(world, smoother.update(factor_selection.keyframe_update(world, keyframe)))
+    return world, factor_selection, smoother
+
+
+WINDOWED = FactorSelectionConfig(full_keyframes=0, window_keyframes=3, marginalise_batch=COUNT // 2)
+
+
+def test_a_small_map_keeps_every_landmark_in_the_graph() -> None:
+    world, _, smoother = windowed_world(replace(WINDOWED, full_keyframes=100))
+    assert world.landmarks.in_graph.all()
+    assert len(smoother.estimate().landmark_ids) == 2 * COUNT
+
+
+def test_two_batches_retire_at_once_at_most() -> None:
+    config = replace(WINDOWED, marginalise_batch=5)
+    world, factor_selection, _ = windowed_world(replace(config, full_keyframes=100))
+    factor_selection.config = config
+    features = make_features(pose_of(5), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
+    update = factor_selection.keyframe_update(world, add_keyframe(world, pose_of(5), features))
+    assert len(update.marginalise_landmarks) == 10
+
+
+def test_landmarks_outside_the_window_retire_and_come_back_when_seen() -> None:
+    world, factor_selection, smoother = windowed_world(WINDOWED)
+    old, new = np.arange(COUNT), COUNT + np.arange(COUNT)
+    assert not world.landmarks.in_graph[old].any()
+    assert world.landmarks.in_graph[new].all()
+    assert world.landmarks.alive.all()
+    assert smoother.estimate().landmark_ids.tolist() == new.tolist()
+    features = make_features(
+        pose_of(6), world.landmarks.points_world[old], random_descriptors(COUNT, RNG)
+    )
+    keyframe = add_keyframe(world, pose_of(6), features)
+    world.attach(keyframe, old, old)
+    update = factor_selection.keyframe_update(world, keyframe)
+    assert update.landmark_ids.tolist() == old.tolist()
+    assert pairs(update) == {(keyframe.id, i) for i in old.tolist()}
+    assert update.marginalise_landmarks.tolist() == new.tolist()
+    estimate = smoother.update(update)
+    assert len(estimate.refused) == 0
+    read_back(world, estimate)
+    error = se3_log(inverse(pose_of(6)) @ keyframe.T_world_camera)
+    assert np.abs(error).max() < 1e-6
+    assert world.landmarks.in_graph[old].all()
+
+
+def test_a_retired_landmark_that_is_given_observations_comes_back_at_once() -> None:
+    """As fusing does after a loop: what a newer landmark held, an old one now holds."""
+    world, factor_selection, _ = windowed_world(WINDOWED)
+    gone = world.replace_landmarks(np.array([COUNT + 3]), np.array([4]))
+    factor_selection.forget_landmarks(gone)
+    update = factor_selection.map_update(world)
+    assert update.landmark_ids.tolist() == [4]
+    assert pairs(update) == {(6, 4), (7, 4), (8, 4)}
+    assert world.landmarks.in_graph[4]
+
+
+def test_the_whole_map_holds_the_retired_landmarks_too() -> None:
+    world, factor_selection, _ = windowed_world(WINDOWED)
+    update = factor_selection.whole_update(world)
+    assert update.landmark_ids.tolist() == list(range(2 * COUNT))
+    assert pairs(update) == pairs_of(world)
+
+
+def test_no_window_keeps_every_landmark() -> None:
+    world, _, smoother = windowed_world(FactorSelectionConfig())
+    assert world.landmarks.in_graph.all()
+    assert smoother.estimate().landmark_ids.tolist() == list(range(2 * COUNT))

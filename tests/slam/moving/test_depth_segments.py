@@ -1,0 +1,165 @@
+"""A card before a wall and a floor, in part where space was free."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bmask_slam.moving.depth_segments import DepthSegmentConfig, depth_segments
+
+CONFIG = DepthSegmentConfig(step_px=8, least=3, share=0.2)
+
+
+def scene() -> np.ndarray:
+    """Metres: a wall at 4, a card at 2 whose foot stands on a floor that comes nearer."""
+    depth_m = np.full((240, 320), 4.0, np.float32)
+    depth_m[120:] = (4.0 * 120 / np.arange(120, 240))[:, None]
+    depth_m[40:216, 80:160] = 2.0
+    depth_m[:, 300:] = np.nan
+    return depth_m
+
+
+def free_in(rows: slice, columns: slice) -> np.ndarray:
+    """Verdicts of the samples: free space in a part of the image, a surface elsewhere."""
+    point_motions = np.ones((240, 320), np.int8)
+    point_motions[rows, columns] = -1
+    return point_motions[::8, ::8]
+
+
+def test_the_whole_card_moves_if_a_part_does_and_the_floor_stays() -> None:
+    regions = depth_segments(scene(), CONFIG)
+    moving = regions.moving(free_in(slice(40, 216), slice(80, 104)))
+    expected = np.zeros((240, 320), bool)
+    expected[40:210, 80:160] = True
+    assert np.array_equal(moving[:, :38], expected[::8, ::8][:, :38])
+    assert not moving[:, 38:].any()
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [
+        (slice(40, 56), slice(80, 88)),  # too few
+        (slice(40, 216), slice(80, 88)),  # too small a share
+        (slice(0, 120), slice(160, 300)),  # part of a region that fills half the image
+        (slice(0, 240), slice(300, 320)),  # where there is no depth
+    ],
+)
+def test_little_evidence_moves_nothing(rows: slice, columns: slice) -> None:
+    config = DepthSegmentConfig(step_px=8, least=3, share=0.2, largest=0.4)
+    assert not depth_segments(scene(), config).moving(free_in(rows, columns)).any()
+
+
+def test_keypoints_are_on_what_is_as_far_away_as_they_are() -> None:
+    regions = depth_segments(scene(), CONFIG)
+    moving = regions.moving(free_in(slice(40, 216), slice(80, 104)))
+    pixels = np.array([[120, 100], [163, 100], [163, 100], [163, 100], [200, 100], [75, 60.0]])
+    depth_m = np.array([2.0, 4.0, 2.0, np.nan, np.nan, 2.05])
+    found = regions.space(moving).on(pixels, depth_m)
+    assert found.tolist() == [True, False, True, True, False, True]
+
+
+@pytest.mark.parametrize("step", [2, 4])
+def test_every_few_pixels_are_covered_where_keypoints_there_are(step: int) -> None:
+    regions = depth_segments(scene(), CONFIG)
+    space = regions.space(regions.moving(free_in(slice(40, 216), slice(80, 104))))
+    few = scene()[::step, ::step]
+    rows, columns = np.indices(few.shape)
+    pixels = step * np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+    slow = space.on(pixels, few.ravel().astype(float)).reshape(few.shape)
+    np.testing.assert_array_equal(space.covers(few, step), slow)
+    assert slow[48 // step : 208 // step, 80 // step : 160 // step].all()
+    assert not slow[: 24 // step].any()
+
+
+def loaded(box_m: float = 1.9) -> np.ndarray:
+    """The scene, and beside the card a box whose side falls away from it, 8 % every 8 pixels."""
+    depth_m = scene()
+    depth_m[80:160, 160:224] = box_m * 1.08 ** (np.arange(64) // 8)
+    return depth_m
+
+
+def held(depth_m: np.ndarray, seen: np.ndarray, **config: float) -> np.ndarray:
+    """What the card holds, where views spoke of samples ``seen`` (30, 40) and nothing else."""
+    regions = depth_segments(depth_m, DepthSegmentConfig(step_px=8, **config))  # type: ignore[arg-type]
+    return regions.held(CARD, seen.astype(np.int8))
+
+
+BOX, CARD = np.zeros((2, 240, 320), bool)
+CARD[40:216, 80:160] = True
+BOX[80:160, 160:224] = True
+BOX, CARD = BOX[::8, ::8], CARD[::8, ::8]
+ROOM = ~BOX & ~CARD
+
+
+def test_what_moves_holds_what_it_touches_and_no_view_spoke_of() -> None:
+    np.testing.assert_array_equal(held(loaded(), ROOM), BOX)
+
+
+def test_what_was_seen_to_stand_is_not_held() -> None:
+    assert not held(loaded(), ROOM | BOX).any()
+    lower = BOX.copy()
+    lower[:15] = False
+    np.testing.assert_array_equal(held(loaded(), ROOM | lower), BOX & ~lower)
+
+
+def test_a_room_that_was_never_seen_is_not_held() -> None:
+    assert not held(loaded(), np.zeros((30, 40))).any()
+
+
+@pytest.mark.parametrize(
+    ("box_m", "config"),
+    [
+        (2.6, {}),  # far behind the card
+        (1.9, {"load": 0.1}),  # too much for who holds it
+        (1.9, {"held_jump": 0.05}),  # in pieces
+        (1.9, {"largest": 0.15}),  # no single thing any more
+    ],
+)
+def test_not_everything_is_held(box_m: float, config: dict[str, float]) -> None:
+    assert held(loaded(box_m), ROOM, **config).sum() < 0.15 * BOX.sum()
+
+
+def test_regions_are_those_of_a_flood_fill() -> None:
+    rng = np.random.default_rng(3)
+    depth_m = rng.choice([1.0, 1.02, 1.5, np.nan], (30, 40)).astype(np.float32)
+    regions = depth_segments(depth_m, DepthSegmentConfig(step_px=1, jump=0.03))
+    labels = regions.labels
+    assert np.array_equal(labels > 0, np.isfinite(depth_m))
+    for (i, j), d in np.ndenumerate(depth_m):
+        for k, m in ((i + 1, j), (i, j + 1)):
+            if k < 30 and m < 40 and np.isfinite(d) and np.isfinite(depth_m[k, m]):
+                linked = abs(d - depth_m[k, m]) < 0.03
+                assert not linked or labels[i, j] == labels[k, m]
+    for label in range(1, labels.max() + 1):
+        assert reached(labels == label, depth_m) == (labels == label).sum()
+
+
+def reached(region: np.ndarray, depth_m: np.ndarray) -> int:
+    """How many pixels of a region its first one reaches by steps of less than the jump."""
+    todo, seen = [tuple(np.argwhere(region)[0])], set()
+    while todo:
+        i, j = todo.pop()
+        if (i, j) in seen:
+            continue
+        seen.add((i, j))
+        for k, m in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+            inside = 0 <= k < region.shape[0] and 0 <= m < region.shape[1]
+            if inside and region[k, m] and abs(depth_m[i, j] - depth_m[k, m]) < 0.03 * 1.5:
+                todo.append((k, m))
+    return len(seen)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"step_px": 0},
+        {"jump": 0.0},
+        {"share": 0.0},
+        {"largest": 2.0},
+        {"held_jump": 0.0},
+        {"load": -1.0},
+    ],
+)
+def test_bad_configuration_is_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        DepthSegmentConfig(**bad)  # type: ignore[arg-type]

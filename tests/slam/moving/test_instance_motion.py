@@ -1,0 +1,67 @@
+"""What a keyframe's masks and views tell of its instances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import Array, se3_exp, transform
+from bmask_slam.moving.free_space_check import FreeSpaceCheck, FreeSpaceCheckConfig
+from bmask_slam.moving.instance_motion import InstanceMotion
+from bmask_slam.moving.keyframe_masks import KeyframeMasks
+from bmask_slam.semantics.beliefs.movability import read_priors
+from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.tracks.instance_track import Track
+
+CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+NAMES = label_set(("person",))
+POSE = se3_exp(np.array([0.1, -0.4, 0.2, 0.3, -0.2, 0.5]))
+SIZE = (CAMERA.height, CAMERA.width)
+
+
+def instance_motion() -> InstanceMotion:
+    check = FreeSpaceCheck(CAMERA, 0.1, FreeSpaceCheckConfig())
+    return InstanceMotion(CAMERA, check, read_priors("movability"), 2.0, 20)
+
+
+def masks(depth_m: NDArray[np.float32]) -> KeyframeMasks:
+    """Of a keyframe with every fourth pixel of that depth each way, and no instance."""
+    assignment = assign_pixels([], depth_m, SIZE, VoteConfig())
+    none = np.zeros(0, np.int64)
+    return KeyframeMasks(3, NAMES, assignment, depth_m, POSE, none, none, np.zeros((0, 2)))
+
+
+def track(centre: Array) -> Track:
+    """Of a thing half a metre deep, whose middle is there in the camera's frame."""
+    (mean,) = transform(POSE, np.array([centre]))
+    half_size, distribution = np.array([0.3, 0.9, 0.25]), np.array([0, 1], np.float32)
+    state = np.r_[mean, 0, 0, 0], np.eye(6)
+    return Track(0, 0.0, *state, half_size, distribution, 3.0, 0.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("centre", "there_m", "shown"),
+    [
+        ((0.5, 0.2, 2.0), 2.0, True),
+        ((0.5, 0.2, 2.0), 4.0, True),
+        ((0.5, 0.2, 2.0), 1.6, False),
+        ((0.5, 0.2, 2.0), np.nan, False),
+        ((1.4, 0.2, 2.0), 4.0, False),
+        ((0.5, 0.2, -2.0), 4.0, False),
+    ],
+)
+def test_a_keyframe_shows_a_place_that_nothing_hides(
+    centre: tuple[float, float, float], there_m: float, shown: bool
+) -> None:
+    depth_m = np.full((120, 160), 4.0, np.float32)
+    column, row = CAMERA.project(np.array([[0.5, 0.2, 2.0]]))[0] / 4
+    depth_m[int(row) - 1 : int(row) + 2, int(column) - 1 : int(column) + 2] = there_m
+    assert instance_motion().shows(masks(depth_m), track(np.array(centre))) is shown
+
+
+def test_of_a_view_without_depth_nothing_is_shown() -> None:
+    seen = masks(np.full((120, 160), np.nan, np.float32))
+    assert not instance_motion().shows(seen, track(np.array([0.0, 0.0, 2.0])))

@@ -1,0 +1,212 @@
+"""A saved map: another recording goes on from it, or is only localised in it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fake_run import FakeSystem, make_sequence
+from repository import KITCHEN
+from synthetic_view import CAMERA, render_plane
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import Arrays, read_arrays, write_arrays
+from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.offline.map_localisation import MapLocalisation
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.run_folder.folder import FILES
+from bmask_slam.run_folder.map_file import MAP_FILE, read_map, write_map
+from bmask_slam.system import SlamSystem
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
+
+
+def sideways(count: int, start_x_m: float, step_m: float = 0.03) -> list[Array]:
+    """Poses along the plane, looking at it."""
+    return [se3_exp(np.array([0, 0, 0, start_x_m + step_m * i, 0, 0])) for i in range(count)]
+
+
+def factor_selection(system: SlamSystem, poses: list[Array], first: int = 0) -> list[FrameResult]:
+    return [system.process(render_plane(pose, first + i)) for i, pose in enumerate(poses)]
+
+
+@pytest.fixture(scope="module")
+def state() -> Arrays:
+    """The map of a plane from x = -1.6 m to -1.
+
+    Its frames begin at stamp 0, as those of every other session here do.
+    """
+    system = SlamSystem(CAMERA)
+    factor_selection(system, sideways(20, -1.6))
+    system.finish()
+    return system.state()
+
+
+def started(state: Arrays, make: type[SlamSystem] = SlamSystem) -> SlamSystem:
+    system = make(CAMERA)
+    system.restore({name: array.copy() for name, array in state.items()}, Path("map"))
+    system.begin_session()
+    return system
+
+
+def largest_error_m(results: list[FrameResult], poses: list[Array]) -> float:
+    """Of the frames as the map sees them, whose world is the camera at x = -1.6 m."""
+    T_map_plane = inverse(sideways(1, -1.6)[0])
+    offsets = [
+        se3_log(inverse(T_map_plane @ T) @ r.T_world_camera)[3:]
+        for T, r in zip(poses, results, strict=True)
+    ]
+    return float(np.linalg.norm(offsets, axis=1).max())
+
+
+def test_a_second_session_goes_on_in_the_frame_of_the_map(state: Arrays) -> None:
+    system, poses = started(state), sideways(30, -1.3, 0.05)
+    results = factor_selection(system, poses)  # most of it beyond what the map knows
+    system.finish()
+    assert {r.segment for r in results} == {0}
+    assert {r.status for r in results} == {TrackingStatus.OK}
+    assert largest_error_m(results, poses) < 0.005
+    assert len(system.trajectory()) == 30  # of this session alone
+    made = [r.keyframe_id for r in results if r.keyframe_id is not None]
+    assert len(system.keyframe_trajectory()) == len(made) >= 1
+    assert min(made) == int(state["mapper.world.next_keyframe_id"])
+    assert {0, *made} <= set(system.mapper.world.keyframes)
+
+
+def test_what_is_not_recognised_is_a_segment_until_it_is(state: Arrays, caplog) -> None:
+    system, poses = started(state), sideways(46, 1.5, -0.06)
+    results = factor_selection(system, poses[:10])
+    assert {r.segment for r in results} == {1}
+    assert {r.status for r in results} == {TrackingStatus.OK}
+    apart = started(system.state())  # and a third session knows both
+    assert sorted({k.segment for k in apart.mapper.world.keyframes.values()}) == [0, 1]
+    results += factor_selection(system, poses[10:], first=10)
+    assert results[-1].segment == 0
+    system.finish()
+    assert "never recognised" not in caplog.text
+    assert len(system.trajectory()) == len(results)
+    assert largest_error_m(results[-1:], poses[-1:]) < 0.02
+
+
+def test_a_session_elsewhere_says_that_it_has_a_frame_of_its_own(state: Arrays, caplog) -> None:
+    system = started(state)
+    factor_selection(system, sideways(6, 1.5))
+    system.finish()
+    assert "never recognised in the map: the trajectory has a frame of its own" in caplog.text
+
+
+def test_localisation_finds_every_frame_and_changes_nothing(state: Arrays) -> None:
+    system = started(state, MapLocalisation)
+    poses = sideways(12, -1.55, 0.045)
+    results = factor_selection(system, poses)
+    system.finish()
+    assert {r.status for r in results} == {TrackingStatus.OK}
+    assert largest_error_m(results, poses) < 0.005
+    assert {r.keyframe_id for r in results} == {None}
+    poses_of_map = part_of_state(system.state())
+    for name, array in part_of_state(state).items():
+        np.testing.assert_array_equal(array, poses_of_map[name])
+    assert system.files() == {}
+    assert len(system.trajectory()) == 12
+    assert len(system.keyframe_trajectory()) == 0
+
+
+def part_of_state(state: Arrays) -> Arrays:
+    """The map proper: not how often landmarks were looked for."""
+    counters = ("visible", "found")
+    kept = ("mapper.world", "mapper.graph")
+    return {k: a for k, a in state.items() if k.startswith(kept) and not k.endswith(counters)}
+
+
+def test_localisation_elsewhere_is_lost_and_says_so(state: Arrays) -> None:
+    system = started(state, MapLocalisation)
+    poses = [*sideways(3, 1.6), *sideways(5, -1.4)]
+    results = factor_selection(system, poses)
+    assert [r.status for r in results] == [TrackingStatus.LOST] * 3 + [TrackingStatus.OK] * 5
+    assert [r.T_world_camera is None for r in results] == [True] * 3 + [False] * 5
+    assert len(system.trajectory()) == 5
+    assert largest_error_m(results[3:], poses[3:]) < 0.005
+
+
+def test_a_map_is_read_back_from_file_and_folder(state: Arrays, tmp_path: Path) -> None:
+    write_map(tmp_path / "map", state, CAMERA)
+    for path in (tmp_path, tmp_path / "map"):
+        found, camera = read_map(path)
+        assert camera == CAMERA
+        assert all(found[name].tobytes() == array.tobytes() for name, array in state.items())
+
+
+def test_maps_that_are_none_are_refused(state: Arrays, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"map: there is no saved map here"):
+        read_map(tmp_path)
+    write_map(tmp_path / "map", SlamSystem(CAMERA).state(), CAMERA)
+    with pytest.raises(InputError, match=r"map: holds no keyframe"):
+        read_map(tmp_path)
+    write_map(tmp_path / "map", state, CAMERA)
+    header, arrays = read_arrays(tmp_path / "map", MAP_FILE)
+    write_arrays(tmp_path / "newer", replace(MAP_FILE, version=7), header, arrays)
+    with pytest.raises(InputError, match=r"newer: holds 'bmask-slam map' version \d, expected"):
+        read_map(tmp_path / "newer")
+    del arrays["mapper.feed.removed"]
+    with pytest.raises(InputError, match=r"map: array 'mapper.feed.removed' is missing"):
+        SlamSystem(CAMERA).restore(arrays, tmp_path / "map")
+
+
+def test_a_map_of_another_camera_is_not_continued(state: Arrays, tmp_path: Path) -> None:
+    write_map(tmp_path / "map", state, CAMERA)
+    options = RunOptions(make_sequence(tmp_path / "seq"), out=tmp_path / "out", quiet=True)
+    with pytest.raises(InputError, match=r"map: made with Camera.* \(--localise takes any\)"):
+        run(replace(options, map=tmp_path / "map"), FakeSystem)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("other", "flag"),
+    [("map", "continue"), ("dense", "map"), ("checkpoint_every", "checkpoint-every")],
+)
+def test_localisation_excludes_what_learns(other: str, flag: str) -> None:
+    with pytest.raises(InputError, match=f"--localise m: learns nothing that --{flag} could"):
+        RunOptions(Path("x"), localise=Path("m"), **{other: 7})
+
+
+def cut_out(folder: Path, frames: range, margin_px: int = 0) -> Path:
+    """Some frames of the kitchen as a sequence, seen by a camera with a smaller image."""
+    inside = slice(margin_px, -margin_px or None)
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+        lines = (KITCHEN / f"{kind}.txt").read_text().splitlines()[1:]  # without the comment
+        (folder / f"{kind}.txt").write_text("\n".join(lines[i] for i in frames) + "\n")
+        for name in (lines[i].split()[1] for i in frames):
+            image = cv2.imread(str(KITCHEN / name), cv2.IMREAD_UNCHANGED)[inside, inside]
+            cv2.imwrite(str(folder / name), image, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    camera = (KITCHEN / "camera.yaml").read_text()
+    for old, new in (("640", 640), ("480", 480), ("321.42", 321.42), ("237.05", 237.05)):
+        less = margin_px * (2 if isinstance(new, int) else 1)
+        camera = camera.replace(f" {old}\n", f" {new - less}\n")
+    (folder / "camera.yaml").write_text(camera)
+    (folder / "groundtruth.txt").symlink_to(KITCHEN / "groundtruth.txt")
+    return folder
+
+
+@pytest.mark.skipif(not KITCHEN.is_dir(), reason="no ../shared/data/redkitchen here")
+def test_real_frames_go_on_and_are_localised_in_one_frame(tmp_path: Path) -> None:
+    first = cut_out(tmp_path / "first", range(36))
+    run(RunOptions(first, out=tmp_path / "old", quiet=True))
+    saved = (tmp_path / "old/map").read_bytes()
+    second = cut_out(tmp_path / "second", range(30, 54))
+    run(RunOptions(second, out=tmp_path / "new", map=tmp_path / "old", quiet=True))
+    small = cut_out(tmp_path / "small", range(3, 33, 3), margin_px=40)
+    run(RunOptions(small, out=tmp_path / "found", localise=tmp_path / "old/map", quiet=True))
+    truth = read_tum(KITCHEN / "groundtruth.txt")
+    start = inverse(truth.poses_world_camera[0])
+    for name, stamps in (("new", second), ("found", small)):
+        found = read_tum(tmp_path / name / "trajectory.txt")
+        index = np.rint(found.timestamps_s * 30).astype(int)
+        assert len(found) == len((stamps / "rgb.txt").read_text().splitlines())
+        error = inverse(start @ truth.poses_world_camera[index]) @ found.poses_world_camera
+        assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 0.05  # no alignment: one frame
+    assert (tmp_path / "old/map").read_bytes() == saved
+    assert {p.name for p in (tmp_path / "found").iterdir()} == {*FILES} - {"map", "graph"}

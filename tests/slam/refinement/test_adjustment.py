@@ -1,0 +1,214 @@
+"""``bmask-slam optimise RUN``: frames carried along exactly, a real run made no worse."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from repository import KITCHEN
+
+from bmask_slam import cli
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import part
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
+from bmask_slam.graph.smoother.storage import read_graph, write_graph
+from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.refinement.adjustment import carry_along
+from bmask_slam.run_folder.map_file import read_map
+from bmask_slam.run_folder.saved_run import read_run
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.world.map_state import world_of
+
+
+def random_poses(count: int, seed: int) -> np.ndarray:
+    return se3_exp(np.random.default_rng(seed).normal(size=(count, 6)))
+
+
+# --- frames between keyframes ---------------------------------------------------------------------
+
+
+def test_frames_move_with_the_world_when_all_keyframes_do() -> None:
+    poses, T = random_poses(7, 0), random_poses(1, 1)[0]
+    frames = Trajectory(np.arange(7.0), poses)
+    carried = carry_along(frames, np.array([1.0, 4.0]), poses[[1, 4]], T @ poses[[1, 4]])
+    np.testing.assert_allclose(carried.poses_world_camera, T @ poses, atol=1e-12)
+
+
+def test_a_keyframes_frame_follows_it_and_those_between_share() -> None:
+    """Two keyframes turn about their own centres and shift; the frame halfway gets the half."""
+    poses = make_pose(np.eye(3), np.arange(5.0)[:, None] * [1.0, 0, 0])
+    turn = so3_exp(np.array([0, 0.2, 0]))
+    after = np.stack([poses[1], make_pose(turn, poses[3, :3, 3] + [0, 0.4, 0])])
+    carried = carry_along(
+        Trajectory(np.arange(5.0), poses), np.array([1, 3.0]), poses[[1, 3]], after
+    )
+    T = carried.poses_world_camera
+    np.testing.assert_allclose(T[:2], poses[:2], atol=1e-12)  # rigid with the first keyframe
+    np.testing.assert_allclose(T[3], after[1], atol=1e-12)
+    np.testing.assert_allclose(T[4], after[1] @ inverse(poses[3]) @ poses[4], atol=1e-12)
+    np.testing.assert_allclose(T[2, :3, :3], so3_exp(np.array([0, 0.1, 0])), atol=1e-12)
+    by_second = after[1] @ inverse(poses[3]) @ poses[2]
+    assert 0.45 < T[2, 1, 3] / by_second[1, 3] < 0.55
+
+
+def test_keyframes_of_other_trajectories_have_no_say() -> None:
+    poses, moved = random_poses(4, 2), random_poses(3, 3)
+    stamps_s = np.array([1.0, np.nan, 2.5])  # of this run, of another one, of another segment
+    before = np.stack([poses[1], poses[0], poses[2]])
+    frames = Trajectory(np.arange(4.0), poses)
+    carried = carry_along(frames, stamps_s, before, moved)
+    expected = moved[0] @ inverse(poses[1]) @ poses
+    np.testing.assert_allclose(carried.poses_world_camera, expected, atol=1e-12)
+    assert carry_along(frames, stamps_s[1:], before[1:], moved[1:]) is frames
+
+
+# --- a real run -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over a part of the red kitchen, without the adjustment that ends a run."""
+    out = tmp_path_factory.mktemp("runs") / "kitchen"
+    config = SystemConfig(final_adjustment=False)
+    return run(RunOptions(KITCHEN, config, out=out, max_frames=60, stride=2, quiet=True)).folder
+
+
+def optimise(*words: object) -> int:
+    return cli.main(["optimise", *(str(word) for word in words)])
+
+
+def value(run_folder: Path, name: str) -> float:
+    rows = json.loads((run_folder / "metrics.json").read_text())
+    return {row["name"]: row["value"] for row in rows}[name]
+
+
+def test_a_run_folder_becomes_a_better_one(capsys, kitchen: Path, tmp_path: Path) -> None:
+    before = {p.name: p.read_bytes() for p in kitchen.iterdir()}
+    out = tmp_path / "adjusted"
+    assert optimise(kitchen, "--out", out, "--reference", KITCHEN) == 0
+    printed = capsys.readouterr().out
+    assert "stage robust" in printed
+    assert "wrong views" in printed
+    assert str(out / "before_after.png") in printed
+    assert {p.name: p.read_bytes() for p in kitchen.iterdir()} == before
+    assert {p.name for p in out.iterdir()} >= {*before, "before_after.png"}
+    assert value(out, "cost_final") < value(out, "cost_initial")
+    assert value(out, "ate_rmse") < 1.05 * value(kitchen, "ate_rmse")
+    old, new = (read_tum(folder / "trajectory.txt") for folder in (kitchen, out))
+    np.testing.assert_array_equal(new.timestamps_s, old.timestamps_s)
+    shift_m = np.linalg.norm(new.positions_world - old.positions_world, axis=1)
+    assert 1e-5 < shift_m.max() < 0.05
+    assert cli.main(["evaluate", str(out), "--reference", str(KITCHEN)]) == 0
+
+
+def test_keyframes_landmarks_and_graph_fit_together(kitchen: Path, tmp_path: Path) -> None:
+    out = tmp_path / "adjusted"
+    assert optimise(kitchen, "--out", out, "--quiet") == 0
+    tables, _ = read_graph(out / "graph")
+    frames, keyframes = (read_tum(out / f"{name}.txt") for name in ("trajectory", "keyframes"))
+    np.testing.assert_allclose(keyframes.poses_world_camera, tables.keyframes.values, atol=2e-9)
+    at = np.searchsorted(frames.timestamps_s, keyframes.timestamps_s)
+    np.testing.assert_allclose(
+        frames.poses_world_camera[at], keyframes.poses_world_camera, atol=5e-9
+    )
+    old, cloud = read_ply(kitchen / "landmarks.ply"), read_ply(out / "landmarks.ply")
+    points = np.stack([cloud[axis] for axis in "xyz"], axis=1)
+    inside = tables.landmarks.contains(cloud["id"].astype(np.int64))
+    np.testing.assert_allclose(
+        points[inside], tables.landmarks.get(cloud["id"][inside]), rtol=1e-6, atol=1e-6
+    )
+    rows = np.searchsorted(old["id"], cloud["id"])
+    moved = points - np.stack([old[axis] for axis in "xyz"], axis=1)[rows]
+    assert 0 < np.abs(moved[~inside]).max() < 0.05  # the others went along
+    # what is optimal stays: once more changes nothing, with observations kept
+    again = tmp_path / "again"
+    assert optimise(out, "--out", again, "--quiet") == 0
+    T = read_tum(again / "trajectory.txt").poses_world_camera
+    assert np.abs(T - frames.poses_world_camera).max() < 5e-3
+
+
+def test_the_map_that_is_left_is_the_adjusted_one(kitchen: Path, tmp_path: Path) -> None:
+    """Its poses are the graph's, and other runs are localised in it, or go on with it."""
+    out = tmp_path / "adjusted"
+    assert optimise(kitchen, "--out", out, "--quiet") == 0
+    state, camera = read_map(out)
+    assert camera == read_map(kitchen)[1]
+    tables, _ = read_graph(out / "graph")
+    poses, given = (
+        of["mapper.world.keyframes.T_world_camera"] for of in (state, read_map(kitchen)[0])
+    )
+    np.testing.assert_array_equal(poses, tables.keyframes.values)
+    assert np.abs(poses - given).max() > 1e-5
+    world = world_of(part(state, "mapper.world"))
+    inside = np.flatnonzero(world.landmarks.in_graph)
+    np.testing.assert_array_equal(inside, tables.landmarks.ids)
+    np.testing.assert_array_equal(world.landmarks.points_world[inside], tables.landmarks.values)
+    config = SystemConfig(final_adjustment=False)
+    for name in ("localise", "map"):
+        options = RunOptions(
+            KITCHEN, config, out=tmp_path / name, max_frames=12, quiet=True, **{name: out}
+        )
+        found = read_tum(run(options).folder / "trajectory.txt")
+        expected = read_tum(out / "trajectory.txt")
+        assert len(found) >= 10
+        at = np.searchsorted(found.timestamps_s, expected.timestamps_s[:5])
+        error_m = found.positions_world[at] - expected.positions_world[:5]
+        assert np.linalg.norm(error_m, axis=1).max() < 0.02
+
+
+def test_the_exported_graph_is_adjusted_to_the_same_cost(kitchen: Path, tmp_path: Path) -> None:
+    file, out, folder = tmp_path / "a.g2o", tmp_path / "b.g2o", tmp_path / "run"
+    words = ["export", kitchen, "--format", "g2o", "--out", file, "--quiet"]
+    assert cli.main([str(word) for word in words]) == 0
+    plot = tmp_path / "before_after.svg"
+    assert optimise(file, "--out", out, "--plot", plot, "--quiet") == 0
+    assert optimise(kitchen, "--out", folder, "--quiet") == 0
+    (tables, _), (read, _) = read_graph(folder / "graph"), read_landmark_graph(out)
+    assert len(read.observations) == len(tables.observations)
+    np.testing.assert_allclose(read.keyframes.values, tables.keyframes.values, atol=1e-6)
+    np.testing.assert_allclose(read.landmarks.values, tables.landmarks.values, atol=1e-4)
+    assert plot.stat().st_size > 1000
+
+
+def test_of_the_configuration_only_the_graphs_part_counts(kitchen: Path, tmp_path: Path) -> None:
+    """A run of another version, whose other settings have other names, is adjusted too."""
+    other = tmp_path / "other"
+    shutil.copytree(kitchen, other)
+    (other / "config.yaml").write_text("tracking: {gone: 1}\ngraph: {huber_stereo: 5.5}\n")
+    assert read_run(other).config.huber_stereo == 5.5
+    (other / "config.yaml").write_text("graph: {gone: 1}\n")
+    with pytest.raises(InputError, match="gone"):
+        read_run(other)
+
+
+def test_what_cannot_be_is_refused(capsys, kitchen: Path, tmp_path: Path) -> None:
+    def error(*words: object) -> str:
+        assert optimise(*words) == 1
+        return capsys.readouterr().err
+
+    assert "is the input" in error(kitchen, "--out", kitchen, "--overwrite")
+    out = tmp_path / "taken"
+    out.mkdir()
+    (out / "trajectory.txt").write_text("mine")
+    assert "already holds a run" in error(kitchen, "--out", out)
+    assert (out / "trajectory.txt").read_text() == "mine"
+    assert optimise(kitchen, "--out", out, "--overwrite", "--quiet") == 0
+    other = tmp_path / "other"
+    shutil.copytree(kitchen, other)
+    tables, camera = read_graph(other / "graph")
+    tables.keyframes.values[1, 0, 3] += 0.1
+    write_graph(other / "graph", tables, camera)
+    assert "do not belong together" in error(other, "--out", tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+    keyframes = read_tum(kitchen / "keyframes.txt")
+    write_tum(
+        other / "keyframes.txt",
+        Trajectory(keyframes.timestamps_s + 99, keyframes.poses_world_camera),
+    )
+    assert "do not belong together" in error(other, "--out", tmp_path / "new")
+    (other / "frames.csv").unlink()
+    assert "frames.csv: no such file" in error(other, "--out", tmp_path / "new")
