@@ -11,39 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-import faiss
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.features.matching import Bits, Ints
+from bmask_slam.features.descriptor_index import DescriptorIndex, Votes
+from bmask_slam.features.matching import Bits
 from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
 
-BITS = 512
-ROWS_PER_LIST = 32  # before the index is partitioned
-Mask = NDArray[np.bool_]
 Neighbours = Callable[[int], Collection[int]]  # keyframe id -> ids of the covisible ones
-
-
-@dataclass(frozen=True)
-class IndexConfig:
-    """Every keyframe votes with ``query_keypoints`` of its descriptors.
-
-    A descriptor votes for a keyframe where its nearest neighbour there is within ``max_distance``
-    bits, and where that distance times ``ratio`` is at most the one in the best keyframe of all.
-    If n of K keyframes have a neighbour within the gate, a vote counts
-    log((K + 1) / n) / log(K + 1) (inverse document frequency): 1 for what is seen in one place
-    only, 0 for what is everywhere.
-
-    The index is searched whole until it holds 32 times ``lists`` descriptors. Then each belongs to
-    the nearest of ``lists`` of them, and only the ``probes`` lists nearest to a query are searched.
-    """
-
-    query_keypoints: int = 450
-    max_distance: int = 70
-    ratio: float = 0.8
-    lists: int = 1024
-    probes: int = 16
 
 
 @dataclass(frozen=True)
@@ -63,17 +37,6 @@ class PlaceConfig:
 
 
 @dataclass(frozen=True)
-class Votes:
-    """Keyframe ids (K,) with their weighted votes (K,) > 0, most first, then the oldest first."""
-
-    keyframe_ids: Ints
-    scores: Array
-
-    def __len__(self) -> int:
-        return len(self.keyframe_ids)
-
-
-@dataclass(frozen=True)
 class PlaceCandidate:
     """A keyframe that may show the same place as the query.
 
@@ -87,128 +50,6 @@ class PlaceCandidate:
     votes: float
     group_votes: float
     queries: int
-
-
-class DescriptorIndex:
-    """All keyframes' descriptors in a faiss binary index; grows and shrinks by keyframes.
-
-    The same calls give the same votes. A removed keyframe's rows stay in the index and are
-    ignored, until they are more than half of it and it is built anew.
-    """
-
-    def __init__(self, config: IndexConfig | None = None):
-        self.config = config or IndexConfig()
-        self._descriptors: dict[int, Bits] = {}
-        self._clear()
-
-    def __len__(self) -> int:
-        """Number of keyframes held."""
-        return len(self._descriptors)
-
-    @property
-    def keyframe_ids(self) -> list[int]:
-        """The keyframes held, in the order they came."""
-        return list(self._descriptors)
-
-    def add(self, keyframe_id: int, descriptors: Bits) -> None:
-        """Take in a keyframe's descriptors (N, 8); they are not copied and must not change.
-
-        Raises:
-            ValueError: the keyframe is held already.
-        """
-        if keyframe_id in self._descriptors:
-            raise ValueError(f"keyframe {keyframe_id} is in the index already")
-        self._descriptors[keyframe_id] = descriptors
-        self._append(keyframe_id, descriptors)
-        if not self._partitioned and self._rows >= ROWS_PER_LIST * self.config.lists:
-            self.rebuild()
-
-    def restore(self, descriptors: dict[int, Bits]) -> None:
-        """Hold these keyframes, (N, 8) descriptors by id, and no others."""
-        self._descriptors = dict(descriptors)
-        self.rebuild()
-
-    def remove(self, keyframe_id: int) -> None:
-        """Forget a keyframe; one that is not held is no error."""
-        descriptors = self._descriptors.pop(keyframe_id, None)
-        if descriptors is None:
-            return
-        self._dead += len(descriptors)
-        if 2 * self._dead > self._rows:
-            self.rebuild()
-
-    def votes(self, descriptors: Bits, excluded: Collection[int] = ()) -> Votes:
-        """Votes of descriptors (N, 8) for the keyframes held, but for the excluded ones."""
-        excluded = set(excluded)
-        candidates = [k for k in self._descriptors if k not in excluded]
-        allowed = np.zeros(max(candidates, default=-1) + 2, bool)  # its last entry stays False
-        allowed[candidates] = True
-        query, keyframe_ids, distance = self._near(descriptors)
-        keep = allowed[np.minimum(keyframe_ids, len(allowed) - 1)]
-        query, keyframe_ids, distance = query[keep], keyframe_ids[keep], distance[keep]
-        best = np.full(len(descriptors), BITS)
-        np.minimum.at(best, query, distance)
-        pairs, clear = _unique_pairs(
-            query, keyframe_ids, self.config.ratio * distance <= best[query]
-        )
-        common = np.bincount(pairs[0], minlength=len(descriptors))
-        total = len(candidates) + 1
-        ballots, voted_for = pairs[0][clear], pairs[1][clear]
-        weights = np.log(total / common[ballots]) / np.log(total)
-        ids, which = np.unique(voted_for, return_inverse=True)
-        scores: Array = np.bincount(which, weights, minlength=len(ids)).astype(np.float64)
-        order = np.lexsort((ids, -scores))
-        return Votes(ids[order].astype(np.int64), scores[order])
-
-    def _near(self, descriptors: Bits) -> tuple[Ints, Ints, Ints]:
-        """All (query row, keyframe id, Hamming distance) within the gate, removed ones too."""
-        step = max(-(-len(descriptors) // self.config.query_keypoints), 1)
-        query = _bytes(descriptors[::step])
-        if self._rows == 0 or len(query) == 0:
-            return (np.zeros(0, np.int64),) * 3
-        # faiss takes what is nearer than the radius, strictly
-        limits, distance, rows = self._index.range_search(query, self.config.max_distance + 1)
-        limits = limits.astype(np.int64)
-        owner = np.repeat(np.arange(len(query)), limits[1:] - limits[:-1])
-        starts = np.array(self._starts)
-        owners = np.array(self._owners)
-        keyframe_ids = owners[np.searchsorted(starts, rows, side="right") - 1]
-        return owner, keyframe_ids, distance.astype(np.int64)
-
-    def _append(self, keyframe_id: int, descriptors: Bits) -> None:
-        if len(descriptors) == 0:
-            return
-        self._starts.append(self._rows)
-        self._owners.append(keyframe_id)
-        self._index.add(_bytes(descriptors))
-        self._rows += len(descriptors)
-
-    def _clear(self) -> None:
-        self._index: faiss.IndexBinary = faiss.IndexBinaryFlat(BITS)
-        self._partitioned = False
-        self._rows = self._dead = 0
-        self._starts: list[int] = []  # first row of each block of rows
-        self._owners: list[int] = []  # and the keyframe whose block it is
-
-    def rebuild(self) -> None:
-        """Build the index anew, partitioned if the keyframes hold enough descriptors.
-
-        The lists' centres are descriptors evenly picked from all: measured against k-means they
-        find the same share of neighbours, and need no training.
-        """
-        self._clear()
-        total = sum(map(len, self._descriptors.values()))
-        if total >= ROWS_PER_LIST * self.config.lists:
-            everything = np.concatenate(list(self._descriptors.values()))
-            centres = faiss.IndexBinaryFlat(BITS)
-            picked = np.linspace(0, total - 1, self.config.lists).astype(np.int64)
-            centres.add(_bytes(everything[picked]))
-            self._index = faiss.IndexBinaryIVF(centres, BITS, self.config.lists)
-            self._index.is_trained = True
-            self._index.nprobe = self.config.probes
-            self._partitioned = True
-        for keyframe_id, descriptors in self._descriptors.items():
-            self._append(keyframe_id, descriptors)
 
 
 class PlaceRecogniser:
@@ -282,17 +123,3 @@ class PlaceRecogniser:
     def _repeats(self, group: frozenset[int]) -> int:
         """The longest row of earlier queries that a group continues."""
         return max((queries for old, queries in self._previous if old & group), default=0)
-
-
-def _unique_pairs(query: Ints, keyframe_ids: Ints, clear: Mask) -> tuple[tuple[Ints, Ints], Mask]:
-    """Every (query, keyframe) once, and whether any of its neighbours is clear."""
-    order = np.lexsort((~clear, keyframe_ids, query))
-    query, keyframe_ids = query[order], keyframe_ids[order]
-    first = np.ones(len(query), bool)
-    first[1:] = (query[1:] != query[:-1]) | (keyframe_ids[1:] != keyframe_ids[:-1])
-    return (query[first], keyframe_ids[first]), clear[order][first]
-
-
-def _bytes(descriptors: Bits) -> NDArray[np.uint8]:
-    """Descriptors (N, 8) uint64 as the (N, 64) uint8 that faiss and OpenCV take."""
-    return np.ascontiguousarray(descriptors).view(np.uint8)

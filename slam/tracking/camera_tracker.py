@@ -6,6 +6,7 @@ import numpy as np
 
 from bmask_slam.back_end.landmark_management import MappingConfig, local_landmarks
 from bmask_slam.features.brisk import Features
+from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.files.array_file import Arrays
 from bmask_slam.graph.geometry import (
     Array,
@@ -15,7 +16,6 @@ from bmask_slam.graph.geometry import (
     se3_exp,
     se3_log,
 )
-from bmask_slam.loops.place_recognition import DescriptorIndex
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.tracking.rolling_shutter import PreviousPose

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.back_end.mapper import add_keyframe, without_image
+from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import Array, inverse
@@ -34,7 +35,6 @@ from bmask_slam.live.processes.remote_pruner import RemotePruner
 from bmask_slam.live.processes.supervision import late_start
 from bmask_slam.live.processes.worker import Failure, Worker
 from bmask_slam.live.replica import apply_delta
-from bmask_slam.loops.place_recognition import DescriptorIndex
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig

@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 from synthetic_view import random_descriptors
 
+from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
 from bmask_slam.features.matching import Bits, hamming
-from bmask_slam.loops.place_recognition import (
-    DescriptorIndex,
-    IndexConfig,
-    PlaceConfig,
-    PlaceRecogniser,
-)
+from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 
 PARTITIONED = IndexConfig(lists=8, probes=8)  # from 256 descriptors on
 WHOLE = IndexConfig(lists=1 << 20)
