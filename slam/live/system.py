@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import faiss
@@ -44,6 +46,26 @@ MASKS_S = 10.0
 FINISH_S = 600.0
 
 
+@contextmanager
+def settings_for_tracking() -> Iterator[None]:
+    """Set the interpreter and faiss for short pauses of this process; restore them at the end.
+
+    A setting that already is as wanted, for instance by another live system, is left alone.
+    """
+    switch_s, threads = sys.getswitchinterval(), faiss.omp_get_max_threads()
+    with ExitStack() as restore:
+        if switch_s > SWITCH_S:
+            sys.setswitchinterval(SWITCH_S)
+            restore.callback(sys.setswitchinterval, switch_s)
+        if threads > 1:  # a second thread would wait for a core, and tracking for that thread
+            faiss.omp_set_num_threads(1)
+            restore.callback(faiss.omp_set_num_threads, threads)
+        if not gc.get_freeze_count():  # scanning all modules would stop tracking for 0.1 s
+            gc.freeze()
+            restore.callback(gc.unfreeze)
+        yield
+
+
 class LiveSystem(SlamSystem):
     """Tracks in the caller's process; ``finish`` brings the map home.
 
@@ -63,16 +85,16 @@ class LiveSystem(SlamSystem):
     ) -> None:
         self.segmenter, self.dense = segmenter, dense
         self._names = (segmenter or NoSegmenter).labels.names
-        self.remote = RemoteMapper(camera, config, self._names, folder)
-        super().__init__(camera, config)
-        self.remote.wait_until_ready(Patience().start_s)
-        if dense is not None:
-            dense.wait_until_ready()
-        self.semantics = _Asked(self)
-        gc.freeze()  # to look through all modules would stop tracking for 0.1 s
-        self._switch_s = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_S)
-        faiss.omp_set_num_threads(1)  # a second one would wait for a core, and tracking for it
+        with ExitStack() as undo:
+            self.remote = RemoteMapper(camera, config, self._names, folder)
+            undo.callback(self.remote.close)
+            super().__init__(camera, config)
+            self.remote.wait_until_ready(Patience().start_s)
+            if dense is not None:
+                dense.wait_until_ready()
+            self.semantics = _Asked(self)
+            undo.enter_context(settings_for_tracking())
+            self._resources = undo.pop_all()
 
     def _make_mapper(self, tracker: Tracker) -> Mapper:
         return self.remote  # type: ignore[return-value]  # it has what the step asks for
@@ -172,9 +194,7 @@ class LiveSystem(SlamSystem):
 
     def _end(self) -> None:
         """End all that a finished map does without."""
-        gc.unfreeze()
-        sys.setswitchinterval(self._switch_s)
-        self.remote.close()
+        self._resources.close()
         if self.segmenter is not None:
             self.segmenter.close()
 

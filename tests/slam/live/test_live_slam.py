@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import faiss
 import numpy as np
 import pytest
 from feeding import factor_selection
@@ -20,6 +23,7 @@ from bmask_slam.graph.geometry import Array, inverse, se3_exp
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import NewKeyframe
+from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import Patience
 from bmask_slam.run_folder.folder import HEALTH
@@ -194,6 +198,38 @@ def test_black_frames_are_lost_and_tracking_comes_back() -> None:
         assert factor_selection(slam, FRAMES[11:13])[-1] is TrackingStatus.OK
         health = slam.health()
     assert (health.lost_frames, health.lost_episodes) == (3, 1)
+
+
+def settings() -> tuple[float, int, int]:
+    return sys.getswitchinterval(), faiss.omp_get_max_threads(), gc.get_freeze_count()
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_the_callers_settings_are_restored(frozen: bool) -> None:
+    threads = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(2)
+    if frozen:
+        gc.freeze()
+    try:
+        before = settings()
+        with LiveSlam(CAMERA, CONFIG):
+            assert settings() != before
+        assert settings() == before
+    finally:
+        gc.unfreeze()
+        faiss.omp_set_num_threads(threads)
+
+
+def test_a_dense_process_that_cannot_start_leaves_nothing(tmp_path, monkeypatch) -> None:
+    def late(_: RemoteDenseMapper) -> None:
+        raise InputError("the dense mapper's process did not start")
+
+    monkeypatch.setattr(RemoteDenseMapper, "wait_until_ready", late)
+    before, processes = settings(), children()
+    with pytest.raises(InputError, match="did not start"):
+        LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run", dense=True))
+    assert settings() == before
+    assert children() == processes
 
 
 def test_a_run_folder_in_use_is_refused_and_nothing_starts(tmp_path) -> None:
