@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.geometry import Array, inverse, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
+from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.saved_run import SavedRun, read_run
 from bmask_slam.sequences import Sequence, open_sequence, write_camera
 
@@ -118,7 +118,7 @@ def calibrate_run(options: CalibrateOptions) -> Calibrated:
     """
     out = refuse_early(options)
     run = read_run(options.run)
-    sequence = open_sequence(options.sequence or sequence_of(options.run), camera=run.camera)
+    sequence = open_sequence(options.sequence or find_sequence(options.run), camera=run.camera)
     problem, _ = make_problem(options, run, sequence)
     result = _with_rate_error(calibrate(problem))
     done = Calibrated(
@@ -167,17 +167,6 @@ def refuse_early(options: CalibrateOptions) -> Path:
     if not options.anchor_sigma_m > 0:
         raise InputError(f"--anchor-sigma {options.anchor_sigma_m}: must be positive metres")
     return out
-
-
-def sequence_of(run: Path) -> Path:
-    """The sequence that a run was made of, by the first line of its config.yaml."""
-    path = run / "config.yaml"
-    first = path.read_text(encoding="utf-8").partition("\n")[0] if path.is_file() else ""
-    found = re.search(r"sequence (.+), stride \d+$", first)
-    if found is None or not Path(found[1]).is_dir():
-        named = f"names {found[1]!r}, which is not there" if found else "names no sequence"
-        raise InputError(f"{path}: {named}; give the folder of the run's images as --sequence")
-    return Path(found[1])
 
 
 def make_problem(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from bmask_slam.graph.geometry import Array, inverse, transform
 from bmask_slam.labelling.semantic_mapper import SemanticsConfig
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DepthSource
 from bmask_slam.run_folder.map_file import read_map
+from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.labels import LabelSet, label_set
 from bmask_slam.sequences import Sequence, open_sequence
@@ -33,7 +33,6 @@ logger = logging.getLogger(__name__)
 
 MAX_STAMP_ERROR_S = 1e-4
 MIN_DEPTH_SHARE = 0.01
-_ORIGIN = re.compile(r"^# .*?, sequence (?P<path>.+), stride \d+$")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +97,7 @@ def open_run(path: Path, sequence: Path | None = None) -> MappedRun:
     if not path.is_dir():
         raise InputError(f"{path}: no such folder; give the folder of a finished run")
     saved = read_saved_map(path)
-    folder = sequence or _recorded_sequence(path / "config.yaml")
+    folder = sequence or find_sequence(path)
     opened = open_sequence(folder, camera=saved.camera)
     return MappedRun(**vars(saved), sequence=opened)
 
@@ -124,21 +123,6 @@ def _labels(state: Arrays, config: Path) -> RunLabels | None:
     store = LabelStore(len(names), run_semantics(config).labels)
     store.restore(part(state, "labels"))
     return RunLabels(names, store)
-
-
-def _recorded_sequence(config: Path) -> Path:
-    """The sequence named in the first line of a run's config.yaml."""
-    try:
-        first = config.read_text(encoding="utf-8").partition("\n")[0]
-    except OSError as error:
-        raise InputError(f"{config}: cannot be read ({error.strerror}); give --sequence") from error
-    found = _ORIGIN.match(first)
-    if found is None:
-        raise InputError(f"{config}: its first line names no sequence; give --sequence")
-    folder = Path(found["path"])
-    if not folder.is_dir():
-        raise InputError(f"{folder}: the run's sequence is not there any more; give --sequence")
-    return folder
 
 
 def load(

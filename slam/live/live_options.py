@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.run_folder.origin import Origin
 from bmask_slam.viewer.scene import ViewOptions
 
 
@@ -33,6 +34,6 @@ class LiveOptions:
     dense: bool = False
 
     @property
-    def origin(self) -> str:
-        """What config.yaml says of where the frames are."""
-        return "live" if self.images == Path() else f"sequence {self.images}, stride 1"
+    def origin(self) -> Origin:
+        """The sequence folder that the frames come from, if any, for config.yaml."""
+        return Origin(None if self.images == Path() else self.images)

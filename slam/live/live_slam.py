@@ -13,7 +13,6 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam import __version__
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
 from bmask_slam.features.brisk import Features
@@ -99,7 +98,7 @@ class LiveSlam:
             if self.options.out is not None:
                 folder = RunFolder(self.options.out, self.options.overwrite).__enter__()
                 self._recorder = Recorder(folder)
-                origin = f"bmask-slam {__version__}, {self.options.origin}"
+                origin = self.options.origin
                 folder.write_text("config.yaml", f"# {origin}\n{dump(self.config)}")
                 logger.info("%s: %s", origin, self.options.title)
             if self.options.view.anywhere:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import re
 import tempfile
 from pathlib import Path
 
@@ -16,13 +15,13 @@ from bmask_slam.calibration.calibrate import (
     CalibrateOptions,
     calibrate_run,
     refuse_early,
-    sequence_of,
 )
 from bmask_slam.calibration.report import Calibrated, format_calibration
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import frame_stamps
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.run_folder.origin import find_sequence, read_origin
 from bmask_slam.sequences import write_camera
 from bmask_slam.system_config import SystemConfig
 
@@ -43,7 +42,7 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
     if rounds < 1:
         raise InputError(f"--rounds {rounds}: must be a whole number of at least 1")
     out = refuse_early(options)
-    sequence = options.sequence or sequence_of(options.run)
+    sequence = options.sequence or find_sequence(options.run)
     with tempfile.TemporaryDirectory(prefix=".calibrate-", dir=out.parent) as made:
         folder = Path(made)
         options_1 = dataclasses.replace(options, out=folder / "camera-1.yaml", sequence=sequence)
@@ -63,7 +62,6 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
 def _again(before: Path, sequence: Path, camera: Path, out: Path, quiet: bool) -> RunOptions:
     """The same frames with the same configuration and another camera."""
     config = before / "config.yaml"
-    stride = re.search(r"stride (\d+)$", config.read_text(encoding="utf-8").partition("\n")[0])
     frames = frame_stamps(before / "trajectory.txt")
     return RunOptions(
         sequence,
@@ -71,6 +69,6 @@ def _again(before: Path, sequence: Path, camera: Path, out: Path, quiet: bool) -
         out=out,
         camera=camera,
         max_frames=None if frames is None else len(frames),
-        stride=int(stride[1]) if stride else 1,
+        stride=read_origin(before).stride,
         quiet=quiet,
     )

@@ -16,7 +16,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from bmask_slam import __version__
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.camera import Camera
@@ -29,6 +28,7 @@ from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder, free_run_path
 from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.metrics import RunCounters, measure, save
+from bmask_slam.run_folder.origin import Origin
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
@@ -149,7 +149,7 @@ def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
 
 def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> None:
     """Write the resolved configuration, and to the log what is run, by what and where."""
-    origin = f"bmask-slam {__version__}, sequence {sequence.folder}, stride {options.stride}"
+    origin = Origin(sequence.folder, options.stride)
     folder.write_text("config.yaml", f"# {origin}\n{dump(options.config)}")
     logger.info("%s: %s", origin, shlex.join(sys.argv))
     packages = ("gtsam", "numpy", "opencv-python-headless")

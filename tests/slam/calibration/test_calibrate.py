@@ -10,7 +10,7 @@ import pytest
 from calibration_run import camera_path, make_run, room_depth
 
 from bmask_slam import cli
-from bmask_slam.calibration.calibrate import CalibrateOptions, calibrate_run, sequence_of
+from bmask_slam.calibration.calibrate import CalibrateOptions, calibrate_run
 from bmask_slam.calibration.report import format_calibration
 from bmask_slam.calibration.views import raw_pixels, smooth_value
 from bmask_slam.features.brisk import undistort
@@ -152,13 +152,6 @@ def test_impossible_wishes(made, tmp_path, changes, words) -> None:
     with pytest.raises(InputError, match=words):
         calibrate_run(CalibrateOptions(made[1], tmp_path / "camera.yaml", **changes))
     assert not (tmp_path / "camera.yaml").exists()
-
-
-def test_the_sequence_of_a_run_is_named_by_its_configuration(made, tmp_path) -> None:
-    assert sequence_of(made[1]) == made[0]
-    (tmp_path / "config.yaml").write_text("# bmask-slam 0.1.0, sequence /nowhere, stride 2\n")
-    with pytest.raises(InputError, match="names '/nowhere', which is not there; give the folder"):
-        sequence_of(tmp_path)
 
 
 def test_two_rounds_run_again_with_the_camera_found(

@@ -26,6 +26,7 @@ from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.offline.runner import RunOptions, RunSummary, run
 from bmask_slam.run_folder.folder import FILES
+from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.tracker import TrackingConfig
 
@@ -79,6 +80,16 @@ def test_a_run_leaves_the_whole_contract(sequence: Path, out: Path) -> None:
     assert json.loads((out / "metrics.json").read_text()) == summary.rows
     assert "Python" in (out / "log.txt").read_text()
     assert (summary.frames, summary.skipped, summary.stopped_by) == (20, 0, None)
+
+
+def test_a_relative_sequence_is_recorded_by_its_absolute_path(
+    sequence: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(sequence.parent)
+    fake_run(Path(sequence.name), out)
+    monkeypatch.chdir("/")
+    assert find_sequence(out) == sequence
+    assert f", sequence {sequence}, stride 1" in (out / "config.yaml").read_text()
 
 
 def test_frames_csv(sequence: Path, out: Path) -> None:

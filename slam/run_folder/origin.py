@@ -1,0 +1,68 @@
+"""Which sequence a run was made from: the comment in the first line of its config.yaml."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from bmask_slam import __version__
+from bmask_slam.graph.errors import InputError
+
+CONFIG = "config.yaml"
+_SEQUENCE = re.compile(r"^# .*?, sequence (?P<path>.+), stride (?P<stride>\d+)$")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The sequence folder of a run, absolute, and its stride; None for a camera or a bag."""
+
+    sequence: Path | None
+    stride: int = 1
+
+    def __str__(self) -> str:
+        begin = f"bmask-slam {__version__}"
+        if self.sequence is None:
+            return f"{begin}, live"
+        return f"{begin}, sequence {self.sequence.absolute()}, stride {self.stride}"
+
+
+def read_origin(run: Path) -> Origin:
+    """The origin of a run; a relative path, as older runs have, is resolved.
+
+    It was relative to the folder where the run was started, which is not known: the working
+    directory is tried, then the run's folder and those above it. It stays relative if no such
+    folder exists.
+    """
+    config = run / CONFIG
+    try:
+        first = config.read_text(encoding="utf-8").partition("\n")[0] if config.is_file() else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{config}: cannot be read ({error}); give --sequence") from error
+    found = _SEQUENCE.match(first)
+    if found is None:
+        return Origin(None)
+    path = Path(found["path"])
+    if not path.is_absolute():
+        folders = (Path.cwd(), run.absolute(), *run.absolute().parents)
+        path = next((f / path for f in folders if _may_be_sequence(f / path)), path)
+    return Origin(path, int(found["stride"]))
+
+
+def _may_be_sequence(folder: Path) -> bool:
+    """Whether it is a folder and no run: runs/office is named after its sequence, office."""
+    return folder.is_dir() and not (folder / CONFIG).exists()
+
+
+def find_sequence(run: Path) -> Path:
+    """The sequence folder that a run was made from.
+
+    Raises:
+        InputError: config.yaml names none, or one that is not there.
+    """
+    sequence = read_origin(run).sequence
+    if sequence is None or not sequence.is_dir():
+        named = f"names {str(sequence)!r}, which is not there" if sequence else "names no sequence"
+        cure = "give the folder of the run's images as --sequence"
+        raise InputError(f"{run / CONFIG}: {named}; {cure}")
+    return sequence
