@@ -10,8 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, make_pose, so3_exp, transform
+from bmask_slam.graph.geometry import inverse, make_pose, so3_exp, transform
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 BLOCK_M = (21.6, 9.6)

@@ -19,12 +19,12 @@ import numpy as np
 from dynamic_pairs import CAMERA as MAN_CAMERA
 from dynamic_pairs import DATA as PAIRS
 from dynamic_pairs import man_in, read_pair
-from numpy.typing import NDArray
 from report import table
 from scipy.interpolate import CubicSpline
 
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.arrays import Array, Mask
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.annotations import FrameMarks, coco, frame_marks
@@ -98,7 +98,7 @@ def make(folder: Path, frames: int) -> None:
         man = men[int(stamps_s[i] / LEG_S) % 2]
         focal_px = camera.fx, camera.cx
         new = composed(frame, man, place, focal_px) if place[2] > 0.5 else frame
-        changed: NDArray[np.bool_] = (new.rgb != frame.rgb).any(axis=2)
+        changed: Mask = (new.rgb != frame.rgb).any(axis=2)
         changed |= ~np.isclose(new.depth_m, frame.depth_m, equal_nan=True)
         instances = changed.astype(np.uint16)
         name = f"{stamps[i]}.png"

@@ -19,8 +19,9 @@ import numpy as np
 from graph_growth import CAMERA, Feeder
 from scipy.stats import chi2
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate
-from bmask_slam.graph.geometry import Array, adjoint, inverse, se3_log
+from bmask_slam.graph.geometry import adjoint, inverse, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.sequences import open_sequence

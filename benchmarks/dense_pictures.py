@@ -16,7 +16,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from bmask_slam.graph.arrays import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -27,7 +28,7 @@ MAX_WIDTH_PX = 1400
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 85]
 
 
-def side_by_side(files: list[Path]) -> NDArray[np.uint8]:
+def side_by_side(files: list[Path]) -> Image:
     """Pictures of about the same height in a row, on white."""
     images = [np.asarray(cv2.imread(str(f))) for f in files]
     height = max(len(i) for i in images)

@@ -22,12 +22,14 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.input import undistorted
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DenseMapper, FusedKeyframe
 from bmask_slam.mapping.products.cloud import merged, spill
 from bmask_slam.mapping.products.cloud_files import CloudWriter

@@ -8,11 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bmask_slam.dense.input import MappedRun, image_name
-from bmask_slam.graph.geometry import Array, make_pose, transform
+from bmask_slam.graph.arrays import Array, Floats
+from bmask_slam.graph.geometry import make_pose, transform
 from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
@@ -28,7 +28,7 @@ VOXEL_M = 0.01
 class Truth:
     """What a keyframe really sees: depth (H, W) and its pose in the estimate's world."""
 
-    depth_m: NDArray[np.float32]
+    depth_m: Floats
     T_world_camera: Array
 
 

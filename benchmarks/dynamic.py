@@ -27,11 +27,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from moving_points import KINDS, NEAR_PX, MovingTruth, WatchedSystem, strip
-from numpy.typing import NDArray
 from report import table
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features, select
+from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.moving.feature_replenishment import FeatureReplenishment
 from bmask_slam.moving.moving_object_filter import StaticFeatures
@@ -106,7 +106,7 @@ class IdealSystem(WatchedSystem):
             static, features=replenishment.replenished(frame, features, static.moving, judge)
         )
 
-    def _on_moving(self, frame: Frame, features: Features) -> NDArray[np.bool_]:
+    def _on_moving(self, frame: Frame, features: Features) -> Mask:
         """Which features (N,) lie on or near what moves in truth."""
         moves = np.any(list(self.truth.masks(frame).values()), axis=0).astype(np.uint8)
         moves = cv2.dilate(moves, np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8))

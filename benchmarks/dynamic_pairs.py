@@ -22,8 +22,8 @@ from moving_points import Count, Image, Mask, count, picture, strip
 from report import table
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 from bmask_slam.sequences.frame import Frame

@@ -23,13 +23,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from bmask_slam.graph.arrays import Array
+
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from dynamic import SCENES, VARIANTS, rendered
 from no_harm import ate_m, other_keypoints
 from report import table
 
-from bmask_slam.graph.geometry import Array
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 Job = tuple[Path, str, int]

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 
 QUARTERS = (0.25, 0.5, 0.75, 1.0)
 COLOURS = ("#1f5fa8", "#d6302a", "#3a8f4d", "#8a5fb0")

@@ -13,9 +13,10 @@ import dataclasses
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate, Observations
-from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, se3_log, transform
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)

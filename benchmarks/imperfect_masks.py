@@ -8,8 +8,9 @@ from zlib import crc32
 import cv2
 import numpy as np
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.instances.instances import Instance, mask_box
-from bmask_slam.semantics.segmenters.segmenter import Image, Segmenter
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,11 @@ import numpy as np
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
 from bmask_slam.features.matching import MatchConfig, WindowIndex, match_pairs
 from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches, register_patches
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.sequences import Sequence, open_sequence
-from bmask_slam.world.landmark_table import Ints
 
 GAPS = (1, 5, 15)
 STEP = 10

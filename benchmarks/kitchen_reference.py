@@ -26,8 +26,9 @@ from scipy.optimize import least_squares
 
 from bmask_slam.calibration.calibrate import CalibrateOptions, make_problem
 from bmask_slam.evaluation import evaluate
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.model import CalibrationViews
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, skew
+from bmask_slam.graph.geometry import inverse, se3_exp, skew
 from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices, read_tum, write_tum
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.run_folder.saved_run import read_run

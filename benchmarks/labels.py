@@ -26,7 +26,8 @@ from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.rendering.engine.sensor import depth_sigma_m
 from bmask_slam.rendering.true_boxes import OBJECTS_TRUTH
 from bmask_slam.semantics.beliefs.label_store import LabelStore

@@ -21,6 +21,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from bmask_slam.graph.arrays import Array, Ints
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.building import CAMERA, landmarks, visible, walk
@@ -28,11 +30,10 @@ from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
-    IntArray,
     Observations,
     RelativePose,
 )
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.smoother.smoother import Smoother
 
@@ -57,7 +58,7 @@ class FrontEnd:
         self.poses = walk(ROUNDS, args.keyframes // ROUNDS, self.rng)
         self.points, self.on_wall = landmarks(PER_M2, self.rng)
         self.measurements, self.retires = args.measurements, retires
-        self.seen: list[IntArray] = []
+        self.seen: list[Ints] = []
         self.last_seen = np.full(len(self.points), -1)
         self.loops: list[tuple[int, int]] = []
         self._in_known_place = False
@@ -84,7 +85,7 @@ class FrontEnd:
             marginalise_landmarks=self._outside_window(known) if self.retires else known[:0],
         )
 
-    def _measure(self, k: int) -> tuple[IntArray, Array]:
+    def _measure(self, k: int) -> tuple[Ints, Array]:
         """Some of the visible landmarks, those seen last first, and their noisy measurements."""
         ids, z = visible(self.poses[k], self.points, self.on_wall)
         detected = self.rng.random(len(ids)) < FOUND
@@ -96,8 +97,8 @@ class FrontEnd:
         return ids[chosen], z[chosen] + noise
 
     def _recognise(
-        self, k: int, ids: IntArray, z: Array
-    ) -> tuple[tuple[RelativePose, ...], IntArray, Array]:
+        self, k: int, ids: Ints, z: Array
+    ) -> tuple[tuple[RelativePose, ...], Ints, Array]:
         """Where a known place begins, a loop to it; its landmarks are found from then on."""
         again = (self.last_seen[ids] >= 0) & (self.last_seen[ids] < k - GAP)
         if self._in_known_place or again.mean() < 0.5:
@@ -112,7 +113,7 @@ class FrontEnd:
         self.loops.append((old, k))
         return (loop,), ids[~again], z[~again]
 
-    def _outside_window(self, in_graph: IntArray) -> IntArray:
+    def _outside_window(self, in_graph: Ints) -> Ints:
         """As ``back_end.factor_selection.FactorSelector`` chooses what retires."""
         mine = np.zeros(len(self.points), bool)
         mine[self.seen[-1]] = True

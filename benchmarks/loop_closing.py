@@ -18,7 +18,7 @@ import numpy as np
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import evaluate_trajectory
-from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint

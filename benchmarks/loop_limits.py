@@ -21,11 +21,12 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.batch.bundle_adjustment import AdjustmentConfig, adjust, loop_numbers
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
-from bmask_slam.graph.geometry import Array, inverse, se3_log
+from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
 from bmask_slam.run_folder.saved_run import SavedRun, read_run

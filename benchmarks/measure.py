@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.evaluation import Row, evaluate
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import associate, read_tum
 from bmask_slam.run_folder.folder import STAGES
 

@@ -16,11 +16,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Image, Mask
 from bmask_slam.moving.moving_object_filter import StaticFeatures
 from bmask_slam.rendering.classes import CATEGORY_IDS
 from bmask_slam.rendering.things.people import PULLED_S
@@ -34,8 +33,6 @@ from bmask_slam.tracking.tracker import Tracked
 NEAR_PX = 6
 """Keypoints so near to a border count for neither side."""
 KINDS = ("person", "box", "chair")
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 class MovingTruth:

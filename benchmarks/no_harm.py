@@ -31,6 +31,8 @@ import cv2
 import numpy as np
 import torch
 
+from bmask_slam.graph.arrays import Array, Image
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.dynamic import rendered
@@ -39,11 +41,10 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import evaluate
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import LabelSet
-from bmask_slam.semantics.segmenters.segmenter import Image, Segmenter
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig

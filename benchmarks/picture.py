@@ -18,12 +18,12 @@ import numpy as np
 import PIL.Image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from bmask_slam.evaluation.plot import draw_top_view
+from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.ply import read_ply
-from bmask_slam.graph.geometry import Array, inverse, make_pose, transform
+from bmask_slam.graph.geometry import inverse, make_pose, transform
 from bmask_slam.graph.metrics import absolute_error
 from bmask_slam.graph.trajectory import Trajectory, associate, associate_stamps, read_tum
 from bmask_slam.semantics.instances.overlay import draw
@@ -31,7 +31,6 @@ from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, ma
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
 
-Image = NDArray[np.uint8]
 VIEW_SIZE = (960, 720)
 BACKGROUND = 24
 NEAR_M, FAR_M = 0.8, 5.0

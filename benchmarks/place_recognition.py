@@ -18,12 +18,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
-from bmask_slam.features.matching import Bits
+from bmask_slam.graph.arrays import Array, Bits, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.loops.place_recognition import (
     BITS,
@@ -108,7 +107,7 @@ def overlaps(made: list[View], camera: Camera) -> Array:
     return share
 
 
-def _seen(points: Array, depth_m: Array, camera: Camera) -> NDArray[np.bool_]:
+def _seen(points: Array, depth_m: Array, camera: Camera) -> Mask:
     """Whether points (N, 3) of a camera are in its image, where the depth is theirs within 5 %."""
     z = np.maximum(points[:, 2], 0.1)
     pixels = camera.project(np.column_stack([points[:, :2], z])) / DEPTH_STEP_PX

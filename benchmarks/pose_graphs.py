@@ -22,18 +22,14 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.g2o.pose_graphs import read_g2o
-from bmask_slam.graph.geometry import Array, make_pose, so3_exp
+from bmask_slam.graph.geometry import make_pose, so3_exp
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.pose_graph.factors import chordal_poses
 from bmask_slam.graph.pose_graph.loop_prediction import pose_draws
 from bmask_slam.graph.pose_graph.optimisation import Method, PoseGraphConfig, optimise_pose_graph
-from bmask_slam.graph.pose_graph.pose_graph import (
-    Mask,
-    PoseGraph,
-    planar_poses,
-    spanning_tree_poses,
-)
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
 
 FOLDER = Path(__file__).resolve().parents[1] / "../shared/data/posegraphs"
 METHODS: tuple[Method, ...] = ("lm", "dogleg", "gnc")

@@ -8,9 +8,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bmask_slam.graph.arrays import Array
 
 
 def make_pose(R: Array, t: Array) -> Array:

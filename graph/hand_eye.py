@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, so3_log
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_log
 from bmask_slam.graph.metrics import time_pairs
 from bmask_slam.graph.trajectory import Trajectory
 

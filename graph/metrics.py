@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.geometry import Array, inverse, so3_log
-from bmask_slam.graph.trajectory import Indices, Trajectory, nearest_indices
+from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.geometry import inverse, so3_log
+from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 
 RELATIVE_DELTA_TOLERANCE = 0.1
 
@@ -128,7 +129,7 @@ def absolute_error(
 
 
 def relative_error(
-    estimate: Trajectory, reference: Trajectory, pairs: tuple[Indices, Indices]
+    estimate: Trajectory, reference: Trajectory, pairs: tuple[Ints, Ints]
 ) -> RelativeError | None:
     """Relative pose error over index pairs (i, j); None when there is no pair.
 
@@ -142,13 +143,13 @@ def relative_error(
     return RelativeError(estimate.timestamps_s[i], *_sizes(E))
 
 
-def frame_pairs(count: int, delta: int = 1) -> tuple[Indices, Indices]:
+def frame_pairs(count: int, delta: int = 1) -> tuple[Ints, Ints]:
     """Every pair (i, i + delta) of ``count`` poses (evo's delta in frames with all pairs)."""
     i = np.arange(max(count - delta, 0))
     return i, i + delta
 
 
-def time_pairs(timestamps_s: Array, delta_s: float = 1.0) -> tuple[Indices, Indices]:
+def time_pairs(timestamps_s: Array, delta_s: float = 1.0) -> tuple[Ints, Ints]:
     """For each i the j whose stamp is nearest to ``t_i + delta_s``, as TUM's script pairs them.
 
     A pair whose time difference is off by more than a tenth of ``delta_s`` is left out, so that
@@ -164,7 +165,7 @@ def time_pairs(timestamps_s: Array, delta_s: float = 1.0) -> tuple[Indices, Indi
     return i[good], j[good]
 
 
-def distance_pairs(positions: Array, delta_m: float = 1.0) -> tuple[Indices, Indices]:
+def distance_pairs(positions: Array, delta_m: float = 1.0) -> tuple[Ints, Ints]:
     """For each i the later j to which the path over ``positions`` (N, 3) is nearest to ``delta_m``.
 
     A pair whose path is off by more than a tenth of ``delta_m`` is left out. This is evo's delta in

@@ -10,21 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
-from bmask_slam.graph.geometry import (
-    Array,
-    make_pose,
-    quaternion_from_rotation,
-    rotation_from_quaternion,
-)
+from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 
 MAX_TIME_DIFFERENCE_S = 0.02
 MAX_TYPICAL_STEP_S = 5.0
 TUM_HEADER = "# timestamp_s tx ty tz qx qy qz qw (T_world_camera, metres)"
 
 logger = logging.getLogger(__name__)
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +72,7 @@ class Trajectory:
         return Trajectory(self.timestamps_s, T_new_world @ self.poses_world_camera)
 
 
-def nearest_indices(stamps_s: Array, queries_s: Array) -> Indices:
+def nearest_indices(stamps_s: Array, queries_s: Array) -> Ints:
     """Index (M,) of the stamp nearest to each query; ``stamps_s`` (N,) sorted and not empty.
 
     Of two equally near stamps the earlier is taken.
@@ -92,7 +86,7 @@ def nearest_indices(stamps_s: Array, queries_s: Array) -> Indices:
 
 def associate_stamps(
     a_s: Array, b_s: Array, max_difference_s: float = MAX_TIME_DIFFERENCE_S
-) -> tuple[Indices, Indices]:
+) -> tuple[Ints, Ints]:
     """Pairs of stamps that belong together: indices into ``a_s`` (N,) and ``b_s`` (M,), sorted.
 
     The closest pair is taken first, then the closest of what is left, as TUM's associate script
@@ -102,7 +96,7 @@ def associate_stamps(
     partners, which makes no difference larger than the larger of the two: both results increase.
     """
     left_a, left_b = np.arange(len(a_s)), np.arange(len(b_s))
-    pairs: list[tuple[Indices, Indices]] = [(left_a[:0], left_b[:0])]
+    pairs: list[tuple[Ints, Ints]] = [(left_a[:0], left_b[:0])]
     while len(left_a) and len(left_b):
         to_b = nearest_indices(b_s[left_b], a_s[left_a])
         to_a = nearest_indices(a_s[left_a], b_s[left_b])

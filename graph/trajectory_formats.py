@@ -11,13 +11,9 @@ from typing import Literal
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError, finite_number
-from bmask_slam.graph.geometry import (
-    Array,
-    make_pose,
-    quaternion_from_rotation,
-    rotation_from_quaternion,
-)
+from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 from bmask_slam.graph.trajectory import Trajectory, read_tum
 from bmask_slam.graph.whole_file import whole_file
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import BriskExtractor, Features
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import Arrays, check_like, nested, part
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.files.array_file import check_like, nested, part
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.moving.moving_object_filter import MovingObjectFilter, StaticFeatures
 from bmask_slam.runtime.stage_clock import StageClock
@@ -23,7 +23,6 @@ from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.keyframe_decision import KeyframeEvidence, keyframe_reason
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 from bmask_slam.tracking.tracker import Tracked, Tracker, lost, untracked
-from bmask_slam.world.landmark_table import Ints
 from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.run_folder.landmark_file import LandmarkCloud
 from bmask_slam.sequences.frame import Frame

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import Arrays
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import MapObjects
 from bmask_slam.labelling.semantic_mapper import SemanticMapper

@@ -18,16 +18,16 @@ import gtsam
 import numpy as np
 from scipy.stats import chi2
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.batch.iteration import Progress, iterate
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.checks import OBSERVATION_PROBABILITY, wrong_observations
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.gnc import first_mu, graduate
-from bmask_slam.graph.factors.graph_update import GraphUpdate, IntArray, RelativePose
+from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.smoother.removal import remove
 
 LOOP = "loop"
@@ -81,10 +81,10 @@ class Adjustment:
 
     stages: tuple[Stage, ...]
     loops: int
-    wrong_loops: IntArray
+    wrong_loops: Ints
     observations: int
-    wrong_observations: IntArray
-    dropped_landmarks: IntArray
+    wrong_observations: Ints
+    dropped_landmarks: Ints
     duration_ms: float
 
     @property
@@ -139,7 +139,7 @@ def adjust(
     )
 
 
-def loop_edges(tables: FactorTables) -> IntArray:
+def loop_edges(tables: FactorTables) -> Ints:
     """Keyframe ids (N, 2) of the loop edges."""
     edges = [tables.pose_factors[number].keyframes for number in loop_numbers(tables)]
     return np.array(edges, np.int64).reshape(-1, 2)
@@ -177,7 +177,7 @@ class _Adjuster:
         after = self._run(graph, self._config.max_iterations)
         self.stages.append(Stage(name, graph.size(), before, after, self._done - done))
 
-    def drop_wrong_loops(self) -> IntArray:
+    def drop_wrong_loops(self) -> Ints:
         """Decide on the loop edges by GNC; keyframes (N, 2) of those that left.
 
         The right ones stay without a kernel until the end of this stage, so that the solution
@@ -216,7 +216,7 @@ class _Adjuster:
         self.stages.append(Stage("loops", graph.size(), before, after, self._done - done))
         return edges.reshape(-1, 2)
 
-    def drop_wrong_observations(self) -> tuple[IntArray, IntArray]:
+    def drop_wrong_observations(self) -> tuple[Ints, Ints]:
         """Pairs (N, 2) of the observations that left, and the landmarks (N,) with them."""
         probability = self._config.observation_probability
         pairs = wrong_observations(self._tables, self._camera, probability)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.covariance import covariance_of
 from bmask_slam.graph.calibration.equations import (
     CAUCHY,
@@ -29,7 +30,7 @@ from bmask_slam.graph.calibration.problem import (
     body_arm,
     prior_residuals,
 )
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.geometry import se3_exp
 
 MIN_NOISE_SCALE = 0.02
 MEDIAN_CHI2_1DOF, MEDIAN_CHI2_2DOF = 0.455, 1.386

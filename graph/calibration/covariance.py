@@ -6,6 +6,7 @@ import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.equations import normal_equations, root_weights, with_points
 from bmask_slam.graph.calibration.model import CalibrationViews, linearise
 from bmask_slam.graph.calibration.problem import (
@@ -14,8 +15,6 @@ from bmask_slam.graph.calibration.problem import (
     N,
     prior_information,
 )
-from bmask_slam.graph.factors.graph_update import IntArray
-from bmask_slam.graph.geometry import Array
 
 STRETCHES = 8
 
@@ -53,7 +52,7 @@ def covariance_of(problem: CalibrationProblem, state: CalibrationState, scales: 
     return np.where(np.outer(free, free), model * np.outer(larger, larger), 0.0)
 
 
-def _clusters(views: CalibrationViews) -> tuple[IntArray, IntArray, IntArray]:
+def _clusters(views: CalibrationViews) -> tuple[Ints, Ints, Ints]:
     """Three ways to say (M,) which views may err together: see ``covariance_of``."""
     keyframes = int(views.keyframes.max()) + 1
     stretch = np.arange(keyframes) * min(STRETCHES, keyframes) // keyframes
@@ -62,7 +61,7 @@ def _clusters(views: CalibrationViews) -> tuple[IntArray, IntArray, IntArray]:
     return views.landmarks, stretch[views.keyframes], stretch[first[views.landmarks]]
 
 
-def _clustered_variance(scores: Array, clusters: IntArray) -> Array:
+def _clustered_variance(scores: Array, clusters: Ints) -> Array:
     """Variances (13,) from scores (M, 13) whose errors depend on each other within clusters (M,).
 
     Few clusters tell their spread badly: the variance is raised so that 1.96 of its roots are the

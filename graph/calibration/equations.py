@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import bsr_array
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.model import CalibrationViews, linearise
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState, N, add_priors
-from bmask_slam.graph.geometry import Array
 
 CAUCHY = 2.385  # 95 % efficiency on Gaussian noise
 

@@ -26,10 +26,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, skew
+from bmask_slam.graph.geometry import inverse, skew
 
 PARAMETERS = (
     *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
@@ -58,8 +58,8 @@ class CalibrationViews:
             of the image, from -1/2 to 1/2, by which its row lies below the middle.
     """
 
-    keyframes: NDArray[np.int64]
-    landmarks: NDArray[np.int64]
+    keyframes: Ints
+    landmarks: Ints
     pixels: Array
     inverse_depth: Array
     inverse_depth_rate: Array
@@ -83,7 +83,7 @@ class Linearised:
     pose: Array
     point: Array
     calibration: Array
-    valid: NDArray[np.bool_]
+    valid: Mask
 
 
 def parameters_of(camera: Camera, raw_scale: float) -> Array:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.model import PARAMETERS, CalibrationViews
-from bmask_slam.graph.geometry import Array, inverse, se3_log, skew
+from bmask_slam.graph.geometry import inverse, se3_log, skew
 
 N = len(PARAMETERS)
 
@@ -31,7 +31,7 @@ class Anchors:
     positions_world: Array
     position_sigma_m: float = 0.01
     on_body: bool = False
-    ends: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    ends: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     arms_m: Array = field(default_factory=lambda: np.zeros((0, 2, 3)))
     distances_m: Array = field(default_factory=lambda: np.zeros(0))
     distance_sigma_m: float = 0.005

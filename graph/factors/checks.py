@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables, ValueTable
 from bmask_slam.graph.factors.graph_update import (
     GraphUpdate,
-    IntArray,
     ObservationErrors,
     Observations,
     PosePrior,
@@ -27,9 +26,8 @@ from bmask_slam.graph.factors.graph_update import (
     RelativePoseErrors,
 )
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array, inverse, se3_log
+from bmask_slam.graph.geometry import inverse, se3_log
 
-Mask = NDArray[np.bool_]
 OBSERVATION_PROBABILITY = 0.95
 _ROBUST = (None, "huber", "cauchy", "dcs")
 
@@ -38,32 +36,32 @@ _ROBUST = (None, "huber", "cauchy", "dcs")
 class Candidates:
     """New variables with usable initial values, with everything the graph already holds."""
 
-    new_keyframes: IntArray
+    new_keyframes: Ints
     new_poses: Array
-    new_landmarks: IntArray
+    new_landmarks: Ints
     new_points: Array
     tables: FactorTables
 
-    def has_keyframes(self, ids: IntArray) -> Mask:
+    def has_keyframes(self, ids: Ints) -> Mask:
         """Which of these are new or in the graph."""
         return self.tables.keyframes.contains(ids) | np.isin(ids, self.new_keyframes)
 
-    def has_landmarks(self, ids: IntArray) -> Mask:
+    def has_landmarks(self, ids: Ints) -> Mask:
         """Which of these are new or in the graph."""
         return self.tables.landmarks.contains(ids) | np.isin(ids, self.new_landmarks)
 
-    def poses(self, ids: IntArray) -> Array:
+    def poses(self, ids: Ints) -> Array:
         """Poses (N, 4, 4) of ids that must exist."""
         table = self.tables.keyframes
         return _lookup(ids, (table.ids, table.values), (self.new_keyframes, self.new_poses))
 
-    def points(self, ids: IntArray) -> Array:
+    def points(self, ids: Ints) -> Array:
         """Points (N, 3) of ids that must exist."""
         table = self.tables.landmarks
         return _lookup(ids, (table.ids, table.values), (self.new_landmarks, self.new_points))
 
 
-def check_variables(ids: IntArray, values: Array, known: IntArray) -> tuple[IntArray, IntArray]:
+def check_variables(ids: Ints, values: Array, known: Ints) -> tuple[Ints, Ints]:
     """Rows of usable new variables, and a reason (0: fine) for each given one."""
     reasons = np.zeros(len(ids), np.int64)
     first = np.zeros(len(ids), bool)
@@ -127,7 +125,7 @@ def _pose_factor_reason(
 
 def check_observations(
     observations: Observations, candidates: Candidates, camera: Camera, config: SmootherConfig
-) -> IntArray:
+) -> Ints:
     """A reason (0: fine) for each observation taken alone."""
     z, sigmas = observations.measurements, observations.sigmas_px
     stereo = np.isfinite(z[:, 2])
@@ -192,7 +190,7 @@ def observation_errors(tables: FactorTables, camera: Camera) -> ObservationError
 
 def wrong_observations(
     tables: FactorTables, camera: Camera, probability: float = OBSERVATION_PROBABILITY
-) -> IntArray:
+) -> Ints:
     """Keyframe and landmark ids (N, 2) of observations beyond their chi-square bound.
 
     3 degrees of freedom with depth, 2 without; taken without the kernel.
@@ -235,7 +233,7 @@ def _repeated(observations: Observations, tables: FactorTables) -> Mask:
     return repeated
 
 
-def _lookup(ids: IntArray, *tables: tuple[IntArray, Array]) -> Array:
+def _lookup(ids: Ints, *tables: tuple[Ints, Array]) -> Array:
     values = np.full((len(ids), *tables[0][1].shape[1:]), np.nan)
     for known_ids, known in tables:
         if not len(known_ids):

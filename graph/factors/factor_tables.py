@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
+from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.marginalised_landmarks import MarginalisedLandmarks
-from bmask_slam.graph.geometry import Array
 
 NO_SLOT = -1
 
 
-def ids_array(ids: Iterable[int]) -> IntArray:
+def ids_array(ids: Iterable[int]) -> Ints:
     """Sorted distinct ids as an int64 array."""
     return np.array(sorted(set(ids)), np.int64)
 
@@ -29,28 +29,28 @@ class ValueTable:
     """Sorted ids with one array value each: a pose (4, 4) or a point (3,)."""
 
     def __init__(self, *shape: int) -> None:
-        self.ids: IntArray = np.zeros(0, np.int64)
+        self.ids: Ints = np.zeros(0, np.int64)
         self.values: Array = np.zeros((0, *shape))
 
-    def contains(self, ids: IntArray) -> np.ndarray:
+    def contains(self, ids: Ints) -> np.ndarray:
         """Mask (N,) of the ids that are here."""
         if not len(self.ids):
             return np.zeros(len(ids), bool)
         at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
         return self.ids[at] == ids
 
-    def get(self, ids: IntArray) -> Array:
+    def get(self, ids: Ints) -> Array:
         """Values (N, ...) of ids that must be here."""
         return self.values[np.searchsorted(self.ids, ids)]
 
-    def insert(self, ids: IntArray, values: Array) -> None:
+    def insert(self, ids: Ints, values: Array) -> None:
         """Add ids that must not be here yet."""
         merged = np.concatenate([self.ids, np.asarray(ids, np.int64)])
         order = np.argsort(merged, kind="stable")
         self.ids = merged[order]
         self.values = np.concatenate([self.values, values])[order]
 
-    def remove(self, ids: IntArray) -> None:
+    def remove(self, ids: Ints) -> None:
         """Take ids out; those that are not here are passed over."""
         keep = ~np.isin(self.ids, ids)
         self.ids, self.values = self.ids[keep], self.values[keep]
@@ -68,13 +68,13 @@ class ObservationTable:
         self.of_landmark: dict[int, dict[int, int]] = {}
         self._free: list[int] = []
         self._columns = Observations()
-        self._slots: IntArray = np.zeros(0, np.int64)
+        self._slots: Ints = np.zeros(0, np.int64)
         self._used = 0
 
     def __len__(self) -> int:
         return self._used - len(self._free)
 
-    def add(self, observations: Observations) -> IntArray:
+    def add(self, observations: Observations) -> Ints:
         """Put observations in; their rows (M,)."""
         rows = self._take_rows(len(observations))
         self._columns.keyframe_ids[rows] = observations.keyframe_ids
@@ -93,7 +93,7 @@ class ObservationTable:
             self.of_landmark.setdefault(landmark, {})[keyframe] = row
         return rows
 
-    def remove(self, rows: IntArray) -> None:
+    def remove(self, rows: Ints) -> None:
         """Take rows out; each must be in use."""
         pairs = zip(
             self._columns.keyframe_ids[rows].tolist(),
@@ -109,39 +109,39 @@ class ObservationTable:
         """The row of this observation, or None."""
         return self.of_keyframe.get(keyframe, {}).get(landmark)
 
-    def rows_of_keyframes(self, ids: Iterable[int]) -> IntArray:
+    def rows_of_keyframes(self, ids: Iterable[int]) -> Ints:
         """All rows of these keyframes."""
         return _rows_of(self.of_keyframe, ids)
 
-    def rows_of_landmarks(self, ids: Iterable[int]) -> IntArray:
+    def rows_of_landmarks(self, ids: Iterable[int]) -> Ints:
         """All rows of these landmarks."""
         return _rows_of(self.of_landmark, ids)
 
-    def select(self, rows: IntArray) -> Observations:
+    def select(self, rows: Ints) -> Observations:
         """The observations in these rows."""
         return self._columns.select(rows)
 
-    def slots(self, rows: IntArray) -> IntArray:
+    def slots(self, rows: Ints) -> Ints:
         """Places of these rows' factors in ISAM2, NO_SLOT where there is none."""
         return self._slots[rows]
 
-    def set_slots(self, rows: IntArray, slots: IntArray) -> None:
+    def set_slots(self, rows: Ints, slots: Ints) -> None:
         """Remember the places of these rows' factors in ISAM2."""
         self._slots[rows] = slots
 
-    def used_rows(self) -> IntArray:
+    def used_rows(self) -> Ints:
         """Every row in use, in no order that means anything."""
         used = np.ones(self._used, bool)
         used[self._free] = False
         return np.flatnonzero(used)
 
-    def all_rows(self) -> IntArray:
+    def all_rows(self) -> Ints:
         """Every row in use, ordered by keyframe, then landmark: the same for equal contents."""
         rows = self.used_rows()
         columns = self._columns.select(rows)
         return rows[np.lexsort((columns.landmark_ids, columns.keyframe_ids))]
 
-    def _take_rows(self, count: int) -> IntArray:
+    def _take_rows(self, count: int) -> Ints:
         again = [self._free.pop() for _ in range(min(count, len(self._free)))]
         fresh = range(self._used, self._used + count - len(again))
         self._used += len(fresh)
@@ -233,7 +233,7 @@ def _discard(index: dict[int, dict[int, int]], first: int, second: int) -> None:
         del index[first]
 
 
-def _rows_of(index: dict[int, dict[int, int]], ids: Iterable[int]) -> IntArray:
+def _rows_of(index: dict[int, dict[int, int]], ids: Iterable[int]) -> Ints:
     rows: set[int] = set()
     for i in ids:
         rows.update(index.get(i, {}).values())

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 
 
 def truncated_weights(chi_squares: Array, limit: float, mu: float) -> Array:

@@ -15,9 +15,8 @@ from enum import Enum, IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Ints, Mask
 
-IntArray = NDArray[np.int64]
 RelativePoseName = tuple[int, int, str]
 """keyframe_a, keyframe_b, kind."""
 NO_LANDMARK = -1
@@ -56,7 +55,7 @@ class RemovalPolicy(Enum):
     """Carry out nothing of the update's removals, and name each such variable."""
 
 
-def _no_ids() -> IntArray:
+def _no_ids() -> Ints:
     return np.zeros(0, np.int64)
 
 
@@ -78,8 +77,8 @@ class Observations:
             NaN.
     """
 
-    keyframe_ids: IntArray = field(default_factory=_no_ids)
-    landmark_ids: IntArray = field(default_factory=_no_ids)
+    keyframe_ids: Ints = field(default_factory=_no_ids)
+    landmark_ids: Ints = field(default_factory=_no_ids)
     measurements: Array = field(default_factory=lambda: _zeros(0, 3))
     sigmas_px: Array = field(default_factory=lambda: _zeros(0, 3))
 
@@ -163,20 +162,20 @@ class GraphUpdate:
     Ids to remove that the graph does not hold are passed over.
     """
 
-    keyframe_ids: IntArray = field(default_factory=_no_ids)
+    keyframe_ids: Ints = field(default_factory=_no_ids)
     poses_world_camera: Array = field(default_factory=lambda: _zeros(0, 4, 4))
-    landmark_ids: IntArray = field(default_factory=_no_ids)
+    landmark_ids: Ints = field(default_factory=_no_ids)
     points_world: Array = field(default_factory=lambda: _zeros(0, 3))
     observations: Observations = field(default_factory=Observations)
     relative_poses: tuple[RelativePose, ...] = ()
     priors: tuple[PosePrior, ...] = ()
-    remove_landmarks: IntArray = field(default_factory=_no_ids)
-    remove_keyframes: IntArray = field(default_factory=_no_ids)
-    remove_observations: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    remove_landmarks: Ints = field(default_factory=_no_ids)
+    remove_keyframes: Ints = field(default_factory=_no_ids)
+    remove_observations: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     remove_relative_poses: tuple[RelativePoseName, ...] = ()
     removal_policy: RemovalPolicy = RemovalPolicy.DROP
     max_iterations: int = 0
-    marginalise_landmarks: IntArray = field(default_factory=_no_ids)
+    marginalise_landmarks: Ints = field(default_factory=_no_ids)
 
 
 @dataclass(frozen=True)
@@ -188,9 +187,9 @@ class Refusals:
         reasons: (N,) int64 values of RefusalReason.
     """
 
-    keyframe_ids: IntArray = field(default_factory=_no_ids)
-    landmark_ids: IntArray = field(default_factory=_no_ids)
-    reasons: IntArray = field(default_factory=_no_ids)
+    keyframe_ids: Ints = field(default_factory=_no_ids)
+    landmark_ids: Ints = field(default_factory=_no_ids)
+    reasons: Ints = field(default_factory=_no_ids)
 
     def __len__(self) -> int:
         return len(self.reasons)
@@ -222,9 +221,9 @@ class RemovalReport:
             there is any, nothing went.
     """
 
-    landmark_ids: IntArray = field(default_factory=_no_ids)
-    keyframe_ids: IntArray = field(default_factory=_no_ids)
-    observations: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    landmark_ids: Ints = field(default_factory=_no_ids)
+    keyframe_ids: Ints = field(default_factory=_no_ids)
+    observations: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     relative_poses: tuple[RelativePoseName, ...] = ()
     refused: Refusals = field(default_factory=Refusals)
 
@@ -256,16 +255,16 @@ class GraphEstimate:
         factors: number of factors in the graph now.
     """
 
-    keyframe_ids: IntArray
+    keyframe_ids: Ints
     poses_world_camera: Array
-    landmark_ids: IntArray
+    landmark_ids: Ints
     points_world: Array
     refused: Refusals = field(default_factory=Refusals)
     refused_factors: tuple[RefusedFactor, ...] = ()
     removal: RemovalReport = field(default_factory=RemovalReport)
-    dropped_landmarks: IntArray = field(default_factory=_no_ids)
-    dropped_keyframes: IntArray = field(default_factory=_no_ids)
-    anchored_keyframes: IntArray = field(default_factory=_no_ids)
+    dropped_landmarks: Ints = field(default_factory=_no_ids)
+    dropped_keyframes: Ints = field(default_factory=_no_ids)
+    anchored_keyframes: Ints = field(default_factory=_no_ids)
     rebuilt: bool = False
     failed_variable: str = ""
     cost_before: float = math.nan
@@ -287,11 +286,11 @@ class ObservationErrors:
         is_stereo: (M,) bool.
     """
 
-    keyframe_ids: IntArray
-    landmark_ids: IntArray
+    keyframe_ids: Ints
+    landmark_ids: Ints
     chi2: Array
     depth_m: Array
-    is_stereo: NDArray[np.bool_]
+    is_stereo: Mask
 
 
 @dataclass(frozen=True)
@@ -304,7 +303,7 @@ class RelativePoseErrors:
         chi2: (N,) squared whitened errors WITHOUT any robust kernel, 6 degrees of freedom.
     """
 
-    keyframe_a: IntArray
-    keyframe_b: IntArray
+    keyframe_a: Ints
+    keyframe_b: Ints
     kinds: NDArray[np.str_]
     chi2: Array

@@ -11,12 +11,13 @@ from collections.abc import Iterable
 import gtsam
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
 from bmask_slam.graph.factors.noise import pixel_noises, pose_noise
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array, make_pose
+from bmask_slam.graph.geometry import make_pose
 
 _GTSAM_STEREO_ORDER = [0, 2, 1]
 
@@ -89,7 +90,7 @@ def make_graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFacto
 
 
 def make_values(
-    keyframe_ids: IntArray, poses_world_camera: Array, landmark_ids: IntArray, points_world: Array
+    keyframe_ids: Ints, poses_world_camera: Array, landmark_ids: Ints, points_world: Array
 ) -> gtsam.Values:
     """Values of keyframes (K, 4, 4) and landmarks (L, 3) in metres."""
     values = gtsam.Values()

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from bmask_slam.graph.factors.graph_update import IntArray
+from bmask_slam.graph.arrays import Ints
 
 _INDEX_BITS = 56
 KEYFRAME_BASE = ord("x") << _INDEX_BITS
@@ -15,12 +15,12 @@ _NAMED = re.compile(r"(?:Symbol: |key \")([xl])(\d+)")
 _NAMES = {"x": "keyframe", "l": "landmark"}
 
 
-def keyframe_keys(ids: IntArray) -> list[int]:
+def keyframe_keys(ids: Ints) -> list[int]:
     """The keys of keyframes, as Python integers."""
     return (np.asarray(ids, np.int64) + KEYFRAME_BASE).tolist()
 
 
-def landmark_keys(ids: IntArray) -> list[int]:
+def landmark_keys(ids: Ints) -> list[int]:
     """The keys of landmarks, as Python integers."""
     return (np.asarray(ids, np.int64) + LANDMARK_BASE).tolist()
 

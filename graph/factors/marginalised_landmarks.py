@@ -11,10 +11,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.factors.graph_update import IntArray, Observations
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.factors.graph_update import Observations
 
 MARGINAL = "marginal"
 
@@ -30,7 +29,7 @@ class Chunk:
     """
 
     observations: Observations
-    is_summary: NDArray[np.bool_]
+    is_summary: Mask
     numbers: tuple[int, ...] = ()
 
 
@@ -109,7 +108,7 @@ class MarginalisedLandmarks:
             return False
         return keyframe in self.observers.get(landmark, ())
 
-    def are_summaries(self, keyframes: IntArray, landmarks: IntArray) -> NDArray[np.bool_]:
+    def are_summaries(self, keyframes: Ints, landmarks: Ints) -> Mask:
         """Mask (M,) of the pairs that are the summary with which a landmark came back."""
         hosts = [
             -1 if (s := self.returned.get(j)) is None else s.keyframe_id for j in landmarks.tolist()

@@ -7,7 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 
 
 def pixel_noises(sigmas_px: Array, huber_k: float | None) -> list[gtsam.noiseModel.Base]:

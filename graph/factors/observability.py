@@ -8,9 +8,9 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from bmask_slam.graph.factors.graph_update import IntArray, Observations
+from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array
 
 Edges = Sequence[tuple[int, ...]]
 """Keyframes of pose factors: one id for a prior, two for a relative pose."""
@@ -21,7 +21,7 @@ def constrained_landmarks(
     poses_world_camera: Array,
     points_world: Array,
     min_parallax_deg: float,
-) -> IntArray:
+) -> Ints:
     """Sorted ids of the landmarks that these observations alone constrain.
 
     ``poses_world_camera`` (M, 4, 4) and ``points_world`` (M, 3) belong to the observations row
@@ -46,12 +46,12 @@ def constrained_landmarks(
 
 
 def loose_keyframes(
-    ids: IntArray,
+    ids: Ints,
     observations: Observations,
     values: tuple[Array, Array],
     edges: Edges,
     config: SmootherConfig,
-) -> IntArray:
+) -> Ints:
     """Those of the sorted ids (K,) that nothing ties firmly to a prior.
 
     Grown from the priors: a keyframe joins by a relative pose to a firm one, or by
@@ -86,7 +86,7 @@ def loose_keyframes(
         firm = now
 
 
-def firm_parts(ids: IntArray, observations: Observations, edges: Edges, minimum: int) -> IntArray:
+def firm_parts(ids: Ints, observations: Observations, edges: Edges, minimum: int) -> Ints:
     """The number (K,) of the part of the sorted ids that each is in, by firm links alone.
 
     A link is a relative pose between two of them, or ``minimum`` landmarks that both see and
@@ -105,7 +105,7 @@ def firm_parts(ids: IntArray, observations: Observations, edges: Edges, minimum:
     return connected_components(links, directed=False)[1].astype(np.int64)
 
 
-def component_labels(ids: IntArray, observations: Observations, edges: Edges) -> IntArray:
+def component_labels(ids: Ints, observations: Observations, edges: Edges) -> Ints:
     """The number (K,) of the connected part that each of the sorted ids is in."""
     names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
     pairs = np.array([edge for edge in edges if len(edge) == 2], np.int64).reshape(-1, 2)
@@ -116,7 +116,7 @@ def component_labels(ids: IntArray, observations: Observations, edges: Edges) ->
     return connected_components(links, directed=False)[1][: len(ids)].astype(np.int64)
 
 
-def shared_landmarks(ids: IntArray, observations: Observations) -> csr_array:
+def shared_landmarks(ids: Ints, observations: Observations) -> csr_array:
     """How many landmarks each two of the sorted ids (K,) share: (K, K), sparse."""
     names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
     rows = np.searchsorted(ids, observations.keyframe_ids)

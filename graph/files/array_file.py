@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.errors import InputError
 
-Arrays = dict[str, NDArray[Any]]
 Header = dict[str, Any]
 _HEADER = "header"
 _UNREADABLE = (  # RuntimeError: a damaged byte may ask for encryption or another compression

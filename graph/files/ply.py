@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.whole_file import whole_file
 
@@ -50,7 +51,7 @@ def write_ply(path: Path, columns: Mapping[str, NDArray[Any]], comment: str = ""
         temporary.write_bytes("\n".join(header).encode("ascii") + vertices.tobytes())
 
 
-def read_ply(path: Path) -> dict[str, NDArray[Any]]:
+def read_ply(path: Path) -> Arrays:
     """Columns (N,) of the vertices of a file as ``write_ply`` makes them.
 
     Raises:

@@ -33,9 +33,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.g2o.lines import (
     Tag,
     information_columns,
@@ -43,7 +44,6 @@ from bmask_slam.graph.g2o.lines import (
     pose_columns,
     write_lines,
 )
-from bmask_slam.graph.geometry import Array
 
 VIEW = "EDGE_PROJECT_DISPARITY"
 CAMERA, STEREO, OFFSET = "PARAMS_CAMERACALIB", "PARAMS_STEREOCAMERACALIB", "PARAMS_SE3OFFSET"
@@ -100,7 +100,7 @@ def write_landmark_graph(path: Path, tables: FactorTables, camera: Camera) -> No
     write_lines(path, [*lines, *_lines(VIEW, names, _view_columns(seen, camera))])
 
 
-def _lines(tag: str, names: IntArray, numbers: Array) -> list[str]:
+def _lines(tag: str, names: Ints, numbers: Array) -> list[str]:
     rows = zip(names.reshape(len(numbers), -1).tolist(), numbers, strict=True)
     return [f"{tag} {' '.join(map(str, ids))} {numbers_text(row)}" for ids, row in rows]
 

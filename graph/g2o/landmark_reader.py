@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.observability import component_labels
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.g2o.landmark_graphs import (
@@ -35,7 +36,6 @@ from bmask_slam.graph.g2o.lines import (
     vertex_ids,
 )
 from bmask_slam.graph.g2o.pose_graphs import check_fixed, pairs_of
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.smoother.anchoring import anchor_components
 
 logger = logging.getLogger(__name__)
@@ -158,7 +158,7 @@ def _check_parameters(edge: str, parameter: str, rows: dict[str, Rows], path: Pa
             )
 
 
-def _views(rows: Rows, names: IntArray, offset: int, camera: Camera, path: Path) -> Observations:
+def _views(rows: Rows, names: Ints, offset: int, camera: Camera, path: Path) -> Observations:
     """Observations from lines of u, v, 1/z and their information."""
     values = np.array(rows.numbers)
     u, v, inverse_depth = values[:, :3].T
@@ -188,7 +188,7 @@ def _views(rows: Rows, names: IntArray, offset: int, camera: Camera, path: Path)
 
 
 def _pose_factors(
-    rows: dict[str, Rows], notes: _Notes, keyframe_ids: IntArray, path: Path
+    rows: dict[str, Rows], notes: _Notes, keyframe_ids: Ints, path: Path
 ) -> list[RelativePose | PosePrior]:
     """Priors, then relative poses; without a comment edges between ids in a row are odometry."""
     factors: list[RelativePose | PosePrior] = []

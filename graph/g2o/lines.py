@@ -18,15 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
-from bmask_slam.graph.geometry import (
-    Array,
-    make_pose,
-    quaternion_from_rotation,
-    rotation_from_quaternion,
-)
+from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 from bmask_slam.graph.pose_graph.pose_graph import planar_coordinates, planar_poses
-from bmask_slam.graph.trajectory import Indices
 
 logger = logging.getLogger(__name__)
 
@@ -116,7 +111,7 @@ def _id(word: str, where: str) -> int:
     return int(word)
 
 
-def vertex_ids(vertices: Rows, path: Path) -> tuple[Indices, Indices]:
+def vertex_ids(vertices: Rows, path: Path) -> tuple[Ints, Ints]:
     """Sorted ids (N,), and the vertex line (N,) of each. Raises InputError for an id twice."""
     names = np.array(vertices.ids, np.int64).reshape(-1, 1)[:, 0]
     ids, first = np.unique(names, return_index=True)
@@ -127,7 +122,7 @@ def vertex_ids(vertices: Rows, path: Path) -> tuple[Indices, Indices]:
     return ids, first
 
 
-def indices_of(names: Indices, lines: list[int], ids: Indices, path: Path) -> Indices:
+def indices_of(names: Ints, lines: list[int], ids: Ints, path: Path) -> Ints:
     """Rows (M, ...) into sorted ``ids`` of the vertices (M, ...) that edges name."""
     missing = ~np.isin(names, ids)
     if missing.any():

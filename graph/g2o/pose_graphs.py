@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.g2o.lines import (
     Rows,
@@ -26,7 +27,6 @@ from bmask_slam.graph.g2o.lines import (
     write_lines,
 )
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, component_labels
-from bmask_slam.graph.trajectory import Indices
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ def write_g2o(path: Path, graph: PoseGraph) -> None:
     write_lines(Path(path), lines)
 
 
-def pairs_of(edges: Rows, path: Path) -> Indices:
+def pairs_of(edges: Rows, path: Path) -> Ints:
     """Ids (M, 2) that edges join. Raises InputError for an edge from a vertex to itself."""
     names = np.array(edges.ids, np.int64).reshape(-1, 2)
     if (names[:, 0] == names[:, 1]).any():
@@ -105,7 +105,7 @@ def pairs_of(edges: Rows, path: Path) -> Indices:
     return names
 
 
-def _known_fixed(fixed: dict[int, int], ids: Indices, path: Path, has_poses: bool) -> list[int]:
+def _known_fixed(fixed: dict[int, int], ids: Ints, path: Path, has_poses: bool) -> list[int]:
     check_fixed(fixed, ids, path)
     if len(fixed) > 1 and not has_poses:
         line = max(fixed.values())
@@ -113,7 +113,7 @@ def _known_fixed(fixed: dict[int, int], ids: Indices, path: Path, has_poses: boo
     return list(fixed)
 
 
-def check_fixed(fixed: dict[int, int], ids: Indices, path: Path) -> None:
+def check_fixed(fixed: dict[int, int], ids: Ints, path: Path) -> None:
     """Refuse a FIX of a vertex that is not among ``ids``."""
     known = set(ids.tolist())
     for name, line in fixed.items():

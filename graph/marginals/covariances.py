@@ -14,9 +14,8 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from bmask_slam.graph.factors.graph_update import IntArray
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
-from bmask_slam.graph.geometry import Array
 
 
 @dataclass(frozen=True)
@@ -33,17 +32,17 @@ class Marginals:
         landmarks: (L, 3, 3) of points_world in metres.
     """
 
-    keyframe_ids: IntArray
+    keyframe_ids: Ints
     keyframes: Array
-    landmark_ids: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    landmark_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
 
 def marginals_of(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
-    keyframe_ids: IntArray,
-    landmark_ids: IntArray,
+    keyframe_ids: Ints,
+    landmark_ids: Ints,
 ) -> Marginals:
     """The covariances of some variables. Raises RuntimeError where the graph is singular."""
     source = gtsam.Marginals(graph, values)

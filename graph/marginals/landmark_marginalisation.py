@@ -26,13 +26,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, ids_array
 from bmask_slam.graph.factors.graph_update import (
     GraphUpdate,
-    IntArray,
     Observations,
     RelativePose,
     concatenate,
@@ -45,7 +44,7 @@ from bmask_slam.graph.factors.marginalised_landmarks import (
 )
 from bmask_slam.graph.factors.observability import constrained_landmarks
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.marginals.point_elimination import (
     PointInformation,
     PoseInformation,
@@ -53,8 +52,6 @@ from bmask_slam.graph.marginals.point_elimination import (
     projection_jacobian,
 )
 from bmask_slam.graph.marginals.sparsification import recover, spanning_tree, with_new_bases
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass
@@ -66,7 +63,7 @@ class Marginalisation:
 
 
 def marginalise_landmarks(
-    ids: IntArray, tables: FactorTables, camera: Camera, config: SmootherConfig
+    ids: Ints, tables: FactorTables, camera: Camera, config: SmootherConfig
 ) -> Marginalisation:
     """Replace all factors of these landmarks; ids that the graph does not hold are passed over."""
     table, marginalised, done = tables.observations, tables.marginalised, Marginalisation()
@@ -133,7 +130,7 @@ def returning(update: GraphUpdate, tables: FactorTables, camera: Camera) -> Grap
     )
 
 
-def note_returned(landmark_ids: IntArray, marginalised: MarginalisedLandmarks) -> None:
+def note_returned(landmark_ids: Ints, marginalised: MarginalisedLandmarks) -> None:
     """These landmarks entered the graph; those that were retired are so no more."""
     for landmark in landmark_ids.tolist():
         marginalised.returned.pop(landmark, None)
@@ -141,7 +138,7 @@ def note_returned(landmark_ids: IntArray, marginalised: MarginalisedLandmarks) -
             marginalised.returned[landmark] = marginalised.summaries.pop(landmark)
 
 
-def note_retracted(landmark_ids: IntArray, marginalised: MarginalisedLandmarks) -> None:
+def note_retracted(landmark_ids: Ints, marginalised: MarginalisedLandmarks) -> None:
     """These landmarks were taken out again: those that had come back are retired as before."""
     for landmark in landmark_ids.tolist():
         if landmark in marginalised.returned:
@@ -182,7 +179,7 @@ def reinstate(tables: FactorTables, camera: Camera, config: SmootherConfig) -> N
 def _put(
     chunk: Chunk,
     number: int,
-    landmarks: tuple[IntArray, Array],
+    landmarks: tuple[Ints, Array],
     model: tuple[FactorTables, Camera, SmootherConfig],
     done: Marginalisation,
 ) -> None:
@@ -248,7 +245,7 @@ def _renew(
         _put(rest, number, (ids, points), model, done)
 
 
-def _parts(seen: Observations, limit: int) -> Iterator[IntArray]:
+def _parts(seen: Observations, limit: int) -> Iterator[Ints]:
     """Rows in groups of whole landmarks that few keyframes see, halved by when they were last seen.
 
     A single landmark may have more than ``limit`` keyframes.
@@ -266,7 +263,7 @@ def _parts(seen: Observations, limit: int) -> Iterator[IntArray]:
             waiting += [group[len(group) // 2 :], group[: len(group) // 2]]
 
 
-def _points_of(ids: IntArray, tables: FactorTables, camera: Camera) -> Array:
+def _points_of(ids: Ints, tables: FactorTables, camera: Camera) -> Array:
     """Where landmarks (N,) are: in the graph, or carried by the keyframes of their summaries."""
     points = np.zeros((len(ids), 3))
     inside = tables.landmarks.contains(ids)

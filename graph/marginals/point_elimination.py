@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.graph_update import IntArray, Observations
+from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array, inverse, skew
+from bmask_slam.graph.geometry import inverse, skew
 
 _POINT_FLOOR_PER_M2 = 1e-6
 """Information added to each point, that of a sigma of 1 km: keeps a flat one invertible."""
@@ -33,7 +34,7 @@ class PoseInformation:
         g: (K, 6) gradient there.
     """
 
-    keyframe_ids: IntArray
+    keyframe_ids: Ints
     poses_world_camera: Array
     H: Array
     g: Array
@@ -49,7 +50,7 @@ class PointInformation:
         points_world: (L, 3) the optimum of one Gauss-Newton step.
     """
 
-    landmark_ids: IntArray
+    landmark_ids: Ints
     covariances: Array
     points_world: Array
 
@@ -102,8 +103,8 @@ def _huber_weights(r: Array, stereo: Array, config: SmootherConfig) -> Array:
 
 def eliminate_points(
     observations: Observations,
-    keyframes: tuple[IntArray, Array],
-    landmarks: tuple[IntArray, Array],
+    keyframes: tuple[Ints, Array],
+    landmarks: tuple[Ints, Array],
     camera: Camera,
     config: SmootherConfig,
 ) -> tuple[PoseInformation, PointInformation]:

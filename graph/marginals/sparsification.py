@@ -17,14 +17,13 @@ landmarks with any; one that comes back to a known place needs no new one.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from bmask_slam.graph.factors.graph_update import IntArray, RelativePose
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, skew
+from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.factors.graph_update import RelativePose
+from bmask_slam.graph.geometry import inverse, se3_exp, skew
 from bmask_slam.graph.marginals.point_elimination import PoseInformation
 
-Mask = NDArray[np.bool_]
 _KNOWN_SIGMAS = np.array([0.05] * 3 + [0.1] * 3)
 """How well (rad, m) the poses are known to each other without what is made sparse. Some poses
 hang on one or two of the landmarks; taken alone these would allow any pose, far from where the
@@ -37,7 +36,7 @@ _LEAST = 1.0
 """Information (rad^-2, m^-2) that makes every covariance finite; an edge with less is left out."""
 
 
-def recover(information: PoseInformation, edges: IntArray, kind: str) -> list[RelativePose]:
+def recover(information: PoseInformation, edges: Ints, kind: str) -> list[RelativePose]:
     """Relative poses on a tree (E, 2) of rows that stand for the dense information.
 
     Their gradient at the linearisation is that of the dense cost, so that a graph at its optimum
@@ -70,7 +69,7 @@ def recover(information: PoseInformation, edges: IntArray, kind: str) -> list[Re
     ]
 
 
-def spanning_tree(information: PoseInformation, is_base: Mask) -> IntArray:
+def spanning_tree(information: PoseInformation, is_base: Mask) -> Ints:
     """Pairs of rows (K - 1, 2): the best tree between bases, all others on their best base."""
     count = len(is_base)
     _, covariance = _anchored(information)
@@ -85,7 +84,7 @@ def spanning_tree(information: PoseInformation, is_base: Mask) -> IntArray:
     return np.sort(np.concatenate([trunk, hanging]).astype(np.int64), axis=1)
 
 
-def with_new_bases(shared: IntArray, is_base: Mask, share: float) -> Mask:
+def with_new_bases(shared: Ints, is_base: Mask, share: float) -> Mask:
     """Bases (K,) bool such that each pose shares enough of its landmarks with one.
 
     ``shared`` (K, K) counts common landmarks. Of those left over, the one that covers most of
@@ -133,12 +132,12 @@ def _known(count: int, anchor: int) -> Array:
     return covariance
 
 
-def _jacobians(poses: Array, a: IntArray, b: IntArray) -> Array:
+def _jacobians(poses: Array, a: Ints, b: Ints) -> Array:
     """d tangent of T_a^-1 T_b (right side) / d tangent of T_a, (E, 6, 6); by T_b it is 1."""
     return -adjoint(inverse(poses[b]) @ poses[a])
 
 
-def _relative(covariance: Array, poses: Array, a: IntArray, b: IntArray) -> Array:
+def _relative(covariance: Array, poses: Array, a: Ints, b: Ints) -> Array:
     """Covariances (E, 6, 6) of the tangents of T_a^-1 T_b, on its right side."""
     J = _jacobians(poses, a, b)
     across = J @ covariance[a, :, b]

@@ -8,7 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_coordinates, planar_poses
 
 _IN_PLANE = np.array([3, 4, 2])  # where x, y and angle stand in a tangent of SE(3)

@@ -7,11 +7,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.stats import chi2
 
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.factors.gnc import first_mu, graduate
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.pose_graph.loop_consistency import LoopSupport
 from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
-from bmask_slam.graph.pose_graph.pose_graph import Mask, PoseGraph, is_connected
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, is_connected
 from bmask_slam.graph.pose_graph.solver import PoseGraphConfig, PoseGraphSolver
 
 LEAST_WEIGHT = 1e-6  # where odometry does not connect: what one edge alone holds stays solvable

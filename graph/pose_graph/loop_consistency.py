@@ -8,11 +8,10 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.factors.checks import mahalanobis
-from bmask_slam.graph.factors.graph_update import IntArray
-from bmask_slam.graph.geometry import Array, adjoint, inverse, se3_log
+from bmask_slam.graph.geometry import adjoint, inverse, se3_log
 from bmask_slam.graph.pose_graph.pose_graph import (
-    Mask,
     PoseGraph,
     is_connected,
     planar_coordinates,
@@ -86,7 +85,7 @@ def cycle_chi2(
     T_a_b: Array,
     covariances: Array,
     ends: tuple[Array, Array],
-    pairs: tuple[IntArray, IntArray],
+    pairs: tuple[Ints, Ints],
     map_covariances: Array,
 ) -> Array:
     """Chi-square (P,), 6 degrees of freedom, of the cycles that pairs of loops close.

@@ -6,16 +6,15 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
-from bmask_slam.graph.factors.graph_update import IntArray
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.pose_graph.factors import make_factors, make_gauge, make_values
-from bmask_slam.graph.pose_graph.pose_graph import Mask, PoseGraph
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph
 
 SAMPLES = 100
 SEED = 0
 
 
-def predicted_chi2(graph: PoseGraph, used: Mask, asked: IntArray) -> Array:
+def predicted_chi2(graph: PoseGraph, used: Mask, asked: Ints) -> Array:
     """Chi-squares (A,) of edges against the solution of others, its own uncertainty counted.
 
     ``r^T (Sigma + J P J^T)^-1 r`` with r and J the residual and the Jacobian of an edge of

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.pose_graph.factors import chordal_poses, pose_graph_cost
 from bmask_slam.graph.pose_graph.gnc import find_wrong_loops
 from bmask_slam.graph.pose_graph.loop_consistency import loop_support
-from bmask_slam.graph.pose_graph.pose_graph import Mask, PoseGraph, spanning_tree_poses
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, spanning_tree_poses
 from bmask_slam.graph.pose_graph.solver import Method, PoseGraphConfig, PoseGraphSolver
 
 __all__ = ["Method", "PoseGraphConfig", "PoseGraphResult", "optimise_pose_graph"]

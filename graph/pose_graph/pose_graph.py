@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-from bmask_slam.graph.geometry import Array, inverse, make_pose
-from bmask_slam.graph.trajectory import Indices
-
-Mask = NDArray[np.bool_]
+from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.geometry import inverse, make_pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +30,9 @@ class PoseGraph:
         ValueError: shapes that do not fit, or ids that do not increase.
     """
 
-    ids: Indices
+    ids: Ints
     poses: Array
-    edges: Indices
+    edges: Ints
     measurements: Array
     information: Array
     fixed: Mask
@@ -71,7 +68,7 @@ class PoseGraph:
         """The same graph with poses (N, 4, 4)."""
         return replace(self, poses=poses, has_poses=True)
 
-    def with_edges(self, keep: Indices | Mask) -> PoseGraph:
+    def with_edges(self, keep: Ints | Mask) -> PoseGraph:
         """The same vertices with these edges alone (indices or mask over M)."""
         return replace(
             self,
@@ -109,7 +106,7 @@ def planar_coordinates(T: Array) -> Array:
     return np.concatenate([T[..., :2, 3], angle_rad[..., None]], axis=-1)
 
 
-def component_labels(graph: PoseGraph) -> Indices:
+def component_labels(graph: PoseGraph) -> Ints:
     """(N,) number of the connected part that each vertex belongs to."""
     return connected_components(_adjacency(graph), directed=False)[1]
 

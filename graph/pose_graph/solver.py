@@ -8,8 +8,8 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.batch.iteration import Progress, iterate
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.pose_graph.factors import make_factors, make_gauge, make_values, poses_of
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, ids_array
-from bmask_slam.graph.factors.graph_update import IntArray, Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.observability import (
     Edges,
     component_labels,
@@ -22,11 +23,11 @@ from bmask_slam.graph.factors.observability import (
     shared_landmarks,
 )
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.geometry import inverse
 
 
 def anchor_loose(
-    loose: IntArray, gone: Observations, edges: Edges, tables: FactorTables, config: SmootherConfig
+    loose: Ints, gone: Observations, edges: Edges, tables: FactorTables, config: SmootherConfig
 ) -> list[int]:
     """Bridge or anchor loose keyframes until none is left; numbers of the factors added.
 
@@ -42,7 +43,7 @@ def anchor_loose(
     return added
 
 
-def loose_in(tables: FactorTables, config: SmootherConfig) -> IntArray:
+def loose_in(tables: FactorTables, config: SmootherConfig) -> Ints:
     """The keyframes of the graph that nothing ties firmly to a prior."""
     numbers = tables.pose_factors
     return loose_among(
@@ -63,7 +64,7 @@ def anchor_components(tables: FactorTables, config: SmootherConfig) -> list[int]
 
 def release_anchors(
     new: Observations, tables: FactorTables, config: SmootherConfig
-) -> tuple[IntArray, list[int]]:
+) -> tuple[Ints, list[int]]:
     """Take out the bridges that new observations, in the shadow already, made needless.
 
     Returns the keyframes that they held, and their places in ISAM2.
@@ -107,18 +108,18 @@ def bridge(a: int, b: int, tables: FactorTables, config: SmootherConfig) -> Rela
     return RelativePose(a, b, inverse(T_world_a) @ T_world_b, covariance, kind="bridge")
 
 
-def keyframes_held_by(numbers: list[int], tables: FactorTables) -> IntArray:
+def keyframes_held_by(numbers: list[int], tables: FactorTables) -> Ints:
     """The keyframes (N,) that these bridges and priors were made for."""
     return ids_array(tables.pose_factors[number].keyframes[-1] for number in numbers)
 
 
 def loose_among(
-    ids: IntArray,
-    rows: IntArray,
+    ids: Ints,
+    rows: Ints,
     numbers: Iterable[int],
     tables: FactorTables,
     config: SmootherConfig,
-) -> IntArray:
+) -> Ints:
     """The keyframes that these rows and pose factors of the shadow would leave loose."""
     seen, poses, points = rows_in_front(rows, tables, config)
     edges = [tables.pose_factors[number].keyframes for number in sorted(numbers)]
@@ -126,7 +127,7 @@ def loose_among(
 
 
 def rows_in_front(
-    rows: IntArray, tables: FactorTables, config: SmootherConfig
+    rows: Ints, tables: FactorTables, config: SmootherConfig
 ) -> tuple[Observations, Array, Array]:
     """Those of the rows whose landmark lies before the camera, their poses and points.
 
@@ -149,7 +150,7 @@ class _Before:
         shared: (K, K) landmarks and relative poses that two of them shared.
     """
 
-    parts: IntArray
+    parts: Ints
     shared: Array
 
     @classmethod
@@ -172,7 +173,7 @@ class _Before:
         return cls(component_labels(ids, seen, edges)[left], shared[np.ix_(left, left)])
 
     def anchor_for(
-        self, loose: IntArray, tables: FactorTables, config: SmootherConfig
+        self, loose: Ints, tables: FactorTables, config: SmootherConfig
     ) -> PosePrior | RelativePose:
         """A prior in a part without any firm keyframe; else the bridge that shared most."""
         ids = tables.keyframes.ids

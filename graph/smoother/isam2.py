@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
 from bmask_slam.graph.factors.keys import (
     KEYFRAME_BASE,
@@ -19,7 +19,6 @@ from bmask_slam.graph.factors.keys import (
     variable_named_in,
 )
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
 
 Variable = tuple[str, int]
@@ -34,7 +33,7 @@ class SolverError(Exception):
         self.variable = variable
 
 
-def _no_ids() -> IntArray:
+def _no_ids() -> Ints:
     return np.zeros(0, np.int64)
 
 
@@ -43,10 +42,10 @@ class Change:
     """What to pass to ISAM2: rows and numbers of new factors in the shadow, ids of new
     variables, the slots of factors that left, and how many further steps may follow."""
 
-    rows: IntArray = field(default_factory=_no_ids)
+    rows: Ints = field(default_factory=_no_ids)
     numbers: list[int] = field(default_factory=list)
-    keyframe_ids: IntArray = field(default_factory=_no_ids)
-    landmark_ids: IntArray = field(default_factory=_no_ids)
+    keyframe_ids: Ints = field(default_factory=_no_ids)
+    landmark_ids: Ints = field(default_factory=_no_ids)
     removed_slots: list[int] = field(default_factory=list)
     max_iterations: int = 0
 
@@ -114,9 +113,7 @@ class Solver:
         tables.keyframes.values, tables.landmarks.values = poses, points
         return before, after
 
-    def marginal_covariance(
-        self, tables: FactorTables, keyframes: IntArray, landmarks: IntArray
-    ) -> Array:
+    def marginal_covariance(self, tables: FactorTables, keyframes: Ints, landmarks: Ints) -> Array:
         """Joint covariance of keyframes (6 each, ``[rad, m]``), then landmarks (3 each, m).
 
         From ISAM2, or from the shadow at its current values when there is none.
@@ -131,7 +128,7 @@ class Solver:
         except RuntimeError as error:
             raise self._failure(error) from error
 
-    def marginals(self, tables: FactorTables, landmarks: IntArray) -> Marginals:
+    def marginals(self, tables: FactorTables, landmarks: Ints) -> Marginals:
         """Covariances of every keyframe and of some landmarks at the shadow's current values."""
         if not len(tables.keyframes.ids):
             return Marginals(tables.keyframes.ids, np.zeros((0, 6, 6)))
@@ -147,7 +144,7 @@ class Solver:
         keyframes, landmarks = tables.keyframes, tables.landmarks
         return graph, make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
 
-    def _factors(self, tables: FactorTables, rows: IntArray, numbers: list[int]) -> list:
+    def _factors(self, tables: FactorTables, rows: Ints, numbers: list[int]) -> list:
         factors = self._maker.observations(tables.observations.select(rows))
         return factors + [
             self._maker.pose_factor(tables.pose_factors[number].factor) for number in numbers

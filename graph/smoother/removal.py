@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, ids_array
 from bmask_slam.graph.factors.graph_update import (
     NO_KEYFRAME,
     NO_LANDMARK,
     GraphUpdate,
-    IntArray,
     PosePrior,
     RefusalReason,
     Refusals,
@@ -37,7 +37,7 @@ from bmask_slam.graph.smoother.anchoring import (
 )
 
 
-def _no_ids() -> IntArray:
+def _no_ids() -> Ints:
     return np.zeros(0, np.int64)
 
 
@@ -54,9 +54,9 @@ class Removal:
     """
 
     slots: list[int] = field(default_factory=list)
-    dropped_landmarks: IntArray = field(default_factory=_no_ids)
+    dropped_landmarks: Ints = field(default_factory=_no_ids)
     pose_factors: list[int] = field(default_factory=list)
-    anchored_keyframes: IntArray = field(default_factory=_no_ids)
+    anchored_keyframes: Ints = field(default_factory=_no_ids)
     report: RemovalReport = field(default_factory=RemovalReport)
 
     def __bool__(self) -> bool:
@@ -71,13 +71,13 @@ class _Plan:
     without a hold.
     """
 
-    landmarks: IntArray
-    keyframes: IntArray
+    landmarks: Ints
+    keyframes: Ints
     numbers: list[int]
-    rows: IntArray
-    single: IntArray
-    dropped: IntArray = field(default_factory=_no_ids)
-    loose: IntArray = field(default_factory=_no_ids)
+    rows: Ints
+    single: Ints
+    dropped: Ints = field(default_factory=_no_ids)
+    loose: Ints = field(default_factory=_no_ids)
 
 
 def remove(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) -> Removal:
@@ -131,8 +131,8 @@ def _name(number: int, tables: FactorTables) -> RelativePoseName | None:
 
 
 def _left_underconstrained(
-    rows: IntArray, landmarks: IntArray, tables: FactorTables, config: SmootherConfig
-) -> IntArray:
+    rows: Ints, landmarks: Ints, tables: FactorTables, config: SmootherConfig
+) -> Ints:
     """Landmarks that lose some of these rows and are not held by what remains."""
     table = tables.observations
     hit = np.setdiff1d(table.select(rows).landmark_ids, landmarks)
@@ -143,12 +143,12 @@ def _left_underconstrained(
 
 
 def _left_loose(
-    rows: IntArray,
-    keyframes: IntArray,
+    rows: Ints,
+    keyframes: Ints,
     numbers: list[int],
     tables: FactorTables,
     config: SmootherConfig,
-) -> IntArray:
+) -> Ints:
     """Keyframes without a hold once rows, keyframes and pose factors are gone."""
     if _still_linked(rows, keyframes, numbers, tables, config):
         return np.zeros(0, np.int64)
@@ -159,8 +159,8 @@ def _left_loose(
 
 
 def _still_linked(
-    rows: IntArray,
-    keyframes: IntArray,
+    rows: Ints,
+    keyframes: Ints,
     numbers: list[int],
     tables: FactorTables,
     config: SmootherConfig,

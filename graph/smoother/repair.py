@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import reprojection
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
-from bmask_slam.graph.factors.graph_update import GraphUpdate, IntArray
+from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.factors.observability import constrained_landmarks
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.smoother.anchoring import (
@@ -31,9 +32,9 @@ from bmask_slam.graph.smoother.removal import remove
 class Repair:
     """What a repair took out of the shadow, and whom it tied loosely."""
 
-    dropped_landmarks: IntArray
-    dropped_keyframes: IntArray
-    anchored_keyframes: IntArray
+    dropped_landmarks: Ints
+    dropped_keyframes: Ints
+    anchored_keyframes: Ints
 
     @property
     def changed(self) -> bool:
@@ -47,7 +48,7 @@ class Repair:
 
 def repair(
     named: Variable | None,
-    new_keyframes: IntArray,
+    new_keyframes: Ints,
     tables: FactorTables,
     camera: Camera,
     config: SmootherConfig,
@@ -81,7 +82,7 @@ def _is_anchored(keyframe: int, tables: FactorTables) -> bool:
     return any(getattr(factor, "kind", "") == "bridge" for factor in factors)
 
 
-def _broken_observations(tables: FactorTables, camera: Camera) -> IntArray:
+def _broken_observations(tables: FactorTables, camera: Camera) -> Ints:
     """Pairs (N, 2) of observations without a finite error; a NaN spoils every value."""
     seen = tables.observations.select(tables.observations.all_rows())
     poses = tables.keyframes.get(seen.keyframe_ids)
@@ -91,7 +92,7 @@ def _broken_observations(tables: FactorTables, camera: Camera) -> IntArray:
     return np.stack([seen.keyframe_ids[bad], seen.landmark_ids[bad]], axis=1)
 
 
-def _loose_landmarks(tables: FactorTables, camera: Camera, config: SmootherConfig) -> IntArray:
+def _loose_landmarks(tables: FactorTables, camera: Camera, config: SmootherConfig) -> Ints:
     """Landmarks that the views in front of a camera do not constrain."""
     seen = tables.observations.select(tables.observations.all_rows())
     poses = tables.keyframes.get(seen.keyframe_ids)
@@ -104,7 +105,7 @@ def _loose_landmarks(tables: FactorTables, camera: Camera, config: SmootherConfi
     return np.setdiff1d(tables.landmarks.ids, held)
 
 
-def _tie(loose: IntArray, tables: FactorTables, config: SmootherConfig) -> IntArray:
+def _tie(loose: Ints, tables: FactorTables, config: SmootherConfig) -> Ints:
     """Bridge loose keyframes to firm ones, one at a time: one bridge may hold a whole part."""
     anchored: list[int] = []
     while len(loose):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import (
     observation_errors,
@@ -21,7 +22,6 @@ from bmask_slam.graph.factors.factor_tables import FactorTables, ValueTable, ids
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
-    IntArray,
     ObservationErrors,
     PosePrior,
     RelativePose,
@@ -30,8 +30,6 @@ from bmask_slam.graph.factors.graph_update import (
 )
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.marginals.covariances import Marginals
 from bmask_slam.graph.marginals.landmark_marginalisation import (
     Marginalisation,
@@ -155,16 +153,14 @@ class Smoother:
         """
         return self.joint_covariance(np.array([keyframe_id]))
 
-    def joint_covariance(
-        self, keyframe_ids: IntArray, landmark_ids: IntArray | None = None
-    ) -> Array:
+    def joint_covariance(self, keyframe_ids: Ints, landmark_ids: Ints | None = None) -> Array:
         """Joint covariance (6K + 3L square): keyframes in the given order, then landmarks."""
         landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
         _check_known(self._tables.keyframes, keyframe_ids)
         _check_known(self._tables.landmarks, landmarks)
         return self._solver.marginal_covariance(self._tables, keyframe_ids, landmarks)
 
-    def marginals(self, landmark_ids: IntArray | None = None) -> Marginals:
+    def marginals(self, landmark_ids: Ints | None = None) -> Marginals:
         """Covariances of every keyframe, and of some landmarks, from one factorisation.
 
         Raises KeyError for an unknown id, SolverError for a graph that cannot be solved.
@@ -249,7 +245,7 @@ class Smoother:
     def _recover(
         self,
         failure: SolverError,
-        new_keyframes: IntArray,
+        new_keyframes: Ints,
         report: UpdateReport,
         solve: Callable[[FactorTables], None],
     ) -> bool:
@@ -314,7 +310,7 @@ class Smoother:
         )
 
 
-def _check_known(table: ValueTable, ids: IntArray) -> None:
+def _check_known(table: ValueTable, ids: Ints) -> None:
     known = table.contains(ids)
     if not known.all():
         raise KeyError(f"not in the graph: {ids[~known].tolist()}")

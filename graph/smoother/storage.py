@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
-from bmask_slam.graph.files.array_file import Arrays, FileKind, Header, read_arrays, write_arrays
+from bmask_slam.graph.files.array_file import FileKind, Header, read_arrays, write_arrays
 from bmask_slam.graph.smoother.marginalised_storage import (
     SHAPES,
     marginalised_arrays,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import (
     Candidates,
@@ -24,7 +25,6 @@ from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.graph_update import (
     NO_LANDMARK,
     GraphUpdate,
-    IntArray,
     Observations,
     PosePrior,
     RefusalReason,
@@ -34,16 +34,15 @@ from bmask_slam.graph.factors.graph_update import (
 )
 from bmask_slam.graph.factors.observability import constrained_landmarks
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array
 
 
 @dataclass(frozen=True)
 class Validated:
     """The part of an update that may enter, and what may not."""
 
-    keyframe_ids: IntArray
+    keyframe_ids: Ints
     poses_world_camera: Array
-    landmark_ids: IntArray
+    landmark_ids: Ints
     points_world: Array
     observations: Observations
     pose_factors: tuple[RelativePose | PosePrior, ...]
@@ -89,11 +88,11 @@ def validate(
 
 def _settle(
     observations: Observations,
-    reasons: IntArray,
+    reasons: Ints,
     pose_factors: tuple[RelativePose | PosePrior, ...],
     candidates: Candidates,
     config: SmootherConfig,
-) -> tuple[IntArray, IntArray]:
+) -> tuple[Ints, Ints]:
     """Ids of the new keyframes and landmarks that are constrained; marks the others' rows.
 
     A landmark that falls takes support from a keyframe and the other way round, so this is
@@ -123,10 +122,10 @@ def _settle(
 def _anchored(
     accepted: Observations,
     pose_factors: tuple[RelativePose | PosePrior, ...],
-    keyframes: IntArray,
+    keyframes: Ints,
     candidates: Candidates,
     config: SmootherConfig,
-) -> IntArray:
+) -> Ints:
     """The new keyframes that hang together with the graph or with a prior.
 
     Grown from the graph's keyframes: a keyframe joins by a prior, by a relative pose to one
@@ -162,7 +161,7 @@ def _held(
 
 def _split_by_keyframes(
     pose_factors: tuple[RelativePose | PosePrior, ...],
-    keyframes: IntArray,
+    keyframes: Ints,
     candidates: Candidates,
 ) -> tuple[tuple[RelativePose | PosePrior, ...], list[RefusedFactor]]:
     inside = {*keyframes.tolist(), *candidates.tables.keyframes.ids.tolist()}
@@ -175,9 +174,7 @@ def _split_by_keyframes(
     return kept, lost
 
 
-def _refusals(
-    update: GraphUpdate, reasons: IntArray, keyframe_reasons: IntArray, fell: IntArray
-) -> Refusals:
+def _refusals(update: GraphUpdate, reasons: Ints, keyframe_reasons: Ints, fell: Ints) -> Refusals:
     rows = np.flatnonzero(reasons)
     bad = np.flatnonzero(keyframe_reasons)
     keyframes = np.concatenate([update.keyframe_ids[bad], fell])

@@ -13,8 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bmask_slam.graph.arrays import Array, Bytes, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.inverse_depth.depth_map import DepthNoise, InverseDepthMap, from_sensor
 from bmask_slam.mapping.inverse_depth.fusion import MAX_NEIGHBOURS, fuse, stated
 from bmask_slam.mapping.inverse_depth.plane_sweep import completed, sweep
@@ -25,7 +26,6 @@ from bmask_slam.mapping.inverse_depth.warping import View
 
 DepthSource = Literal["sensor", "both", "stereo", "motion"]
 MIN_BASELINE_M, SWEEP_VIEWS = 0.03, 2
-Mask = NDArray[np.bool_]
 WINDOW = 6
 """Keyframes on either side among which neighbours are chosen."""
 
@@ -49,12 +49,12 @@ class DenseKeyframe:
 
     id: int
     T_world_camera: Array
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
-    landmark_ids: NDArray[np.int64]
+    rgb: Image
+    depth_m: Floats
+    landmark_ids: Ints
     landmark_depths_m: Array
     instances: NDArray[np.uint16] | None = None
-    right: NDArray[np.uint8] | None = None
+    right: Image | None = None
     unmatched: Mask | None = None
 
 
@@ -70,7 +70,7 @@ class FusedKeyframe:
 
     keyframe: DenseKeyframe
     map: InverseDepthMap
-    views: NDArray[np.uint8]
+    views: Bytes
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class DenseMapper:
         return fused(own, [others[n.id] for n in chosen], self.camera, self.config)
 
 
-def as_image(rgb: NDArray[np.uint8], device: str = "cpu") -> Tensor:
+def as_image(rgb: Image, device: str = "cpu") -> Tensor:
     """Slightly blurred colours (3, H, W), 0 to 255, of an image (H, W, 3)."""
     blurred = np.ascontiguousarray(cv2.blur(rgb, (3, 3)).transpose(2, 0, 1))
     return torch.from_numpy(blurred).to(device, torch.float32)

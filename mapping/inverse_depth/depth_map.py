@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from bmask_slam.graph.arrays import Floats, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.mapping.inverse_depth.pixelwise import gate
 
@@ -40,15 +40,15 @@ class InverseDepthMap:
             torch.where(keep, self.rho, missing), torch.where(keep, self.variance, missing)
         )
 
-    def without(self, hidden: NDArray[np.bool_]) -> InverseDepthMap:
+    def without(self, hidden: Mask) -> InverseDepthMap:
         """The same, with everything in ``hidden`` (H, W) unknown."""
         return self.where(torch.from_numpy(~hidden).to(self.rho.device))
 
-    def depth_m(self) -> NDArray[np.float32]:
+    def depth_m(self) -> Floats:
         """Depth (H, W) in metres, NaN where missing."""
         return np.asarray((1 / self.rho).cpu().numpy(), np.float32)
 
-    def depth_sigma_m(self) -> NDArray[np.float32]:
+    def depth_sigma_m(self) -> Floats:
         """Standard deviation of the depth (H, W) in metres, to first order: sigma_rho / rho^2."""
         sigma = torch.sqrt(self.variance) / self.rho**2
         return np.asarray(sigma.cpu().numpy(), np.float32)
@@ -71,7 +71,7 @@ class DepthNoise:
 
 
 def from_sensor(
-    depth_m: NDArray[np.float32], camera: Camera, noise: DepthNoise, device: str = "cpu"
+    depth_m: Floats, camera: Camera, noise: DepthNoise, device: str = "cpu"
 ) -> InverseDepthMap:
     """The measurement of a depth sensor as an inverse-depth map.
 

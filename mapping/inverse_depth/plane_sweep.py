@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 from bmask_slam.mapping.inverse_depth.matching_cost import (
     GuidedFilter,

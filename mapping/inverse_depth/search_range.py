@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 
 MIN_LANDMARKS = 5
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints
 from bmask_slam.mapping.products.submaps import Submap, voxel_keys
 from bmask_slam.mapping.products.surface_labels import LabelTable
 
@@ -44,12 +44,12 @@ class Cloud:
         views: (N,) uint16, submaps that were fused.
     """
 
-    points: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    sigmas_m: NDArray[np.float32]
+    points: Floats
+    normals: Floats
+    colours: Bytes
+    sigmas_m: Floats
     labels: NDArray[np.uint16]
-    probabilities: NDArray[np.float32]
+    probabilities: Floats
     views: NDArray[np.uint16]
 
     def __len__(self) -> int:
@@ -125,7 +125,7 @@ def _mean(voxel: NDArray, values: NDArray, weight: Array, total: Array) -> Array
 
 def _fused_labels(
     voxel: NDArray, cell: NDArray, instance: NDArray, table: LabelTable
-) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
+) -> tuple[NDArray[np.uint16], Floats]:
     """Class (M,) and its probability (M,) of voxels, points (N,) in them being of instances (N,).
 
     ``cell`` (M,) is that of each voxel.
@@ -139,9 +139,7 @@ def _fused_labels(
     return label.astype(np.uint16), probability
 
 
-def _views(
-    voxel: NDArray, cell: NDArray, instance: NDArray, submap_of: NDArray[np.int64]
-) -> csr_matrix:
+def _views(voxel: NDArray, cell: NDArray, instance: NDArray, submap_of: Ints) -> csr_matrix:
     """(M, I) shares of instances in what each submap shows of each voxel, one in all.
 
     A submap that has points in a voxel's cell, but none in the voxel, since its own grid lies

@@ -11,6 +11,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Bytes
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.products.cloud import Cloud
 
@@ -26,7 +27,7 @@ class CloudWriter:
     A context manager: the files take their names when the block ends well.
     """
 
-    def __init__(self, stem: Path, palette: NDArray[np.uint8] | None = None) -> None:
+    def __init__(self, stem: Path, palette: Bytes | None = None) -> None:
         """``stem`` is the path without suffix; with a ``palette`` (C, 3) points get their
         label's colour.
         """
@@ -86,7 +87,7 @@ _LAYOUT = np.dtype(
 )
 
 
-def _rows(cloud: Cloud, palette: NDArray[np.uint8] | None) -> NDArray:
+def _rows(cloud: Cloud, palette: Bytes | None) -> NDArray:
     rows = np.empty(len(cloud), _LAYOUT)
     colours = cloud.colours if palette is None else palette[cloud.labels]
     for names, values in (

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Image, Ints
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.pictures import EMPTY, palette, with_legend
 
@@ -146,7 +146,7 @@ class FloorPlan:
         grid[occupied] = _labels(votes[occupied])
         return grid, np.column_stack([path[:, 0] - low[0], high[1] + 1 - path[:, 1]])
 
-    def picture(self, names: Sequence[str], path_world: Array) -> NDArray[np.uint8]:
+    def picture(self, names: Sequence[str], path_world: Array) -> Image:
         """The plan (H, W, 3), red first, with scale bar, legend and the camera's path (N, 3)."""
         grid, path = self.grid(path_world)
         scale = max(1, round(900 / max(grid.shape)))
@@ -163,7 +163,7 @@ class FloorPlan:
         return with_legend(image, names, present)
 
 
-def _labels(votes: NDArray[np.int64]) -> NDArray[np.int64]:
+def _labels(votes: Ints) -> Ints:
     """The class of each cell (N, C): a thing before the background, with a fifth of the points."""
     things = votes[:, 1:]
     if things.shape[1] == 0:
@@ -172,7 +172,7 @@ def _labels(votes: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(enough, things.argmax(axis=1) + 1, 0)
 
 
-def _scale_bar(image: NDArray[np.uint8], px_per_m: float, margin: int) -> None:
+def _scale_bar(image: Image, px_per_m: float, margin: int) -> None:
     """One metre, at the lower left."""
     x, y, length = margin, image.shape[0] - margin // 2, round(px_per_m)
     cv2.rectangle(image, (x, y - 6), (x + length, y), (0, 0, 0), -1)

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Bytes, Floats
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.open3d_loader import load_open3d
 
-View = tuple[NDArray[np.float32], NDArray[np.uint8], Array]
+View = tuple[Floats, Bytes, Array]
 """Depth (H, W) in metres, NaN where missing, colours (H, W, 3) and T_world_camera (4, 4)."""
 BLOCK_VOXELS, BLOCKS = 8, 10_000
 MAX_DEPTH_M = 6.0

@@ -10,9 +10,8 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
@@ -30,7 +29,7 @@ class ObjectRegion:
     box: OrientedBox
 
 
-def owners(cloud: Cloud, regions: Sequence[ObjectRegion]) -> NDArray[np.int64]:
+def owners(cloud: Cloud, regions: Sequence[ObjectRegion]) -> Ints:
     """The region (N,) of each point, -1 for none: of those with its label whose box holds it, the
     one whose centre is nearest.
     """

@@ -9,14 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Bytes, Image, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 
 BACKGROUND_COLOUR = (150, 150, 150)
 EMPTY = 255
 
 
-def palette(classes: int) -> NDArray[np.uint8]:
+def palette(classes: int) -> Bytes:
     """Colours (classes, 3) of labels: grey for the background, else hues far from each other."""
     colours = [BACKGROUND_COLOUR]
     for k in range(1, classes):
@@ -41,7 +42,7 @@ class Picture:
         self._depth = np.full((camera.height, camera.width), np.inf, np.float32)
         self._rgb = np.full((camera.height, camera.width, 3), EMPTY, np.uint8)
 
-    def draw(self, points_world: NDArray[np.floating], colours: NDArray[np.uint8]) -> None:
+    def draw(self, points_world: NDArray[np.floating], colours: Bytes) -> None:
         """Draw points (N, 3) with colours (N, 3)."""
         points = transform(inverse(self.T_world_camera), points_world.astype(float))
         front = points[:, 2] > 0.05
@@ -52,7 +53,7 @@ class Picture:
             reach = np.maximum(abs(dy), abs(dx)) <= size_px // 2
             self._put(pixels[reach] + (dx, dy), points[reach, 2], colours[reach])
 
-    def _put(self, pixels: NDArray[np.int64], z: Array, colours: NDArray[np.uint8]) -> None:
+    def _put(self, pixels: Ints, z: Array, colours: Bytes) -> None:
         height, width = self._depth.shape
         inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
         index = pixels[inside, 1] * width + pixels[inside, 0]
@@ -63,7 +64,7 @@ class Picture:
         won = (z32 == nearest[index]) & (z32 < depth[index])
         depth[index[won]], rgb[index[won]] = z32[won], colours[inside][won]
 
-    def image(self) -> NDArray[np.uint8]:
+    def image(self) -> Image:
         """(H, W, 3) uint8, red first, white where nothing is."""
         return self._rgb
 
@@ -74,9 +75,7 @@ def _offsets(size: int) -> list[tuple[int, int]]:
     return [(dy, dx) for dy in steps for dx in steps]
 
 
-def with_legend(
-    image: NDArray[np.uint8], names: Sequence[str], labels: Sequence[int]
-) -> NDArray[np.uint8]:
+def with_legend(image: Image, names: Sequence[str], labels: Sequence[int]) -> Bytes:
     """The image with a column of class names and colours at its right."""
     colours = palette(len(names))
     column = np.full((max(image.shape[0], 24 * len(labels) + 16), 190, 3), EMPTY, np.uint8)

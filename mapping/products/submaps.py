@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Arrays, Bytes, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
-from bmask_slam.graph.geometry import Array
 from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
 from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 
@@ -35,16 +35,16 @@ class Submap:
     """
 
     anchor: int
-    points: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    variances: NDArray[np.float32]
+    points: Floats
+    normals: Floats
+    colours: Bytes
+    variances: Floats
     instances: NDArray[np.uint16]
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def placed(self, T_world_anchor: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def placed(self, T_world_anchor: Array) -> tuple[Floats, Floats]:
         """Points and normals (N, 3) in the world for a pose of the anchor (4, 4)."""
         T = T_world_anchor.astype(np.float32)
         return self.points @ T[:3, :3].T + T[:3, 3], self.normals @ T[:3, :3].T
@@ -80,7 +80,7 @@ def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) ->
 
 
 def relabelled(
-    submap: Submap, camera: Camera, instances: NDArray[np.uint16], moves: NDArray[np.bool_]
+    submap: Submap, camera: Camera, instances: NDArray[np.uint16], moves: Mask
 ) -> Submap:
     """A submap with the instances (H, W) of its keyframe, without points on what ``moves`` (H, W).
 
@@ -92,9 +92,7 @@ def relabelled(
     return Submap(submap.anchor, **arrays | {"instances": instances[rows, columns][keep]})
 
 
-def nearest_a_voxel(
-    points: NDArray[np.float32], variances: NDArray[np.float32], voxel_m: float
-) -> NDArray[np.int64]:
+def nearest_a_voxel(points: Floats, variances: Floats, voxel_m: float) -> Ints:
     """Indices, rising, of the surest point (N, 3) in each voxel, of equals the first."""
     if len(points) == 0:
         return np.zeros(0, np.int64)
@@ -108,7 +106,7 @@ def nearest_a_voxel(
     return np.sort(np.minimum.reduceat(surest, starts))
 
 
-def voxel_keys(points: NDArray[np.floating], voxel_m: float) -> NDArray[np.int64]:
+def voxel_keys(points: NDArray[np.floating], voxel_m: float) -> Ints:
     """One number (N,) for the voxel of each point (N, 3); 21 bits an axis."""
     index = np.floor(points / voxel_m).astype(np.int64) + (1 << 20)
     return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
@@ -126,7 +124,7 @@ def read_submap(path: Path) -> Submap:
     return Submap(int(header["anchor"]), **arrays)
 
 
-def _arrays(submap: Submap) -> dict[str, NDArray]:
+def _arrays(submap: Submap) -> Arrays:
     names: Sequence[str] = ("points", "normals", "colours", "variances", "instances")
     return {name: getattr(submap, name) for name in names}
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from bmask_slam.graph.arrays import Floats, Ints, Mask
 from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
 from bmask_slam.semantics.instances.instances import Instance
 
@@ -31,7 +32,7 @@ class KeyframeLabels:
     """
 
     numbers: NDArray[np.uint16]
-    log_likelihoods: NDArray[np.float32]
+    log_likelihoods: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +45,16 @@ class InstanceEvidence:
         landmark_instances: (L,) uint16 which, from 1.
     """
 
-    log_likelihoods: NDArray[np.float32]
-    landmark_ids: NDArray[np.int64]
+    log_likelihoods: Floats
+    landmark_ids: Ints
     landmark_instances: NDArray[np.uint16]
 
     def with_landmarks(
         self,
         distributions: NDArray[np.floating],
-        known: NDArray[np.bool_],
+        known: Mask,
         prior: NDArray[np.floating],
-    ) -> NDArray[np.float32]:
+    ) -> Floats:
         """The likelihoods (I + 1, C) with what the map believes of the landmarks on instances.
 
         ``distributions`` (L, C) of the landmarks that are ``known`` (L,). Whether there is a thing
@@ -87,22 +88,22 @@ class LabelTable:
         fusion: how views are fused.
     """
 
-    log_likelihoods: NDArray[np.float32]
-    submaps: NDArray[np.int64]
+    log_likelihoods: Floats
+    submaps: Ints
     fusion: LabelStoreConfig
 
     @classmethod
-    def of(cls, keyframes: Sequence[NDArray[np.float32]], fusion: LabelStoreConfig) -> LabelTable:
+    def of(cls, keyframes: Sequence[Floats], fusion: LabelStoreConfig) -> LabelTable:
         """The table of keyframes, each with its rows (I_k + 1, C)."""
         submaps = np.repeat(np.arange(len(keyframes)), [len(k) for k in keyframes])
         return cls(np.concatenate(keyframes), submaps, fusion)
 
     @property
-    def first(self) -> NDArray[np.int64]:
+    def first(self) -> Ints:
         """(K,) the row of each submap for no instance."""
         return np.flatnonzero(np.diff(self.submaps, prepend=-1))
 
-    def fused(self, views: csr_matrix) -> NDArray[np.float32]:
+    def fused(self, views: csr_matrix) -> Floats:
         """Log probabilities (N, C), but for a constant a point, of points seen in ``views`` (N, I).
 
         As the label store fuses views of a landmark: what instances say, and that those who saw
@@ -137,7 +138,7 @@ def keyframe_labels(
     return KeyframeLabels(numbers, table)
 
 
-def widened(shown: NDArray[np.bool_], margin_px: int = 5) -> NDArray[np.bool_]:
+def widened(shown: Mask, margin_px: int = 5) -> Mask:
     """Pixels (H, W) of a mask, and those nearly beside it."""
     size = 2 * margin_px + 1
     return np.asarray(cv2.dilate(shown.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)

@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaln
 
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float32]
 _FIRST_CAPACITY = 1024
 
 

@@ -9,16 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
 from bmask_slam.semantics.labels import UNKNOWN, LabelSet
 
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 _FIRST_CAPACITY = 1024
 
 
@@ -128,8 +124,8 @@ class MovabilityFilter:
         self._evidence[state["ids"]] = state["evidence"]
 
     def _clear(self) -> None:
-        self._prior: NDArray[np.float32] = np.full(_FIRST_CAPACITY, self._unknown, np.float32)
-        self._evidence: NDArray[np.float32] = np.zeros(_FIRST_CAPACITY, np.float32)
+        self._prior: Floats = np.full(_FIRST_CAPACITY, self._unknown, np.float32)
+        self._evidence: Floats = np.zeros(_FIRST_CAPACITY, np.float32)
 
     def _reserve(self, ids: Ints) -> None:
         size, had = int(ids.max(initial=-1)) + 1, len(self._prior)

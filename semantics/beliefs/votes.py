@@ -9,14 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints, Mask
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
 from bmask_slam.semantics.instances.instances import Instance, mask_box
 from bmask_slam.semantics.instances.mask_order import painting_order
 from bmask_slam.semantics.labels import LabelSet
 
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 NOBODY = -1
 _MAD_TO_SIGMA = 1.4826
 
@@ -76,7 +74,7 @@ class PixelAssignment:
     owner: NDArray[np.int16]
     under: NDArray[np.int16]
     inner: Mask
-    depth_m: NDArray[np.float32]
+    depth_m: Floats
     depth_range_m: Array
 
     def on_surface(self, owners: Ints, z_m: Array) -> Mask:
@@ -102,8 +100,8 @@ class Votes:
     instances: Ints
     missed: Mask
     sure: Mask
-    distributions: NDArray[np.float32]
-    weights: NDArray[np.float32]
+    distributions: Floats
+    weights: Floats
 
 
 def check_instances(
@@ -135,7 +133,7 @@ def check_instances(
 
 def assign_pixels(
     instances: Sequence[Instance],
-    depth_m: NDArray[np.float32],
+    depth_m: Floats,
     size: tuple[int, int],
     config: VoteConfig,
     in_boxes: bool = False,
@@ -205,13 +203,11 @@ def vote(
 
 def _mixed(
     instances: Sequence[Instance], first: Ints, second: Ints, classes: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Floats, Floats]:
     """What instances (M,) with others (M,) behind them, or NOBODY, say: distributions, weights."""
     nothing = np.zeros(classes)
-    table: NDArray[np.float32] = np.array(
-        [*(i.distribution for i in instances), nothing], np.float32
-    )
-    scores: NDArray[np.float32] = np.array([*(i.mask_score for i in instances), 0.0], np.float32)
+    table: Floats = np.array([*(i.distribution for i in instances), nothing], np.float32)
+    scores: Floats = np.array([*(i.mask_score for i in instances), 0.0], np.float32)
     front, back = scores[first], (1 - scores[first]) * scores[second]
     weights = front + back
     sums = front[:, None] * table[first] + back[:, None] * table[second]
@@ -244,7 +240,7 @@ def _at_edges(
     return np.where(one, last, NOBODY), first == last
 
 
-def _disc(radius_px: int) -> NDArray[np.uint8]:
+def _disc(radius_px: int) -> Bytes:
     side = 2 * radius_px + 1
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
 
@@ -252,7 +248,7 @@ def _disc(radius_px: int) -> NDArray[np.uint8]:
 def _surfaces(
     owner: NDArray[np.int16],
     inner: Mask,
-    depth_m: NDArray[np.float32],
+    depth_m: Floats,
     count: int,
     config: VoteConfig,
 ) -> Array:

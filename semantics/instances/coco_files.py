@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
+from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.labels import LabelSet, label_set
 
@@ -41,7 +41,7 @@ class CocoObject:
     class_score: float = 1.0
     distribution: tuple[float, ...] | None = None
 
-    def mask(self) -> NDArray[np.bool_]:
+    def mask(self) -> Mask:
         """(H, W) bool."""
         return np.asarray(coco_mask.decode(self.runs), bool)
 

@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 
 _TAIL_BYTES = 4096
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
-def read_colour(path: Path) -> NDArray[np.uint8]:
+def read_colour(path: Path) -> Image:
     """A colour image (H, W, 3), red first; grey images are expanded.
 
     Raises:

@@ -6,22 +6,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from bmask_slam.graph.arrays import Bytes, Floats, Mask
 
 
 @dataclass(frozen=True, eq=False)
 class PackedMask:
     """A mask of ``shape`` (H, W) with a bit a pixel: ``bits`` (H * W / 8,), rounded up."""
 
-    bits: NDArray[np.uint8]
+    bits: Bytes
     shape: tuple[int, ...]
 
     @classmethod
-    def of(cls, mask: NDArray[np.bool_]) -> PackedMask:
+    def of(cls, mask: Mask) -> PackedMask:
         """A mask (H, W)."""
         return cls(np.packbits(mask), mask.shape)
 
-    def unpacked(self) -> NDArray[np.bool_]:
+    def unpacked(self) -> Mask:
         """The mask (H, W)."""
         size = int(np.prod(self.shape))
         return np.unpackbits(self.bits, count=size).reshape(self.shape) > 0
@@ -41,10 +42,10 @@ class Instance:
             mask can be trusted. Equal to the class score where nobody predicted an IoU.
     """
 
-    mask: NDArray[np.bool_]
-    box: NDArray[np.float32]
+    mask: Mask
+    box: Floats
     label: int
-    distribution: NDArray[np.float32]
+    distribution: Floats
     class_score: float
     mask_score: float
 
@@ -58,7 +59,7 @@ def _with_mask(packed: PackedMask, rest: tuple) -> Instance:
     return Instance(packed.unpacked(), *rest)
 
 
-def mask_box(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def mask_box(mask: Mask) -> Floats:
     """The box (4,) around the pixels of a mask (H, W), all 0 if there are none."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
@@ -66,7 +67,7 @@ def mask_box(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float32)
 
 
-def certain(label: int, classes: int, score: float = 1.0) -> NDArray[np.float32]:
+def certain(label: int, classes: int, score: float = 1.0) -> Floats:
     """The distribution (classes,) of a label with a score and no word about the others.
 
     What is left goes to the background: "something else".

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Floats, Ints
 from bmask_slam.semantics.instances.instances import Instance, mask_box
 
-Ints = NDArray[np.int64]
 _COARSE = 4
 """Every so many pixels each way of masks are compared."""
 
@@ -33,7 +32,7 @@ def painting_order(ranked: Sequence[Instance], nested: float, in_boxes: bool) ->
     return np.lexsort((-np.arange(len(ranked)), inside.sum(axis=1)))
 
 
-def _filled(mask: NDArray[np.float32]) -> NDArray[np.float32]:
+def _filled(mask: Floats) -> Floats:
     """The box around a mask (H, W), as one."""
     x1, y1, x2, y2 = mask_box(mask > 0).astype(int)
     box = np.zeros_like(mask)

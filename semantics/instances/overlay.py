@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Bytes, Floats, Image
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.labels import LabelSet
 
@@ -15,9 +15,7 @@ OPACITY = 0.45
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-def draw(
-    image: NDArray[np.uint8], instances: Sequence[Instance], labels: LabelSet
-) -> NDArray[np.uint8]:
+def draw(image: Image, instances: Sequence[Instance], labels: LabelSet) -> Bytes:
     """The image (H, W, 3) with masks in the colours of their classes, outlines, names and scores.
 
     The number is the mask score.
@@ -40,7 +38,7 @@ def draw(
     return drawn
 
 
-def class_colour(label: int) -> NDArray[np.float32]:
+def class_colour(label: int) -> Floats:
     """A bright colour (3,), red first, that is always the same for a label."""
     hue = (label * 0.61803398875) % 1.0  # golden ratio: neighbours differ
     hsv = np.array([[[hue * 180, 200, 255]]], np.uint8)

@@ -8,8 +8,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from bmask_slam.graph.geometry import Array
-from bmask_slam.semantics.beliefs.votes import Ints, Mask
+from bmask_slam.graph.arrays import Array, Ints, Mask
 
 _IMPOSSIBLE = 1e6
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Mask
 
 MIN_SIZE_M = 0.01
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -41,7 +40,7 @@ class OrientedBox:
         """Its volume."""
         return float(np.prod(self.size_m))
 
-    def contains(self, points_world: Array) -> NDArray[np.bool_]:
+    def contains(self, points_world: Array) -> Mask:
         """Which of the points (N, 3) are inside."""
         points = (points_world - self.T_world_box[:3, 3]) @ self.T_world_box[:3, :3]
         return np.asarray((np.abs(points) <= 0.5 * self.size_m).all(axis=1))
@@ -55,7 +54,7 @@ def upright_axes(up_world: Array) -> Array:
     return np.stack([first, np.cross(up_world, first), up_world], axis=1)
 
 
-def supported(points: Array, neighbours: int, reach_m: float) -> NDArray[np.bool_]:
+def supported(points: Array, neighbours: int, reach_m: float) -> Mask:
     """Which of the points (N, 3) of one thing have so many others near them.
 
     Near is within ``reach_m`` and, where points are sparse, three times the median distance of the

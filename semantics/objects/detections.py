@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
-from bmask_slam.semantics.beliefs.votes import NOBODY, Ints, PixelAssignment
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.semantics.beliefs.votes import NOBODY, PixelAssignment
 
 _COARSE = 4
 """Of masks every so many pixels each way are counted."""
@@ -61,7 +61,7 @@ class Detections:
 
 
 def detect(
-    assignment: PixelAssignment, depth_m: NDArray[np.float32], rays: Array, config: DetectionConfig
+    assignment: PixelAssignment, depth_m: Floats, rays: Array, config: DetectionConfig
 ) -> Detections:
     """The surface points of each instance.
 
@@ -102,7 +102,7 @@ def _doubles(assignment: PixelAssignment, share: float) -> list[int]:
 
 
 def _smoothed(
-    images: tuple[NDArray[np.int16], NDArray[np.float32]],
+    images: tuple[NDArray[np.int16], Floats],
     rows: Ints,
     columns: Ints,
     reach: int,
@@ -135,7 +135,7 @@ def _without_border(assignment: PixelAssignment, config: DetectionConfig) -> NDA
     return np.where(alone | ~near_vague, owner, np.int16(NOBODY))
 
 
-def _evenly(groups: Ints, sizes: Ints, most: int) -> NDArray[np.bool_]:
+def _evenly(groups: Ints, sizes: Ints, most: int) -> Mask:
     """Of each group (sorted, of these sizes) at most so many members, spread over it."""
     place = np.arange(len(groups)) - (np.cumsum(sizes) - sizes)[groups]
     share = np.minimum(1.0, most / np.maximum(sizes, 1))[groups]

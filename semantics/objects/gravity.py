@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Arrays, Floats
 
 _SAMPLES = 64
 _MAX_STEP = 0.05  # of the depth
@@ -17,9 +15,9 @@ class GravityEstimator:
     """Surface normals of each keyframe, in its frame, so that they turn with the graph."""
 
     def __init__(self) -> None:
-        self._normals: dict[int, NDArray[np.float32]] = {}
+        self._normals: dict[int, Floats] = {}
 
-    def add(self, keyframe_id: int, depth_m: NDArray[np.float32], rays: Array) -> None:
+    def add(self, keyframe_id: int, depth_m: Floats, rays: Array) -> None:
         """Sample the normals of a depth image (h, w); ``rays`` (h, w, 3) have z = 1."""
         self._normals[keyframe_id] = sample_normals(depth_m, rays)
 
@@ -49,7 +47,7 @@ class GravityEstimator:
         self._normals = dict(zip(state["keyframes"].tolist(), state["normals"], strict=True))
 
 
-def sample_normals(depth_m: NDArray[np.float32], rays: Array) -> NDArray[np.float32]:
+def sample_normals(depth_m: Floats, rays: Array) -> Floats:
     """Unit normals (64, 3) toward the camera, spread over the smooth parts of a depth image.
 
     Zero where there are fewer. Differences over a few pixels, since depth is noisy.

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import Arrays, nested, part
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.files.array_file import nested, part
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
-from bmask_slam.semantics.beliefs.votes import NOBODY, Ints, PixelAssignment
+from bmask_slam.semantics.beliefs.votes import NOBODY, PixelAssignment
 from bmask_slam.semantics.objects.association import (
     AssociationConfig,
     Evidence,
@@ -63,7 +63,7 @@ class KeyframeView:
     keyframe_id: int
     timestamp_s: float
     T_world_camera: Array
-    depth_m: NDArray[np.float32]
+    depth_m: Floats
     rays: Array
     assignment: PixelAssignment
     poses: dict[int, Array]
@@ -226,7 +226,7 @@ class ObjectMap:
 
     def _covering(
         self, view: KeyframeView, found: Detections, points: Array, pixels: Ints
-    ) -> tuple[Ints, NDArray[np.bool_]]:
+    ) -> tuple[Ints, Mask]:
         """The detection (N,) that covers each object point, -1 for none; which are visible (N,)."""
         step = self.camera.height // view.depth_m.shape[0]
         limits = np.array(view.depth_m.shape) - 1

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array, transform
-from bmask_slam.semantics.beliefs.votes import Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
+from bmask_slam.graph.geometry import transform
 
 
 class ObjectPoints:
@@ -15,7 +13,7 @@ class ObjectPoints:
 
     def __init__(self) -> None:
         self._next_id = 0
-        self._points: NDArray[np.float32] = np.zeros((0, 3), np.float32)  # in the anchor's frame
+        self._points: Floats = np.zeros((0, 3), np.float32)  # in the anchor's frame
         self._anchors: Ints = np.zeros(0, np.int64)
         self._owners: Ints = np.zeros(0, np.int64)
         self._sightings: Ints = np.zeros((0, 2), np.int64)  # object, keyframe

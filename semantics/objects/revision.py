@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
-from bmask_slam.semantics.beliefs.votes import Ints
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.semantics.objects.association import Overlap, class_affinity
 
 
@@ -52,12 +50,12 @@ class MergeEvidence:
         """Drop every key with an object in it."""
         self._counts = {key: v for key, v in self._counts.items() if number not in key}
 
-    def state(self) -> NDArray[np.int64]:
+    def state(self) -> Ints:
         """Rows (N, 3) of key and count, by key."""
         rows = [(a, b, n) for (a, b), n in sorted(self._counts.items())]
         return np.array(rows, np.int64).reshape(-1, 3)
 
-    def restore(self, rows: NDArray[np.int64]) -> None:
+    def restore(self, rows: Ints) -> None:
         """Become the balance of a state."""
         self._counts = {(a, b): n for a, b, n in rows.tolist()}
 

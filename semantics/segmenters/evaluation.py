@@ -17,6 +17,7 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import CocoFile, CocoImage
 from bmask_slam.semantics.instances.image_files import read_colour
@@ -48,7 +49,7 @@ class ApCurve:
     ap: float
     ap50: float
     ap75: float
-    precision: NDArray[np.float64]
+    precision: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,9 +151,7 @@ def _average_precision(
     return ApCurve(kind, ranked_by, ap, ap50, ap75, mean)
 
 
-def _iou_pairs(
-    found: Sequence[Instance], image: CocoImage, numbers: Sequence[int]
-) -> NDArray[np.float64]:
+def _iou_pairs(found: Sequence[Instance], image: CocoImage, numbers: Sequence[int]) -> Array:
     """(N, 2) predicted and true mask IoU of the detections that stand for an object."""
     pairs = []
     for i in found:
@@ -169,15 +168,15 @@ def _iou_pairs(
     return np.array(pairs, np.float64).reshape(-1, 2)
 
 
-def _with_size(boxes: NDArray[Any]) -> NDArray[np.float64]:
+def _with_size(boxes: NDArray[Any]) -> Array:
     """x, y, width, height of boxes (N, 4)."""
     return np.c_[boxes[:, :2], boxes[:, 2:] - boxes[:, :2]].astype(np.float64)
 
 
-def _correlation(pairs: NDArray[np.float64]) -> float:
+def _correlation(pairs: Array) -> float:
     if len(pairs) < 3 or pairs[:, 0].std() < 1e-9 or pairs[:, 1].std() < 1e-9:
         return float("nan")
-    matrix: NDArray[np.float64] = np.asarray(np.corrcoef(pairs.T), np.float64)
+    matrix: Array = np.asarray(np.corrcoef(pairs.T), np.float64)
     return float(matrix[0, 1])
 
 

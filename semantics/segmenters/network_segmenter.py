@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.network.box_head import ClassifiedBoxes
 from bmask_slam.semantics.network.boxes import mirrored
 from bmask_slam.semantics.network.mask_heads import expected_iou
 from bmask_slam.semantics.network.model import Detections, MaskRCNN
 from bmask_slam.semantics.network.paste import paste
-from bmask_slam.semantics.segmenters.segmenter import Image, check_image
+from bmask_slam.semantics.segmenters.segmenter import check_image
 from bmask_slam.semantics.segmenters.yolox import YoloxDetector
 from bmask_slam.semantics.weights.checkpoints import TrainedNetwork
 

@@ -12,11 +12,12 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.ray_connection import connect
-from bmask_slam.semantics.segmenters.segmenter import Image, check_image
+from bmask_slam.semantics.segmenters.segmenter import check_image
 
 if TYPE_CHECKING:
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions

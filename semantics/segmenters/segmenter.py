@@ -7,15 +7,14 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import CocoImage, read_coco
 from bmask_slam.semantics.instances.image_files import decode_image
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import LabelSet, label_set
 
-Image = NDArray[np.uint8]
 INSTANCES_A_CLASS = 1000
 """In a label PNG, value = 1000 * label + instance; below 1000 the value is the label alone."""
 

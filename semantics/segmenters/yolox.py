@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.labels import LabelSet, read_label_set
 from bmask_slam.semantics.network.box_head import ClassifiedBoxes
 from bmask_slam.semantics.network.boxes import iou
 from bmask_slam.semantics.network.nms import grouped_nms
-from bmask_slam.semantics.segmenters.segmenter import Image
 
 STRIDES = (8, 16, 32)
 SIZES_PX = (416, 640)
@@ -146,7 +146,7 @@ def voted(boxes: Tensor, scores: Tensor, labels: Tensor, keep: Tensor, min_iou: 
     return (weights @ boxes) / weights.sum(dim=1, keepdim=True)
 
 
-def letterbox(image: Image, side_px: int) -> tuple[NDArray[np.float32], float]:
+def letterbox(image: Image, side_px: int) -> tuple[Floats, float]:
     """The network's input (1, 3, side, side), blue first in 0..255, and the factor of its scale.
 
     The image fills the upper left; the rest is grey.

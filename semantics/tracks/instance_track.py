@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +22,7 @@ class Sighting:
 
     centroid_world: Array
     half_size: Array
-    distribution: NDArray[np.float32]
+    distribution: Floats
     prior: float
     evidence: float = 0.0
     still: bool = False
@@ -56,7 +53,7 @@ class Track:
     mean: Array
     covariance: Array
     half_size: Array
-    distribution: NDArray[np.float32]
+    distribution: Floats
     prior: float
     evidence: float
     sightings: int

@@ -8,14 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from filterpy.common import Q_discrete_white_noise
 from filterpy.kalman import predict, update
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.semantics.tracks.instance_track import Sighting, Track
 
-Mask = NDArray[np.bool_]
 _H = np.eye(3, 6)
 _NEVER = 1e9
 
@@ -199,7 +196,7 @@ class InstanceTracks:
             )
         ]
 
-    def _wholes(self, sightings: Sequence[Sighting], R_world_box: Array) -> NDArray[np.int64]:
+    def _wholes(self, sightings: Sequence[Sighting], R_world_box: Array) -> Ints:
         """(N,) the largest sighting that each is a part of, itself if there is none."""
         if not sightings:
             return np.zeros(0, np.int64)
@@ -294,6 +291,6 @@ def _within(points: Array, centres: Array, sizes: Array, R_world_box: Array) -> 
     return np.asarray((away <= sizes).all(axis=2))
 
 
-def _alike(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+def _alike(a: Floats, b: Floats) -> float:
     """How much two distributions (C,) have in common, 0 to 1."""
     return float(np.sqrt(a * b).sum()) if a.shape == b.shape else 0.0

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Image, Ints, Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import CocoFile, CocoImage, CocoObject
 from bmask_slam.semantics.instances.image_files import read_colour
@@ -33,9 +33,9 @@ class Sample:
         labels: (G,) int64, from 1.
     """
 
-    image: NDArray[np.uint8]
-    masks: NDArray[np.bool_]
-    labels: NDArray[np.int64]
+    image: Image
+    masks: Mask
+    labels: Ints
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,12 @@ class Dataset:
         return len(self.images)
 
     @property
-    def upright(self) -> NDArray[np.bool_]:
+    def upright(self) -> Mask:
         """Which images are higher than wide."""
         return np.array([image.height > image.width for image in self.images])
 
     @cached_property
-    def objects(self) -> NDArray[np.float64]:
+    def objects(self) -> Array:
         """How many objects each image has."""
         return np.array([len(self._objects(image)) for image in self.images], np.float64)
 
@@ -119,12 +119,12 @@ class JoinedDatasets:
         return int(self._ends[-1])
 
     @property
-    def upright(self) -> NDArray[np.bool_]:
+    def upright(self) -> Mask:
         """Which images are higher than wide."""
         return np.concatenate([part.upright for part in self._parts])
 
     @cached_property
-    def objects(self) -> NDArray[np.float64]:
+    def objects(self) -> Array:
         """How many objects each image has."""
         return np.concatenate([part.objects for part in self._parts])
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.network import mask_heads
 from bmask_slam.semantics.network.box_head import ClassifiedBoxes
 from bmask_slam.semantics.network.boxes import enlarged, iou, mirrored, rescale
@@ -18,7 +19,6 @@ from bmask_slam.semantics.network.mask_heads import MaskIoUHead, expected_iou, o
 from bmask_slam.semantics.network.model import ROI_LEVELS, MaskRCNN
 from bmask_slam.semantics.network.paste import paste
 from bmask_slam.semantics.network.roi_align import feature_table, roi_align
-from bmask_slam.semantics.segmenters.segmenter import Image
 from bmask_slam.semantics.training.dataset import Dataset, as_tensors
 from bmask_slam.semantics.training.targets import Target
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bmask_slam.features.brisk import Features, spread_order
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
@@ -14,9 +15,6 @@ from bmask_slam.graph.factors.graph_update import (
     PosePrior,
     concatenate,
 )
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 

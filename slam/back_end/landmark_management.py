@@ -8,11 +8,11 @@ import numpy as np
 
 from bmask_slam.back_end.triangulation import TriangulationConfig
 from bmask_slam.features.matching import Matches, WindowIndex
+from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import transform
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
-from bmask_slam.world.landmark_table import Ints
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 

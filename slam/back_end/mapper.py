@@ -24,10 +24,11 @@ from bmask_slam.back_end.segment_joining import join_segment
 from bmask_slam.back_end.triangulation import triangulate_landmarks
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
+from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import GraphEstimate
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.files.array_file import Arrays, nested, part
+from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
@@ -35,7 +36,7 @@ from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.tracker import Tracked, Tracker
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.landmark_table import Ints, Patches
+from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.map_state import world_of, world_state
 from bmask_slam.world.world_map import Keyframe, WorldMap
 

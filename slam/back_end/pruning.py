@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from bmask_slam.back_end.factor_selection import read_back
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
@@ -23,9 +24,7 @@ from bmask_slam.graph.factors.graph_update import (
     RelativePoseName,
     RemovalPolicy,
 )
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.smoother.smoother import Smoother
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.features.matching import MatchConfig, match_brute_force
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF
-from bmask_slam.world.landmark_table import Ints
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
@@ -53,7 +52,7 @@ def triangulate(
     poses_world_camera: tuple[Array, Array],
     camera: Camera,
     config: TriangulationConfig,
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Array, Mask]:
     """Midpoints (N, 3) in metres of the two rays of every match, and which of them are landmarks.
 
     A match counts if the point lies in front of both cameras and not too far, the rays' angle

@@ -11,6 +11,7 @@ import numpy as np
 from bmask_slam.calibration.motion import seen_motion
 from bmask_slam.calibration.report import Calibrated, format_calibration
 from bmask_slam.calibration.views import connected_views, make_views
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
 from bmask_slam.graph.calibration.model import (
     FACTOR,
@@ -23,8 +24,7 @@ from bmask_slam.graph.calibration.model import (
 from bmask_slam.graph.calibration.problem import Anchors, CalibrationProblem
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.graph_update import IntArray
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
 from bmask_slam.run_folder.origin import find_sequence
@@ -171,7 +171,7 @@ def refuse_early(options: CalibrateOptions) -> Path:
 
 def make_problem(
     options: CalibrateOptions, run: SavedRun, sequence: Sequence
-) -> tuple[CalibrationProblem, IntArray]:
+) -> tuple[CalibrationProblem, Ints]:
     """What the solver needs, and the ids (K,) of the keyframes in it."""
     stamps_s = dict(zip(run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s, strict=True))
     frames = _frames_of(stamps_s, sequence)
@@ -234,7 +234,7 @@ def _with_distance(
     known: tuple[float, float, float],
     run: SavedRun,
     stamps_s: Array,
-    keyframe_ids: IntArray,
+    keyframe_ids: Ints,
 ) -> Anchors:
     """Anchors with a distance between where the camera was at two moments of the run."""
     *moments_s, distance_m = known

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import Observations
-from bmask_slam.graph.geometry import Array, inverse, se3_log, transform
+from bmask_slam.graph.geometry import inverse, se3_log, transform
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.run_folder.saved_run import SavedRun
 from bmask_slam.tracking.rolling_shutter import exposed_after_s, velocities

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationResult
 from bmask_slam.graph.calibration.model import FACTOR, PARAMETERS
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 
 NORMAL_95 = 1.96
 UNOBSERVED, WEAK = 0.8, 0.4

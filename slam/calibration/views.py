@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from bmask_slam.calibration.motion import as_exposed
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.model import CalibrationViews, distort, parameters_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import IntArray, Observations
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.sequences import Sequence
 from bmask_slam.sequences.images import SURFACE_STEP, read_depth
 from bmask_slam.tracking.rolling_shutter import share_of_rows
@@ -27,7 +27,7 @@ MAX_STEP_SIGMAS = 4.0
 MAX_RATE_STEP_S = 0.2
 
 
-def connected_views(tables: FactorTables, keyframe_ids: IntArray, most: int) -> Observations:
+def connected_views(tables: FactorTables, keyframe_ids: Ints, most: int) -> Observations:
     """Of these keyframes, the observations by which the largest connected set hangs together.
 
     Of more than ``most`` keyframes those with most observations are taken.
@@ -79,7 +79,7 @@ def make_views(
     frames: dict[int, int],
     sequence: Sequence,
     motion: tuple[Array, Array],
-) -> tuple[CalibrationViews, IntArray, IntArray]:
+) -> tuple[CalibrationViews, Ints, Ints]:
     """The views of a run, and the ids (K,) and (L,) of keyframes and landmarks.
 
     ``frames`` tells each keyframe's index in the sequence, whose camera must be the run's;

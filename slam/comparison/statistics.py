@@ -17,7 +17,7 @@ import numpy as np
 from bmask_slam.comparison.experiment.experiment import VERDICT_METRICS
 from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 
 LEVEL = 0.05
 RESAMPLES = 10_000

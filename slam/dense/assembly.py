@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.fusion import FusionCounts, dense_config
 from bmask_slam.dense.input import MappedRun, open_run, run_semantics
 from bmask_slam.dense.keyframes import KeyframeWork, OpenMap
 from bmask_slam.dense.options import MapOptions
+from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW, DepthSource
 from bmask_slam.semantics.beliefs.movability import read_priors
@@ -124,7 +124,7 @@ def fuse_run(opened: OpenMap, progress: Progress = lambda done, total: None) -> 
     return work.counts
 
 
-def _needed(keyframes: list[Keyframe], folder: DenseFolder) -> NDArray[np.bool_]:
+def _needed(keyframes: list[Keyframe], folder: DenseFolder) -> Mask:
     """Which keyframes (K,) must be read: the unfinished, and those in their windows."""
     unfinished = np.array([not folder.is_done(k.id) for k in keyframes], bool)
     near = np.convolve(unfinished, np.ones(2 * WINDOW + 1))[WINDOW : WINDOW + len(keyframes)]

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
@@ -99,7 +100,7 @@ class DenseFolder:
         self,
         keyframe_id: int,
         camera: Camera,
-        shown: tuple[NDArray[np.uint16], NDArray[np.bool_]],
+        shown: tuple[NDArray[np.uint16], Mask],
         evidence: InstanceEvidence,
     ) -> None:
         """Give a finished keyframe its instances (H, W), without what moves in it (H, W).

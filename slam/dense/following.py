@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bmask_slam.dense.assembly import assembled
 from bmask_slam.dense.input import MappedRun
 from bmask_slam.dense.keyframes import KeyframeWork
 from bmask_slam.dense.options import MapOptions
+from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.sequences import Sequence
@@ -28,7 +26,7 @@ class LastSegmentation:
         self._segmenter = segmenter
         self._name: str | None = None
 
-    def segment(self, image: NDArray[np.uint8], name: str) -> list[Instance]:
+    def segment(self, image: Image, name: str) -> list[Instance]:
         """What the segmenter finds."""
         if name != self._name:
             self._found = self._segmenter.segment(image, name)

@@ -14,21 +14,19 @@ from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.input import run_semantics, undistorted_labels
 from bmask_slam.dense.options import MapOptions
 from bmask_slam.features.brisk import FeatureConfig
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 from bmask_slam.mapping.inverse_depth.dense_mapper import (
     DenseConfig,
     DenseKeyframe,
     DenseMapper,
     FusedKeyframe,
-    Mask,
 )
 from bmask_slam.mapping.inverse_depth.depth_map import DepthNoise, from_sensor
 from bmask_slam.mapping.products.submaps import Submap, make_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence, keyframe_labels, widened
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.labels import LabelSet
-from bmask_slam.world.landmark_table import Ints
 
 
 @dataclass(eq=False)

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.keyframe_view import SeenKeyframe, seen
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import Arrays, part
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.files.array_file import part
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.labelling.semantic_mapper import SemanticsConfig
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DepthSource
 from bmask_slam.run_folder.map_file import read_map
@@ -25,7 +26,6 @@ from bmask_slam.semantics.labels import LabelSet, label_set
 from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.right_images import RightImages
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.map_state import world_of
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -176,7 +176,7 @@ def frame_index(run: MappedRun, keyframe: Keyframe) -> int:
     )
 
 
-def _right(run: MappedRun, keyframe: Keyframe, source: DepthSource) -> NDArray[np.uint8] | None:
+def _right(run: MappedRun, keyframe: Keyframe, source: DepthSource) -> Image | None:
     """The keyframe's right image; only where it is the one source of depth it cannot be missed."""
     if run.right is None or source == "motion":
         return None
@@ -196,7 +196,7 @@ def image_name(run: MappedRun, keyframe: Keyframe) -> str:
     return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name
 
 
-def undistorted(frame: Frame, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+def undistorted(frame: Frame, camera: Camera) -> tuple[Image, Floats]:
     """Colour and depth of a frame as a camera without distortion sees them."""
     if not any(camera.distortion):
         return frame.rgb, frame.depth_m
@@ -214,7 +214,7 @@ def undistorted_labels(numbers: NDArray[np.uint16], camera: Camera) -> NDArray[n
     return np.asarray(cv2.remap(numbers, *undistortion_maps(camera), cv2.INTER_NEAREST))
 
 
-def undistortion_maps(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def undistortion_maps(camera: Camera) -> tuple[Floats, Floats]:
     """Where each pixel (H, W) of the undistorted image lies in the distorted one."""
     size = (camera.width, camera.height)
     x, y = cv2.initUndistortRectifyMap(

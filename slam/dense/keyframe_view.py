@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.world.landmark_table import Ints
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.input import MappedRun, SavedMap, load, run_semantics
 from bmask_slam.dense.keyframes import OpenMap
 from bmask_slam.dense.options import MapOptions
+from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, make_pose
+from bmask_slam.graph.geometry import make_pose
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.products.cloud import Cloud, merged, spill
 from bmask_slam.mapping.products.cloud_files import CloudWriter
@@ -256,7 +256,7 @@ def _views(run: MappedRun, keyframes: list[Keyframe], folder: DenseFolder) -> It
         yield folder.fused(keyframe.id).depth_m(), dense.rgb, keyframe.T_world_camera
 
 
-def _write(folder: DenseFolder, name: str, image: NDArray[np.uint8]) -> Path:
+def _write(folder: DenseFolder, name: str, image: Image) -> Path:
     path = folder.path / name
     with whole_file(path) as temporary:
         if not cv2.imwrite(str(temporary), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):

@@ -11,8 +11,9 @@ from typing import TypedDict
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, so3_log
+from bmask_slam.graph.geometry import so3_log
 from bmask_slam.graph.hand_eye import body_trajectory, hand_eye
 from bmask_slam.graph.metrics import (
     AbsoluteError,

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.metrics import AbsoluteError, absolute_error
 from bmask_slam.graph.trajectory import Trajectory, associate
 from bmask_slam.graph.whole_file import whole_file

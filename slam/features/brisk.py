@@ -7,11 +7,10 @@ from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.features.fixed_size_descriptor import FixedSizeBrisk
+from bmask_slam.graph.arrays import Array, Bits, Bytes, Floats, Image, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 from bmask_slam.sequences.frame import Frame
 
 FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
@@ -63,14 +62,14 @@ class Features:
 
     pixels: Array
     image_pixels: Array
-    descriptors: NDArray[np.uint64]
+    descriptors: Bits
     scales: Array
     angles_rad: Array
     depth_m: Array
     disparity_px: Array
     sigmas_px: Array
-    colours: NDArray[np.uint8]
-    gray: NDArray[np.uint8]
+    colours: Bytes
+    gray: Image
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -127,9 +126,7 @@ class BriskExtractor:
         found = self._describer.describe(features.gray, features.image_pixels.astype(np.float32))
         return replace(features, descriptors=found[0], angles_rad=found[1])
 
-    def _corners(
-        self, gray: NDArray[np.uint8], enough: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64], int]:
+    def _corners(self, gray: Image, enough: int) -> tuple[Floats, Array, int]:
         """Pixels (N, 2) and responses (N,) at the highest threshold that gives enough, and it.
 
         A corner's response is the highest threshold at which it is still found, so that one
@@ -150,14 +147,14 @@ class BriskExtractor:
         pixels = np.reshape(cv2.KeyPoint_convert(found), (-1, 2)).astype(np.float32, copy=False)
         return pixels[strong], response[strong], threshold
 
-    def _inside(self, gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _inside(self, gray: Image) -> Bytes:
         """255 where a descriptor can be had."""
         border, (height, width) = self._border_px, gray.shape
         inside = np.zeros_like(gray)
         inside[border : height - border, border : width - border] = 255
         return inside
 
-    def _with_scales(self, frame: Frame, gray: NDArray[np.uint8], threshold: int) -> Features:
+    def _with_scales(self, frame: Frame, gray: Image, threshold: int) -> Features:
         """Features of several sizes, by OpenCV's BRISK."""
         brisk = cv2.BRISK_create(threshold, self.config.octaves)
         found = brisk.detect(gray, self._inside(gray))
@@ -176,9 +173,7 @@ class BriskExtractor:
             np.ascontiguousarray(bits).view(np.uint64),
         )
 
-    def _spread(
-        self, pixels: NDArray[np.float32], response: Array, width: int
-    ) -> NDArray[np.int64]:
+    def _spread(self, pixels: Floats, response: Array, width: int) -> Ints:
         """The order of keypoints (N, 2): every bucket's strongest, then the second, and so on."""
         size = self.config.bucket_px
         column, row = (pixels // size).astype(np.int64).T
@@ -187,9 +182,9 @@ class BriskExtractor:
     def _assemble(
         self,
         frame: Frame,
-        gray: NDArray[np.uint8],
+        gray: Image,
         keypoints: tuple[Array, Array, Array],
-        descriptors: NDArray[np.uint64],
+        descriptors: Bits,
     ) -> Features:
         """With depth and noise, from pixels (N, 2), scales (N,) and angles (N,) in radians."""
         raw, scales, angles_rad = keypoints
@@ -214,7 +209,7 @@ class BriskExtractor:
         )
 
 
-def select(features: Features, rows: NDArray[np.int64]) -> Features:
+def select(features: Features, rows: Ints) -> Features:
     """Some of the keypoints, by their rows (M,)."""
     columns = {f.name: getattr(features, f.name) for f in fields(features)}
     return Features(**{n: a if n == "gray" else a[rows] for n, a in columns.items()})
@@ -227,7 +222,7 @@ def joined(first: Features, second: Features) -> Features:
     return replace(first, **{name: np.concatenate(pair) for name, pair in pairs.items()})
 
 
-def spread_order(bucket: NDArray[np.int64], score: Array) -> NDArray[np.int64]:
+def spread_order(bucket: Ints, score: Array) -> Ints:
     """Indices ordered by their rank inside their bucket, then by score, best first.
 
     A prefix of any length is spread over the buckets as evenly as they allow.
@@ -240,9 +235,7 @@ def spread_order(bucket: NDArray[np.int64], score: Array) -> NDArray[np.int64]:
     return order[np.lexsort((-score[order], rank))]
 
 
-def sample_depth(
-    depth_m: NDArray[np.float32], pixels: Array, config: FeatureConfig
-) -> tuple[Array, Array]:
+def sample_depth(depth_m: Floats, pixels: Array, config: FeatureConfig) -> tuple[Array, Array]:
     """Depth (N,) at keypoints and its local spread (N,) in metres.
 
     The depth is the median of the valid pixels in a small window; the spread is half

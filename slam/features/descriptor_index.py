@@ -11,14 +11,11 @@ from dataclasses import dataclass
 
 import faiss
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.features.matching import Bits, Ints
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Bits, Bytes, Ints, Mask
 
 BITS = 512
 ROWS_PER_LIST = 32  # before the index is partitioned
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -184,6 +181,6 @@ def _unique_pairs(query: Ints, keyframe_ids: Ints, clear: Mask) -> tuple[tuple[I
     return (query[first], keyframe_ids[first]), clear[order][first]
 
 
-def _bytes(descriptors: Bits) -> NDArray[np.uint8]:
+def _bytes(descriptors: Bits) -> Bytes:
     """Descriptors (N, 8) uint64 as the (N, 64) uint8 that faiss and OpenCV take."""
     return np.ascontiguousarray(descriptors).view(np.uint8)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Bits, Floats, Image
 
 RING_POINTS = (1, 10, 14, 15, 20)
 RING_RADII = (0.0, 2.465, 4.165, 6.29, 9.18)
@@ -57,9 +57,7 @@ class FixedSizeBrisk:
         np.add.at(gradient, j[is_long], -pull)
         self._gradient = np.ascontiguousarray(gradient.T, np.float32)
 
-    def describe(
-        self, gray: NDArray[np.uint8], pixels: NDArray[np.float32]
-    ) -> tuple[NDArray[np.uint64], Array]:
+    def describe(self, gray: Image, pixels: Floats) -> tuple[Bits, Array]:
         """Descriptors (N, 8) uint64 and orientations (N,) in radians of pixels (N, 2).
 
         The image (H, W) must reach ``reach_px`` beyond each of them.
@@ -85,7 +83,7 @@ class FixedSizeBrisk:
         packed = np.packbits(columns, axis=1, bitorder="little")
         return packed.view(np.uint64), np.arctan2(dy, dx).astype(float) % (2 * np.pi)
 
-    def _smoothed(self, gray: NDArray[np.uint8]) -> NDArray[np.int16]:
+    def _smoothed(self, gray: Image) -> NDArray[np.int16]:
         """The image (H, W) smoothed for every ring, one below the other: (5 H, W)."""
         height = len(gray)
         rings = np.empty((len(self._kernels) * height, gray.shape[1]), np.int16)

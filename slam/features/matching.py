@@ -6,12 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
-
-Ints = NDArray[np.int64]
-Bits = NDArray[np.uint64]
+from bmask_slam.graph.arrays import Array, Bits, Ints, Mask
 
 _LOW_BYTES = np.uint64(0x00FF00FF00FF00FF)
 _LOWEST_SUM = np.uint64(0xFFFF)
@@ -47,7 +43,7 @@ class Matches:
     def __len__(self) -> int:
         return len(self.query)
 
-    def __getitem__(self, keep: Array | Ints | NDArray[np.bool_]) -> Matches:
+    def __getitem__(self, keep: Array | Ints | Mask) -> Matches:
         return Matches(self.query[keep], self.train[keep], self.distance[keep])
 
 

@@ -14,9 +14,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Bytes, Floats, Image
 
 PATCH_PX = 17  # side of a stored patch: enough of it to be made smaller
 _RADIUS = 5  # of the template; the outermost ring only serves the gradients
@@ -46,16 +45,16 @@ class SubpixelConfig:
         return math.radians(self.max_angle_deg), self.max_zoom
 
 
-def cut_patches(gray: NDArray[np.uint8], pixels: Array) -> NDArray[np.uint8]:
+def cut_patches(gray: Image, pixels: Array) -> Bytes:
     """Patches (M, 17, 17) uint8 around pixels (M, 2), interpolated linearly."""
     window = np.rint(_sample(gray, pixels, PATCH_PX // 2)).astype(np.uint8)
     return np.ascontiguousarray(window.transpose(2, 0, 1))
 
 
 def register_patches(
-    gray: NDArray[np.uint8],
+    gray: Image,
     pixels: Array,
-    patches: NDArray[np.uint8],
+    patches: Bytes,
     iterations: int,
     zooms: Array | None = None,
 ) -> tuple[Array, Array]:
@@ -92,7 +91,7 @@ def register_patches(
     return moved, _dot(image, inner) / _norm(image)
 
 
-def _zoomed(patches: NDArray[np.uint8], zooms: Array) -> NDArray[np.float32]:
+def _zoomed(patches: Bytes, zooms: Array) -> Floats:
     """The middles (11, 11, M) of patches (M, 17, 17), each magnified about its centre.
 
     Interpolated linearly; what lies beyond a patch looks like its rim.
@@ -105,7 +104,7 @@ def _zoomed(patches: NDArray[np.uint8], zooms: Array) -> NDArray[np.float32]:
     corner = (first + whole * PATCH_PX)[:, None] + whole
     values = patches.reshape(-1).astype(np.float32)
 
-    def along_row(start: int) -> NDArray[np.float32]:
+    def along_row(start: int) -> Floats:
         left = values[start:].take(corner)
         return left + share * (values[start + 1 :].take(corner) - left)
 
@@ -113,23 +112,23 @@ def _zoomed(patches: NDArray[np.uint8], zooms: Array) -> NDArray[np.float32]:
     return top + share[:, None] * (along_row(PATCH_PX) - top)
 
 
-def _centred(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _centred(values: Floats) -> Floats:
     """Windows (S, S, M) as columns (S * S, M) of zero mean."""
     columns = values.reshape(values.shape[0] * values.shape[1], values.shape[2])
     return columns - columns.mean(axis=0)
 
 
-def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> Array:
+def _dot(a: Floats, b: Floats) -> Array:
     """Products (M,) of columns, in double precision from here on."""
     return np.einsum("km,km->m", a, b).astype(float)
 
 
-def _norm(columns: NDArray[np.float32]) -> NDArray[np.float32]:
+def _norm(columns: Floats) -> Floats:
     """Norms (M,) of columns, never 0."""
     return np.sqrt(np.einsum("km,km->m", columns, columns)) + np.float32(1e-3)
 
 
-def _sample(gray: NDArray[np.uint8], pixels: Array, radius: int) -> NDArray[np.float32]:
+def _sample(gray: Image, pixels: Array, radius: int) -> Floats:
     """Windows (2r+1, 2r+1, M) float32 around pixels (M, 2), by linear interpolation.
 
     All pixels of a window share one fraction of a pixel. OpenCV's remap would round it to 1/32.

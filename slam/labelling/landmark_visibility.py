@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.moving.free_space_check import distorted
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import Keyframe
 
 _REACH = 0.02
@@ -66,7 +65,7 @@ class VisibleLandmarks:
 
     def with_visible(
         self,
-        depth_m: NDArray[np.float32],
+        depth_m: Floats,
         camera: Camera,
         mapper: Mapper,
         wanted: Mask | None = None,

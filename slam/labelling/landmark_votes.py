@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import Arrays
 from bmask_slam.labelling.landmark_visibility import Observed, VisibleLandmarks, observed_by
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, VoteConfig, vote
 from bmask_slam.semantics.instances.instances import Instance
-from bmask_slam.world.landmark_table import Ints
 
 RECENT = 8
 """Of so many keyframes the masks vote on landmarks that are made later."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 from bmask_slam.semantics.beliefs.label_store import LabelEstimates
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.object_map import MapObject

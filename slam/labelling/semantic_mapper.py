@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.graph.arrays import Arrays, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import Arrays, nested, part
+from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
 from bmask_slam.labelling.landmark_votes import LabelVotes
 from bmask_slam.labelling.results import LandmarkLabels, MapObjects
@@ -39,7 +39,6 @@ from bmask_slam.semantics.objects.object_map import (
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter, Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.world.landmark_table import Ints
 from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
@@ -90,7 +89,7 @@ class _Waiting:
     """What a keyframe's masks will need: its stamp and every second pixel of its depth (h, w)."""
 
     timestamp_s: float
-    depth_m: NDArray[np.float32]
+    depth_m: Floats
 
 
 class SemanticMapper:
@@ -140,7 +139,7 @@ class SemanticMapper:
                 raise
             logger.warning("keyframe %d has no masks: %s", keyframe.id, error)
 
-    def expect(self, keyframe: Keyframe, depth_m: NDArray[np.float32]) -> None:
+    def expect(self, keyframe: Keyframe, depth_m: Floats) -> None:
         """Keep of a keyframe what its masks will need, its ``kept_depth``, until they come."""
         self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, depth_m)
         self._gravity.add(keyframe.id, depth_m, self._rays)
@@ -300,6 +299,6 @@ class SemanticMapper:
         return np.append(objects, -1)
 
 
-def kept_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+def kept_depth(depth_m: Floats) -> Floats:
     """Every DEPTH_STEP-th pixel each way of a z-depth image (H, W) in m."""
     return depth_m[::DEPTH_STEP, ::DEPTH_STEP].copy()

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.live.health import Health
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.system import LiveSystem
@@ -32,7 +31,7 @@ class Display:
         self._placed: dict[int, Array] = {}
         self._away: list[int] = []
 
-    def frame(self, result: FrameResult, rgb: NDArray[np.uint8], system: LiveSystem) -> bool:
+    def frame(self, result: FrameResult, rgb: Image, system: LiveSystem) -> bool:
         """Show a frame, and of the submaps what is due; whether the map has changed."""
         self._frames += 1
         self._scene.frame(result, rgb if self._frames % IMAGE_EVERY == 1 else None)

@@ -11,11 +11,11 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
 from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
@@ -121,7 +121,7 @@ class LiveSlam:
     ) -> None:
         self.close()
 
-    def prepare(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Prepared:
+    def prepare(self, rgb: Image, depth_m: Floats) -> Prepared:
         """A frame's features, for ``track``; may be called ahead in another thread."""
         arrived_s, started_s = time.monotonic(), time.perf_counter()
         features = self._system.prepare(Frame(0, 0.0, rgb, depth_m))
@@ -130,8 +130,8 @@ class LiveSlam:
     def track(
         self,
         timestamp_s: float,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
+        rgb: Image,
+        depth_m: Floats,
         prepared: Prepared | None = None,
         name: str = "",
     ) -> FrameResult:

@@ -5,18 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Floats, Image, Ints
 from bmask_slam.live.replica import WorldDelta
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
 from bmask_slam.tracking.tracker import Tracked
 from bmask_slam.world.frame_history import Entries
-from bmask_slam.world.landmark_table import Ints, Patches
-
-Image = NDArray[np.uint8]
-Depth = NDArray[np.float32]
+from bmask_slam.world.landmark_table import Patches
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +48,7 @@ class NewKeyframe:
     local_ids: Ints
     sightings: Sightings
     history: Entries
-    depth_m: Depth
+    depth_m: Floats
 
 
 @dataclass(frozen=True, eq=False)

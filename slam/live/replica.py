@@ -10,12 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.geometry import Array, carried_along
+from bmask_slam.graph.arrays import Array, Arrays, Bytes, Ints, Mask
+from bmask_slam.graph.geometry import carried_along
 from bmask_slam.world.frame_history import FrameHistory
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 COLUMNS = (
@@ -54,10 +53,10 @@ class WorldDelta:
     """
 
     size: int
-    alive: NDArray[np.uint8]
+    alive: Bytes
     points_world: Array
     ids: Ints
-    columns: dict[str, NDArray]
+    columns: Arrays
     replaced_by: Ints | None
     next_keyframe_id: int
     keyframe_ids: Ints
@@ -72,7 +71,7 @@ class _Sent:
     """What the other side has: of landmarks those that live, by ``ids``."""
 
     ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    landmarks: dict[str, NDArray] = field(default_factory=dict)
+    landmarks: Arrays = field(default_factory=dict)
     fused: int = 0
     observations: dict[int, Ints] = field(default_factory=dict)
     masked: dict[int, Mask] = field(default_factory=dict)

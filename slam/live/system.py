@@ -14,9 +14,9 @@ import numpy as np
 
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, read_arrays
-from bmask_slam.graph.geometry import Array
 from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.messages import ImageToSegment
@@ -32,7 +32,6 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.tracking.tracker import Tracked, Tracker
 from bmask_slam.world.frame_history import NOBODY
-from bmask_slam.world.landmark_table import Ints
 from bmask_slam.world.world_map import Keyframe
 
 MAX_PENDING = 3

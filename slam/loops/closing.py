@@ -14,15 +14,15 @@ import numpy as np
 from scipy.stats import chi2
 
 from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import mahalanobis
 from bmask_slam.graph.factors.graph_update import RelativePose
-from bmask_slam.graph.files.array_file import Arrays, nested, part
-from bmask_slam.graph.geometry import Array, inverse, se3_log
+from bmask_slam.graph.files.array_file import nested, part
+from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.pose_graph.loop_consistency import cycle_chi2
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)

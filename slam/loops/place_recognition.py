@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bmask_slam.features.descriptor_index import DescriptorIndex, Votes
-from bmask_slam.features.matching import Bits
-from bmask_slam.graph.files.array_file import Arrays
+from bmask_slam.graph.arrays import Arrays, Bits
 
 Neighbours = Callable[[int], Collection[int]]  # keyframe id -> ids of the covisible ones
 

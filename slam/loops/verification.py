@@ -20,9 +20,9 @@ from bmask_slam.features.matching import (
     match_brute_force,
     match_pairs,
 )
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import (
-    Array,
     adjoint,
     inverse,
     make_pose,
@@ -31,7 +31,6 @@ from bmask_slam.graph.geometry import (
     transform,
 )
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, jacobian, residuals
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 NEAREST_M = 0.1

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
-from bmask_slam.moving.free_space_check import Depths, PointMotions
-from bmask_slam.world.landmark_table import Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.moving.free_space_check import PointMotions
 
 _FAR_M = np.float32(1e6)
 
@@ -61,7 +60,7 @@ class DepthSegments:
     """
 
     labels: NDArray[np.int32]
-    depth_m: Depths
+    depth_m: Floats
     config: DepthSegmentConfig
 
     def moving(self, point_motions: PointMotions) -> Mask:
@@ -109,8 +108,8 @@ class MovingSpace:
             ``high_m`` is less.
     """
 
-    low_m: Depths
-    high_m: Depths
+    low_m: Floats
+    high_m: Floats
     step_px: int
 
     def on(self, pixels: Array, depth_m: Array) -> Mask:
@@ -122,7 +121,7 @@ class MovingSpace:
         columns, rows = np.rint(pixels / self.step_px).astype(np.int64).T
         return self._at((self._inside(rows, 0), self._inside(columns, 1)), depth_m)
 
-    def covers(self, depth_m: Depths, step: int) -> Mask:
+    def covers(self, depth_m: Floats, step: int) -> Mask:
         """Which of every ``step``-th pixel both ways (H', W') are on moving things, likewise."""
         rows, columns = (np.rint(np.arange(n) * step / self.step_px) for n in depth_m.shape)
         place = self._inside(rows.astype(np.int64), 0), self._inside(columns.astype(np.int64), 1)
@@ -131,18 +130,18 @@ class MovingSpace:
     def _inside(self, places: Ints, axis: int) -> Ints:
         return np.minimum(places, self.low_m.shape[axis] - 1)
 
-    def _at(self, place: tuple[Ints, ...], depth_m: Array | Depths) -> Mask:
+    def _at(self, place: tuple[Ints, ...], depth_m: Array | Floats) -> Mask:
         low_m, high_m = self.low_m[place], self.high_m[place]
         return np.asarray((low_m < high_m) & ~((depth_m < low_m) | (depth_m > high_m)))
 
 
-def depth_segments(depth_m: Depths, config: DepthSegmentConfig) -> DepthSegments:
+def depth_segments(depth_m: Floats, config: DepthSegmentConfig) -> DepthSegments:
     """The regions of a depth image (H, W) in metres, NaN where missing."""
     few = depth_m[:: config.step_px, :: config.step_px]
     return DepthSegments(_joined_up(few, np.isfinite(few), config.jump), few, config)
 
 
-def _joined_up(depth_m: Depths, chosen: Mask, jump: float) -> NDArray[np.int32]:
+def _joined_up(depth_m: Floats, chosen: Mask, jump: float) -> NDArray[np.int32]:
     """Numbers (h, w) of the pieces of ``chosen`` samples (h, w), 0 for the others.
 
     Neighbours hang together if their depths differ by less than ``jump`` of it.

@@ -8,11 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bmask_slam.back_end.mapper import Mapper
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Arrays, Mask
 from bmask_slam.moving.depth_segments import MovingSpace
 from bmask_slam.moving.free_space_check import DepthView
-from bmask_slam.world.landmark_table import Mask
 
 
 @dataclass(frozen=True, eq=False)

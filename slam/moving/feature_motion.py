@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.moving.depth_segments import DepthSegmentConfig, MovingSpace, depth_segments
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.free_space_check import FreeSpaceCheck, PointMotion, PointMotions, distorted
 from bmask_slam.semantics.objects.object_map import pixel_rays
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.world.landmark_table import Mask
 
 NEAREST_M = 0.2
 """A box whose middle is nearer to the camera is not looked for in the image."""

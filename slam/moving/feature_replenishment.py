@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features, joined, select
+from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.world.landmark_table import Mask
 
 LEAST_SHARE = 0.1
 """Of the keypoints; where fewer were left out none are looked for."""

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.geometry import inverse
 
-Depths = NDArray[np.float32]
 PointMotions = NDArray[np.int8]
 
 
@@ -77,8 +77,8 @@ class DepthView:
         farthest_m: the farthest depth in it, 0 where all are missing.
     """
 
-    nearest_m: Depths
-    farthest_m: Depths
+    nearest_m: Floats
+    farthest_m: Floats
     step: int
 
     def thinned(self, factor: int) -> DepthView:
@@ -87,12 +87,12 @@ class DepthView:
         return DepthView(near, far, factor * self.step)
 
 
-def depth_view(depth_m: Depths, window_px: int) -> DepthView:
+def depth_view(depth_m: Floats, window_px: int) -> DepthView:
     """The view of a depth image (H, W), NaN where missing, at every second pixel."""
     return thinned_view(depth_m[::2, ::2].copy(), 2, window_px)
 
 
-def thinned_view(depth_m: Depths, step: int, window_px: int) -> DepthView:
+def thinned_view(depth_m: Floats, step: int, window_px: int) -> DepthView:
     """The view of every ``step``-th pixel each way of a depth image; they are overwritten."""
     cv2.patchNaNs(depth_m, 0.0)
     side = 2 * (window_px // step) + 1
@@ -131,7 +131,7 @@ class FreeSpaceCheck:
 
     def offsets(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
-    ) -> tuple[Depths, NDArray[np.bool_]]:
+    ) -> tuple[Floats, Mask]:
         """How far behind points (N, 3) the surface is that views, each with T_world_camera, show.
 
         (K, N) m, 0 within the window's depths; NaN out of view, where a depth is missing in it, and
@@ -183,7 +183,7 @@ class FreeSpaceCheck:
 
     def _seen(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
-    ) -> tuple[Depths, NDArray[np.bool_], Depths, Depths]:
+    ) -> tuple[Floats, Mask, Floats, Floats]:
         """Of points (N, 3) in views: depth, whether in view, nearest and farthest there (K, N)."""
         T_camera_world = inverse(np.array([T for _, T in views])).astype(np.float32)
         to_cameras = T_camera_world[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3)
@@ -202,11 +202,11 @@ class FreeSpaceCheck:
         nearest, farthest = _looked_up([view for view, _ in views], place.astype(np.int64))
         return z, ahead, nearest, farthest
 
-    def _margin_m(self, depth_m: Depths) -> Depths:
+    def _margin_m(self, depth_m: Floats) -> Floats:
         """How far apart two depths as large as these may lie and still be one surface."""
         return np.float32(self.config.margin_m) + np.float32(self._sigmas_per_m2) * depth_m**2
 
-    def _pixels(self, x: Depths, y: Depths, z: Depths) -> tuple[Depths, Depths]:
+    def _pixels(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
         """Columns and rows (K, N) in the image as recorded of points (K, N) before it."""
         if any(self.camera.distortion):
             points = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(float)
@@ -218,7 +218,7 @@ class FreeSpaceCheck:
         return u.astype(np.float32, copy=False), v.astype(np.float32, copy=False)
 
 
-def _looked_up(views: Sequence[DepthView], place: NDArray[np.int64]) -> tuple[Depths, Depths]:
+def _looked_up(views: Sequence[DepthView], place: Ints) -> tuple[Floats, Floats]:
     """Nearest and farthest depths (K, N) of each view at its places (K, N), counted by rows."""
     nearest = np.empty(place.shape, np.float32)
     farthest = np.empty(place.shape, np.float32)

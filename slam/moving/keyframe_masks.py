@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 from bmask_slam.moving.free_space_check import thinned_view
 from bmask_slam.semantics.beliefs.votes import PixelAssignment
 from bmask_slam.semantics.labels import LabelSet
-from bmask_slam.world.landmark_table import Ints, Mask
 
 _SAMPLES = 400
 """Points of an instance, at most."""
@@ -33,7 +31,7 @@ class KeyframeMasks:
     keyframe_id: int
     names: LabelSet
     assignment: PixelAssignment
-    depth_m: NDArray[np.float32]
+    depth_m: Floats
     T_world_camera: Array
     landmark_ids: Ints
     instances: Ints

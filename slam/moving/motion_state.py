@@ -7,7 +7,7 @@ from enum import Enum
 
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.free_space_check import FreeSpaceCheck
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import FeatureConfig, Features, select
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import Arrays, nested, part
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.files.array_file import nested, part
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.moving.config import MovingObjectConfig
 from bmask_slam.moving.depth_segments import MovingSpace
 from bmask_slam.moving.depth_view_buffer import DepthViewBuffer, PosedView
@@ -33,7 +34,6 @@ from bmask_slam.semantics.tracks.instance_tracks import InstanceTracks
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.tracker import Tracked
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)

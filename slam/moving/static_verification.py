@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bmask_slam.back_end.pruning import covered
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array, transform
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.graph.geometry import transform
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.free_space_check import DepthView, FreeSpaceCheck
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.semantics.tracks.instance_track import Track
-from bmask_slam.world.landmark_table import Ints, LandmarkTable, Mask, Patches
+from bmask_slam.world.landmark_table import LandmarkTable, Patches
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 

@@ -17,16 +17,10 @@ import numpy as np
 
 from bmask_slam import __version__
 from bmask_slam.config.configuration import dump, resolve
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import (
-    Arrays,
-    FileKind,
-    nested,
-    part,
-    read_arrays,
-    write_arrays,
-)
+from bmask_slam.graph.files.array_file import FileKind, nested, part, read_arrays, write_arrays
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder

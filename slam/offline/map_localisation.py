@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.runtime.stage_clock import StageClock
 from bmask_slam.sequences.frame import Frame

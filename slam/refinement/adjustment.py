@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from bmask_slam.evaluation import (
@@ -20,13 +19,13 @@ from bmask_slam.evaluation import (
     read_reference,
 )
 from bmask_slam.evaluation.plot import plot_trajectory
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, AdjustmentConfig, adjust
 from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.files.ply import write_ply
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.smoother.storage import write_graph
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.refinement.adjustment_plot import check_picture
@@ -182,14 +181,14 @@ def carry_along(
     return Trajectory(t_s, blended)
 
 
-def _microseconds(stamps_s: Array) -> IntArray:
+def _microseconds(stamps_s: Array) -> Ints:
     """Stamps as the files hold them; -1 for NaN."""
     return np.where(np.isfinite(stamps_s), np.rint(stamps_s * 1e6), -1.0).astype(np.int64)
 
 
 def moved_landmarks(
-    columns: dict[str, NDArray], before: Placed, tables: FactorTables, adjustment: Adjustment
-) -> dict[str, NDArray]:
+    columns: Arrays, before: Placed, tables: FactorTables, adjustment: Adjustment
+) -> Arrays:
     """Columns of landmarks.ply after the adjustment; landmarks that were dropped are left out.
 
     A landmark outside the graph moves rigidly with the first keyframe that sees its nearest

@@ -13,9 +13,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
-from bmask_slam.graph.trajectory import Indices
 from bmask_slam.graph.whole_file import whole_file
 
 PICTURE_TYPES = (".png", ".pdf", ".svg")
@@ -35,7 +34,7 @@ class View:
 
     title: str
     points: Array
-    edges: Sequence[tuple[Indices, str, float]]
+    edges: Sequence[tuple[Ints, str, float]]
     cloud: Array = field(default_factory=lambda: np.zeros((0, 2)))
     axes: str = "xyz"
 

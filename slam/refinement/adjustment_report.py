@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.evaluation.plot import view_plane
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, Stage, loop_edges
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import IntArray
-from bmask_slam.graph.geometry import Array
 from bmask_slam.refinement.adjustment_plot import View, draw_before_after
 
 
@@ -19,11 +18,11 @@ from bmask_slam.refinement.adjustment_plot import View, draw_before_after
 class Placed:
     """Where a graph's variables are: ids (K,), poses (K, 4, 4), ids (L,), points (L, 3), loops."""
 
-    keyframe_ids: IntArray
+    keyframe_ids: Ints
     poses_world_camera: Array
-    landmark_ids: IntArray
+    landmark_ids: Ints
     points_world: Array
-    loops: IntArray
+    loops: Ints
 
     @classmethod
     def of(cls, tables: FactorTables) -> Placed:

@@ -6,21 +6,20 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, adjust
 from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.g2o.landmark_graphs import write_landmark_graph
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
 from bmask_slam.graph.g2o.pose_graphs import read_g2o, write_g2o
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.pose_graph.optimisation import (
     Method,
     PoseGraphConfig,
     PoseGraphResult,
     optimise_pose_graph,
 )
-from bmask_slam.graph.pose_graph.pose_graph import Mask, PoseGraph
-from bmask_slam.graph.trajectory import Indices
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph
 from bmask_slam.refinement.adjustment_plot import View, check_picture, draw_before_after
 from bmask_slam.refinement.adjustment_report import Placed, draw_adjustment
 
@@ -134,7 +133,7 @@ def _is_flat(points: Array) -> bool:
     return bool(extent_m[2] < 0.1 * extent_m[:2].max())
 
 
-def _edges(graph: PoseGraph, is_outlier: Mask) -> list[tuple[Indices, str, float]]:
+def _edges(graph: PoseGraph, is_outlier: Mask) -> list[tuple[Ints, str, float]]:
     """Loops, wrong loops and odometry, with colours and widths."""
     odometry = graph.is_odometry
     return [

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from bmask_slam.back_end.factor_selection import read_back
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.files.array_file import Arrays, nested, part
+from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.graph.smoother.storage import graph_arrays
 from bmask_slam.world.map_state import world_of, world_state

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.rendering.classes import CATEGORY_IDS
 from bmask_slam.rendering.engine.builder import UNLABELLED
@@ -42,7 +43,7 @@ def frame_marks(instances: NDArray[np.uint16]) -> FrameMarks:
     return marks
 
 
-def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
+def run_lengths(mask: Mask) -> list[int]:
     """COCO's uncompressed run lengths: columns one after the other, zeros first."""
     flat = mask.ravel(order="F")
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1

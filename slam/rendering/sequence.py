@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.rendering.annotations import FrameMarks, coco, frame_marks
-from bmask_slam.rendering.engine.builder import Image, SceneBuilder
+from bmask_slam.rendering.engine.builder import SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lighting
 from bmask_slam.rendering.engine.path import CameraPath, camera_poses
 from bmask_slam.rendering.engine.raycast import Renderer, View, to_image

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, quaternion_from_rotation
+from bmask_slam.graph.geometry import quaternion_from_rotation
 
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.smoother.isam2 import SolverError
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.graph.whole_file import whole_file
-from bmask_slam.world.landmark_table import Ints
 
 logger = logging.getLogger(__name__)
 

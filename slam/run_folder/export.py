@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.g2o.landmark_graphs import has_landmarks, write_landmark_graph
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
@@ -90,7 +90,7 @@ def _points_of_graph(source: Path, form: ExportFormat, out: Path) -> Exported:
     return Exported((out,), f"{len(x)} landmarks: x y z in metres, id")
 
 
-def _ids(ids: IntArray) -> NDArray[np.int32]:
+def _ids(ids: Ints) -> NDArray[np.int32]:
     """Ids as PLY can hold them."""
     if len(ids) and ids.max() > np.iinfo(np.int32).max:
         raise InputError("landmark ids beyond 32 bits, which PLY has not; renumber them")

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.graph.files.ply import write_ply
-from bmask_slam.graph.geometry import Array
 from bmask_slam.labelling.results import LandmarkLabels
 
 LANDMARKS_COMMENT = "bmask-slam landmarks, world frame, metres"
@@ -22,10 +21,10 @@ class LandmarkCloud:
     ``labels`` says what they are, if there was a segmenter.
     """
 
-    ids: NDArray[np.int64]
+    ids: Ints
     points_world: Array
-    colours: NDArray[np.uint8]
-    observations: NDArray[np.int64]
+    colours: Bytes
+    observations: Ints
     labels: LandmarkLabels | None = None
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import Arrays, FileKind, read_arrays, write_arrays
+from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
 from bmask_slam.graph.smoother.storage import read_camera
 
 MAP_FILE = FileKind("map", 4, compressed=True)

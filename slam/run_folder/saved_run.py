@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import IntArray
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.ply import read_ply
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.marginals.landmark_marginalisation import reinstate
 from bmask_slam.graph.smoother.storage import read_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum
@@ -46,7 +44,7 @@ class SavedRun:
     keyframe_stamps_s: Array
     trajectories: dict[str, Trajectory]
     keyframes: Trajectory
-    landmarks: dict[str, NDArray]
+    landmarks: Arrays
 
 
 def read_run(path: Path) -> SavedRun:
@@ -76,7 +74,7 @@ def read_run(path: Path) -> SavedRun:
     return run
 
 
-def _keyframe_stamps(path: Path, ids: IntArray) -> Array:
+def _keyframe_stamps(path: Path, ids: Ints) -> Array:
     """Stamps (K,) of keyframes by the lines of frames.csv."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give the folder as the run left it")

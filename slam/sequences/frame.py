@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
+from bmask_slam.graph.arrays import Floats, Image
 
 
 @dataclass(frozen=True)
@@ -22,6 +21,6 @@ class Frame:
 
     index: int
     timestamp_s: float
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
+    rgb: Image
+    depth_m: Floats
     name: str = ""

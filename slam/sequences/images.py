@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
@@ -16,7 +17,7 @@ SURFACE_STEP = 0.05
 """A pixel whose depth changes by more from one depth image to the next shows another surface."""
 
 
-def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
+def read_rgb(path: Path, camera: Camera) -> Image:
     """The colour image (H, W, 3), red first; grey images are expanded.
 
     Raises:
@@ -28,7 +29,7 @@ def read_rgb(path: Path, camera: Camera) -> NDArray[np.uint8]:
     return rgb
 
 
-def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
+def read_depth(path: Path, camera: Camera) -> Floats:
     """The depth image (H, W) in metres (paper eq. 9: z = d / s, and an offset), NaN where missing.
 
     Raises:
@@ -49,7 +50,7 @@ def read_depth(path: Path, camera: Camera) -> NDArray[np.float32]:
     return depth_in_metres(stored, camera)
 
 
-def depth_in_metres(stored: NDArray, camera: Camera) -> NDArray[np.float32]:
+def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
     """Depth (H, W) in metres from stored values, integers or floats (paper eq. 9, and an offset).
 
     NaN where they are 0, negative or not finite.
@@ -61,9 +62,7 @@ def depth_in_metres(stored: NDArray, camera: Camera) -> NDArray[np.float32]:
     return depth_m
 
 
-def depth_between(
-    near_m: NDArray[np.float32], other_m: NDArray[np.float32], share: float
-) -> NDArray[np.float32]:
+def depth_between(near_m: Floats, other_m: Floats, share: float) -> Floats:
     """Depth (H, W) at a time between two depth images, ``share`` of the way to the other.
 
     At a fixed pixel of a surface the INVERSE depth changes linearly (exactly so for a plane and a

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.sequences.sequence import Sequence
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
-from bmask_slam.graph.trajectory import Indices, associate_stamps, check_seconds
+from bmask_slam.graph.trajectory import associate_stamps, check_seconds
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ def read_pairs(folder: Path, max_difference_s: float, depth_time_offset_s: float
     )
 
 
-def _neighbours(depth_s: Array, chosen: Indices, lags_s: Array) -> tuple[Indices, Array]:
+def _neighbours(depth_s: Array, chosen: Ints, lags_s: Array) -> tuple[Ints, Array]:
     """For each chosen depth image the one on the other side of the moment ``lags_s`` before it.
 
     Its index, -1 where it is missing or too far away, and the share of the way to it, 0 to 1.

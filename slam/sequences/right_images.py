@@ -6,10 +6,9 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import associate_stamps
@@ -36,7 +35,7 @@ class RightImages:
     files: dict[int, Path]
     camera: Camera
 
-    def load(self, index: int) -> NDArray[np.uint8]:
+    def load(self, index: int) -> Image:
         """The right image (H, W, 3) of a frame, red first.
 
         Raises:

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.trajectory import Trajectory, read_tum
 from bmask_slam.sequences.cameras import find_camera
 from bmask_slam.sequences.frame import Frame
@@ -99,7 +98,7 @@ class Sequence:
             image_name(self.pairs.rgb_files[index], self.folder),
         )
 
-    def _depth(self, index: int) -> NDArray[np.float32]:
+    def _depth(self, index: int) -> Floats:
         """The depth at the colour image's stamp, if the camera says when depth is taken."""
         depth_m = self._read_depth(self.pairs.depth_files[index])
         other = self.pairs.neighbour_files[index]

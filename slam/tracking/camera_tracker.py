@@ -7,20 +7,12 @@ import numpy as np
 from bmask_slam.back_end.landmark_management import MappingConfig, local_landmarks
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import (
-    Array,
-    carried_along,
-    inverse,
-    orthonormalised,
-    se3_exp,
-    se3_log,
-)
+from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.geometry import carried_along, inverse, orthonormalised, se3_exp, se3_log
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.tracking.rolling_shutter import PreviousPose
 from bmask_slam.tracking.tracker import Tracked, Tracker
-from bmask_slam.world.landmark_table import Ints
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 UNEVEN = 0.25

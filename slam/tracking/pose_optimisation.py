@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, orthonormalised, transform
+from bmask_slam.graph.geometry import inverse, orthonormalised, transform
 from bmask_slam.tracking.reprojection import Reprojection, moved
 
 CHI2_3DOF = 7.815  # 95 %
@@ -48,7 +48,7 @@ class PoseEstimate:
     """
 
     T_world_camera: Array
-    inliers: NDArray[np.bool_]
+    inliers: Mask
     information: Array
     noise_scale: float
     ok: bool
@@ -164,7 +164,7 @@ def _solution(H: Array, b: Array) -> Array:
     return np.asarray(x if failure == 0 else np.linalg.solve(H, b), dtype=np.float64)
 
 
-def _inliers(T: Array, matches: Reprojection, gate: Array) -> NDArray[np.bool_]:
+def _inliers(T: Array, matches: Reprojection, gate: Array) -> Mask:
     """Points (N,) in front of the camera and within the chi-square gate, without any kernel."""
     chi2, _, z = matches.chi2(T)
     return (chi2 < gate) & (z > 0.05)

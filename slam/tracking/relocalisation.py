@@ -11,7 +11,8 @@ from bmask_slam.back_end.landmark_management import MappingConfig, local_landmar
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.features.matching import MatchConfig, consistent_rotation, match_brute_force
-from bmask_slam.graph.geometry import Array, make_pose
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import make_pose
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.tracking.tracker import Tracked, Tracker
 from bmask_slam.world.world_map import Keyframe, WorldMap

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 
 MIN_DEPTH_M = 1e-3  # nearer points are projected as if they were here
 
@@ -49,7 +48,7 @@ class Reprojection:
     def __len__(self) -> int:
         return self.points_world.shape[1]
 
-    def __getitem__(self, keep: NDArray[np.bool_]) -> Reprojection:
+    def __getitem__(self, keep: Mask) -> Reprojection:
         return Reprojection(
             self.points_world[:, keep], self.offset[:, keep], self.weight[:, keep], self.focal
         )

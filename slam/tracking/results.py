@@ -7,7 +7,7 @@ from enum import Enum
 
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 
 
 class TrackingStatus(Enum):

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, se3_log
+from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.tracking.pose_optimisation import PoseEstimate, jacobian, residuals
 
 ACCELERATION = 2.0

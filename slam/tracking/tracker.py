@@ -15,8 +15,9 @@ from bmask_slam.features.matching import (
     match_pairs,
 )
 from bmask_slam.features.patch_alignment import SubpixelConfig, register_patches
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.pose_optimisation import (
     PoseEstimate,
     PoseOptimisationConfig,
@@ -30,7 +31,7 @@ from bmask_slam.tracking.rolling_shutter import (
     corrected,
     motion_since,
 )
-from bmask_slam.world.landmark_table import Ints, LandmarkTable
+from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import WorldMap
 
 COARSE_STEP = 1e-3

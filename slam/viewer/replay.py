@@ -6,12 +6,11 @@ import csv
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Arrays, Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.ply import read_ply
-from bmask_slam.graph.geometry import Array
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.run_folder.folder import STAGES
 from bmask_slam.run_folder.saved_run import SavedRun, read_run
@@ -70,7 +69,7 @@ def _show_map(run: SavedRun, scene: Scene) -> None:
         scene.points("world/dense", _xyz(some), _rgb(some), 0.006)
 
 
-def landmark_colours(landmarks: dict[str, NDArray]) -> NDArray[np.uint8]:
+def landmark_colours(landmarks: Arrays) -> Bytes:
     """Colours (N, 3): of the class, where there is one, else of the landmark itself."""
     colours = _rgb(landmarks)
     labels = landmarks.get("label")
@@ -124,9 +123,9 @@ def _frames(path: Path, trajectory: Trajectory) -> list[FrameResult]:
     return found
 
 
-def _xyz(columns: dict[str, NDArray]) -> Array:
+def _xyz(columns: Arrays) -> Array:
     return np.stack([columns[name] for name in "xyz"], axis=1).astype(float)
 
 
-def _rgb(columns: dict[str, NDArray]) -> NDArray[np.uint8]:
+def _rgb(columns: Arrays) -> Bytes:
     return np.stack([columns[name] for name in ("red", "green", "blue")], axis=1)

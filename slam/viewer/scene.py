@@ -23,9 +23,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Bytes, Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
@@ -55,7 +55,7 @@ class Box:
 
     box: OrientedBox
     text: str
-    colour: NDArray[np.uint8]
+    colour: Bytes
 
 
 class Scene:
@@ -89,7 +89,7 @@ class Scene:
             static=True,
         )
 
-    def frame(self, result: FrameResult, rgb: NDArray[np.uint8] | None = None) -> None:
+    def frame(self, result: FrameResult, rgb: Image | None = None) -> None:
         """A frame's pose, its image (H, W, 3) red first, status and times."""
         rr = self._rr
         self._stream.set_time(TIMELINE, duration=result.timestamp_s)
@@ -111,12 +111,12 @@ class Scene:
         self.numbers("ms", result.stage_ms)
 
     def points(
-        self, path: str, points: NDArray[np.floating], colours: NDArray[np.uint8], radius_m: float
+        self, path: str, points: NDArray[np.floating], colours: Bytes, radius_m: float
     ) -> None:
         """Points (N, 3) with colours (N, 3)."""
         self._log(path, self._rr.Points3D(points, colors=colours, radii=radius_m))
 
-    def submap(self, number: int, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+    def submap(self, number: int, points: Floats, colours: Bytes) -> None:
         """Points (N, 3) with colours (N, 3) in the frame of a keyframe, see ``move_submap``."""
         self.points(f"world/submaps/{number}", points, colours, 0.006)
 

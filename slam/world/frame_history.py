@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.arrays import Array, Arrays
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.world.world_map import WorldMap
 

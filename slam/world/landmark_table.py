@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.features.patch_alignment import PATCH_PX
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.arrays import Array, Arrays, Bytes, Image, Ints, Mask
+from bmask_slam.graph.geometry import inverse, transform
 
 PATCHES = 4  # of a landmark: views from one walk past it, of which each patch serves a range
 
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _Columns = dict[str, tuple[tuple[int, ...], type, float]]
 
@@ -81,7 +79,7 @@ class Patches:
         views: (N, PATCHES, 3) m, NaN where there is none.
     """
 
-    images: NDArray[np.uint8]
+    images: Image
     views: Array
 
     def __getitem__(self, rows: Any) -> Patches:
@@ -140,7 +138,7 @@ class LandmarkTable:
     def __len__(self) -> int:
         return self._size
 
-    def add(self, columns: dict[str, NDArray]) -> Ints:
+    def add(self, columns: Arrays) -> Ints:
         """New landmarks from columns by name; returns their ids (N,)."""
         first = self._size
         self.extend_to(first + len(columns["points_world"]))
@@ -210,7 +208,7 @@ class LandmarkTable:
 
     def nearest_patches(
         self, ids: Ints, centre_world: Array, limits: tuple[float, float]
-    ) -> tuple[NDArray[np.uint8], Array]:
+    ) -> tuple[Bytes, Array]:
         """Of every landmark the patch (N, 17, 17) of the view most like that from a camera (3,).
 
         Also its zoom (N,): how many times larger than in the patch things look from there.
@@ -234,7 +232,7 @@ class LandmarkTable:
         self.patches[ids[without]] = patches.images[without]
         self.patch_views[ids[without]] = patches.views[without]
 
-    def put_patches(self, ids: Ints, slots: Ints, patches: NDArray[np.uint8], views: Array) -> None:
+    def put_patches(self, ids: Ints, slots: Ints, patches: Bytes, views: Array) -> None:
         """Give landmarks (N,), each once, patches (N, 17, 17) and their views (N, 3) in slots."""
         for column, values in ((self.patches, patches), (self.patch_views, views)):
             all_slots = column[ids]

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.files.array_file import Arrays, nested, part
+from bmask_slam.graph.arrays import Arrays
+from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import CulledKeyframe, Keyframe, WorldMap
 
@@ -98,7 +98,7 @@ def _culled_of(state: Arrays) -> dict[int, CulledKeyframe]:
     return dict(zip(state["id"].tolist(), map(CulledKeyframe, *pieces), strict=False))
 
 
-def _joined(objects: Sequence[Any], columns: _Columns) -> dict[str, NDArray[Any]]:
+def _joined(objects: Sequence[Any], columns: _Columns) -> Arrays:
     """Each column of several objects, one after the other; typed where there are none."""
     return {
         name: np.concatenate(

@@ -9,9 +9,10 @@ import numpy as np
 
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, transform
-from bmask_slam.world.landmark_table import Ints, LandmarkTable, Mask
+from bmask_slam.graph.geometry import transform
+from bmask_slam.world.landmark_table import LandmarkTable
 
 MAX_CULLED = 500
 

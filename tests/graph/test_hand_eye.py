@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
 from bmask_slam.graph.hand_eye import body_trajectory, hand_eye
 from bmask_slam.graph.trajectory import Trajectory
 

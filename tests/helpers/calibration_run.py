@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.files.ply import write_ply
-from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp, transform
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp, transform
 from bmask_slam.graph.smoother.storage import write_graph
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.rendering.writer import stored_depth, write_lists, write_png

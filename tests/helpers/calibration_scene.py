@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 from synthetic_room import make_room
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.calibration.problem import CalibrationProblem
-from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, so3_exp, transform
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp, transform
 
 TRUTH = np.array(
     [525.0, 520.0, 318.5, 241.5, 0.05, -0.08, 0.001, -0.002, 0.0, 0.97, 0.012, 0.010, 0.0]

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import Arrays
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.run_folder.landmark_file import LandmarkCloud
 from bmask_slam.sequences.frame import Frame

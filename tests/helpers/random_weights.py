@@ -13,6 +13,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Arrays, Floats
+
 GAINS = {
     "rpn.head.cls_logits.weight": 2.0,
     "rpn.head.bbox_pred.weight": 0.1,
@@ -27,7 +29,7 @@ PYRAMID_GAIN = 0.1
 """Brings the pyramid's levels, sums of many terms, back to about unit variance."""
 
 
-def random_state(shapes: Mapping[str, tuple[int, ...]], seed: int) -> dict[str, NDArray]:
+def random_state(shapes: Mapping[str, tuple[int, ...]], seed: int) -> Arrays:
     """A state_dict as arrays; each depends on the seed and its own name alone."""
     return {name: _random(name, shape, seed) for name, shape in shapes.items()}
 
@@ -49,7 +51,7 @@ def _random(name: str, shape: tuple[int, ...], seed: int) -> NDArray:
     return np.asarray(normal * gain * np.sqrt(2.0 / fan_in), np.float32)
 
 
-def picture(height: int, width: int, seed: int) -> NDArray[np.float32]:
+def picture(height: int, width: int, seed: int) -> Floats:
     """A smooth colourful picture (3, height, width) in 0..1."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[:height, :width] / 16.0
@@ -58,9 +60,7 @@ def picture(height: int, width: int, seed: int) -> NDArray[np.float32]:
     return np.asarray(np.clip(0.5 + image, 0, 1), np.float32)
 
 
-def random_boxes(
-    rng: np.random.Generator, count: int, size: tuple[int, int]
-) -> NDArray[np.float32]:
+def random_boxes(rng: np.random.Generator, count: int, size: tuple[int, int]) -> Floats:
     """Boxes (count, 4) float32 of all sizes inside an image of (height, width)."""
     height, width = size
     sides = np.exp(rng.uniform(np.log(2), np.log([width, height]), (count, 2)))

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations
-from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, transform
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
 
 CAMERA = Camera(640, 480, fx=525.0, fy=520.0, cx=318.5, cy=241.5)
 

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 
 from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.world.world_map import Keyframe, WorldMap
 

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.files.array_file import nested
-from bmask_slam.graph.geometry import Array, inverse, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.run_folder.map_file import write_map
 from bmask_slam.sequences import Sequence
 from bmask_slam.world.map_state import world_state

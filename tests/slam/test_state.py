@@ -14,18 +14,17 @@ from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.patch_alignment import PATCH_PX
+from bmask_slam.graph.arrays import Array, Arrays, Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.smoother.storage import graph_arrays
 from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.moving.static_verification import PendingMovable, Removed
 from bmask_slam.semantics.instances.instances import Instance, PackedMask, certain, mask_box
 from bmask_slam.semantics.labels import label_set
-from bmask_slam.semantics.segmenters.segmenter import Image
 from bmask_slam.semantics.tracks.instance_track import Sighting
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem

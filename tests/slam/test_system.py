@@ -10,7 +10,8 @@ from repository import KITCHEN
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.ply import read_ply
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices, read_tum
 from bmask_slam.run_folder.semantic_files import LABELS, read_labels
 from bmask_slam.semantics.labels import LabelSet
@@ -100,7 +101,7 @@ def truth_from_world(keyframes: Trajectory, truth: Trajectory) -> Array:
     return np.asarray(T[0] @ se3_exp(se3_log(inverse(T[0]) @ T).mean(axis=0)))
 
 
-def true_classes(folder: Path, names: LabelSet) -> NDArray[np.int64]:
+def true_classes(folder: Path, names: LabelSet) -> Ints:
     """The label of each instance number, 0 for background and classes that the set lacks."""
     content = json.loads((folder / "annotations.json").read_text(encoding="utf-8"))
     by_id = {c["id"]: c["name"] for c in content["categories"]}
@@ -110,9 +111,7 @@ def true_classes(folder: Path, names: LabelSet) -> NDArray[np.int64]:
     return classes
 
 
-def visible(
-    points_camera: Array, depth_m: Array, camera: Camera
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def visible(points_camera: Array, depth_m: Array, camera: Camera) -> tuple[Ints, Ints]:
     """Which points (N, 3) an image shows: their rows (M,), and pixels (M, 2) as (u, v)."""
     ahead = np.flatnonzero(points_camera[:, 2] > MIN_DEPTH_M)
     pixels = np.rint(camera.project(points_camera[ahead])).astype(np.int64)

@@ -13,7 +13,7 @@ import numpy as np
 from bmask_slam.comparison.experiment.result import Comparison
 from bmask_slam.comparison.report.drawing import COLOURS, DASHES, as_picture, figure
 from bmask_slam.comparison.report.section import Picture
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 
 LOSSES, CURVES = "losses.csv", "precision_recall.csv"
 TOTAL, MASKS = "total", "segm, by class score x MaskIoU"

@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bmask_slam.dense.keyframe_view import SeenKeyframe
+from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
-from bmask_slam.world.landmark_table import Ints
 
 
 @dataclass(frozen=True)
@@ -94,8 +90,8 @@ class Taken:
 class Preview:
     """Some points (N, 3) of a submap in the frame of its keyframe, and colours (N, 3)."""
 
-    points: NDArray[np.float32]
-    colours: NDArray[np.uint8]
+    points: Floats
+    colours: Bytes
 
 
 @dataclass(frozen=True, eq=False)

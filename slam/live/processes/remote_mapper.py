@@ -15,9 +15,10 @@ import numpy as np
 
 from bmask_slam.back_end.mapper import add_keyframe, without_image
 from bmask_slam.features.descriptor_index import DescriptorIndex
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, inverse
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.live.messages import (
     Began,
@@ -40,7 +41,7 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.tracker import Tracked
 from bmask_slam.world.frame_history import NOBODY, Entries, FrameHistory
-from bmask_slam.world.landmark_table import Ints, Patches
+from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from bmask_slam.graph.arrays import Ints, Mask
 from bmask_slam.live.messages import PruneLandmarks, PruneMask
 from bmask_slam.semantics.instances.instances import PackedMask
-from bmask_slam.world.landmark_table import Ints, Mask
 from bmask_slam.world.world_map import WorldMap
 
 

@@ -8,9 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
@@ -25,8 +23,8 @@ class Shot(NamedTuple):
     """Colour (H, W, 3), red first, and registered depth (H, W) in metres, NaN where missing."""
 
     stamp_s: float
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
+    rgb: Image
+    depth_m: Floats
 
 
 class CameraSource(ABC):

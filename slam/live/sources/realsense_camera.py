@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
 from bmask_slam.live.sources.camera_source import CameraSource, Shot
 from bmask_slam.live.sources.checks import check_depth_scale
 from bmask_slam.live.sources.optional import import_optional

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import decode_bytes
@@ -45,7 +46,7 @@ def stamp_s(header: Any) -> float:
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
-def colour_image(message: Any, where: str) -> NDArray[np.uint8]:
+def colour_image(message: Any, where: str) -> Image:
     """The image (H, W, 3), red first.
 
     Raises:

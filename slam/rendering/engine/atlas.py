@@ -8,13 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.rendering.engine.builder import Image
+from bmask_slam.graph.arrays import Floats, Image
 
 _WIDTH = 16384
 _LEVELS = 9
 _LANE = 1024
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

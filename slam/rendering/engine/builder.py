@@ -7,12 +7,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.rendering.engine.meshes import Shape, between, box_faces, ellipsoid, lathe, quad
 
-Image = NDArray[np.uint8]
 Painter = Callable[[int, int, float, np.random.Generator], Image]
 """A texture maker: (rows, columns, texels per metre, random numbers) -> (rows, columns, 3) RGB."""
 

@@ -11,11 +11,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Image, Mask
 from bmask_slam.mapping.open3d_loader import load_open3d
-from bmask_slam.rendering.engine.builder import Image, Part
+from bmask_slam.rendering.engine.builder import Part
 from bmask_slam.rendering.engine.meshes import Shape
 
 _CELL_M = 0.05
@@ -144,10 +143,8 @@ def _open_sky(scene: Any, start: Array, normals: Array, rng: np.random.Generator
     return 0.25 + 0.75 * free / _SKY_RAYS
 
 
-def _blocked(scene: Any, start: Array, direction: Array, reach: float) -> NDArray[np.bool_]:
+def _blocked(scene: Any, start: Array, direction: Array, reach: float) -> Mask:
     o3d = load_open3d()
     rays = np.concatenate([start, direction], axis=1).astype(np.float32)
-    blocked: NDArray[np.bool_] = scene.test_occlusions(
-        o3d.core.Tensor(rays), tnear=0.0, tfar=reach
-    ).numpy()
+    blocked: Mask = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=reach).numpy()
     return blocked

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from bmask_slam.graph.geometry import Array, make_pose, so3_exp, so3_log
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import make_pose, so3_exp, so3_log
 
 SWEEP = np.array(
     [

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.rendering.engine.atlas import Atlas, sample
-from bmask_slam.rendering.engine.builder import Image
 
-Floats = NDArray[np.float32]
 _MISS = np.uint32(0xFFFFFFFF)
 _QUARTERS = (
     (-0.25, -0.25, 0.125), (0.25, -0.25, 0.625), (-0.25, 0.25, 0.875), (0.25, 0.25, 0.375),
@@ -182,7 +180,7 @@ class Renderer:
 
 
 _Tables = tuple[Floats, NDArray[np.int32], NDArray[np.int32]]
-_Hits = tuple[Floats, NDArray[np.int64], Floats]
+_Hits = tuple[Floats, Ints, Floats]
 
 
 def _stack(layers: list[Geometry]) -> _Tables:
@@ -202,7 +200,7 @@ def _longer(step: Floats, sizes: Floats) -> Floats:
     return longer
 
 
-def _edges(texture: NDArray[np.integer], depth_m: Floats, rgb: Floats) -> NDArray[np.bool_]:
+def _edges(texture: NDArray[np.integer], depth_m: Floats, rgb: Floats) -> Mask:
     """Pixels beside another surface, or a jump in depth, of another colour, (H, W)."""
     edges = np.zeros(texture.shape, bool)
     grey = rgb[..., 1] + 0.5 * (rgb[..., 0] + rgb[..., 2])

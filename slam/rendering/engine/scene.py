@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 from bmask_slam.rendering.engine.atlas import Atlas, build_atlas
 from bmask_slam.rendering.engine.builder import Part, SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lighting, bake

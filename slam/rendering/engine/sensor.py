@@ -8,10 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Floats, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array
-
-Floats = NDArray[np.float32]
 
 RANGE_M = (0.5, 5.0)
 """Depth outside is not measured."""
@@ -70,18 +68,18 @@ def _smooth_noise(shape: tuple[int, ...], sigma_px: float, rng: np.random.Genera
     return (np.stack(smooth) * np.float32(gain)).reshape(shape)
 
 
-def _grazing(normals: Floats, camera: Camera, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _grazing(normals: Floats, camera: Camera, rng: np.random.Generator) -> Mask:
     """Surfaces seen too flat, with a random limit, (H, W)."""
     h, w = normals.shape[:2]
     v, u = np.mgrid[:h, :w].astype(np.float32)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
     cosine = np.abs((normals * rays).sum(-1)) / np.linalg.norm(rays, axis=-1)
     limit = GRAZING_COSINE * (1 + 0.35 * _smooth_noise((h, w), 2.0, rng))
-    grazing: NDArray[np.bool_] = cosine < limit
+    grazing: Mask = cosine < limit
     return grazing
 
 
-def _in_shadow(depth_m: Floats, camera: Camera) -> NDArray[np.bool_]:
+def _in_shadow(depth_m: Floats, camera: Camera) -> Mask:
     """Pixels whose surface the projector, a baseline to the right, does not see, (H, W).
 
     A pixel's column in the projector is u - bf/z. Somewhere to the right a nearer surface with a
@@ -90,11 +88,11 @@ def _in_shadow(depth_m: Floats, camera: Camera) -> NDArray[np.bool_]:
     u = np.arange(depth_m.shape[1], dtype=np.float32)
     column = u - np.float32(camera.stereo_bf_px_m) / np.nan_to_num(depth_m, nan=1e3)
     nearest = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
-    tables: NDArray[np.bool_] = column > nearest + _SHADOW_PX
+    tables: Mask = column > nearest + _SHADOW_PX
     return tables
 
 
-def _ragged(depth_m: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _ragged(depth_m: Floats, rng: np.random.Generator) -> Mask:
     """A random rim, about a pixel wide, on the far side of jumps in depth, (H, W)."""
     z = np.nan_to_num(depth_m, nan=0.0)
     jump = cv2.dilate(z, np.ones((3, 3))) - cv2.erode(z, np.ones((3, 3))) > 0.05 * np.maximum(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 from bmask_slam.rendering.engine.builder import Painter, SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lamp, Lighting
 from bmask_slam.rendering.engine.meshes import pose, tilt

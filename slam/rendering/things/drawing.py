@@ -7,7 +7,7 @@ import string
 import cv2
 import numpy as np
 
-from bmask_slam.rendering.engine.builder import Image
+from bmask_slam.graph.arrays import Image
 from bmask_slam.rendering.things.surfaces import Colour, as_image, field, flat, octaves
 
 _LETTERS = np.array(list(string.ascii_letters + string.digits))

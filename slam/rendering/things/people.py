@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
-from bmask_slam.rendering.engine.builder import UNLABELLED, Image, Painter, Part, SceneBuilder
+from bmask_slam.graph.arrays import Array, Floats, Image
+from bmask_slam.rendering.engine.builder import UNLABELLED, Painter, Part, SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lighting, irradiance
 from bmask_slam.rendering.engine.meshes import Shape, ellipsoid, lathe, pose, tapered_capsule, tilt
 from bmask_slam.rendering.engine.path import CameraPath
-from bmask_slam.rendering.engine.raycast import Floats, Geometry
+from bmask_slam.rendering.engine.raycast import Geometry
 from bmask_slam.rendering.engine.scene import Scene, assemble
 from bmask_slam.rendering.things import objects as o
 from bmask_slam.rendering.things import skeleton as sk

@@ -7,7 +7,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from bmask_slam.rendering.engine.builder import Image, Painter
+from bmask_slam.graph.arrays import Image
+from bmask_slam.rendering.engine.builder import Painter
 from bmask_slam.rendering.things.drawing import (
     canvas,
     framed,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 
 THIGH_M, SHIN_M, TORSO_M, UPPER_ARM_M, FOREARM_M = 0.43, 0.42, 0.50, 0.28, 0.25
 _ANKLE_M = 0.07

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.rendering.engine.builder import Image, Painter
+from bmask_slam.graph.arrays import Floats, Image
+from bmask_slam.rendering.engine.builder import Painter
 
-Field = NDArray[np.float32]
 Colour = tuple[float, ...]
 """Red, green, blue in [0, 255]."""
 
 
-def field(rows: int, columns: int, cell: tuple[float, float], rng: np.random.Generator) -> Field:
+def field(rows: int, columns: int, cell: tuple[float, float], rng: np.random.Generator) -> Floats:
     """A smooth random field (rows, columns), about normal, ``cell`` (v, u) texels a wave."""
     coarse = [
         max(2, round(n / max(c, 1.0)) + 1) for n, c in zip((rows, columns), cell, strict=True)
@@ -29,13 +29,13 @@ def field(rows: int, columns: int, cell: tuple[float, float], rng: np.random.Gen
     return np.asarray(smooth, np.float32)
 
 
-def octaves(rows: int, columns: int, cells_px: list[float], rng: np.random.Generator) -> Field:
+def octaves(rows: int, columns: int, cells_px: list[float], rng: np.random.Generator) -> Floats:
     """The sum of smooth fields of the given cell sizes in texels, of unit variance."""
     total = sum(field(rows, columns, (c, c), rng) for c in cells_px)
     return np.asarray(total, np.float32) / np.float32(np.sqrt(len(cells_px)))
 
 
-def flat(rows: int, columns: int, colour: Colour) -> Field:
+def flat(rows: int, columns: int, colour: Colour) -> Floats:
     """A float32 picture of one colour."""
     return np.broadcast_to(np.asarray(colour, np.float32), (rows, columns, 3)).copy()
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 from bmask_slam.rendering.engine.meshes import pose
 from bmask_slam.rendering.engine.path import CameraPath, duration_s, steady_poses
 

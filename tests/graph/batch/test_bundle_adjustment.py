@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from synthetic_room import CAMERA, Room, make_room
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.batch.bundle_adjustment import AdjustmentConfig, adjust, loop_edges
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.checks import reprojection
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import PosePrior, RelativePose
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.geometry import Array, inverse, make_pose, se3_exp, se3_log
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log
 
 TIGHT = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2
 LOOSE = np.diag([0.2] * 3 + [0.5] * 3) ** 2

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from calibration_scene import PRIORS, TRUTH, make_problem
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import calibrate
 from bmask_slam.graph.calibration.covariance import _clustered_variance
 from bmask_slam.graph.calibration.equations import normal_equations
@@ -18,7 +19,7 @@ from bmask_slam.graph.calibration.problem import (
     CalibrationState,
     anchor_terms,
 )
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.geometry import se3_exp
 
 START = TRUTH + np.array(
     [15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010, 0.005]

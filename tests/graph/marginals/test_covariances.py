@@ -9,8 +9,9 @@ import pytest
 from scipy.stats import chi2
 from synthetic_room import CAMERA, Room, make_room
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import GraphUpdate, PosePrior
-from bmask_slam.graph.geometry import Array, adjoint, inverse, se3_exp, se3_log
+from bmask_slam.graph.geometry import adjoint, inverse, se3_exp, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 
 GAUSSIAN = SmootherConfig(robust=False, gate_sigmas=1e3)

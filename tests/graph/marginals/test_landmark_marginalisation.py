@@ -8,13 +8,14 @@ import pytest
 from graph_checks import assert_isam_matches_tables
 from synthetic_room import CAMERA, Room, make_room
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
     Observations,
     RefusalReason,
 )
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.marginals.point_elimination import eliminate_points, linearise
 from bmask_slam.graph.marginals.sparsification import adjoint
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig

@@ -8,6 +8,7 @@ import pytest
 from synthetic_room import CAMERA, make_room
 
 import bmask_slam.graph.smoother.smoother
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import (
@@ -17,7 +18,7 @@ from bmask_slam.graph.factors.graph_update import (
     RefusalReason,
     Refusals,
 )
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.isam2 import SolverError
 from bmask_slam.graph.smoother.repair import Repair
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig

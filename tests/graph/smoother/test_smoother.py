@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import chi2
 from synthetic_room import CAMERA, Room, make_room
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
@@ -17,7 +18,7 @@ from bmask_slam.graph.factors.graph_update import (
     RelativePose,
 )
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.isam2 import poses_last
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 

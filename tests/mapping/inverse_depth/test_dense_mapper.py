@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from surface_scene import CAMERA, noisy_map, poses
 
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.mapping.inverse_depth.dense_mapper import (
     WINDOW,
     DenseKeyframe,

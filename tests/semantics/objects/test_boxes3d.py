@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, se3_exp, transform
+from bmask_slam.graph.geometry import se3_exp, transform
 from bmask_slam.semantics.objects.boxes3d import (
     EDGES,
     OrientedBox,

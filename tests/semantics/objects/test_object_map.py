@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array, se3_exp, transform
+from bmask_slam.graph.geometry import se3_exp, transform
 from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
 from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bmask_slam.cli import main
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import CocoFile, read_coco
 from bmask_slam.semantics.instances.instances import Instance, as_annotation, certain, mask_box
@@ -19,7 +20,7 @@ from bmask_slam.semantics.segmenters.evaluation import (
     evaluate_segmenter,
     format_segmentation,
 )
-from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter, Image
+from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter
 
 LABELS = label_set(["cup", "mouse"])
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.instances import Instance, as_annotation, certain, mask_box
 from bmask_slam.semantics.instances.overlay import draw
@@ -26,7 +27,6 @@ from bmask_slam.semantics.segmenters.network_segmenter import (
 )
 from bmask_slam.semantics.segmenters.segmenter import (
     CocoSegmenter,
-    Image,
     LabelImageSegmenter,
     NoSegmenter,
     Segmenter,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Floats
 from bmask_slam.graph.geometry import so3_exp
 from bmask_slam.semantics.tracks.instance_track import Sighting
 from bmask_slam.semantics.tracks.instance_tracks import InstanceTracks, TrackConfig
@@ -15,7 +15,7 @@ SIZE = np.array([0.25, 0.9, 0.2])
 PERSON, CHAIR = np.eye(3, dtype=np.float32)[1:]
 
 
-def seen(x: float, y: float = 0.0, z: float = 3.0, what: NDArray[np.float32] = PERSON) -> Sighting:
+def seen(x: float, y: float = 0.0, z: float = 3.0, what: Floats = PERSON) -> Sighting:
     return Sighting(np.array([x, y, z]), SIZE, what, 2.0)
 
 

@@ -21,7 +21,8 @@ from bmask_slam.back_end.landmark_management import (
     local_landmarks,
     redundant_keyframe,
 )
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.world_map import Keyframe, WorldMap
 

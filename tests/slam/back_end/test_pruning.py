@@ -20,8 +20,9 @@ from synthetic_view import (
 from bmask_slam.back_end.factor_selection import FactorSelectionConfig, FactorSelector, read_back
 from bmask_slam.back_end.pruning import KeptReason, MapPruner, MaskScope, covered
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose, RemovalPolicy
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 from true_run import make_run
 
 from bmask_slam.cli import main
@@ -20,9 +19,10 @@ from bmask_slam.dense.assembly import assembled, fuse_run
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.input import open_run
 from bmask_slam.dense.options import MapOptions
+from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, make_pose
+from bmask_slam.graph.geometry import make_pose
 from bmask_slam.rendering.engine.builder import SceneBuilder
 from bmask_slam.rendering.engine.path import camera_poses
 from bmask_slam.rendering.engine.raycast import Renderer, to_image
@@ -210,7 +210,7 @@ class PersonInTheMiddle:
 
     labels = label_set(("person",))
 
-    def segment(self, image: NDArray[np.uint8], name: str) -> list[Instance]:
+    def segment(self, image: Image, name: str) -> list[Instance]:
         mask = np.zeros(image.shape[:2], bool)
         mask[60:120, 90:150] = True
         return [Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 1.0)]

@@ -9,13 +9,13 @@ import pytest
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.run_folder.landmark_file import write_landmarks
 from bmask_slam.run_folder.semantic_files import read_labels, write_labels
 from bmask_slam.semantics.beliefs.label_store import LabelEstimates
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
-from bmask_slam.semantics.segmenters.segmenter import Image
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig

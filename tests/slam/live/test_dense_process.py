@@ -13,7 +13,8 @@ from synthetic_view import CAMERA, PLANE_Z_M, render_plane
 from bmask_slam.config.configuration import dump
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.keyframe_view import SeenKeyframe
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.processes.dense_messages import (
     DenseOrder,
     Forget,

@@ -18,8 +18,9 @@ from feeding import factor_selection
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, inverse, se3_exp
+from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import NewKeyframe

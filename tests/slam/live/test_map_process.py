@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from synthetic_view import CAMERA, render_plane
 
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.messages import (
     LostKeyframe,
     MapChanged,

@@ -9,7 +9,8 @@ import pytest
 from synthetic_view import random_descriptors
 
 from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
-from bmask_slam.features.matching import Bits, hamming
+from bmask_slam.features.matching import hamming
+from bmask_slam.graph.arrays import Bits
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 
 PARTITIONED = IndexConfig(lists=8, probes=8)  # from 256 descriptors on

@@ -16,7 +16,8 @@ from synthetic_view import (
     random_descriptors,
 )
 
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.loops.verification import (
     LoopConfig,
     LoopConstraint,

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.moving.depth_segments import DepthSegmentConfig
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.feature_motion import FeatureMotion

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.moving.depth_segments import DepthSegmentConfig, depth_segments
 from bmask_slam.moving.depth_view_buffer import DepthViewBuffer
 from bmask_slam.moving.free_space_check import (

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import Array, se3_exp, transform
+from bmask_slam.graph.geometry import se3_exp, transform
 from bmask_slam.moving.free_space_check import FreeSpaceCheck, FreeSpaceCheckConfig
 from bmask_slam.moving.instance_motion import InstanceMotion
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
@@ -27,7 +27,7 @@ def instance_motion() -> InstanceMotion:
     return InstanceMotion(CAMERA, check, read_priors("movability"), 2.0, 20)
 
 
-def masks(depth_m: NDArray[np.float32]) -> KeyframeMasks:
+def masks(depth_m: Floats) -> KeyframeMasks:
     """Of a keyframe with every fourth pixel of that depth each way, and no instance."""
     assignment = assign_pixels([], depth_m, SIZE, VoteConfig())
     none = np.zeros(0, np.int64)

@@ -11,11 +11,11 @@ from synthetic_view import CAMERA, TEXTURE, render_plane
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.graph.arrays import Array, Image
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.moving.moving_object_filter import StaticFeatures
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
-from bmask_slam.semantics.segmenters.segmenter import Image
 from bmask_slam.semantics.tracks.instance_track import Sighting
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem

@@ -7,8 +7,7 @@ import pytest
 from synthetic_view import CAMERA
 
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.files.array_file import Arrays
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.free_space_check import FreeSpaceCheck, FreeSpaceCheckConfig, depth_view
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, surfaces

@@ -12,9 +12,10 @@ from fake_run import FakeSystem, make_sequence
 from repository import KITCHEN
 from synthetic_view import CAMERA, render_plane
 
+from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import Arrays, read_arrays, write_arrays
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.files.array_file import read_arrays, write_arrays
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.runner import RunOptions, run

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.rendering.classes import CLASSES
-from bmask_slam.rendering.engine.builder import Image, Painter, SceneBuilder
+from bmask_slam.rendering.engine.builder import Painter, SceneBuilder
 from bmask_slam.rendering.engine.meshes import pose
 from bmask_slam.rendering.engine.path import camera_poses
 from bmask_slam.rendering.rooms.random_furniture import add_piece

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from bmask_slam.cli import main
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array, se3_exp
+from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.labelling.results import MapObjects
 from bmask_slam.run_folder.query import format_answer, query
 from bmask_slam.run_folder.semantic_files import (

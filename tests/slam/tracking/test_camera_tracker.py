@@ -11,7 +11,8 @@ from synthetic_view import T_NEW_OLD, add_keyframe, make_features
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.geometry import Array, se3_exp, se3_log
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import se3_exp, se3_log
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import TrackingStatus

@@ -5,7 +5,8 @@ import pytest
 from scipy.stats import chi2
 from synthetic_view import CAMERA, T_NEW_OLD, points_before
 
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.tracking.pose_optimisation import (
     PoseOptimisationConfig,
     jacobian,

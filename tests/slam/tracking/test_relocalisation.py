@@ -9,7 +9,8 @@ from synthetic_view import CAMERA, render_plane
 from bmask_slam.back_end.landmark_management import MappingConfig, create_landmarks
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, se3_log
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from bmask_slam.tracking.tracker import Tracked, Tracker, TrackingConfig
 from bmask_slam.world.world_map import Keyframe, WorldMap

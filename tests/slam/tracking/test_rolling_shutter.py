@@ -8,7 +8,8 @@ import numpy as np
 from synthetic_view import CAMERA, make_features, points_before, random_descriptors, render_plane
 
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.geometry import Array, inverse, se3_exp, transform
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.system import SlamSystem
 from bmask_slam.tracking.pose_optimisation import optimise_pose

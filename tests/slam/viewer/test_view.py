@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from synthetic_view import CAMERA, make_features, render_plane
 
 from bmask_slam.cli import main
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.display import Display
@@ -68,7 +68,7 @@ def test_a_recording_in_no_folder_is_refused(tmp_path) -> None:
         Scene("a", ViewOptions(record=tmp_path / "none" / "a.rrd"))
 
 
-def columns(path: Path, entity: str, name: str) -> list[NDArray[np.float64]]:
+def columns(path: Path, entity: str, name: str) -> list[Array]:
     """What a recording holds of one component of an entity, row by row."""
     found = []
     for chunk in RrdReader(path).stream().to_chunks():

@@ -3,7 +3,8 @@
 import numpy as np
 from synthetic_view import add_keyframe, make_features
 
-from bmask_slam.graph.geometry import Array, inverse, se3_exp
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import WorldMap
 

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import Array
 from bmask_slam.live.sources.opencv_camera import OpenCvSource
 from bmask_slam.live.sources.realsense_camera import RealSenseSource, fit_distortion
 from bmask_slam.sequences import write_camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bmask_slam.graph.geometry import Array
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.live.sources.counts import SourceCounts
 from bmask_slam.live.sources.pairing import DEPTH, LATE_S, MAX_WAITING, RGB, Pair, Pairer

@@ -1,0 +1,17 @@
+"""Type aliases of the numpy arrays that the packages hand to each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]  # poses, points, pixels, covariances
+Floats = NDArray[np.float32]  # depth images, textures, beliefs
+Ints = NDArray[np.int64]  # ids and rows
+Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8]  # colour (H, W, 3) or grey (H, W)
+Bytes = NDArray[np.uint8]  # colours of points, image patches, packed bits
+Bits = NDArray[np.uint64]  # binary descriptors, 64 bits a word
+Arrays = dict[str, NDArray[Any]]  # arrays by name, as a file holds them
