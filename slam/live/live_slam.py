@@ -21,7 +21,6 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.display import Display
 from bmask_slam.live.health import WINDOW, FrameMeter, Health
-from bmask_slam.live.incoming import checked
 from bmask_slam.live.live_options import LiveOptions
 from bmask_slam.live.processes.dense_messages import MapWritten
 from bmask_slam.live.processes.start import start_system
@@ -31,7 +30,7 @@ from bmask_slam.live.system import LiveSystem
 from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
 from bmask_slam.run_folder.landmark_file import LandmarkCloud
 from bmask_slam.run_folder.metrics import RunCounters, measure, row, save
-from bmask_slam.sequences.frame import Frame
+from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.viewer.scene import Scene
@@ -142,18 +141,17 @@ class LiveSlam:
         Args:
             timestamp_s: of the frame; later than the one before.
             rgb: (H, W, 3) uint8, red first.
-            depth_m: (H, W) z-depth in metres, NaN or 0 where missing, registered to rgb.
+            depth_m: (H, W) float z-depth in metres, NaN or 0 where missing, registered to rgb.
             prepared: from ``prepare``, if the features were computed ahead.
             name: of the image, for a segmenter that looks masks up.
 
         Raises:
-            InputError: an image of another size or type than the camera's, or a stamp that is not
-                later. The frame is not used; the next one may be.
+            InputError: a frame that ``check_frame`` refuses. It is not used; the next one may be.
         """
         arrived_s = time.monotonic() if prepared is None else prepared.arrived_s
         try:
             given = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name)
-            frame = checked(given, self.camera, self._last_s)
+            frame = check_frame(given, self.camera, self._last_s)
         except InputError:
             self._refused += 1
             raise

@@ -1,10 +1,16 @@
-"""What a sequence yields."""
+"""One registered RGB-D frame, and the checks of a frame that a caller hands in."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
 
 from bmask_slam.graph.arrays import Floats, Image
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -24,3 +30,59 @@ class Frame:
     rgb: Image
     depth_m: Floats
     name: str = ""
+
+
+def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -> Frame:
+    """The frame as tracking needs it: float32 depth, NaN where it was 0.
+
+    Args:
+        last_stamp_s: stamp of the frame before.
+
+    Raises:
+        InputError: an image that is no array of the camera's size and the type that ``Frame``
+            states (depth may be of any float type), depth that is negative or infinite, or a stamp
+            that is not finite or not later than ``last_stamp_s``.
+    """
+    _check_stamp(frame.timestamp_s, last_stamp_s)
+    where, size = f"frame at {frame.timestamp_s}", (camera.height, camera.width)
+    if _kind(frame.rgb) != "uint8" or frame.rgb.shape != (*size, 3):
+        raise InputError(
+            f"{where}: colour is {_described(frame.rgb)}, the camera gives uint8 {(*size, 3)}; "
+            "resize it, or correct the camera"
+        )
+    if not _kind(frame.depth_m).startswith("float") or frame.depth_m.shape != size:
+        raise InputError(
+            f"{where}: depth is {_described(frame.depth_m)}; give metres as float32 {size}, "
+            "registered to the colour image"
+        )
+    return replace(frame, depth_m=_checked_depth(frame.depth_m, where))
+
+
+def _check_stamp(stamp_s: float, last_stamp_s: float) -> None:
+    if not isinstance(stamp_s, Real) or not math.isfinite(stamp_s):
+        raise InputError(f"frame at {stamp_s!r}: the stamp is not a finite number of seconds")
+    if stamp_s <= last_stamp_s:
+        raise InputError(
+            f"frame at {stamp_s}: not later than the frame before, at {last_stamp_s}; leave it "
+            "out, or begin a new run if the clock was set back"
+        )
+
+
+def _checked_depth(depth_m: NDArray[np.floating], where: str) -> NDArray[np.float32]:
+    """Depth (H, W) as float32 with NaN in place of 0; the caller's array where nothing changes."""
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite
+        known_m = depth_m.astype(np.float32, copy=False)
+    lowest_m = np.fmin.reduce(known_m, axis=None)
+    if lowest_m < 0 or np.isposinf(np.fmax.reduce(known_m, axis=None)):
+        raise InputError(f"{where}: depth is negative or infinite; write NaN where it is missing")
+    return np.where(known_m == 0, np.float32(np.nan), known_m) if lowest_m == 0 else known_m
+
+
+def _kind(image: Any) -> str:
+    """The name of an array's type; empty for what is no array."""
+    return str(image.dtype) if isinstance(image, np.ndarray) else ""
+
+
+def _described(image: Any) -> str:
+    """Type and shape of an array, or what else it is."""
+    return f"{image.dtype} {image.shape}" if _kind(image) else f"a {type(image).__name__}"

@@ -174,7 +174,7 @@ def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> Non
             (second.rgb, (1000 * np.nan_to_num(second.depth_m)).astype(np.uint16), 1.0, "metres"),
             (second.rgb, second.depth_m[:100], 1.0, "registered"),
             (second.rgb, second.depth_m, first.timestamp_s, "not later"),
-            (second.rgb, second.depth_m, float("nan"), "not later"),
+            (second.rgb, second.depth_m, float("nan"), "not a finite"),
         ):
             with pytest.raises(InputError, match=words):
                 slam.track(stamp_s, rgb, depth_m)
