@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
-from bmask_slam.graph.arrays import Floats, Image
+import numpy as np
+from numpy.typing import NDArray
 
+from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 
@@ -68,7 +70,7 @@ def _check_stamp(stamp_s: float, last_stamp_s: float) -> None:
         )
 
 
-def _checked_depth(depth_m: NDArray[np.floating], where: str) -> NDArray[np.float32]:
+def _checked_depth(depth_m: NDArray[np.floating], where: str) -> Floats:
     """Depth (H, W) as float32 with NaN in place of 0; the caller's array where nothing changes."""
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite
         known_m = depth_m.astype(np.float32, copy=False)
