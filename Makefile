@@ -1,6 +1,7 @@
 # make demo    sets everything up in .venv, runs, maps, asks and compares on a rendered sequence, offline and live
 # make test    sets up and runs the tests
 # make check   lint, format, types and tests (with the layer rule)
+# make typing  makes build/typing, the tree that mypy (and an editor) reads the package from
 # make bench   measures and writes docs/benchmarks.md; BENCH="..." passes arguments
 # make clean   removes what these made, but for runs/
 
@@ -10,11 +11,12 @@ BENCH ?=
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEMO := runs/demo-sequence
+TYPING := build/typing/bmask_slam
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
-.PHONY: demo test check bench setup clean
+.PHONY: demo test check typing bench setup clean
 .DELETE_ON_ERROR:
 
 demo: $(DEMO)
@@ -31,11 +33,21 @@ $(DEMO): | $(READY)
 test: $(READY)
 	@$(BIN)/python -m pytest
 
-check: $(READY)
+check: $(READY) typing
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/python -m pytest
+
+# The four folders as the one package that they are installed as, for mypy and editors; made anew
+# each time, so that a file that is gone leaves no link.
+typing:
+	@rm -rf build/typing
+	@mkdir -p $(TYPING)
+	@for path in slam/*.py slam/py.typed slam/*/ graph semantics mapping; do \
+	  name=$$(basename $$path); \
+	  test $$name = __pycache__ || ln -s ../../../$${path%/} $(TYPING)/$$name; \
+	done
 
 bench: $(READY)
 	@$(BIN)/python benchmarks/run.py $(BENCH)
