@@ -150,7 +150,7 @@ def rendered(sequences: Path, scene: str, seed: int) -> Path:
 def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespace) -> Outcome:
     """Run a sequence; with "labels" or "both" its masks are segmented too."""
     labels, geometry = VARIANTS[variant]
-    settings = [f"dynamics.{k}={v}" for k, v in (("labels", labels), ("geometry", geometry))]
+    settings = [f"moving_objects.{k}={v}" for k, v in (("labels", labels), ("geometry", geometry))]
     config = resolve(SystemConfig, None, [*settings, *arguments.set])
     options = SegmenterOptions(arguments.segmenter if labels else "none", arguments.weights)
     segmenter = make_segmenter(options, folder)

@@ -1,4 +1,4 @@
-"""The report of a comparison: a page, a PDF, and the tables as CSV, Markdown and LaTeX."""
+"""The report of a comparison: a web page, tables as CSV, Markdown and LaTeX, figures as PDF."""
 
 from bmask_slam.comparison.report.report import write_report
 

@@ -1,4 +1,4 @@
-"""How figures of the report look, and their bytes as SVG and PDF."""
+"""Style of the report's figures, and their bytes as SVG (for the page) and PDF (for a paper)."""
 
 from __future__ import annotations
 

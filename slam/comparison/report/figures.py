@@ -91,7 +91,8 @@ def common_scales(found: list[Errors]) -> Scales:
         if e.absolute.translation_m.rmse > 0
     ]
     fitting = [factor for factor in ENLARGED if factor <= min(ratios, default=1)]
-    return Scales(LEGEND_ROOM * max(tops, default=1.0), max(fitting, default=1))
+    top_cm = max(tops, default=0.0) or 1.0  # an axis needs a length, also without any error
+    return Scales(LEGEND_ROOM * top_cm, max(fitting, default=1))
 
 
 def error_picture(method: Method, errors: Errors, scales: Scales) -> Picture:

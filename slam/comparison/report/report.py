@@ -6,7 +6,6 @@ from pathlib import Path
 
 from bmask_slam.comparison.experiment.result import Comparison
 from bmask_slam.comparison.report.html import html_text
-from bmask_slam.comparison.report.pdf import pdf_bytes
 from bmask_slam.comparison.report.section import Section, slug
 from bmask_slam.comparison.report.sections import make_sections, summary
 from bmask_slam.comparison.report.table import metric_tables
@@ -19,7 +18,7 @@ FIGURES = "figures"
 
 
 def write_report(comparison: Comparison, folder: Path) -> list[Path]:
-    """Write report.html, .pdf, tables.csv, .md, .tex and figures/ to the comparison's folder.
+    """Write report.html, tables.csv, .md, .tex and figures/*.pdf to the comparison's folder.
 
     Returns the paths. Files of cells that are missing or broken leave their figure out, with a
     warning. The same comparison and files give the same bytes.
@@ -36,8 +35,6 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
         "tables.tex": latex_text(tables),
     }
     written = [_write(folder / name, text.encode("utf-8")) for name, text in texts.items()]
-    pdf = pdf_bytes(title, comparison.description, sentences, sections)
-    written.append(_write(folder / "report.pdf", pdf))
     return written + _write_figures(folder / FIGURES, sections)
 
 

@@ -72,7 +72,7 @@ def test_a_comparison(data, tmp_path):
     assert cells["broken"].error in (out / cells["broken"].log).read_text()
     assert (out / cells["default"].trajectory).is_file()
     assert read_results(out) == found
-    assert {"report.html", "report.pdf", "tables.csv"} <= {path.name for path in out.iterdir()}
+    assert {"report.html", "tables.csv"} <= {path.name for path in out.iterdir()}
     assert {"commit", "machine", "packages", "date"} <= set(found.provenance)
     text = format_comparison(found)
     assert "failed: office: broken" in text

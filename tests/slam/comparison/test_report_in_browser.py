@@ -80,8 +80,19 @@ def test_text_can_be_read_on_both_backgrounds(browser, page):
 
 
 def test_it_prints(browser, page):
+    """Headings stay with what follows them, rows and figures are whole, nothing dark is printed."""
     browser.open(page, DESK_PX)
     assert browser.print_pdf().startswith(b"%PDF")
+    browser.open(page, A4_PX, "print", "dark")
+    kept = {"h2": "breakAfter", "h3": "breakAfter", "tr": "breakInside", "figure": "breakInside",
+            ".caption": "breakBefore"}  # fmt: skip
+    for selector, rule in kept.items():
+        each = f"e => getComputedStyle(e).{rule}"
+        found = browser.evaluate(f"[...document.querySelectorAll('{selector}')].map({each})")
+        assert set(found) == {"avoid"}, selector
+    paper = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert paper == "rgb(255, 255, 255)"
+    assert browser.evaluate("getComputedStyle(document.querySelector('nav')).display") == "none"
 
 
 CONTRAST = """
