@@ -1,97 +1,173 @@
-"""The wheel: what is in it, and that it works on its own, outside the checkout."""
+"""The wheel: what is in it, and that it works beside a user's own modules of the same names."""
 
 from __future__ import annotations
 
 import configparser
 import os
 import re
+import shutil
 import subprocess
 import sys
+import sysconfig
 import tomllib
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from repository import ROOT
 
-PACKAGES = ("graph", "semantics", "mapping", "slam")
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = PYPROJECT["project"]
+FOLDERS: dict[str, str] = PYPROJECT["tool"]["setuptools"]["package-dir"]
+USERS_OWN = ("graph.py", "slam.py", "mapping.py", "semantics.py")
+PUBLIC_NAMES = "SlamSystem, SystemConfig, Camera, Frame, open_sequence, run, evaluate, Run"
+
+
+def packages_of_the_tree() -> dict[str, Path]:
+    """Import name and folder of every package of the checkout."""
+    found = {}
+    for name, folder in FOLDERS.items():
+        for path in (ROOT / folder).rglob("__init__.py"):
+            inner = path.parent.relative_to(ROOT / folder).parts
+            found[".".join((name, *inner))] = path.parent
+    return found
+
+
+def installed_path(path: Path) -> str:
+    """Where a file of the checkout lies in the wheel."""
+    top, *inner = path.relative_to(ROOT).parts
+    (name,) = (name for name, folder in FOLDERS.items() if folder == top)
+    return "/".join((*name.split("."), *inner))
+
+
+def files_of_the_tree() -> set[str]:
+    """Path in the wheel of every module, of all data and of the marker of typed packages."""
+    modules = {path for k in FOLDERS.values() for path in (ROOT / k).rglob("*.py")}
+    data = {path for path in (ROOT / "data").rglob("*") if path.is_file()}
+    chosen = {path for path in modules | data if "__pycache__" not in path.parts}
+    return {installed_path(path) for path in (*chosen, ROOT / "slam/py.typed")}
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A wheel of the checkout."""
-    folder = tmp_path_factory.mktemp("wheel")
-    code = f"from hatchling.build import build_wheel; build_wheel({str(folder)!r})"
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    """A wheel of a copy of the checkout, which therefore stays free of build folders."""
+    copy, folder = tmp_path_factory.mktemp("checkout"), tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy)
+    for name in FOLDERS.values():
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, copy / name, ignore=ignored)
+    code = f"from setuptools.build_meta import build_wheel; build_wheel({str(folder)!r})"
+    _run([sys.executable, "-c", code], copy)
     (path,) = folder.glob("*.whl")
     return path
 
 
+@dataclass(frozen=True)
+class Environment:
+    """A virtual environment with the wheel alone: its folder, and a folder of the user's."""
+
+    path: Path
+    users_folder: Path
+
+    @property
+    def site_packages(self) -> Path:
+        """Where the wheel is installed."""
+        (path,) = self.path.glob("lib/python3*/site-packages")
+        return path
+
+    def run(self, program: str, *arguments: str) -> str:
+        """Output of a program of the environment, run in the user's folder."""
+        return _run([str(self.path / "bin" / program), *arguments], self.users_folder)
+
+
 @pytest.fixture(scope="module")
-def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel unpacked, as an installation has it, far from the checkout."""
-    folder = tmp_path_factory.mktemp("site")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder)
-    return folder
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Environment:
+    """The wheel installed; dependencies are those of the running environment.
+
+    A line of a ``.pth`` file adds their folder behind the new one, but does not process the
+    ``.pth`` files in it, so that an editable installation of the checkout has no effect.
+    """
+    environment = Environment(*(tmp_path_factory.mktemp(name) for name in ("env", "user")))
+    _run([sys.executable, "-m", "venv", "--without-pip", str(environment.path)], wheel.parent)
+    pip = [sys.executable, "-m", "pip", "--python", str(environment.path / "bin/python")]
+    _run([*pip, "install", "--no-deps", "--no-index", str(wheel)], wheel.parent)
+    dependencies = sorted({sysconfig.get_path(key) for key in ("purelib", "platlib")})
+    pth = environment.site_packages / "dependencies.pth"
+    pth.write_text("\n".join(dependencies) + "\n", encoding="utf-8")
+    for name in USERS_OWN:
+        text = f"raise ImportError('the user\\'s own {name} was imported')\n"
+        (environment.users_folder / name).write_text(text, encoding="utf-8")
+    return environment
 
 
-def run_installed(installed: Path, *arguments: str) -> str:
-    """Output of Python with the unpacked wheel ahead of everything else."""
-    environment = {**os.environ, "PYTHONPATH": str(installed)}
-    command = [sys.executable, *arguments]
+def _run(command: list[str], folder: Path) -> str:
+    variables = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     done = subprocess.run(
-        command, cwd=installed.parent, env=environment, capture_output=True, text=True, check=False
+        command, cwd=folder, env=variables, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def test_the_wheel_holds_every_module_and_all_data(wheel: Path) -> None:
+def test_the_listed_packages_are_those_of_the_tree() -> None:
+    listed = PYPROJECT["tool"]["setuptools"]["packages"]
+    assert len(listed) == len(set(listed))
+    assert set(listed) == {*packages_of_the_tree(), "bmask_slam.data"}
+
+
+def test_every_folder_with_modules_is_a_package() -> None:
+    folders = {path.parent for k in FOLDERS.values() for path in (ROOT / k).rglob("*.py")}
+    assert folders == set(packages_of_the_tree().values())
+
+
+def test_the_wheel_holds_every_module_all_data_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        names = set(archive.namelist())
-    modules = {str(p.relative_to(ROOT)) for k in PACKAGES for p in (ROOT / k).rglob("*.py")}
-    data = {
-        f"slam/{path.relative_to(ROOT)}"
-        for path in (ROOT / "data").rglob("*")
-        if path.is_file() and not path.name.startswith(".")
-    }
-    assert modules <= names
-    assert data <= names
-    strangers = {
-        n for n in names if not n.startswith((*(f"{k}/" for k in PACKAGES), "bmask_slam-"))
-    }
-    assert strangers == set()
-    assert not any("__pycache__" in name for name in names)
+        names = {name for name in archive.namelist() if not name.endswith("/")}
+    assert {name for name in names if not name.startswith("bmask_slam-")} == files_of_the_tree()
+    assert "bmask_slam/py.typed" in names
+    assert "bmask_slam/graph/geometry.py" in names
+    assert "bmask_slam/data/weights/light.safetensors" in names
 
 
-def test_the_licence_and_the_command_are_in_the_wheel(installed: Path) -> None:
-    (information,) = installed.glob("bmask_slam-*.dist-info")
-    assert "Redistribution" in (information / "licenses/LICENSE").read_text()
-    assert "License-Expression: BSD-3-Clause" in (information / "METADATA").read_text()
+def test_the_licence_and_the_command_are_in_the_wheel(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        texts = {
+            path.partition(".dist-info/")[2]: archive.read(path).decode()
+            for path in archive.namelist()
+            if path.startswith("bmask_slam-")
+        }
+    assert "Redistribution" in texts["licenses/LICENSE"]
+    assert "License-Expression: BSD-3-Clause" in texts["METADATA"]
     points = configparser.ConfigParser()
-    points.read(information / "entry_points.txt")
+    points.read_string(texts["entry_points.txt"])
     assert points["console_scripts"]["bmask-slam"] == "bmask_slam.cli:main"
 
 
-def test_the_wheel_works_outside_the_checkout(installed: Path) -> None:
-    found = run_installed(
-        installed, "-c", "import slam, graph; print(slam.__file__, graph.__file__)"
-    )
-    assert found.split() == [str(installed / f"{k}/__init__.py") for k in ("slam", "graph")]
-    assert "usage: bmask-slam" in run_installed(installed, "-m", "bmask_slam", "--help")
+def test_only_one_import_name_is_installed(installed: Environment) -> None:
+    names = {path.name for path in installed.site_packages.iterdir()}
+    (information,) = (name for name in names if name.endswith(".dist-info"))
+    assert information.startswith("bmask_slam-")
+    assert names - {"__pycache__"} == {"bmask_slam", information, "dependencies.pth"}
 
 
-def test_every_shipped_configuration_is_found_in_the_wheel(installed: Path) -> None:
+def test_it_works_beside_a_users_own_modules(installed: Environment) -> None:
+    assert set(USERS_OWN) <= {path.name for path in installed.users_folder.iterdir()}
+    code = f"import bmask_slam; from bmask_slam import {PUBLIC_NAMES}; print(bmask_slam.__file__)"
+    file = installed.run("python", "-c", code).strip()
+    assert file == str(installed.site_packages / "bmask_slam/__init__.py")
+    version = installed.run("bmask-slam", "--version")
+    assert version == installed.run("python", "-m", "bmask_slam", "--version")
+    assert re.fullmatch(r"bmask-slam \d+\.\d+\.\d+\n", version)
+
+
+def test_every_shipped_configuration_is_found_in_the_wheel(installed: Environment) -> None:
     code = "from bmask_slam.graph.data_files import data_path; print(data_path('configs'))"
-    assert run_installed(installed, "-c", code).strip() == str(installed / "slam/data/configs")
+    folder = installed.run("python", "-c", code).strip()
+    assert folder == str(installed.site_packages / "bmask_slam/data/configs")
     for path in (ROOT / "data/configs").glob("*.yaml"):
-        run_installed(
-            installed, "-m", "bmask_slam", "run", "-", "--config", path.stem, "--print-config"
-        )
+        installed.run("bmask-slam", "run", "-", "--config", path.stem, "--print-config")
 
 
 def _constraints() -> dict[str, str]:
@@ -126,6 +202,7 @@ def test_every_import_is_a_declared_dependency() -> None:
         "faiss": "faiss-cpu",
         "mpl_toolkits": "matplotlib",
         "rerun": "rerun-sdk",
+        "ruamel": "ruamel.yaml",
     }
     optional = [t for k, v in PROJECT["optional-dependencies"].items() if k != "dev" for t in v]
     declared, extras = (
@@ -133,11 +210,11 @@ def test_every_import_is_a_declared_dependency() -> None:
         for texts in (PROJECT["dependencies"], optional)
     )
     needed = set()
-    for path in (p for k in PACKAGES for p in (ROOT / k).rglob("*.py")):
+    for path in (p for k in FOLDERS.values() for p in (ROOT / k).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 needed |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 needed.add(str(node.module).partition(".")[0])
-    needed -= {*sys.stdlib_module_names, *PACKAGES}
+    needed -= {*sys.stdlib_module_names, *FOLDERS}
     assert {_canonical(distributions.get(name, name)) for name in needed} - extras == declared
