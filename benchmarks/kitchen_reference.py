@@ -31,7 +31,7 @@ from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.geometry import inverse, se3_exp, skew
 from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices, read_tum, write_tum
 from bmask_slam.mapping.open3d_loader import load_open3d
-from bmask_slam.run_folder.saved_run import read_run
+from bmask_slam.run_folder.map_file import read_run
 from bmask_slam.sequences import Sequence, open_sequence
 
 KITCHEN = Path(__file__).resolve().parents[1] / "../shared/data/redkitchen"

@@ -29,7 +29,7 @@ from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
-from bmask_slam.run_folder.saved_run import SavedRun, read_run
+from bmask_slam.run_folder.map_file import SavedRun, read_run
 
 EXACT = 1e-4  # of a loop's covariance
 DRAWS = 60

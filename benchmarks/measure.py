@@ -18,7 +18,7 @@ from bmask_slam.evaluation import Row, evaluate
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import associate, read_tum
-from bmask_slam.run_folder.folder import STAGES
+from bmask_slam.run_folder.frame_file import STAGES
 
 logger = logging.getLogger(__name__)
 

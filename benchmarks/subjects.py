@@ -35,7 +35,7 @@ CALIBRATION = _of("graph", "calibration*.py") + _of(
     "slam", "calibrate.py calibration_motion.py calibration_rounds.py calibration_views.py"
 )
 STATE = _of("graph", "archive_storage.py array_file.py storage.py") + _of(
-    "slam", "checkpoint.py map_state.py run_options.py saved_run.py"
+    "slam", "checkpoint.py map_state.py run_options.py"
 )
 WEIGHTS = ("data/weights/light.safetensors",)
 NETWORK = _of(

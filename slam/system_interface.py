@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import FrameResult
 

@@ -12,7 +12,7 @@ from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.labelling.results import MapObjects
+from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.run_folder.covariance_file import (
     COVARIANCES,
@@ -20,7 +20,6 @@ from bmask_slam.run_folder.covariance_file import (
     find_covariances,
     write_covariances,
 )
-from bmask_slam.run_folder.landmark_file import LandmarkCloud
 from bmask_slam.run_folder.map_file import MAP, write_map
 from bmask_slam.run_folder.semantic_files import semantic_writers
 from bmask_slam.system_config import SystemConfig

@@ -27,8 +27,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
+from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.origin import find_sequence
-from bmask_slam.run_folder.saved_run import SavedRun, read_run
 from bmask_slam.sequences import Sequence, open_sequence, write_camera
 
 MIN_KEYFRAMES = 5

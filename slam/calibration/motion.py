@@ -9,7 +9,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.geometry import inverse, se3_log, transform
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
-from bmask_slam.run_folder.saved_run import SavedRun
+from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.tracking.rolling_shutter import exposed_after_s, velocities
 
 MAX_LATE_S, MAX_STEP_S = 1e-3, 0.2

@@ -1,10 +1,10 @@
-"""What is told of the map's things: the labels of its landmarks, its objects."""
+"""What the system says of its map: the landmarks with their labels, the objects."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.semantics.beliefs.label_store import LabelEstimates
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.object_map import MapObject
@@ -12,10 +12,29 @@ from bmask_slam.semantics.objects.object_map import MapObject
 
 @dataclass(frozen=True)
 class LandmarkLabels:
-    """What landmarks (N,) are: estimates of ``names``."""
+    """The labels of landmarks (N,): estimates of ``names``."""
 
     names: LabelSet
     estimates: LabelEstimates
+
+
+@dataclass(frozen=True)
+class LandmarkCloud:
+    """The landmarks of a map's largest segment, without those that were removed.
+
+    Attributes:
+        ids: (N,).
+        points_world: (N, 3) in metres.
+        colours: (N, 3), red first.
+        observations: (N,), number of keyframes that observed each.
+        labels: of the same landmarks; None without a segmenter.
+    """
+
+    ids: Ints
+    points_world: Array
+    colours: Bytes
+    observations: Ints
+    labels: LandmarkLabels | None = None
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.display import Display
 from bmask_slam.live.health import WINDOW, FrameMeter, Health
 from bmask_slam.live.live_options import LiveOptions
@@ -28,7 +29,6 @@ from bmask_slam.live.recorder import Recorder, rescued
 from bmask_slam.live.sources.counts import SourceCounts
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
-from bmask_slam.run_folder.landmark_file import LandmarkCloud
 from bmask_slam.run_folder.metrics import RunCounters, measure, row, save
 from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.system_config import SystemConfig

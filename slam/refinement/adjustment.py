@@ -33,9 +33,8 @@ from bmask_slam.refinement.adjustment_report import Placed, draw_adjustment, for
 from bmask_slam.refinement.optimised_map import optimised_map
 from bmask_slam.run_folder.folder import RunFolder
 from bmask_slam.run_folder.landmark_file import LANDMARKS_COMMENT
-from bmask_slam.run_folder.map_file import MAP, read_map, write_map
+from bmask_slam.run_folder.map_file import MAP, SavedRun, read_map, read_run, write_map
 from bmask_slam.run_folder.metrics import EVALUATION_ROWS
-from bmask_slam.run_folder.saved_run import SavedRun, read_run
 
 logger = logging.getLogger(__name__)
 

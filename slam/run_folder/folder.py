@@ -45,10 +45,10 @@ from typing import IO, Any
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.run_folder.covariance_file import COVARIANCES
+from bmask_slam.run_folder.frame_file import COLUMNS, frame_row
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
 from bmask_slam.tracking.results import FrameResult
 
-STAGES = ("features", "moving", "tracking", "keyframe", "graph", "loops", "semantics")
 FILES = (
     "config.yaml",
     "trajectory.txt",
@@ -66,12 +66,6 @@ HEALTH = "health.json"
 SOMETIMES = (CHECKPOINT, COVARIANCES, HEALTH, *SEMANTIC_FILES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)
-COLUMNS = (
-    *("index", "timestamp", "status", "segment", "matches", "inliers"),
-    *("ignored", "mostly_moving"),
-    *(f"{stage}_ms" for stage in STAGES),
-    *("keyframe", "keyframe_reason"),
-)
 
 
 def free_run_path(stem: str, root: Path = Path("runs")) -> Path:
@@ -171,21 +165,7 @@ class RunFolder:
         Raises:
             ValueError: a stage that is no column.
         """
-        keyframe = "" if result.keyframe_id is None else result.keyframe_id
-        row: dict[str, object] = {
-            "index": result.index,
-            "timestamp": f"{result.timestamp_s:.6f}",
-            "status": result.status.value,
-            "segment": result.segment,
-            "matches": result.matches,
-            "inliers": result.inliers,
-            "ignored": result.ignored,
-            "mostly_moving": int(result.mostly_moving),
-            "keyframe": keyframe,
-            "keyframe_reason": result.keyframe_reason,
-        }
-        row |= {f"{stage}_ms": f"{ms:.3f}" for stage, ms in result.stage_ms.items()}
-        self._rows.writerow(row)
+        self._rows.writerow(frame_row(result))
         self._frames.flush()
         self._begun = True
 

@@ -1,31 +1,16 @@
-"""The landmarks of a map as they leave it: as arrays, and as a PLY file."""
+"""landmarks.ply: the landmarks of a map, written, and read back as arrays."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.graph.files.ply import write_ply
-from bmask_slam.labelling.results import LandmarkLabels
+from bmask_slam.labelling.results import LandmarkCloud
 
+LANDMARKS = "landmarks.ply"
 LANDMARKS_COMMENT = "bmask-slam landmarks, world frame, metres"
-
-
-@dataclass(frozen=True)
-class LandmarkCloud:
-    """The living landmarks: ids (N,), points_world (N, 3) m, colours (N, 3), observations (N,).
-
-    ``labels`` says what they are, if there was a segmenter.
-    """
-
-    ids: Ints
-    points_world: Array
-    colours: Bytes
-    observations: Ints
-    labels: LandmarkLabels | None = None
 
 
 def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:

@@ -1,18 +1,34 @@
-"""A saved map: what a finished run knows, for other runs to go on from or to be localised in."""
+"""The map and the graph of a finished run: saved, and read back to be worked on.
+
+A saved map is what other runs go on from or are localised in; a saved graph is what an adjustment
+or a calibration starts from.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 
-from bmask_slam.graph.arrays import Arrays
+import numpy as np
+
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.factor_tables import FactorTables
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
-from bmask_slam.graph.smoother.storage import read_camera
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.marginals.landmark_marginalisation import reinstate
+from bmask_slam.graph.smoother.storage import read_camera, read_graph
+from bmask_slam.graph.trajectory import Trajectory, read_tum
+from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 
 MAP_FILE = FileKind("map", 4, compressed=True)
 MAP = "map"
+MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals
+MAX_POSE_ERROR = 1e-5  # of poses with nine: metres, and entries of rotations
 
 
 def write_map(path: Path, state: Arrays, camera: Camera) -> None:
@@ -31,3 +47,82 @@ def read_map(path: Path) -> tuple[Arrays, Camera]:
     if not len(state.get("mapper.world.keyframes.id", ())):
         raise InputError(f"{file}: holds no keyframe; give the map of a run that saw something")
     return state, read_camera(header, file)
+
+
+@dataclass(frozen=True, eq=False)
+class SavedRun:
+    """A finished run with its whole graph, read to be adjusted or calibrated.
+
+    Attributes:
+        path: the run folder.
+        tables: the graph, with the observations of marginalised landmarks put back.
+        camera: of the graph.
+        config: what the graph was made with.
+        keyframe_stamps_s: (K,) of the graph's keyframes; NaN for those of an earlier run that
+            this one continued.
+        trajectories: each map segment by file name; trajectory.txt, the largest, is first.
+        keyframes: what keyframes.txt holds.
+        landmarks: columns of landmarks.ply.
+    """
+
+    path: Path
+    tables: FactorTables
+    camera: Camera
+    config: SmootherConfig
+    keyframe_stamps_s: Array
+    trajectories: dict[str, Trajectory]
+    keyframes: Trajectory
+    landmarks: Arrays
+
+
+def read_run(path: Path) -> SavedRun:
+    """Read a finished run.
+
+    Raises:
+        InputError: a file that is missing or broken, or keyframes.txt and graph of different runs.
+    """
+    if not (path / "graph").is_file():
+        raise InputError(f"{path}: holds no graph; give the folder of a run that came to its end")
+    tables, camera = read_graph(path / "graph")
+    config = path / "config.yaml"
+    graph_config = resolve(SmootherConfig, config if config.is_file() else None, section="graph")
+    reinstate(tables, camera, graph_config)
+    names = ["trajectory.txt", *sorted(p.name for p in path.glob("trajectory_segment_*.txt"))]
+    run = SavedRun(
+        path,
+        tables,
+        camera,
+        graph_config,
+        _keyframe_stamps(path / FRAMES, tables.keyframes.ids),
+        {name: read_tum(path / name) for name in names},
+        read_tum(path / "keyframes.txt"),
+        read_ply(path / "landmarks.ply"),
+    )
+    _check_same_run(run)
+    return run
+
+
+def _keyframe_stamps(path: Path, ids: Ints) -> Array:
+    """Stamps (K,) of keyframes by the lines of frames.csv."""
+    frames = read_frames(path)
+    keyframes = zip(frames.keyframe_ids.tolist(), frames.timestamps_s.tolist(), strict=True)
+    stamps_s = {number: stamp_s for number, stamp_s in keyframes if number >= 0}
+    return np.array([stamps_s.get(number, np.nan) for number in ids.tolist()])
+
+
+def _check_same_run(run: SavedRun) -> None:
+    """Refuse a graph whose keyframes are not where keyframes.txt has them."""
+    known = np.flatnonzero(np.isfinite(run.keyframe_stamps_s))
+    known = known[np.argsort(run.keyframe_stamps_s[known])]
+    stamps_s, written = run.keyframe_stamps_s[known], run.keyframes
+    at = np.searchsorted(stamps_s + MAX_STAMP_ERROR_S, written.timestamps_s)
+    if (at < len(known)).all():
+        at = known[at]
+        late_s = np.abs(run.keyframe_stamps_s[at] - written.timestamps_s)
+        error = np.abs(run.tables.keyframes.values[at] - written.poses_world_camera)
+        if (late_s < MAX_STAMP_ERROR_S).all() and error.max(initial=0) < MAX_POSE_ERROR:
+            return
+    raise InputError(
+        f"{run.path}: keyframes.txt and graph do not belong together; give the folder as the run "
+        "left it"
+    )

@@ -10,8 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.labelling.results import MapObjects
-from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.semantics.instances.overlay import class_colour
 from bmask_slam.semantics.objects.boxes3d import EDGES, upright_axes
 

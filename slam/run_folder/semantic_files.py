@@ -14,8 +14,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.labelling.results import MapObjects
-from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.run_folder.object_picture import draw_objects
 from bmask_slam.semantics.instances.overlay import class_colour
 from bmask_slam.semantics.objects.boxes3d import EDGES, OrientedBox

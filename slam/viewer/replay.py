@@ -12,8 +12,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.run_folder.folder import STAGES
-from bmask_slam.run_folder.saved_run import SavedRun, read_run
+from bmask_slam.run_folder.frame_file import STAGES
+from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
 from bmask_slam.semantics.instances.overlay import class_colour
 from bmask_slam.tracking.results import FrameResult, TrackingStatus

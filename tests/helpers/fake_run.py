@@ -13,7 +13,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory, write_tum
-from bmask_slam.run_folder.landmark_file import LandmarkCloud
+from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, TrackingStatus

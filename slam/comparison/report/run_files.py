@@ -13,7 +13,7 @@ import numpy as np
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind
 from bmask_slam.comparison.report.section import Picture
 from bmask_slam.comparison.report.table import EMPTY, Entry, Table, TableRow
-from bmask_slam.run_folder.folder import STAGES
+from bmask_slam.run_folder.frame_file import STAGES
 
 KEYFRAME_STAGES = ("keyframe", "graph", "loops", "semantics")
 PICTURE_WIDTH_PX = 900

@@ -15,7 +15,7 @@ from bmask_slam.comparison.experiment.result import Comparison
 from bmask_slam.comparison.report import write_report
 from bmask_slam.comparison.report.curves import network_pictures, read_losses, read_precision
 from bmask_slam.comparison.report.run_files import map_pictures, stage_table
-from bmask_slam.run_folder.folder import COLUMNS, STAGES
+from bmask_slam.run_folder.frame_file import COLUMNS, STAGES
 from bmask_slam.semantics.segmenters.evaluation import ApCurve, SegmentationResult, write_curves
 
 

@@ -22,13 +22,13 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import NewKeyframe
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import Patience
 from bmask_slam.run_folder.folder import HEALTH
-from bmask_slam.run_folder.landmark_file import LandmarkCloud
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig

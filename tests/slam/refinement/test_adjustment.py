@@ -18,8 +18,7 @@ from bmask_slam.graph.smoother.storage import read_graph, write_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.refinement.adjustment import carry_along
-from bmask_slam.run_folder.map_file import read_map
-from bmask_slam.run_folder.saved_run import read_run
+from bmask_slam.run_folder.map_file import read_map, read_run
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.map_state import world_of
 
