@@ -49,15 +49,14 @@ class Worker:
     def __init__(self, name: str, target: str, *arguments: Any) -> None:
         self.name = name
         ours, theirs = socket.socketpair()
-        path = os.pathsep.join(filter(None, sys.path))
         files = [nameless_file(SIZE) for _ in range(2)]
         descriptors = [theirs.fileno(), *files]
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", f"from {__name__} import serve; serve(*{descriptors})"],
+                [sys.executable, "-P", "-c", f"from {__name__} import serve; serve(*{descriptors})"],
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
-                env=os.environ | ONE_THREAD | {"PYTHONPATH": path},
+                env=os.environ | ONE_THREAD | safe_import_path(),
                 process_group=0,  # Ctrl-C in a terminal is for the owner to act on
             )
             self._channel = Channel(Connection(ours.detach()), (Ring(files[0]), Ring(files[1])))
@@ -101,6 +100,16 @@ class Worker:
         self._process.wait()
         self._channel.read_to_the_end()
         self._channel.close()
+
+
+def safe_import_path() -> dict[str, str]:
+    """Environment of a child that imports from where this process does, but for the current folder.
+
+    The current folder may hold anybody's files, such as a downloaded recording with a ``queue.py``.
+    """
+    here = os.path.realpath(os.curdir)
+    folders = [p for p in sys.path if os.path.isabs(p) and os.path.realpath(p) != here]
+    return {"PYTHONPATH": os.pathsep.join(folders), "PYTHONSAFEPATH": "1"}
 
 
 def serve(connection: int, theirs: int, ours: int) -> None:

@@ -124,6 +124,20 @@ def test_one_that_does_not_end_is_killed(caplog) -> None:
     assert "sleeper does not end; killed" in caplog.text
 
 
+def test_it_does_not_import_from_the_current_folder(tmp_path, monkeypatch) -> None:
+    hostile = "from pathlib import Path; Path('ran').touch()"
+    (tmp_path / "queue.py").write_text(hostile)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # as ``python -m`` does
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    worker.send(1)
+    try:
+        assert answers(worker, 1) == [("a", 1)]
+    finally:
+        worker.kill()
+    assert not (tmp_path / "ran").exists()
+
+
 def test_ctrl_c_in_the_terminal_does_not_reach_it() -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
     worker.send(1)
