@@ -94,7 +94,7 @@ def run_job(job: Job, threads: int = 1, started: Start = lambda process: None) -
     begin_s = time.monotonic()
     with log.open("wb") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "bmask_slam.comparison.jobs.child", json.dumps(asdict(job))],
+            [sys.executable, "-P", "-m", f"{__package__}.child", json.dumps(asdict(job))],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,

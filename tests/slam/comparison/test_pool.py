@@ -50,6 +50,13 @@ def wait_for(condition, limit_s: float = 20) -> None:
         time.sleep(0.02)
 
 
+def test_a_job_does_not_import_from_the_current_folder(tmp_path, monkeypatch):
+    (tmp_path / "queue.py").write_text("from pathlib import Path; Path('ran').touch()")
+    monkeypatch.chdir(tmp_path)
+    assert run_job(job(tmp_path)).status is CellStatus.DONE
+    assert not (tmp_path / "ran").exists()
+
+
 def test_a_job_is_recorded_and_is_finished_while_nothing_changes(tmp_path):
     given = job(tmp_path)
     assert finished(given) is None
