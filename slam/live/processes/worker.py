@@ -51,9 +51,10 @@ class Worker:
         ours, theirs = socket.socketpair()
         files = [nameless_file(SIZE) for _ in range(2)]
         descriptors = [theirs.fileno(), *files]
+        code = f"from {__name__} import serve; serve(*{descriptors})"
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", f"from {__name__} import serve; serve(*{descriptors})"],
+                [sys.executable, "-P", "-c", code],
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 env=os.environ | ONE_THREAD | safe_import_path(),

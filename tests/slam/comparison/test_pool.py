@@ -51,7 +51,7 @@ def wait_for(condition, limit_s: float = 20) -> None:
 
 
 def test_a_job_does_not_import_from_the_current_folder(tmp_path, monkeypatch):
-    (tmp_path / "queue.py").write_text("from pathlib import Path; Path('ran').touch()")
+    (tmp_path / "argparse.py").write_text("from pathlib import Path; Path('ran').touch()")
     monkeypatch.chdir(tmp_path)
     assert run_job(job(tmp_path)).status is CellStatus.DONE
     assert not (tmp_path / "ran").exists()
