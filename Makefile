@@ -2,7 +2,7 @@
 # make test    sets up and runs the tests
 # make check   lint, format, types and tests (with the layer rule)
 # make typing  makes build/typing, the tree that mypy (and an editor) reads the package from
-# make bench   measures and writes docs/benchmarks.md; BENCH="..." passes arguments
+# make bench   measures and writes docs/results/benchmarks.md; BENCH="..." passes arguments
 # make clean   removes what these made, but for runs/
 
 PYTHON ?= python3
@@ -50,7 +50,7 @@ typing:
 	done
 
 bench: $(READY)
-	@$(BIN)/python benchmarks/run.py $(BENCH)
+	@$(BIN)/python -m benchmarks.run $(BENCH)
 
 setup: $(READY)
 

@@ -1,12 +1,12 @@
-"""Measure everything and write docs/benchmarks.md; ``make bench`` calls it.
+"""Measure everything and write docs/results/benchmarks.md; ``make bench`` calls it.
 
-    python benchmarks/run.py                  all sequences; also the table in README.md
-    python benchmarks/run.py --quick          the first frames of two sequences, in a minute or two
-    python benchmarks/run.py --sequence DIR   a sequence of your own instead
+    python -m benchmarks.run                  all sequences; also the table in README.md
+    python -m benchmarks.run --quick          the first frames of two sequences, in a minute or two
+    python -m benchmarks.run --sequence DIR   a sequence of your own instead
 
 Every run is a process of its own. Rendered sequences are made once, in runs/bench/, and the red
 kitchen is measured where ../shared holds it. Only a run over everything touches docs/ and
-README.md; the others write their report into runs/bench/, or where --report says.
+README.md; the others write their report into runs/bench/pages/, or where --report says.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from figures import growth_rows, plot_growth, read_growth
-from freshness import code_print
-from machine import brisk_ms, describe_commit, describe_machine, load_average, now
-from measure import (
-    ROOT,
-    SHARED,
+from benchmarks.machine import brisk_ms, describe_commit, describe_machine, load_average, now
+from benchmarks.pages import WRITTEN
+from benchmarks.paths import KITCHEN, RESULTS, ROOT
+from benchmarks.suite.figures import growth_rows, plot_growth, read_growth
+from benchmarks.suite.measure import (
     Job,
     Measurement,
     call,
@@ -33,17 +32,15 @@ from measure import (
     render,
     shown,
 )
-from report import fill_readme, write_report
+from benchmarks.suite.report import fill_readme, write_report
 
 logger = logging.getLogger("benchmarks")
 
-WRITTEN = ("docs/benchmarks.md", "docs/images", "README.md")
 RENDERED = {
     "office": ("office-300", ("--frames", "300", "--true-depth")),
     "living_room": ("living_room", ()),
     "corridor": ("corridor", ()),
 }
-KITCHEN = SHARED / "redkitchen"
 WITHOUT_SUBPIXEL = ("--set", "tracking.subpixel.enabled=false")
 LABELLED = "with labels"
 GROWING = ("redkitchen", "corridor")
@@ -87,7 +84,7 @@ def recorded(name: str, folder: Path, work: Path, frames: int) -> Any:
     """A run that writes down how the graph grows."""
     out = work / "results" / f"{name}-recorded"
     logger.info("running %s, recorded", name)
-    call(["benchmarks/recorded_run.py", str(folder), "--out", str(out)])
+    call(["-m", "benchmarks.suite.recorded_run", str(folder), "--out", str(out)])
     return read_growth(out / "growth.csv", name, frames)
 
 
@@ -113,12 +110,11 @@ def measure_all(arguments: argparse.Namespace) -> dict[str, Any]:
         draw_overview(folders["office"], arguments)
     noise = {}
     if "office" in folders and (folders["office"] / "depth_true").is_dir():
-        command = ["benchmarks/keypoint_noise.py", str(folders["office"]), "--json"]
+        command = ["-m", "benchmarks.suite.keypoint_noise", str(folders["office"]), "--json"]
         noise = json.loads(call(command))
     return {
         "machine": describe_machine(),
         "commit": describe_commit(WRITTEN),
-        "code": code_print(Path(__file__)),
         "date": now(),
         "command": command_line(arguments),
         "render_commands": commands,
@@ -145,13 +141,13 @@ def draw_overview(folder: Path, arguments: argparse.Namespace) -> None:
     run = arguments.work / "results" / f"office-{LABELLED}".replace(" ", "-")
     call(["-m", "bmask_slam", "map", str(run), "--quiet"])
     out = image_path(arguments).with_name("overview.png")
-    command = ["benchmarks/picture.py", str(run), str(folder), "--out", str(out)]
+    command = ["-m", "benchmarks.suite.picture", str(run), str(folder), "--out", str(out)]
     call([*command, "--frame", str(OVERVIEW_FRAME)])
 
 
 def image_path(arguments: argparse.Namespace) -> Path:
-    """The growth figure lies beside the report."""
-    path: Path = arguments.report.parent / "images" / "graph_growth.png"
+    """The growth figure lies beside the report's folder, as docs/images beside docs/results."""
+    path: Path = arguments.report.parent.parent / "images" / "graph_growth.png"
     return path
 
 
@@ -178,7 +174,7 @@ def parse() -> argparse.Namespace:
     arguments = parser.parse_args()
     arguments.whole = not (arguments.quick or arguments.sequence or arguments.report)
     if arguments.report is None:
-        folder = ROOT / "docs" if arguments.whole else arguments.work
+        folder = RESULTS if arguments.whole else arguments.work / "pages"
         arguments.report = folder / "benchmarks.md"
     return arguments
 

@@ -1,12 +1,10 @@
-"""Run benchmarks one after the other and keep what they print in a report under docs/.
+"""Run benchmarks one after the other and keep what they print in a page under docs/results/.
 
-    python benchmarks/section_report.py graph [--only loops,session] [--sequences runs/bench]
-    python benchmarks/section_report.py --stale [graph]
+    python -m benchmarks.section_report graph [--only loops,session] [--sequences runs/bench]
 
-What a benchmark prints stands in the report as it is, below the command. With ``--only`` the other
-sections stay as they were; with ``--stale`` those that are not there, or older than the code that
-makes them, are made anew, in one report or in all. README.md and docs/benchmarks.md are written by
-``make bench``.
+Each section of a page holds the command, what it printed, and a line with machine, commit and date.
+With ``--only`` the other sections stay as they were. README.md and docs/results/benchmarks.md are
+written by ``make bench``.
 """
 
 from __future__ import annotations
@@ -19,17 +17,15 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from benchmarks.freshness import PAGES, code_print, sections  # noqa: E402
-from benchmarks.machine import describe_commit, now  # noqa: E402
-from bmask_slam.runtime.machine import processor  # noqa: E402
+from benchmarks.machine import describe_commit, now
+from benchmarks.pages import WRITTEN
+from benchmarks.paths import RESULTS, ROOT
+from bmask_slam.runtime.machine import processor
 
 
 @dataclass(frozen=True)
 class Report:
-    """A page of sections by name: each has a title, a command of this folder and pictures."""
+    """A page of sections by name: each has a title, a benchmark and its arguments, pictures."""
 
     path: Path
     title: str
@@ -41,103 +37,112 @@ class Report:
     def head(self) -> str:
         """How the page begins."""
         return (
-            f"# {self.title}\n\nWritten by `python benchmarks/section_report.py {self.path.stem}`; "
+            f"# {self.title}\n\nWritten by `python -m benchmarks.section_report {self.path.stem}`; "
             "each section is what its command printed.\n"
         )
 
 
 REPORTS = {
-    "graph": Report(ROOT / "docs" / "graph.md", "What the graph reaches", {
-        "session": ("A long session with bounded cost", "long_session.py"),
-        "loops": ("Loops closed, and wrong ones survived", "loop_closing.py {sequences}/corridor"),
+    "graph": Report(RESULTS / "graph.md", "Results: the factor graph", {
+        "session": ("A long session with bounded cost", "graph.long_session"),
+        "loops": (
+            "Loops closed, and wrong ones survived", "loops.loop_closing {sequences}/corridor"
+        ),
         "loop-limits": (
             "How much closed loops can take away",
-            "loop_limits.py {sequences}/results/corridor-default "
+            "loops.loop_limits {sequences}/results/corridor-default "
             "{sequences}/results/corridor-no-loop-closed --reference {sequences}/corridor",
         ),
-        "rounds": ("Round after round", "corridor_rounds.py --out {sequences}/rounds"),
-        "pose-graphs": ("Pose graphs, clean and with wrong loops", "pose_graphs.py"),
+        "rounds": ("Round after round", "loops.corridor_rounds --out {sequences}/rounds"),
+        "pose-graphs": ("Pose graphs, clean and with wrong loops", "graph.pose_graphs"),
         "kills": (
             "Killed and resumed",
-            "kill_and_resume.py {sequences}/office-300 --every 30 --kills 10 --max-frames 150",
+            "graph.kill_and_resume {sequences}/office-300 --every 30 --kills 10 --max-frames 150",
         ),
-        "calibration": ("Self-calibration", "calibration.py --out {sequences}/calibration"),
+        "calibration": (
+            "Self-calibration", "calibration.self_calibration --out {sequences}/calibration"
+        ),
         "kitchen-reference": (
             "The red kitchen's reference, judged by its images",
-            "kitchen_reference.py {sequences}/calibration/given",
+            "calibration.kitchen_reference {sequences}/calibration/given",
         ),
         "covariances": (
             "How honest the covariances are",
-            "covariances.py --runs 200 --sequence {sequences}/living_room",
+            "graph.covariances --runs 200 --sequence {sequences}/living_room",
         ),
     }),
-    "live": Report(ROOT / "docs" / "live.md", "What the live loop reaches", {
-        "speed": ("Red kitchen, offline and live", "live.py --repeats 1"),
+    "live": Report(RESULTS / "live.md", "Results: the live loop", {
+        "speed": ("Red kitchen, offline and live", "live.speed --repeats 1"),
         "session": (
-            "Thirty minutes", "live_session.py {sequences}/office-300 --minutes 30 --hz 10"
+            "Thirty minutes", "live.session {sequences}/office-300 --minutes 30 --hz 10"
         ),
     }),
-    "semantics": Report(ROOT / "docs" / "semantics.md", "What the semantics reach", {
+    "semantics": Report(RESULTS / "semantics.md", "Results: masks, labels, moving things", {
         "photographs": (
-            "Masks of photographs", "segmentation.py photographs --weights {sequences}/light-{{}}"
+            "Masks of photographs",
+            "semantics.segmentation photographs --weights {sequences}/light-{{}}",
         ),
-        "rooms": ("Masks of rendered rooms", "segmentation.py rooms --rooms {sequences}/rooms"),
-        "cost": ("Time and memory of the networks", "segmentation.py cost"),
+        "rooms": (
+            "Masks of rendered rooms", "semantics.segmentation rooms --rooms {sequences}/rooms"
+        ),
+        "cost": ("Time and memory of the networks", "semantics.segmentation cost"),
         "beside": (
             "Beside torchvision's network",
-            "beside_torchvision.py --environment {sequences}/torchvision",
+            "semantics.beside_torchvision --environment {sequences}/torchvision",
         ),
         "labels-truth": (
             "Labels and objects from true masks",
-            "labels.py {sequences}/office-300 {sequences}/room-930 {sequences}/room-931",
+            "semantics.labels {sequences}/office-300 {sequences}/room-930 {sequences}/room-931",
         ),
         "labels": (
             "Labels and objects from the network's masks",
-            "labels.py {sequences}/office-300 {sequences}/room-930 {sequences}/room-931 "
+            "semantics.labels {sequences}/office-300 {sequences}/room-930 {sequences}/room-931 "
             "--segmenter light",
         ),
-        "store": ("Time of the label store", "label_store.py"),
+        "store": ("Time of the label store", "semantics.label_store"),
         "dynamic": (
             "People who walk, a carried box and a pulled chair",
-            "dynamic.py --sequences {sequences} --segmenter light --seed 6 "
+            "moving.dynamic --sequences {sequences} --segmenter light --seed 6 "
             "--out {sequences}/dynamic",
         ),
         "dynamic-again": (
             "The same with other people",
-            "dynamic.py --sequences {sequences} --segmenter light --seed 7 "
+            "moving.dynamic --sequences {sequences} --segmenter light --seed 7 "
             "--out {sequences}/dynamic-again",
         ),
         "people": (
             "Three rooms full of people, three runs each",
-            "dynamic_seeds.py --sequences {sequences} --seeds 6,7,8",
+            "moving.dynamic_seeds --sequences {sequences} --seeds 6,7,8",
         ),
         "harm": (
             "What the semantics cost where nothing moves",
-            "no_harm.py {sequences}/office-300 {sequences}/living_room --rooms 20-31 "
+            "moving.no_harm {sequences}/office-300 {sequences}/living_room --rooms 20-31 "
             "--rendered {sequences}",
         ),
         "harm-kitchen": (
             "The same in the red kitchen, its reference of a point beside the camera",
-            "no_harm.py ../shared/data/redkitchen --hand-eye",
+            "moving.no_harm ../shared/data/redkitchen --hand-eye",
         ),
-        "pairs": ("A real man who walks, by geometry alone", "dynamic_pairs.py"),
+        "pairs": ("A real man who walks, by geometry alone", "moving.dynamic_pairs"),
         "pairs-labels": (
             "The same with the network's masks",
-            "dynamic_pairs.py --segmenter light",
+            "moving.dynamic_pairs --segmenter light",
         ),
         "composited": (
             "A real man put into a real recording",
-            "composited.py --segmenter light --out {sequences}/composited",
+            "moving.composited --segmenter light --out {sequences}/composited",
         ),
     }),
-    "mapping": Report(ROOT / "docs" / "mapping.md", "What the dense map reaches", {
-        "dense": ("Depth, surface, labels and time", "dense.py {sequences}/dense"),
-        "loop": ("Submaps follow a loop closure", "dense_session.py loop {sequences}/dense/office"),
+    "mapping": Report(RESULTS / "mapping.md", "Results: the dense map", {
+        "dense": ("Depth, surface, labels and time", "mapping.dense {sequences}/dense"),
+        "loop": (
+            "Submaps follow a loop closure", "mapping.dense_session loop {sequences}/dense/office"
+        ),
         "session": (
             "Memory over a long session",
-            "dense_session.py session {sequences}/dense/office --keyframes 900",
+            "mapping.dense_session session {sequences}/dense/office --keyframes 900",
         ),
-        "pictures": ("What it looks like", "dense_pictures.py {sequences}/dense docs/images"),
+        "pictures": ("What it looks like", "mapping.dense_pictures {sequences}/dense docs/images"),
     }, {
         "pictures": {
             "dense_kitchen.jpg": "The red kitchen; labels by light masks in YOLOX-Nano's boxes",
@@ -151,23 +156,25 @@ REPORTS = {
 
 def make_section(report: Report, name: str, sequences: Path) -> str:
     """Run a benchmark; its section."""
-    title, command = report.sections[name]
-    command = f"benchmarks/{command.format(sequences=sequences)}"
-    print(f"{title}: python {command}", flush=True)
-    commit = describe_commit(tuple(str(page.relative_to(ROOT)) for page in PAGES))
-    code = code_print(ROOT / command.split()[0])
-    begin_s = time.perf_counter()
+    title, given = report.sections[name]
+    module, *arguments = given.format(sequences=sequences).split()
+    command = ["-m", f"benchmarks.{module}", *arguments]
+    typed = f"python {' '.join(command)}"
+    print(f"{title}: {typed}", flush=True)
+    commit, begin_s = describe_commit(WRITTEN), time.perf_counter()
     done = subprocess.run(
-        [sys.executable, *command.split()], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=False
     )
     if done.returncode:
-        raise SystemExit(f"{command} failed:\n{done.stderr[-2000:]}")
+        raise SystemExit(f"{typed} failed:\n{done.stderr[-2000:]}")
     wall_s = time.perf_counter() - begin_s
-    when = f"{processor()}; commit {commit}; code {code}; {now()}; {wall_s:.0f} s."
-    captions = report.pictures.get(name, {})
-    pictures = "".join(f"\n![{text}](images/{file})\n{text}.\n" for file, text in captions.items())
+    stamp = f"{processor()}; commit {commit}; {now()}; {wall_s:.0f} s."
     printed = f"```\n{done.stdout.rstrip()}\n```"
-    return f"## {title}\n\n`python {command}`\n\n{printed}\n\n{when}\n{pictures}"
+    captions = report.pictures.get(name, {})
+    pictures = "".join(
+        f"\n![{text}](../images/{file})\n{text}.\n" for file, text in captions.items()
+    )
+    return f"## {title}\n\n`{typed}`\n\n{printed}\n\n{stamp}\n{pictures}"
 
 
 def replace_section(report: Report, new: str) -> None:
@@ -183,27 +190,16 @@ def replace_section(report: Report, new: str) -> None:
     report.path.write_text(f"{report.head}\n{body.rstrip()}\n")
 
 
-def stale(report: Report) -> list[str]:
-    """Names of the sections that are missing or older than the code that makes them."""
-    written = sections(report.path) if report.path.exists() else []
-    fresh = {section.title for section in written if not section.stale}
-    return [name for name, (title, _) in report.sections.items() if title not in fresh]
-
-
 def main() -> None:
-    """Write a report, or renew some of its sections."""
+    """Write a page, or renew some of its sections."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("report", choices=REPORTS, nargs="?")
+    parser.add_argument("report", choices=REPORTS)
     parser.add_argument("--only", help="some of its sections, such as loops,session")
-    parser.add_argument("--stale", action="store_true", help="those that need it, of all reports")
     parser.add_argument("--sequences", type=Path, default=Path("runs/bench"))
     arguments = parser.parse_args()
-    if not arguments.report and not arguments.stale:
-        parser.error("which report? Or --stale")
-    for report in [REPORTS[arguments.report]] if arguments.report else REPORTS.values():
-        names = stale(report) if arguments.stale else list(report.sections)
-        for name in arguments.only.split(",") if arguments.only else names:
-            replace_section(report, make_section(report, name, arguments.sequences))
+    report = REPORTS[arguments.report]
+    for name in arguments.only.split(",") if arguments.only else report.sections:
+        replace_section(report, make_section(report, name, arguments.sequences))
 
 
 if __name__ == "__main__":

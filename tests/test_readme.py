@@ -13,7 +13,7 @@ from repository import ROOT
 from bmask_slam.cli import make_parser
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 MAX_LINES = 150
 MAKE_TARGET = re.compile(r"\bmake ([a-z]+)\b")
 LINK = re.compile(r"\]\(([^)]+)\)")
@@ -51,7 +51,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page):
     for link in LINK.findall(page.read_text(encoding="utf-8")):
         if link.startswith("http"):
@@ -62,7 +62,7 @@ def test_links_lead_somewhere(page):
         assert not anchor or anchor in anchors(file), link
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_paths_in_code_exist(page):
     words = [w for line in code_lines(page.read_text(encoding="utf-8")) for w in line.split()]
     paths = {word for word in words if REPOSITORY_PATH.match(word)}
@@ -70,7 +70,7 @@ def test_paths_in_code_exist(page):
     assert not missing
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_parse(page):
     """Whole command lines go through the real parser; --help and --version end it with 0."""
     lines = command_lines(page.read_text(encoding="utf-8"))
@@ -128,7 +128,7 @@ def block(text: str) -> str:
 
 
 def test_the_results_are_those_of_the_benchmark():
-    report = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    report = (ROOT / "docs" / "results" / "benchmarks.md").read_text(encoding="utf-8")
     results = block(README)
     assert results == block(report)
     rows = [line for line in results.splitlines() if line.startswith("| ")]

@@ -3,9 +3,10 @@
 A corner is found to half a pixel at best, and anew in every image. The pose error that this causes
 is why dense alignment beats plain features. Aligning the patch around each match with the
 landmark's own patch (Lucas-Kanade, inverse compositional: Baker and Matthews 2004) leaves a
-fraction of that; benchmarks/keypoint_noise.py measures it where the truth is exact. The error is
-then no longer drawn anew in every image: all that are aligned with one patch share it. So patches
-are compared at the scale at which things are seen, and are few (``WorldMap.renew_patches``).
+fraction of that; benchmarks/suite/keypoint_noise.py measures it where the truth is exact. The
+error is then no longer independent from image to image: all observations aligned with one patch
+share it. So patches are compared at the scale of the view, and are few
+(``WorldMap.renew_patches``).
 """
 
 from __future__ import annotations

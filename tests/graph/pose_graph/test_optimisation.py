@@ -250,7 +250,7 @@ def test_truncated_weights_go_from_all_to_nothing() -> None:
     np.testing.assert_allclose(soft, [1, 1, np.sqrt(2) - 1, 0, 0], atol=1e-9)
 
 
-COSTS = {  # plain GTSAM Levenberg-Marquardt from the best initial value: benchmarks/pose_graphs.py
+COSTS = {  # plain GTSAM Levenberg-Marquardt from the best initial value
     "tinyGrid3D": 9.313909,
     "smallGrid3D": 517.9253,
     "MIT": 20.60347,

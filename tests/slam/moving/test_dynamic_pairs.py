@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import permutations
 
 import numpy as np
 import pytest
-from repository import ROOT
 
+from benchmarks.moving.composited import composed
+from benchmarks.moving.dynamic_pairs import DATA, man_in, moving_points, read_pair
+from benchmarks.moving.moving_points import Count, count
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-from composited import composed
-from dynamic_pairs import DATA, man_in, moving_points, read_pair
-from moving_points import Count, count
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data are not here")

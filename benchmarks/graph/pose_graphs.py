@@ -1,0 +1,206 @@
+"""Offline optimisation of the public pose graphs, and of two with wrong loops put in.
+
+    python -m benchmarks.graph.pose_graphs [--graphs FOLDER] [--wrong 0.2] [--seeds 5]
+
+First table: final cost and time of each graph with each method, against GTSAM's own
+Levenberg-Marquardt run from the file's poses (or the odometry) and from the chordal solution, the
+better of the two. Second: a share of the loop edges is replaced by random ones. GNC's poses are
+compared with the optimum of the right edges alone, which knows which were replaced (RMSE of
+positions after alignment), and both with the optimum of the undisturbed graph. What the replaced
+edges knew is lost: by how much this raises the expected ATE is told by the covariances of the two
+optima, and for sphere2500 by GTSAM's ground truth. In the last column the random edges are added
+and none is replaced.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from benchmarks.paths import SHARED
+from bmask_slam.graph.arrays import Array, Mask
+from bmask_slam.graph.g2o.pose_graphs import read_g2o
+from bmask_slam.graph.geometry import make_pose, so3_exp
+from bmask_slam.graph.metrics import align
+from bmask_slam.graph.pose_graph.factors import chordal_poses
+from bmask_slam.graph.pose_graph.loop_prediction import pose_draws
+from bmask_slam.graph.pose_graph.optimisation import Method, PoseGraphConfig, optimise_pose_graph
+from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
+
+FOLDER = SHARED / "posegraphs"
+METHODS: tuple[Method, ...] = ("lm", "dogleg", "gnc")
+
+
+def plain_cost(graph: PoseGraph) -> float:
+    """Final cost of GTSAM's optimiser with its default parameters from the best of two starts."""
+    given = graph.poses if graph.has_poses else spanning_tree_poses(graph)
+    return min(_plain_cost_from(graph.with_poses(poses)) for poses in (given, chordal_poses(graph)))
+
+
+def _plain_cost_from(graph: PoseGraph) -> float:
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    between, pose = (
+        (gtsam.BetweenFactorPose2, _pose2)
+        if graph.is_planar
+        else (gtsam.BetweenFactorPose3, gtsam.Pose3)
+    )
+    for k, T in enumerate(graph.poses):
+        values.insert(k, pose(T))
+    for (i, j), T, omega in zip(
+        graph.edges.tolist(), graph.measurements, graph.information, strict=True
+    ):
+        factors.add(between(i, j, pose(T), gtsam.noiseModel.Gaussian.Information(omega)))
+    prior = gtsam.PriorFactorPose2 if graph.is_planar else gtsam.PriorFactorPose3
+    unit = gtsam.noiseModel.Unit.Create(3 if graph.is_planar else 6)
+    factors.add(prior(0, pose(graph.poses[0]), unit))
+    return float(factors.error(gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()))
+
+
+def _pose2(T: Array) -> gtsam.Pose2:
+    return gtsam.Pose2(T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))
+
+
+def with_wrong_loops(
+    graph: PoseGraph, share: float, rng: np.random.Generator
+) -> tuple[PoseGraph, Mask]:
+    """The graph with this share of its loop edges replaced by random ones, and their mask (M,).
+
+    A wrong edge joins two random vertices by a random rotation, and a translation as long as the
+    graph is wide: nothing in it gives it away.
+    """
+    loops = np.flatnonzero(~graph.is_odometry)
+    wrong = rng.choice(loops, round(share * len(loops)), replace=False)
+    edges, measurements = graph.edges.copy(), graph.measurements.copy()
+    first = rng.integers(0, len(graph.ids), len(wrong))
+    step = rng.integers(2, len(graph.ids) - 2, len(wrong))
+    edges[wrong] = np.stack([first, (first + step) % len(graph.ids)], axis=1)
+    width_m = np.ptp(graph.poses[:, :3, 3], axis=0)
+    t = rng.uniform(-0.5, 0.5, (len(wrong), 3)) * width_m
+    angle_rad = rng.uniform(-np.pi, np.pi, len(wrong))
+    if graph.is_planar:
+        measurements[wrong] = planar_poses(np.column_stack([t[:, :2], angle_rad]))
+    else:
+        axis = rng.normal(size=(len(wrong), 3))
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        measurements[wrong] = make_pose(so3_exp(axis * angle_rad[:, None]), t)
+    mask = np.zeros(len(graph.edges), bool)
+    mask[wrong] = True
+    return replace(graph, edges=edges, measurements=measurements), mask
+
+
+def with_added(graph: PoseGraph, other: PoseGraph, mask: Mask) -> PoseGraph:
+    """The graph with the edges of another under a mask (M,) beside its own."""
+    more = other.with_edges(mask)
+    return replace(
+        graph,
+        edges=np.concatenate([graph.edges, more.edges]),
+        measurements=np.concatenate([graph.measurements, more.measurements]),
+        information=np.concatenate([graph.information, more.information]),
+    )
+
+
+def position_rmse_m(poses: Array, reference: Array) -> float:
+    """Positions against positions, after alignment by a rigid transform."""
+    points, target = poses[:, :3, 3], reference[:, :3, 3]
+    T = align(points, target).T_reference_estimate
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    return float(np.sqrt(np.mean(np.sum((moved - target) ** 2, axis=1))))
+
+
+def sphere_truth(file: Path) -> Array:
+    """Poses (N, 4, 4) that GTSAM's noise-free EDGE3 lines (x y z roll pitch yaw) chain up to."""
+    rows = [line.split()[1:9] for line in file.read_text().splitlines() if line.startswith("EDGE3")]
+    values = np.array(rows, float)
+    axes = np.eye(3)
+    roll, pitch, yaw = (so3_exp(values[:, 5 + k, None] * axes[k]) for k in range(3))
+    steps = make_pose(yaw @ pitch @ roll, values[:, 2:5])
+    i, j = values[:, :2].astype(int).T
+    poses = np.tile(np.eye(4), (j.max() + 1, 1, 1))
+    for k in np.flatnonzero(j == i + 1):
+        poses[j[k]] = poses[i[k]] @ steps[k]
+    return poses
+
+
+def expected_ate_m(graph: PoseGraph, used: Mask) -> float:
+    """ATE that the covariance of an optimum of the ``used`` edges promises, from draws."""
+    columns = slice(0, 2) if graph.is_planar else slice(3, 6)
+    squares = []
+    for tangents in pose_draws(graph, used)[:, :, columns]:
+        moved = graph.poses.copy()
+        R = moved[:, :3, : tangents.shape[1]]
+        moved[:, :3, 3] += (R @ tangents[..., None])[..., 0]
+        squares.append(position_rmse_m(moved, graph.poses) ** 2)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--graphs", type=Path, default=FOLDER)
+    parser.add_argument("--wrong", type=float, default=0.2, help="share of the loop edges")
+    parser.add_argument("--seeds", type=int, default=5)
+    arguments = parser.parse_args()
+    files = sorted(arguments.graphs.glob("*.g2o"))
+    graphs = {file.stem: read_g2o(file) for file in files}
+    compare_methods(graphs)
+    print(f"\nGNC, {100 * arguments.wrong:g} % of the loop edges wrong; distances in mm")
+    print(f"{'graph':16}{'seed':>4}{'wrong':>7}{'found':>7}{'right, out':>12}{'ms':>8}", end="")
+    print(f"{'to right alone':>16}{'to clean':>10}{'right alone to clean':>22}", end="")
+    print(f"{'expected ATE':>14}{'added: to clean':>17}")
+    for (name, graph), seed in itertools.product(graphs.items(), range(arguments.seeds)):
+        if (~graph.is_odometry).sum() * arguments.wrong >= 1:
+            wrong_loops(name, graph, arguments, seed)
+
+
+def compare_methods(graphs: dict[str, PoseGraph]) -> None:
+    """Print the first table."""
+    print(
+        f"{'graph':16}{'vertices':>9}{'edges':>7}  {'method':8}{'start':9}{'iterations':>10}",
+        end="",
+    )
+    print(f"{'ms':>9}{'initial cost':>15}{'final cost':>14}{'plain GTSAM':>14}{'outliers':>10}")
+    for name, graph in graphs.items():
+        plain = plain_cost(graph)
+        for method in METHODS:
+            r = optimise_pose_graph(graph, PoseGraphConfig(method=method))
+            print(
+                f"{name:16}{len(graph.ids):9}{len(graph.edges):7}  {method:8}{r.start:9}"
+                f"{r.iterations:10}{r.duration_ms:9.0f}{r.initial_cost:15.6g}"
+                f"{r.final_cost:14.7g}{plain:14.7g}{r.is_outlier.sum():10}",
+                flush=True,
+            )
+
+
+def wrong_loops(name: str, graph: PoseGraph, arguments: argparse.Namespace, seed: int) -> None:
+    """Print how near GNC comes to the optimum of the right edges, and that to the clean one."""
+    clean = optimise_pose_graph(graph).graph
+    disturbed, wrong = with_wrong_loops(clean, arguments.wrong, np.random.default_rng(seed))
+    disturbed = replace(disturbed, poses=graph.poses, has_poses=graph.has_poses)
+    right = optimise_pose_graph(disturbed.with_edges(~wrong)).graph
+    r = optimise_pose_graph(disturbed, PoseGraphConfig(method="gnc"))
+    added = optimise_pose_graph(with_added(graph, disturbed, wrong), PoseGraphConfig(method="gnc"))
+    rise = expected_ate_m(clean, ~wrong) / expected_ate_m(clean, np.ones(len(wrong), bool)) - 1
+    print(
+        f"{name:16}{seed:4}{wrong.sum():7}{(r.is_outlier & wrong).sum():7}"
+        f"{(r.is_outlier & ~wrong).sum():12}{r.duration_ms:8.0f}"
+        f"{1e3 * position_rmse_m(r.graph.poses, right.poses):16.3f}"
+        f"{1e3 * position_rmse_m(r.graph.poses, clean.poses):10.1f}"
+        f"{1e3 * position_rmse_m(right.poses, clean.poses):22.1f}{100 * rise:+13.1f}%"
+        f"{1e3 * position_rmse_m(added.graph.poses, clean.poses):17.3f}",
+        flush=True,
+    )
+    truth_file = arguments.graphs / "gtsam_sphere2500_groundtruth.txt"
+    if name == "sphere2500" and truth_file.is_file():
+        truth = sphere_truth(truth_file)
+        of = {"clean": clean, "right edges alone": right, "GNC": r.graph}
+        ate = {text: 1e3 * position_rmse_m(g.poses, truth) for text, g in of.items()}
+        texts = (f"{text} {mm:.1f} ({mm / ate['clean'] - 1:+.1%})" for text, mm in ate.items())
+        print(f"{'':20}ATE against the truth: {', '.join(texts)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""What people who walk before the camera do to the trajectory, with and without the cure.
+
+    python -m benchmarks.moving.dynamic [--sequences runs/bench] [--segmenter truth] [--seed 6]
+
+The same camera path through the same room is rendered without people, with one, two and four who
+walk, and with one who carries a box of no class and pulls a chair along; the first two keep step
+with the camera. Sequences that are there already are used as they are. Each is run with nothing,
+with the labels of masks alone, with geometry alone, with both, and with the truth of every frame
+("ideal"), which shows what the people cost by what they hide. "x clean" compares with the same
+camera path without people, run with nothing; "left out" is the share of the keypoints on people,
+the box, the chair while it is pulled, and on all the rest, that were not used. The times of the
+check, and of finding other keypoints in place of those left out ("refill"), are the processor's, of
+all frames. The second table is how much of the pictures they cover, box and pulled chair among
+them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.moving.moving_points import KINDS, NEAR_PX, MovingTruth, WatchedSystem, strip
+from benchmarks.pages import table
+from bmask_slam.config.configuration import resolve
+from bmask_slam.features.brisk import Features, select
+from bmask_slam.graph.arrays import Mask
+from bmask_slam.graph.camera import Camera
+from bmask_slam.moving.feature_replenishment import FeatureReplenishment
+from bmask_slam.moving.moving_object_filter import StaticFeatures
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system_config import SystemConfig
+
+ROOM = "crowded_office"
+SCENES = {
+    "nobody": {"people": 0},
+    "1 walks": {"people": 1},
+    "2 walk": {"people": 2},
+    "4 walk": {"people": 4},
+    "box and chair": {"people": 1, "carry": True},
+}
+IDEAL = "ideal"
+VARIANTS = {
+    "nothing": (False, False),
+    "labels": (True, False),
+    "geometry": (False, True),
+    "both": (True, True),
+    IDEAL: (False, False),
+}
+"""Name to whether labels and geometry count."""
+FPS_HZ = 15.0
+PICTURES = 8
+ASKED = (0.15, 0.5)
+"""How much of a picture people are to cover."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run.
+
+    Attributes:
+        ate_mm: root mean square over all frames.
+        tracked_share: of the frames.
+        left_out: share of keypoints left out, by what they are on; None where it is not there.
+        check_ms: median time of the dynamic check in a frame, and its 95 % quantile.
+        fill_ms: the same of finding other keypoints in place of those left out.
+        mostly_moving: frames in which nearly everything seemed to move.
+        covered: share of each picture that moves.
+    """
+
+    scene: str
+    variant: str
+    ate_mm: float
+    tracked_share: float
+    left_out: dict[str, float | None]
+    check_ms: tuple[float, float]
+    fill_ms: tuple[float, float]
+    mostly_moving: int
+    covered: list[float]
+
+
+class IdealSystem(WatchedSystem):
+    """Leaves out what the truth says, in every frame."""
+
+    def _static_features(self, frame: Frame, features: Features) -> StaticFeatures:
+        static, moving = super()._static_features(frame, features), self._on_moving(frame, features)
+        return StaticFeatures(select(features, np.flatnonzero(~moving)), moving, False, static.view)
+
+    def _replenish(
+        self, frame: Frame, features: Features, static: StaticFeatures
+    ) -> StaticFeatures:
+        super()._replenish(frame, features, static)
+        replenishment = FeatureReplenishment(self.camera, self.config.features)
+        judge = partial(self._on_moving, frame)
+        return replace(
+            static, features=replenishment.replenished(frame, features, static.moving, judge)
+        )
+
+    def _on_moving(self, frame: Frame, features: Features) -> Mask:
+        """Which features (N,) lie on or near what moves in truth."""
+        moves = np.any(list(self.truth.masks(frame).values()), axis=0).astype(np.uint8)
+        moves = cv2.dilate(moves, np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8))
+        columns, rows = np.rint(features.image_pixels).astype(np.int64).T
+        return np.asarray(moves[rows, columns] > 0)
+
+
+def main() -> None:
+    """Parse, render, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sequences", type=Path, default=Path("runs/bench"))
+    parser.add_argument("--segmenter", default="truth")
+    parser.add_argument("--weights")
+    parser.add_argument("--seed", type=int, default=6)
+    parser.add_argument("--scenes", help="some of them, separated by commas")
+    parser.add_argument("--variants", help="some of them, separated by commas")
+    parser.add_argument("--set", action="append", default=[], metavar="A.B=C")
+    parser.add_argument("--out", type=Path, default=Path("runs/dynamic"))
+    arguments = parser.parse_args()
+    chosen = arguments.scenes.split(",") if arguments.scenes else list(SCENES)
+    variants = arguments.variants.split(",") if arguments.variants else list(VARIANTS)
+    outcomes = []
+    for scene in chosen:
+        folder = rendered(arguments.sequences, scene, arguments.seed)
+        outcomes += [measure(folder, scene, variant, arguments) for variant in variants]
+    content = [asdict(outcome) for outcome in outcomes]
+    (arguments.out / "dynamic.json").write_text(json.dumps(content, indent=1) + "\n")
+    print(report(outcomes), coverage(outcomes), sep="\n\n")
+
+
+def rendered(sequences: Path, scene: str, seed: int) -> Path:
+    """The sequence of a scene, rendered if it is not there."""
+    what = SCENES[scene]
+    name = "carry" if "carry" in what else what["people"]
+    folder = sequences / f"{ROOM}-{seed}-{name}"
+    if not folder.is_dir():
+        render_sequence(RenderConfig(ROOM, seed=seed, fps=FPS_HZ, **what), folder)
+    return folder
+
+
+def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespace) -> Outcome:
+    """Run a sequence; with "labels" or "both" its masks are segmented too."""
+    labels, geometry = VARIANTS[variant]
+    settings = [f"moving_objects.{k}={v}" for k, v in (("labels", labels), ("geometry", geometry))]
+    config = resolve(SystemConfig, None, [*settings, *arguments.set])
+    options = SegmenterOptions(arguments.segmenter if labels else "none", arguments.weights)
+    segmenter = make_segmenter(options, folder)
+    systems = []
+    frames = len((folder / "rgb.txt").read_text().splitlines()) - 2
+
+    def make(camera: Camera, config: SystemConfig) -> WatchedSystem:
+        kind = IdealSystem if variant == IDEAL else WatchedSystem
+        system = kind(camera, config, segmenter)
+        systems.append(system.watch(MovingTruth(folder), frames // PICTURES))
+        return system
+
+    out = arguments.out / f"{folder.name}-{variant}"
+    summary = run(RunOptions(folder, config, out=out, overwrite=True, quiet=True), make)
+    metrics = {row["name"]: row["value"] for row in summary.rows}
+    if systems[0].pictures:
+        cv2.imwrite(str(out.with_suffix(".png")), strip(systems[0].pictures[:PICTURES]))
+    with (out / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    check_ms, fill_ms = (
+        np.percentile(times, [50, 95]) for times in (systems[0].check_ms, systems[0].fill_ms)
+    )
+    shares = {kind: systems[0].total(kind).share for kind in (*KINDS, "rest")}
+    return Outcome(
+        scene=scene,
+        variant=variant,
+        ate_mm=1e3 * metrics.get("ate_rmse", float("nan")),
+        tracked_share=metrics["tracked_share"],
+        left_out={k: None if np.isnan(share) else share for k, share in shares.items()},
+        check_ms=(float(check_ms[0]), float(check_ms[1])),
+        fill_ms=(float(fill_ms[0]), float(fill_ms[1])),
+        mostly_moving=sum(int(row["mostly_moving"]) for row in rows),
+        covered=systems[0].covered,
+    )
+
+
+def report(outcomes: Sequence[Outcome]) -> str:
+    """The table in Markdown."""
+    clean_mm = next(
+        (o.ate_mm for o in outcomes if (o.scene, o.variant) == ("nobody", "nothing")), float("nan")
+    )
+    header = ("scene", "with", "ATE mm", "x clean", "tracked", *(f"{k} left out" for k in KINDS),
+              "rest left out", "check ms: median, 95 %", "refill ms")  # fmt: skip
+    rows = [
+        (
+            *(o.scene, o.variant, f"{o.ate_mm:.2f}", f"{o.ate_mm / clean_mm:.2f}"),
+            f"{100 * o.tracked_share:.0f} %",
+            *("" if s is None else f"{100 * s:.1f} %" for s in o.left_out.values()),
+            *("{:.2f}, {:.2f}".format(*times) for times in (o.check_ms, o.fill_ms)),
+        )
+        for o in outcomes
+    ]
+    return table(header, rows)
+
+
+def coverage(outcomes: Sequence[Outcome]) -> str:
+    """How much of the pictures is covered where anything is, as a table in Markdown."""
+    rows = []
+    for scene, covered in {o.scene: np.array(o.covered) for o in outcomes}.items():
+        if not (there := covered[covered > 0]).size:
+            continue
+        shares = there.mean(), *np.quantile(there, [0.1, 0.9]), there.max()
+        asked = (there >= ASKED[0]) & (there <= ASKED[1])
+        rows.append((scene, *(f"{100 * s:.0f} %" for s in (*shares, asked.mean()))))
+    low, high = (f"{100 * share:.0f}" for share in ASKED)
+    header = ("scene", "covered: mean", "10 %", "90 %", "most", f"frames of {low}-{high} %")
+    return table(header, rows)
+
+
+if __name__ == "__main__":
+    main()

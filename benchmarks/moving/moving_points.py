@@ -1,0 +1,194 @@
+"""Which keypoints were taken for moving, against what moves in a rendered sequence.
+
+    python -m benchmarks.moving.moving_points SEQUENCE --segmenter none --strip moving.png
+
+Red in the picture: left out as moving; green: used. What moves is outlined in yellow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bmask_slam.config.configuration import resolve
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Array, Image, Mask
+from bmask_slam.moving.moving_object_filter import StaticFeatures
+from bmask_slam.rendering.classes import CATEGORY_IDS
+from bmask_slam.rendering.things.people import PULLED_S
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.tracker import Tracked
+
+NEAR_PX = 6
+"""Keypoints so near to a border count for neither side."""
+KINDS = ("person", "box", "chair")
+
+
+class MovingTruth:
+    """What moves in each frame of a rendered sequence: people, a carried box, a pulled chair."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        content = json.loads((folder / "annotations.json").read_text())
+        labels = {a["instance_id"]: a["category_id"] for a in content["annotations"]}
+        self._labels = labels
+        self._people = [i for i, label in labels.items() if label == CATEGORY_IDS["person"]]
+
+    def masks(self, frame: Frame) -> dict[str, Mask]:
+        """(H, W) by kind; the chair only while it is pulled.
+
+        A box is in no annotation, and the instance after it is the chair that is pulled.
+        """
+        name = Path(frame.name).name
+        drawn = cv2.imread(str(self.folder / "instances" / name), cv2.IMREAD_UNCHANGED)
+        boxes = sorted(set(np.unique(drawn).tolist()) - {0} - self._labels.keys())
+        found = {"person": np.isin(drawn, self._people), "box": np.isin(drawn, boxes)}
+        pulled = PULLED_S[0] <= frame.timestamp_s <= PULLED_S[1]
+        chairs = [self._people[0] - 1] if self._people and pulled else []
+        chairs = [i for i in chairs if self._labels.get(i) == CATEGORY_IDS["chair"]]
+        return found | {"chair": np.isin(drawn, chairs)}
+
+
+@dataclass(frozen=True)
+class Count:
+    """Keypoints on something, and how many of them were left out."""
+
+    on: int = 0
+    left_out: int = 0
+
+    def __add__(self, other: Count) -> Count:
+        return Count(self.on + other.on, self.left_out + other.left_out)
+
+    @property
+    def share(self) -> float:
+        """Of the keypoints on it, those that were left out; NaN without any."""
+        return self.left_out / self.on if self.on else float("nan")
+
+
+Counts = Mapping[str, Count]
+
+
+def count(pixels: Array, moving: Mask, masks: Mapping[str, Mask]) -> dict[str, Count]:
+    """Keypoints (N, 2) well inside of each mask, and well outside of all ("rest")."""
+    window = np.ones((2 * NEAR_PX + 1, 2 * NEAR_PX + 1), np.uint8)
+    columns, rows = np.rint(pixels).astype(np.int64).reshape(-1, 2).T
+    any_ = np.any(list(masks.values()), axis=0)
+    sides = {kind: cv2.erode(m.astype(np.uint8), window) > 0 for kind, m in masks.items()}
+    sides["rest"] = cv2.dilate(any_.astype(np.uint8), window) == 0
+    on = {kind: side[rows, columns] for kind, side in sides.items()}
+    return {kind: Count(int(o.sum()), int((o & moving).sum())) for kind, o in on.items()}
+
+
+def picture(frame: Frame, static: tuple[Array, Mask], masks: Mapping[str, Mask]) -> Image:
+    """A frame with its keypoints and the outline of what moves, half size, BGR."""
+    drawn = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
+    moves = np.any(list(masks.values()), axis=0).astype(np.uint8)
+    outlines, _ = cv2.findContours(moves, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    cv2.drawContours(drawn, outlines, -1, (0, 220, 255), 2)
+    for (u, v), moving in zip(*static, strict=True):
+        colour = (0, 0, 255) if moving else (0, 220, 0)
+        cv2.circle(drawn, (round(u), round(v)), 3, colour, -1)
+    return np.asarray(cv2.resize(drawn, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+
+
+class WatchedSystem(SlamSystem):
+    """The system; keeps the counts of every frame, and pictures of every ``every``-th.
+
+    ``check_ms`` is the processor's time that a frame's dynamic check took, which other programs
+    do not change; ``fill_ms`` that of finding keypoints in place of those left out. ``covered`` is
+    the share of each frame that what moves covers.
+    """
+
+    truth: MovingTruth
+    every: int
+
+    def watch(self, truth: MovingTruth, every: int) -> WatchedSystem:
+        """Begin to count."""
+        self.truth, self.every = truth, every
+        self.counts: list[dict[str, Count]] = []
+        self.pictures: list[Image] = []
+        self.check_ms: list[float] = []
+        self.fill_ms: list[float] = []
+        self.covered: list[float] = []
+        return self
+
+    def total(self, kind: str) -> Count:
+        """Of all frames but the first, which has nothing to be compared with."""
+        return sum((c[kind] for c in self.counts[1:]), Count())
+
+    def _static_features(self, frame: Frame, features: Features) -> StaticFeatures:
+        begun_s = time.thread_time()
+        static = super()._static_features(frame, features)
+        self.check_ms.append(1e3 * (time.thread_time() - begun_s))
+        masks = self.truth.masks(frame)
+        seen = features.image_pixels, static.moving
+        self.counts.append(count(*seen, masks))
+        self.covered.append(float(np.any(list(masks.values()), axis=0).mean()))
+        if frame.index % self.every == self.every // 2:
+            self.pictures.append(picture(frame, seen, masks))
+        return static
+
+    def _replenish(
+        self, frame: Frame, features: Features, static: StaticFeatures
+    ) -> StaticFeatures:
+        begun_s = time.thread_time()
+        filled = super()._replenish(frame, features, static)
+        self.fill_ms.append(1e3 * (time.thread_time() - begun_s))
+        return filled
+
+    def _watch(self, time_s: float, tracked: Tracked, static: StaticFeatures) -> None:
+        begun_s = time.thread_time()
+        super()._watch(time_s, tracked, static)
+        self.check_ms[-1] += 1e3 * (time.thread_time() - begun_s)
+
+
+def strip(pictures: list[Image], columns: int = 4) -> Image:
+    """Pictures, one or more, in rows; an incomplete last row is left away."""
+    columns = min(columns, len(pictures))
+    rows = range(0, len(pictures) - columns + 1, columns)
+    return np.vstack([np.hstack(pictures[k : k + columns]) for k in rows])
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sequence", type=Path)
+    parser.add_argument("--segmenter", default="none")
+    parser.add_argument("--frames", type=int)
+    parser.add_argument("--set", action="append", default=[])
+    parser.add_argument("--strip", type=Path, help="PNG with a few of the frames")
+    options = parser.parse_args()
+    sequence = open_sequence(options.sequence)
+    segmenter = make_segmenter(SegmenterOptions(options.segmenter), options.sequence)
+    config = resolve(SystemConfig, None, options.set)
+    frames = min(options.frames or len(sequence), len(sequence))
+    system = WatchedSystem(sequence.camera, config, segmenter)
+    system.watch(MovingTruth(options.sequence), max(frames // 12, 1))
+    for frame in sequence.frames():
+        if frame.index >= frames:
+            break
+        system.process(frame)
+        if frame.index % 10 == 0:
+            print(frame.index, {k: (c.on, c.left_out) for k, c in system.counts[-1].items()})
+    print("check ms: median {:.2f}, 95 % {:.2f}".format(*np.percentile(system.check_ms, [50, 95])))
+    print("fill ms: median {:.2f}, 95 % {:.2f}".format(*np.percentile(system.fill_ms, [50, 95])))
+    for kind in (*KINDS, "rest"):
+        total = system.total(kind)
+        print(f"{kind}: left out {total.share:.3f} of {total.on}")
+    if options.strip:
+        cv2.imwrite(str(options.strip), strip(system.pictures))
+
+
+if __name__ == "__main__":
+    main()

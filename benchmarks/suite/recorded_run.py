@@ -1,0 +1,79 @@
+"""A run that also writes how the map and the graph grow: one line a keyframe in growth.csv.
+
+    python -m benchmarks.suite.recorded_run SEQUENCE --out RUN
+
+Nothing that is recorded changes the estimate: trajectory.txt is that of ``bmask-slam run``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+from typing import Any
+
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.tracking.results import FrameResult
+
+COLUMNS = ("frame", "keyframes", "landmarks", "graph_landmarks", "factors", "update_ms", "rss_mb")
+
+
+class RecordingSystem(SlamSystem):
+    """The system, with a row of COLUMNS for every keyframe in ``rows``."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.rows: list[dict[str, float]] = []
+
+    def process(self, frame: Frame, features: Any = None) -> FrameResult:
+        """A frame as ever; then look at the graph."""
+        result = super().process(frame, features)
+        if result.keyframe_id is not None:
+            graph, map_now = self.mapper.smoother.estimate(), self.statistics()
+            update_ms = map_now["isam2_update_ms"]
+            assert isinstance(update_ms, list)
+            self.rows.append(
+                {
+                    "frame": frame.index,
+                    "keyframes": len(graph.keyframe_ids),
+                    "landmarks": int(map_now["landmarks"]),  # type: ignore[arg-type]
+                    "graph_landmarks": len(graph.landmark_ids),
+                    "factors": graph.factors,
+                    "update_ms": round(update_ms[-1], 3),
+                    "rss_mb": round(resident_mb(), 1),
+                }
+            )
+        return result
+
+
+def resident_mb() -> float:
+    """Resident memory of this process now in MB (1e6 bytes); NaN where there is no /proc."""
+    status = Path("/proc/self/statm")
+    if not status.exists():
+        return float("nan")
+    return int(status.read_text(encoding="ascii").split()[1]) * 4096 / 1e6
+
+
+def main() -> None:
+    """Parse, run, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sequence", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    systems: list[RecordingSystem] = []
+
+    def make_system(*given: Any) -> RecordingSystem:
+        systems.append(RecordingSystem(*given))
+        return systems[0]
+
+    run(RunOptions(arguments.sequence, out=arguments.out, overwrite=True, quiet=True), make_system)
+    with (arguments.out / "growth.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(systems[0].rows)
+
+
+if __name__ == "__main__":
+    main()

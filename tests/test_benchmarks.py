@@ -1,0 +1,83 @@
+"""The benchmarks import and start, and what they wrote under docs/results/ says how it was made."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from repository import ROOT
+
+from benchmarks.pages import table, written_sections
+from benchmarks.paths import RESULTS
+from benchmarks.section_report import REPORTS
+
+SCRIPTS = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for path in sorted((ROOT / "benchmarks").rglob("*.py"))
+]
+
+
+def test_every_script_starts(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """All in one process, since most of the time goes into importing the same libraries."""
+    for module in SCRIPTS:
+        monkeypatch.setattr(sys, "argv", [module, "--help"])
+        code = importlib.import_module(module)
+        if hasattr(code, "main"):
+            with pytest.raises(SystemExit) as end:
+                code.main()
+            assert end.value.code == 0, module
+            assert "usage:" in capsys.readouterr().out
+
+
+def test_a_script_runs_as_its_description_says() -> None:
+    command = ["-m", "benchmarks.semantics.label_store", "--landmarks", "10", "--repeats", "2"]
+    done = subprocess.run(
+        [sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("10 landmarks,")
+
+
+@pytest.mark.parametrize("report", REPORTS.values(), ids=REPORTS)
+def test_every_section_names_command_commit_and_date(report) -> None:
+    commands = {
+        title: f"benchmarks.{given.split()[0]}" for title, given in report.sections.values()
+    }
+    written = written_sections(report.path)
+    assert written
+    for section in written:
+        assert section.module == commands[section.title]
+        assert section.module in SCRIPTS
+        assert section.machine, section.title
+        assert section.commit, section.title
+        assert section.date, section.title
+
+
+def test_the_page_of_make_bench_names_commands_commit_and_date() -> None:
+    page = (RESULTS / "benchmarks.md").read_text(encoding="utf-8")
+    assert re.search(
+        r"; commit [0-9a-f]{12}.*; \d{4}-\d\d-\d\d \d\d:\d\d UTC; by `make bench`", page
+    )
+    assert "\nbmask-slam run " in page.partition("## Commands")[2]
+
+
+def test_a_section_without_a_stamp_is_noticed(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    stamp = "CPU; commit 0123abcd with changes in a.py; 2026-01-02 03:04 UTC; 5 s."
+    command = "`python -m benchmarks.loops.loop_closing corridor`"
+    page.write_text(f"# Page\n\n## One\n\n{command}\n\n{stamp}\n\n## Two\n\nnothing\n")
+    one, two = written_sections(page)
+    assert (one.module, one.machine, one.commit, one.date) == (
+        "benchmarks.loops.loop_closing", "CPU", "0123abcd", "2026-01-02 03:04"
+    )  # fmt: skip
+    assert (two.title, two.module, two.commit, two.date) == ("Two", "", "", "")
+
+
+def test_a_table_has_one_cell_under_each_heading() -> None:
+    assert table(("a", "b"), [("1", "2")]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    with pytest.raises(ValueError, match="1 cells under 2"):
+        table(("a", "b"), [("1",)])
