@@ -20,17 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
+from bmask_slam.features.descriptor_index import BITS, DescriptorIndex, IndexConfig
 from bmask_slam.graph.arrays import Array, Bits, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.trajectory import associate_stamps
-from bmask_slam.loops.place_recognition import (
-    BITS,
-    DescriptorIndex,
-    IndexConfig,
-    PlaceConfig,
-    PlaceRecogniser,
-)
+from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.sequences import open_sequence
 
 SAME_PLACE = 0.3  # of the keypoints seen
