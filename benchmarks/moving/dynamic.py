@@ -30,6 +30,7 @@ import numpy as np
 from benchmarks.moving.moving_points import KINDS, NEAR_PX, MovingTruth, WatchedSystem, strip
 from benchmarks.pages import table
 from bmask_slam.config.configuration import resolve
+from bmask_slam.datasets.weights import find_weights
 from bmask_slam.features.brisk import Features, select
 from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
@@ -153,7 +154,7 @@ def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespac
     settings = [f"moving_objects.{k}={v}" for k, v in (("labels", labels), ("geometry", geometry))]
     config = resolve(SystemConfig, None, [*settings, *arguments.set])
     options = SegmenterOptions(arguments.segmenter if labels else "none", arguments.weights)
-    segmenter = make_segmenter(options, folder)
+    segmenter = make_segmenter(options, folder, find_weights)
     systems = []
     frames = len((folder / "rgb.txt").read_text().splitlines()) - 2
 

@@ -23,6 +23,7 @@ from benchmarks.moving.moving_points import Count, Image, Mask, count, picture, 
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
 from bmask_slam.config.configuration import resolve
+from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
@@ -87,7 +88,9 @@ def main() -> None:
     total = {"man": Count(), "rest": Count()}
     for folder in sorted(p for p in arguments.data.iterdir() if p.is_dir()):
         for pair in permutations(read_pair(folder)):
-            found = moving_points(pair, config, make_segmenter(options, arguments.data))
+            found = moving_points(
+                pair, config, make_segmenter(options, arguments.data, find_weights)
+            )
             masks = {"man": man_in(pair[1])}
             counts = count(*found, masks)
             total = {kind: total[kind] + counts[kind] for kind in total}

@@ -29,7 +29,7 @@ from bmask_slam.semantics.training.dataset import Dataset, split
 from bmask_slam.semantics.training.detected import DetectedConfig, collect, train_maskiou
 from bmask_slam.semantics.training.loop import WEIGHTS as WEIGHTS_NAME
 from bmask_slam.semantics.training.run import Source, TrainingRun, run_training
-from bmask_slam.semantics.weights.checkpoints import find_weights, load_network, save_network
+from bmask_slam.semantics.weights.checkpoints import load_network, save_network
 
 DATA = SHARED
 WEIGHTS = ROOT / "data" / "weights" / "light.safetensors"
@@ -56,7 +56,7 @@ def training(arguments: argparse.Namespace) -> TrainingRun:
     """What the command line asks for."""
     alone = arguments.photographs
     steps, rate = (PHOTOGRAPHS_STEPS, PHOTOGRAPHS_RATE) if alone else (STEPS, RATE)
-    weights = arguments.weights or (str(WEIGHTS) if alone else None)
+    weights = arguments.weights or (WEIGHTS if alone else None)
     excerpt = DATA / "coco_excerpt"
     coco = Source(excerpt / "instances.json", excerpt / "images", HELD_OUT, SPLIT_SEED)
     settings = {
@@ -83,7 +83,7 @@ def training(arguments: argparse.Namespace) -> TrainingRun:
 
 def in_detected_boxes(arguments: argparse.Namespace, progress: Callable[[int, int], None]) -> Path:
     """The MaskIoU head's last stage; returns the weights file."""
-    network = load_network(find_weights(arguments.weights or str(WEIGHTS)))
+    network = load_network(arguments.weights or WEIGHTS)
     head = network.model.eval().roi_heads.maskiou_head
     assert head is not None
     excerpt = DATA / "coco_excerpt"
@@ -105,7 +105,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--rooms", type=Path, default=ROOT / "runs" / "bench" / "rooms")
-    parser.add_argument("--weights", help="to start from, instead of ImageNet's MobileNetV2")
+    parser.add_argument(
+        "--weights", type=Path, help="to start from, instead of ImageNet's MobileNetV2"
+    )
     parser.add_argument("--steps", type=int)
     parser.add_argument("--rate", type=float)
     parser.add_argument("--seed", type=int, default=0, help="of batches and augmentation")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from bmask_slam.graph.data_files import data_path
@@ -29,17 +31,17 @@ TRUTH_FILE = "annotations.json"
 
 @dataclass(frozen=True)
 class SegmenterOptions:
-    """What to segment with.
+    """Which segmenter, and its files.
 
     Attributes:
         name: one of NAMES.
-        weights: file or ``torchvision:NAME``, for the networks.
+        weights: of a network: a file, or a name such as ``torchvision:NAME``.
         proposals: ONNX file of a detector that finds the boxes for a network.
         masks: COCO file or folder of label PNGs, for "precomputed".
-        labels: label set of the weights or the PNGs, where it is not in the file.
+        labels: label set of the weights or the PNGs, where the file does not name it.
         min_score: class score below which a network's detection is dropped.
-        ray: address of a Ray cluster that it runs on, see `semantics.segmenters.ray_segmenter`; ""
-        for here.
+        ray: address of a Ray cluster to run on, see `semantics.segmenters.ray_segmenter`; "" for
+            this process.
     """
 
     name: str = "light"
@@ -51,15 +53,23 @@ class SegmenterOptions:
     ray: str = ""
 
     def described(self) -> dict[str, str]:
-        """The options as text, to compare with those of an earlier run."""
+        """The options as text, to compare with those of another run."""
         return {key: str(value) for key, value in asdict(self).items()}
 
 
-def make_segmenter(options: SegmenterOptions, sequence: Path) -> Segmenter:
-    """The segmenter of that name for the images of a folder.
+FindWeights = Callable[[str], Path]
+"""Path of the weights of a name, which it may download."""
+
+
+def make_segmenter(
+    options: SegmenterOptions, sequence: Path, find_weights: FindWeights = Path
+) -> Segmenter:
+    """Make the segmenter of ``options.name`` for the images of a folder.
+
+    By default ``options.weights`` must be a path. ``find_weights`` must be picklable for Ray.
 
     Raises:
-        InputError: an unknown name, or one without the file that it needs.
+        InputError: an unknown name, or a file that is missing or does not fit.
     """
     if options.name not in NAMES:
         raise InputError(f"segmenter {options.name!r}: not known; there are: {', '.join(NAMES)}")
@@ -68,7 +78,8 @@ def make_segmenter(options: SegmenterOptions, sequence: Path) -> Segmenter:
     if options.ray:
         from bmask_slam.semantics.segmenters.ray_segmenter import RaySegmenter  # noqa: PLC0415
 
-        return RaySegmenter(replace(options, ray=""), sequence, options.ray)
+        here = replace(options, ray="")
+        return RaySegmenter(partial(make_segmenter, here, sequence, find_weights), options.ray)
     if options.name == "truth":
         path = sequence / TRUTH_FILE
         if not path.is_file():
@@ -76,7 +87,7 @@ def make_segmenter(options: SegmenterOptions, sequence: Path) -> Segmenter:
         return CocoSegmenter(path)
     if options.name == "precomputed":
         return _precomputed(options)
-    return _network(options)
+    return _network(options, find_weights)
 
 
 def _precomputed(options: SegmenterOptions) -> Segmenter:
@@ -87,13 +98,13 @@ def _precomputed(options: SegmenterOptions) -> Segmenter:
     return CocoSegmenter(options.masks)
 
 
-def _network(options: SegmenterOptions) -> Segmenter:
-    """Imports torch, which takes a second: only for those who need it."""
+def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
+    """A network segmenter; torch is imported here since that takes a second."""
     if options.weights is None and options.name != "light":
         raise InputError(f"segmenter {options.name!r}: give --weights, a file or torchvision:NAME")
     from bmask_slam.semantics.segmenters.network_segmenter import NetworkSegmenter  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.yolox import YoloxConfig, YoloxDetector  # noqa: PLC0415
-    from bmask_slam.semantics.weights.checkpoints import find_weights, load_network  # noqa: PLC0415
+    from bmask_slam.semantics.weights.checkpoints import load_network  # noqa: PLC0415
 
     labels = read_label_set(options.labels) if options.labels else None
     path = find_weights(options.weights) if options.weights else data_path(*LIGHT_WEIGHTS)

@@ -23,7 +23,6 @@ from bmask_slam.semantics.training.loop import CURVES, TrainingConfig, train
 from bmask_slam.semantics.training.transfer import transferred
 from bmask_slam.semantics.weights.checkpoints import (
     TrainedNetwork,
-    find_weights,
     load_mobilenet,
     load_network,
 )
@@ -64,7 +63,7 @@ class TrainingRun:
 
     data: tuple[Source, ...]
     out: Path
-    weights: str | None = None
+    weights: Path | None = None
     light: bool = False
     backbone: Path | None = None
     labels: str = "coco"
@@ -104,7 +103,7 @@ def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork:
     torch.manual_seed(seed)
     if run.weights is not None:
         like = LIGHT if run.light else None
-        return transferred(load_network(find_weights(run.weights)), labels, like)
+        return transferred(load_network(run.weights), labels, like)
     model = MaskRCNN(replace(LIGHT, classes=len(labels)))
     if run.backbone is None:
         raise InputError(

@@ -16,7 +16,6 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.downloads import cache_folder, fetch
 from bmask_slam.semantics.labels import LabelSet, label_set, read_label_set
 from bmask_slam.semantics.network.config import (
     RESNET50,
@@ -31,13 +30,6 @@ from bmask_slam.semantics.network.config import (
 from bmask_slam.semantics.network.model import MaskRCNN
 from bmask_slam.semantics.weights.checkpoint_names import State, current_names, is_mask_scoring
 
-PREFIX = "torchvision:"
-PUBLISHED = {
-    "maskrcnn_resnet50_fpn_coco":
-        "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth",
-    "maskrcnn_resnet50_fpn_v2_coco":
-        "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_v2_coco-73cbd019.pth",
-}  # fmt: skip
 NO_EPS = "maskrcnn_resnet50_fpn_coco-"
 """Files of this name were made with an eps of 0 in batch norm."""
 CAFFE_IMAGES = ImageConfig(
@@ -54,24 +46,6 @@ class TrainedNetwork:
 
     model: MaskRCNN
     labels: LabelSet
-
-
-def find_weights(name: str, folder: Path | None = None) -> Path:
-    """The file of ``--weights``: a path, or ``torchvision:NAME``, downloaded once.
-
-    Raises:
-        InputError: an unknown name, no connection, no such file.
-    """
-    if name.startswith(PREFIX):
-        url = PUBLISHED.get(name.removeprefix(PREFIX))
-        if url is None:
-            known = ", ".join(PREFIX + n for n in PUBLISHED)
-            raise InputError(f"--weights {name}: not known; there are: {known}; or give a file")
-        return fetch(url, folder or cache_folder())
-    path = Path(name)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give weights as .pth or .safetensors")
-    return path
 
 
 def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
@@ -143,8 +117,10 @@ def read_state(path: Path) -> tuple[State, dict[str, str]]:
     """Tensors by name, and the metadata of a safetensors file; no code in the file is run.
 
     Raises:
-        InputError: a truncated file, a pickle of anything but tensors, or no file at all.
+        InputError: no such file, a truncated one, or a pickle of anything but tensors.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give weights as .pth or .safetensors")
     if path.suffix == ".safetensors":
         try:
             with safetensors.safe_open(path, "pt") as file:

@@ -29,8 +29,8 @@ def add_download(commands: _Commands) -> None:
 
 
 def _download(arguments: argparse.Namespace) -> int:
-    from bmask_slam.datasets import obtain, read_catalogue
-    from bmask_slam.datasets.catalogue import find, format_catalogue
+    from bmask_slam.datasets.catalogue import find, format_catalogue, read_catalogue
+    from bmask_slam.datasets.obtain import obtain
     from bmask_slam.graph.errors import InputError
     from bmask_slam.runtime.progress import byte_bars, console_log
 

@@ -34,6 +34,7 @@ def add_evaluate_segmentation(commands: _Commands) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
+    from bmask_slam.datasets.weights import find_weights
     from bmask_slam.runtime.progress import console_log, counting_bar
     from bmask_slam.semantics.instances.coco_files import read_coco
     from bmask_slam.semantics.segmenters.evaluation import (
@@ -50,7 +51,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         truth = read_coco(arguments.data)
         if arguments.held_out is not None:
             _, truth = split(truth, arguments.held_out, arguments.seed)
-        segmenter = make_segmenter(options, arguments.images)
+        segmenter = make_segmenter(options, arguments.images, find_weights)
         result = evaluate_segmenter(segmenter, truth, arguments.images, progress)
     if arguments.plot:
         draw_precision_recall(result, arguments.plot)

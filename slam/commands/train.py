@@ -57,6 +57,7 @@ def add_train(commands: _Commands) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
+    from bmask_slam.datasets.weights import find_weights
     from bmask_slam.graph.errors import InputError
     from bmask_slam.runtime.progress import console_log, counting_bar
     from bmask_slam.semantics.training.run import Source, TrainingRun, run_training
@@ -68,12 +69,14 @@ def _train(arguments: argparse.Namespace) -> int:
         )
     pairs = zip(arguments.data, arguments.images, strict=True)
     data = tuple(Source(file, images, arguments.held_out) for file, images in pairs)
-    names = ("out", "weights", "backbone", "labels")
-    given = {name: getattr(arguments, name) for name in names}
+    given = {name: getattr(arguments, name) for name in ("out", "backbone", "labels")}
+    weights = find_weights(arguments.weights) if arguments.weights else None
     numbers = ("only", "rois", "optimiser", "steps", "batch", "rate", "seed")
     settings = {name: getattr(arguments, name) for name in numbers}
-    run = TrainingRun(data, **given, freeze=tuple(arguments.freeze), settings=settings)
+    run = TrainingRun(
+        data, **given, weights=weights, freeze=tuple(arguments.freeze), settings=settings
+    )
     with console_log(), counting_bar(arguments.quiet) as progress:
-        weights = run_training(run, progress)
-    print(weights if arguments.quiet else f"Weights     {weights}")
+        made = run_training(run, progress)
+    print(made if arguments.quiet else f"Weights     {made}")
     return 0

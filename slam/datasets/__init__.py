@@ -1,6 +1,1 @@
-"""Published recordings: where they lie, brought here, checked, unpacked, in TUM's layout."""
-
-from bmask_slam.datasets.catalogue import Recording, read_catalogue
-from bmask_slam.datasets.obtain import obtain
-
-__all__ = ["Recording", "obtain", "read_catalogue"]
+"""Published recordings and network weights: catalogue, download, unpacking, layout of the files."""

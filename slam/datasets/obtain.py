@@ -12,9 +12,9 @@ import yaml
 from bmask_slam.datasets.catalogue import Recording
 from bmask_slam.datasets.icl_nuim import to_tum_layout
 from bmask_slam.datasets.unpack import unpack
+from bmask_slam.datasets.web_file import WebFile, download
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.whole_file import whole_file
-from bmask_slam.semantics.http_file import WebFile, download
 
 SUMS = "SHA256SUMS"
 LISTS = ("rgb.txt", "associations.txt")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bmask_slam.datasets.weights import find_weights
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.fusion import FusionCounts, dense_config
 from bmask_slam.dense.input import MappedRun, open_run, run_semantics
@@ -38,7 +39,7 @@ def open_map(options: MapOptions) -> OpenMap:
     """
     run = open_run(options.run, options.sequence)
     masks = options.masks or run_semantics(options.run / "config.yaml").segmenter
-    segmenter = make_segmenter(masks, run.sequence.folder)
+    segmenter = make_segmenter(masks, run.sequence.folder, find_weights)
     return assembled(run, segmenter, dataclasses.replace(options, masks=masks))
 
 

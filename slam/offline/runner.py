@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bmask_slam.config.configuration import dump
+from bmask_slam.datasets.weights import find_weights
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -166,7 +167,9 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
 def _with_segmenter(options: RunOptions, sequence: Sequence) -> MakeSystem:
     """The real system, with the segmenter of its configuration. Raises InputError."""
     chosen = options.config.semantics.segmenter
-    segmenter = NoSegmenter() if options.localise else make_segmenter(chosen, sequence.folder)
+    segmenter = (
+        NoSegmenter() if options.localise else make_segmenter(chosen, sequence.folder, find_weights)
+    )
     return partial(SlamSystem, segmenter=segmenter)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.segmenters.mask_cache import CacheOptions, CacheResult, cache_masks
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
@@ -26,7 +27,7 @@ def segment_folder(
         InputError: no images, or as for ``make_segmenter`` and ``cache_masks``.
     """
     files = colour_images(source)
-    segmenter = make_segmenter(options, source)
+    segmenter = make_segmenter(options, source, find_weights)
     settings = {**options.described(), "source": str(source.resolve())}
     return cache_masks(segmenter, files, CacheOptions(out, settings, overlays), progress)
 

@@ -69,7 +69,7 @@ def serve(served: Served) -> Iterator[Served]:
             """Say nothing."""
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as http:
-        threading.Thread(target=http.serve_forever, daemon=True).start()
+        threading.Thread(target=http.serve_forever, args=(0.01,), daemon=True).start()
         served.url = f"http://127.0.0.1:{http.server_port}"
         yield served
         http.shutdown()

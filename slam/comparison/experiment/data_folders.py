@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bmask_slam.comparison.experiment.experiment import Experiment, SequenceSource
-from bmask_slam.datasets import read_catalogue
+from bmask_slam.datasets.catalogue import read_catalogue
 
 ENVIRONMENT = "BMASK_SLAM_DATA"
 DEFAULT = Path("data")

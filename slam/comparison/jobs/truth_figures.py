@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.datasets.weights import find_weights
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
@@ -44,7 +45,7 @@ def label_accuracy(run: Path, sequence: Sequence) -> float | None:
     if not (run / LABELS).is_file() or not (folder / "annotations.json").is_file():
         return None
     config = resolve(SystemConfig, run / "config.yaml")
-    names = make_segmenter(config.semantics.segmenter, folder).labels
+    names = make_segmenter(config.semantics.segmenter, folder, find_weights).labels
     if sequence.groundtruth is None:
         return None
     keyframes, truth = associate(read_tum(run / "keyframes.txt"), sequence.groundtruth)

@@ -7,6 +7,7 @@ import os
 import time
 from pathlib import Path
 
+from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready
@@ -28,7 +29,7 @@ def serve_segmenter(
 ) -> None:
     """Segment images until the channel ends, the newest first, never more than these waiting."""
     os.nice(NICENESS)
-    segmenter = make_segmenter(options, sequence)
+    segmenter = make_segmenter(options, sequence, find_weights)
     channel.send(Ready(segmenter.labels.names))
     stack: list[ImageToSegment] = []
     while channel.open or stack:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -18,14 +14,11 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.downloads import expected_sha256, fetch
 from bmask_slam.semantics.labels import label_set, read_label_set
 from bmask_slam.semantics.network.config import RESNET50, RESNET50_V2, NetworkConfig
 from bmask_slam.semantics.network.model import MaskRCNN
 from bmask_slam.semantics.weights.checkpoints import (
-    PUBLISHED,
     TrainedNetwork,
-    find_weights,
     load_network,
     read_state,
     save_network,
@@ -193,9 +186,7 @@ def test_files_that_are_no_state_dict_are_refused(tmp_path: Path, capsys) -> Non
         assert path.name in str(error.value)
     assert "never run" not in capsys.readouterr().out
     with pytest.raises(InputError, match="no such file"):
-        find_weights(str(tmp_path / "none.pth"))
-    with pytest.raises(InputError, match="there are: torchvision:maskrcnn_resnet50_fpn_coco"):
-        find_weights("torchvision:yolo")
+        load_network(tmp_path / "none.pth")
 
 
 def test_our_own_files_say_what_they_are(tmp_path: Path) -> None:
@@ -223,44 +214,3 @@ def test_a_file_from_before_anchors_were_described(tmp_path: Path) -> None:
     del described["anchors"]
     save_file(state, tmp_path / "old.safetensors", {**metadata, "network": json.dumps(described)})
     assert load_network(tmp_path / "old.safetensors").model.config == config
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[tuple[str, Path]]:
-    """A local web server and the folder that it shows."""
-    folder = tmp_path / "served"
-    folder.mkdir()
-    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as http:
-        threading.Thread(target=http.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{http.server_port}", folder
-        http.shutdown()
-
-
-def test_downloads_are_checked_and_kept(server: tuple[str, Path], tmp_path: Path) -> None:
-    url, folder = server
-    content = b"weights" * 1000
-    name = f"net-{hashlib.sha256(content).hexdigest()[:8]}.pth"
-    (folder / name).write_bytes(content)
-    kept = fetch(f"{url}/{name}", tmp_path / "cache")
-    assert kept.read_bytes() == content
-    (folder / name).unlink()
-    assert fetch(f"{url}/{name}", tmp_path / "cache") == kept  # not asked for again
-    kept.write_bytes(content[:99])
-    with pytest.raises(InputError, match="cannot be downloaded"):
-        fetch(f"{url}/{name}", tmp_path / "cache")  # broken on disk, gone from the server
-
-
-def test_a_file_with_another_sha_is_not_kept(server: tuple[str, Path], tmp_path: Path) -> None:
-    url, folder = server
-    (folder / "net-00000000.pth").write_bytes(b"changed")
-    with pytest.raises(InputError, match=r"SHA-256 begins with .* not 00000000"):
-        fetch(f"{url}/net-00000000.pth", tmp_path / "cache")
-    assert list((tmp_path / "cache").iterdir()) == []
-
-
-def test_published_files_come_over_https_with_their_sha() -> None:
-    for name, url in PUBLISHED.items():
-        assert url.startswith("https://")
-        assert url.rsplit("/", 1)[1].startswith(name)
-        assert len(expected_sha256(url)) == 8

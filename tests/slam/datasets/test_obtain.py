@@ -16,12 +16,12 @@ from range_server import Served, serve
 
 from bmask_slam.cli import main
 from bmask_slam.comparison.experiment.experiment_file import read_experiment
+from bmask_slam.datasets import web_file
 from bmask_slam.datasets.catalogue import Recording, find, read_catalogue
 from bmask_slam.datasets.obtain import SUMS, obtain, read_sums
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
-from bmask_slam.semantics import http_file
 from bmask_slam.sequences import open_sequence
 
 CAMERA = {"width": 640, "height": 480, "fx": 50.0, "fy": 50.0, "cx": 31.5, "cy": 23.5,
@@ -63,7 +63,7 @@ def as_zip(files: dict[str, bytes], top: str) -> bytes:
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    monkeypatch.setattr(http_file, "FIRST_PAUSE_S", 0.0)
+    monkeypatch.setattr(web_file, "FIRST_PAUSE_S", 0.0)
     tum = as_tar(TUM | images(), "rgbd_dataset_freiburg1_tiny/")
     files = {
         "tiny.tgz": tum,

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from range_server import Served, serve
 
+from bmask_slam.datasets import web_file
+from bmask_slam.datasets.web_file import WebFile, download
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics import http_file
-from bmask_slam.semantics.http_file import WebFile, download
 
 CONTENT = bytes(range(256)) * 4000
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -22,7 +22,7 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 @pytest.fixture(autouse=True)
 def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_file, "FIRST_PAUSE_S", 0.0)
+    monkeypatch.setattr(web_file, "FIRST_PAUSE_S", 0.0)
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_a_connection_that_ends_early_is_resumed_where_it_ended(server, tmp_path
 
 def test_an_interrupted_download_goes_on_in_the_next_call(server, tmp_path, monkeypatch):
     server.cut_after, server.cuts = 300_000, 1
-    monkeypatch.setattr(http_file, "TRIES", 1)
+    monkeypatch.setattr(web_file, "TRIES", 1)
     with pytest.raises(InputError, match="300000 bytes are kept"):
         download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f")
     assert not (tmp_path / "f").exists()
@@ -115,7 +115,7 @@ def test_a_server_in_trouble_is_asked_again_but_not_for_ever(server, tmp_path):
     server.status = 503
     with pytest.raises(InputError, match="503"):
         download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f")
-    assert len(server.asked) == http_file.TRIES
+    assert len(server.asked) == web_file.TRIES
 
 
 def test_nobody_at_the_address_is_said_at_once(tmp_path):
@@ -134,7 +134,7 @@ def test_a_disk_that_fills_up_is_no_fault_of_the_connection(server, tmp_path, mo
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(http_file, "_copy", full)
+    monkeypatch.setattr(web_file, "_copy", full)
     with pytest.raises(OSError, match="No space left"):
         download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f")
     assert len(server.asked) == 1, "it must not be tried again"
