@@ -38,8 +38,6 @@ def test_many_things_at_once_equal_bayes_one_by_one() -> None:
     for row, i in enumerate(ids):
         expected = posterior(*(np.array([part[row] for part in v]) for v in zip(*seen)))  # noqa: B905
         assert np.allclose(store.probabilities(np.array([i]))[0], expected, atol=1e-5)
-        counts = sum(w[row] * p[row] for p, w in seen) + PRIOR
-        assert np.allclose(store.dirichlet(np.array([i]))[0], counts, atol=1e-5)
     assert store.estimates(ids).views.tolist() == [6, 6, 6]
 
 
@@ -73,7 +71,6 @@ def test_the_order_of_views_and_repeated_ids_do_not_matter() -> None:
     five = np.array([5])
     assert np.allclose(a.probabilities(five), b.probabilities(five), atol=1e-6)
     assert np.allclose(a.probabilities(five), c.probabilities(five), atol=1e-6)
-    assert np.allclose(a.dirichlet(five), c.dirichlet(five))
 
 
 def missed_by_integral(prior: np.ndarray, misses: float, a: float, b: float) -> np.ndarray:
@@ -112,7 +109,6 @@ def test_a_fused_thing_keeps_both_histories() -> None:
     whole.miss(np.array([2, 2]), np.array([0.5, 1.0], np.float32))
     ids = np.array([1, 2])
     assert np.allclose(store.probabilities(ids), whole.probabilities(ids), atol=1e-6)
-    assert np.allclose(store.dirichlet(ids), whole.dirichlet(ids))
     assert store.estimates(ids).views.tolist() == [0, 6]
     store.drop(ids)
     assert store.known().tolist() == []
@@ -139,6 +135,9 @@ def test_a_store_becomes_the_same_from_its_state() -> None:
     twin.restore(store.state())
     for name, table in vars(store).items():
         assert np.array_equal(table, vars(twin)[name]), name
+    older = {**store.state(), "counts": np.ones(3 * C, np.float32)}  # with Dirichlet counts
+    twin.restore(older)
+    assert np.array_equal(twin.probabilities(np.arange(6000)), store.probabilities(np.arange(6000)))
 
 
 def test_a_keyframe_takes_at_most_two_milliseconds() -> None:
@@ -155,3 +154,16 @@ def test_a_keyframe_takes_at_most_two_milliseconds() -> None:
             store.miss(ids, weights)
             took_s.append(time.perf_counter() - start_s)
         assert min(took_s) < 2e-3, classes
+
+
+def test_a_thing_beyond_the_capacity_is_moved_to_a_smaller_id_and_back() -> None:
+    """After a move to 3000 no id above it is known, and the tables shrink below the first."""
+    p, weights = views(1, np.random.default_rng(7))
+    store, whole = LabelStore(C), LabelStore(C)
+    store.update(np.array([5000]), p, weights)
+    store.move(np.array([5000]), np.array([3000]))
+    whole.update(np.array([3000]), p, weights)
+    ids = np.array([3000, 5000])
+    assert np.array_equal(store.probabilities(ids), whole.probabilities(ids))
+    store.move(np.array([3000]), np.array([9000]))
+    assert store.known().tolist() == [9000]
