@@ -1,12 +1,15 @@
-"""The pinhole RGB-D camera and its pseudo-stereo model."""
+"""The pinhole RGB-D camera: lens distortion and the pseudo-stereo model of its depth."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
+
+UNDISTORTION_STEPS = 5
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,34 @@ class Camera:
         x, y, z = np.moveaxis(points_camera, -1, 0)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
 
+    def project_distorted(self, points_camera: Array) -> Array:
+        """Pixels (N, 2) in the image as recorded of camera-frame points (N, 3) with z > 0."""
+        if not any(self.distortion):
+            return self.project(points_camera)
+        normalised = points_camera[:, :2] * (1 / points_camera[:, 2])[:, None]
+        return self._focal * distort_normalised(normalised, self.distortion) + self._centre
+
+    def distort(self, pixels: Array) -> Array:
+        """Pixels (..., 2) in the image as recorded of undistorted ones."""
+        normalised = (pixels - self._centre) / self._focal
+        return self._focal * distort_normalised(normalised, self.distortion) + self._centre
+
+    def undistort(self, pixels: Array) -> Array:
+        """Undistorted pixels (..., 2), of the same type, of pixels in the image as recorded."""
+        if not any(self.distortion):
+            return pixels.copy()
+        normalised = (pixels.astype(float) - self._centre) * (1 / self._focal)
+        straight = undistort_normalised(normalised, self.distortion)
+        return (self._focal * straight + self._centre).astype(pixels.dtype)
+
+    @property
+    def _focal(self) -> Array:
+        return np.array([self.fx, self.fy])
+
+    @property
+    def _centre(self) -> Array:
+        return np.array([self.cx, self.cy])
+
     def project_stereo(self, points_camera: Array) -> Array:
         """Stereo measurements (..., 3) ``(u_left, v, u_right)`` of camera points (..., 3)."""
         uv = self.project(points_camera)
@@ -63,3 +94,49 @@ class Camera:
         x = (pixels[..., 0] - self.cx) / self.fx * depth_m
         y = (pixels[..., 1] - self.cy) / self.fy * depth_m
         return np.stack([x, y, np.broadcast_to(depth_m, x.shape)], axis=-1)
+
+
+def distort_normalised(normalised: Array, distortion: Sequence[float] | Array) -> Array:
+    """OpenCV's distortion of normalised coordinates (..., 2) by (k1, k2, p1, p2, k3).
+
+    The order of operations is OpenCV's, so that the results are the same to the last bit.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    x, y = np.moveaxis(normalised, -1, 0)
+    r2 = x * x + y * y
+    r4 = r2 * r2
+    radial = 1 + k1 * r2 + k2 * r4 + k3 * (r4 * r2)
+    xy, xx, yy = 2 * x * y, r2 + 2 * x * x, r2 + 2 * y * y
+    return np.stack([x * radial + p1 * xy + p2 * xx, y * radial + p1 * yy + p2 * xy], axis=-1)
+
+
+def undistort_normalised(normalised: Array, distortion: Sequence[float] | Array) -> Array:
+    """The inverse of ``distort_normalised`` by five fixed-point steps, as in OpenCV.
+
+    A point where the model folds back (negative radial factor) stays as it is.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    x0, y0 = np.moveaxis(normalised, -1, 0)
+    x, y = x0, y0
+    folded = np.zeros(x0.shape, bool)
+    for _ in range(UNDISTORTION_STEPS):
+        r2 = x * x + y * y
+        inverse_radial = 1 / (1 + ((k3 * r2 + k2) * r2 + k1) * r2)
+        folded |= inverse_radial < 0
+        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        x = np.where(folded, x0, (x0 - dx) * inverse_radial)
+        y = np.where(folded, y0, (y0 - dy) * inverse_radial)
+    return np.stack([x, y], axis=-1)
+
+
+def distortion_terms(normalised: Array) -> Array:
+    """Derivatives (..., 2, 5) of ``distort_normalised`` by its coefficients, in which it is linear.
+
+    ``distort_normalised(xy, k) = xy + distortion_terms(xy) @ k`` but for rounding.
+    """
+    x, y = np.moveaxis(normalised, -1, 0)
+    r2 = x**2 + y**2
+    along_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x**2, x * r2**3], axis=-1)
+    along_y = np.stack([y * r2, y * r2**2, r2 + 2 * y**2, 2 * x * y, y * r2**3], axis=-1)
+    return np.stack([along_x, along_y], axis=-2)

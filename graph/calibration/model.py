@@ -3,7 +3,7 @@
 A landmark is measured by the raw (distorted) pixel where the colour image shows it, and by the
 inverse of the raw depth that the depth image holds at that pixel:
 
-    pixel          (u, v) = (fx, fy) * distort(x / z, y / z) + (cx, cy)
+    pixel          (u, v) = (fx, fy) * distort_normalised(x / z, y / z) + (cx, cy)
     metric depth   z = factor * raw + offset
 
 The depth image may have been taken tau = lag + time_offset later than the colour image; by then
@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, distort_normalised, distortion_terms
 from bmask_slam.graph.geometry import inverse, skew
 
 PARAMETERS = (
@@ -37,7 +37,7 @@ PARAMETERS = (
 )
 """The calibration as a vector (13,): pixels, OpenCV's distortion, metres a raw depth unit,
 metres, seconds, seconds."""
-F, C, K, P = slice(0, 2), slice(2, 4), [4, 5, 8], slice(6, 8)
+F, C, LENS = slice(0, 2), slice(2, 4), slice(4, 9)
 FACTOR, OFFSET, TIME, SHUTTER = 9, 10, 11, 12
 MIN_DEPTH_M = 0.05
 
@@ -98,21 +98,6 @@ def parameters_of(camera: Camera, raw_scale: float) -> Array:
     )
 
 
-def distort(normalised: Array, calibration: Array) -> Array:
-    """OpenCV's distortion of normalised coordinates (..., 2)."""
-    x, y = np.moveaxis(normalised, -1, 0)
-    (k1, k2, k3), (p1, p2) = calibration[K], calibration[P]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-
-
 def linearise(
     views: CalibrationViews, poses: Array, points_world: Array, calibration: Array
 ) -> Linearised:
@@ -150,8 +135,8 @@ def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
     inv_z = 1 / p[:, 2]
     normalised = p[:, :2] * inv_z[:, None]
     x, y = normalised.T
-    focal, (k1, k2, k3), (p1, p2) = calibration[F], calibration[K], calibration[P]
-    distorted = distort(normalised, calibration)
+    focal, (k1, k2, p1, p2, k3) = calibration[F], calibration[LENS]
+    distorted = distort_normalised(normalised, calibration[LENS])
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d(radial)/d(r2), twice
@@ -166,12 +151,7 @@ def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
     by_calibration = np.zeros((len(p), 2, len(PARAMETERS)))
     by_calibration[:, [0, 1], [0, 1]] = distorted
     by_calibration[:, [0, 1], [2, 3]] = 1.0
-    powers = np.stack([r2, r2**2, r2**3], axis=1)
-    by_calibration[:, :, K] = focal[:, None] * normalised[:, :, None] * powers[:, None]
-    tangential = np.empty((len(p), 2, 2))
-    tangential[:, 0, 0] = tangential[:, 1, 1] = 2 * x * y
-    tangential[:, 0, 1], tangential[:, 1, 0] = r2 + 2 * x * x, r2 + 2 * y * y
-    by_calibration[:, :, P] = focal[:, None] * tangential
+    by_calibration[:, :, LENS] = focal[:, None] * distortion_terms(normalised)
     pixels = focal * distorted + calibration[C]
     return pixels, focal[:, None] * (by_normalised @ normalised_by_p), by_calibration
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -214,12 +213,7 @@ class ObjectMap:
         rows = np.flatnonzero(points[:, 2] > 0.05)
         if not len(rows):
             return rows, np.zeros((0, 2), np.int64)
-        distortion = np.array(self.camera.distortion)
-        pixels = self.camera.project(points[rows])
-        if distortion.any():
-            still = np.zeros(3)
-            pixels = cv2.projectPoints(points[rows], still, still, self.camera.K, distortion)[0]
-        whole = np.rint(pixels.reshape(-1, 2)).astype(np.int64)
+        whole = np.rint(self.camera.project_distorted(points[rows])).astype(np.int64)
         size = np.array([self.camera.width, self.camera.height])
         good = ((whole >= 0) & (whole < size)).all(axis=1)
         return rows[good], whole[good]
@@ -279,7 +273,6 @@ def pixel_rays(camera: Camera, step: int) -> Array:
     """(h, w, 3) what every step-th pixel both ways of an image, as recorded, sees at 1 m."""
     columns, rows = np.meshgrid(np.arange(0, camera.width, step), np.arange(0, camera.height, step))
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(float)
-    distortion = np.array(camera.distortion)
-    if distortion.any():
-        pixels = cv2.undistortPoints(pixels[:, None], camera.K, distortion, P=camera.K)[:, 0]
-    return camera.backproject(pixels, np.ones(len(pixels))).reshape(*columns.shape, 3)
+    return camera.backproject(camera.undistort(pixels), np.ones(len(pixels))).reshape(
+        *columns.shape, 3
+    )

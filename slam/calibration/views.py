@@ -10,8 +10,7 @@ import numpy as np
 
 from bmask_slam.calibration.motion import as_exposed
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.calibration.model import CalibrationViews, distort, parameters_of
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.sequences import Sequence
@@ -92,7 +91,7 @@ def make_views(
     camera = sequence.camera
     keyframe_ids, keyframes = np.unique(seen.keyframe_ids, return_inverse=True)
     landmark_ids, landmarks = np.unique(seen.landmark_ids, return_inverse=True)
-    pixels = raw_pixels(as_exposed(seen.measurements[:, :2], motion, camera), camera)
+    pixels = camera.distort(as_exposed(seen.measurements[:, :2], motion, camera))
     inverse_depth, rms, rate = np.full((3, len(seen)), np.nan)
     lag_s = np.zeros(len(seen))
     # The graph's disparity sigma has the roughness of the surface in it, which is fitted here.
@@ -139,13 +138,6 @@ def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:
     if after - before < 2 or not 0 < step_s < MAX_RATE_STEP_S:
         change[:] = np.nan
     return change, step_s
-
-
-def raw_pixels(undistorted: Array, camera: Camera) -> Array:
-    """Pixels (M, 2) in the image as it was taken, of undistorted ones (M, 2)."""
-    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    calibration = parameters_of(camera, camera.depth_scale)
-    return focal * distort((undistorted - centre) / focal, calibration) + centre
 
 
 def smooth_value(image: Array, pixels: Array, max_step: float) -> tuple[Array, Array]:

@@ -216,8 +216,6 @@ def undistorted_labels(numbers: NDArray[np.uint16], camera: Camera) -> NDArray[n
 
 def undistortion_maps(camera: Camera) -> tuple[Floats, Floats]:
     """Where each pixel (H, W) of the undistorted image lies in the distorted one."""
-    size = (camera.width, camera.height)
-    x, y = cv2.initUndistortRectifyMap(
-        camera.K, np.array(camera.distortion), None, camera.K, size, cv2.CV_32FC1
-    )
-    return x, y
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    x, y = np.moveaxis(camera.distort(np.stack([columns, rows], axis=-1)), -1, 0)
+    return x.astype(np.float32), y.astype(np.float32)

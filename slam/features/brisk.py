@@ -196,7 +196,7 @@ class BriskExtractor:
         sigmas[:, 2] = np.hypot(self.config.disparity_sigma_px, depth_to_disparity * spread_m)
         rows, columns = np.rint(raw[:, 1]).astype(int), np.rint(raw[:, 0]).astype(int)
         return Features(
-            pixels=undistort(self.camera, raw),
+            pixels=self.camera.undistort(raw),
             image_pixels=raw,
             descriptors=descriptors,
             scales=scales,
@@ -263,11 +263,3 @@ def sample_depth(depth_m: Floats, pixels: Array, config: FeatureConfig) -> tuple
         & (extent < config.depth_edge_ratio * median)
     )
     return np.where(good, median, np.nan), np.where(good, spread, np.nan)
-
-
-def undistort(camera: Camera, pixels: Array) -> Array:
-    """Undistorted pixels (N, 2) of detected ones (N, 2), in the same camera matrix."""
-    if not any(camera.distortion) or len(pixels) == 0:
-        return pixels.copy()
-    distortion = np.array(camera.distortion)
-    return cv2.undistortPoints(pixels[:, None], camera.K, distortion, P=camera.K)[:, 0]

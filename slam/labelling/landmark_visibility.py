@@ -10,7 +10,6 @@ from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.moving.free_space_check import distorted
 from bmask_slam.world.world_map import Keyframe
 
 _REACH = 0.02
@@ -85,7 +84,7 @@ class VisibleLandmarks:
         ids = ids[np.isin(landmarks.host[ids], hosts)]
         local = transform(inverse(self.T_world_camera), landmarks.points_world[ids])
         ahead = np.flatnonzero(local[:, 2] > 0.1)
-        pixels = distorted(camera, local[ahead])
+        pixels = camera.project_distorted(local[ahead])
         whole = np.rint(pixels)
         inside = ((whole >= 0) & (whole < [camera.width, camera.height])).all(axis=1)
         rows, pixels = ahead[inside], pixels[inside]

@@ -13,7 +13,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.moving.depth_segments import DepthSegmentConfig, MovingSpace, depth_segments
 from bmask_slam.moving.depth_view_buffer import PosedView
-from bmask_slam.moving.free_space_check import FreeSpaceCheck, PointMotion, PointMotions, distorted
+from bmask_slam.moving.free_space_check import FreeSpaceCheck, PointMotion, PointMotions
 from bmask_slam.semantics.objects.object_map import pixel_rays
 from bmask_slam.sequences.frame import Frame
 
@@ -112,7 +112,7 @@ class FeatureMotion:
         ahead = centres[:, 2] >= NEAREST_M
         centres, half_sizes_m = centres[ahead], half_sizes_m[ahead]
         z = centres[:, 2:]
-        middle = distorted(self.camera, centres)
+        middle = self.camera.project_distorted(centres)
         half_px = np.array([self.camera.fx, self.camera.fy]) * half_sizes_m[:, :2] / z
         inside = ~(np.abs(depth_m - z) > half_sizes_m[:, 2:])
         for k in (0, 1):

@@ -210,7 +210,7 @@ class FreeSpaceCheck:
         """Columns and rows (K, N) in the image as recorded of points (K, N) before it."""
         if any(self.camera.distortion):
             points = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(float)
-            u, v = distorted(self.camera, points).astype(np.float32).T.reshape(2, *z.shape)
+            u, v = self.camera.project_distorted(points).astype(np.float32).T.reshape(2, *z.shape)
             return u, v
         camera, per_z = self.camera, 1 / z
         u = camera.fx * x * per_z + camera.cx
@@ -226,11 +226,3 @@ def _looked_up(views: Sequence[DepthView], place: Ints) -> tuple[Floats, Floats]
         view.nearest_m.take(where, out=near, mode="clip")
         view.farthest_m.take(where, out=far, mode="clip")
     return nearest, farthest
-
-
-def distorted(camera: Camera, points_camera: Array) -> Array:
-    """Pixels (N, 2) in the image as recorded of points (N, 3) in front of the camera."""
-    if not any(camera.distortion) or not len(points_camera):
-        return camera.project(points_camera)
-    zero, lens = np.zeros(3), np.array(camera.distortion)
-    return cv2.projectPoints(points_camera, zero, zero, camera.K, lens)[0][:, 0]

@@ -11,7 +11,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.feature_motion import NEAREST_M
-from bmask_slam.moving.free_space_check import FreeSpaceCheck, distorted
+from bmask_slam.moving.free_space_check import FreeSpaceCheck
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
 from bmask_slam.moving.motion_state import MotionState, motion_state
 from bmask_slam.semantics.beliefs.movability import MovabilityPriors, log_odds
@@ -65,7 +65,7 @@ class InstanceMotion:
         (centre,) = transform(inverse(masks.T_world_camera), track.mean[None, :3])
         if centre[2] < NEAREST_M:
             return False
-        column, row = distorted(self.camera, centre[None])[0]
+        column, row = self.camera.project_distorted(centre[None])[0]
         if not (0 <= column < self.camera.width and 0 <= row < self.camera.height):
             return False
         depth_m, step = masks.depth_m, masks.step

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bmask_slam.features.brisk import Features, select, undistort
+from bmask_slam.features.brisk import Features, select
 from bmask_slam.features.matching import (
     MatchConfig,
     Matches,
@@ -203,7 +203,7 @@ class Tracker:
         image_pixels, pixels = features.image_pixels.copy(), features.pixels.copy()
         sigmas = features.sigmas_px.copy()
         image_pixels[rows] = refined[good]
-        pixels[rows] = undistort(self.camera, refined[good])
+        pixels[rows] = self.camera.undistort(refined[good])
         sigmas[rows, :2] = config.sigma_px
         return replace(features, image_pixels=image_pixels, pixels=pixels, sigmas_px=sigmas)
 

@@ -1,11 +1,22 @@
-"""The pinhole and its pseudo-stereo: axes, signs and units."""
+"""The pinhole, its lens distortion and its pseudo-stereo: axes, signs and units."""
 
+import cv2
 import numpy as np
 import pytest
 
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, distort_normalised, distortion_terms
 
 CAMERA = Camera(640, 480, fx=525.0, fy=510.0, cx=318.5, cy=241.5, stereo_bf_px_m=40.0)
+FREIBURG1 = Camera(
+    640,
+    480,
+    517.306408,
+    516.469215,
+    318.643040,
+    255.313989,
+    distortion=(0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+)
+LENS = np.array(FREIBURG1.distortion)
 RNG = np.random.default_rng(5)
 POINTS = RNG.uniform([-1.0, -0.8, 0.5], [1.0, 0.8, 6.0], (40, 3))
 
@@ -51,3 +62,52 @@ def test_the_right_image_is_seen_from_a_baseline_to_the_right() -> None:
     shifted = CAMERA.project(POINTS - [CAMERA.baseline_m, 0.0, 0.0])
     np.testing.assert_allclose(CAMERA.project_stereo(POINTS)[:, 2], shifted[:, 0], rtol=1e-12)
     assert CAMERA.baseline_m == pytest.approx(40.0 / 525.0)
+
+
+def test_distortion_is_opencvs_to_the_last_bit() -> None:
+    points = RNG.uniform([-2.0, -1.5, 1.0], [2.0, 1.5, 6.0], (1000, 3))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), FREIBURG1.K, LENS)
+    np.testing.assert_array_equal(FREIBURG1.project_distorted(points), expected[:, 0])
+    rows, columns = np.mgrid[:480, :640]
+    distorted = FREIBURG1.distort(np.stack([columns, rows], axis=-1)).astype(np.float32)
+    maps = cv2.initUndistortRectifyMap(
+        FREIBURG1.K, LENS, None, FREIBURG1.K, (640, 480), cv2.CV_32FC1
+    )
+    np.testing.assert_array_equal(distorted, np.stack(maps, axis=-1))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_undistortion_is_opencvs_to_the_last_bit(dtype: type) -> None:
+    """Far outside the image too, where the lens model folds back."""
+    pixels = RNG.uniform([-600, -600], [1300, 1100], (2000, 2)).astype(dtype)
+    expected = cv2.undistortPoints(pixels[:, None], FREIBURG1.K, LENS, P=FREIBURG1.K)[:, 0]
+    undistorted = FREIBURG1.undistort(pixels)
+    assert undistorted.dtype == dtype
+    np.testing.assert_array_equal(undistorted, expected)
+
+
+def test_undistortion_undoes_distortion() -> None:
+    grid = np.stack(np.meshgrid(np.linspace(30, 610, 15), np.linspace(30, 450, 12)), axis=-1)
+    raw = FREIBURG1.distort(grid)
+    assert np.abs(raw - grid).max() > 5.0
+    np.testing.assert_allclose(FREIBURG1.undistort(raw), grid, atol=0.05)
+    points = FREIBURG1.backproject(grid.reshape(-1, 2), np.array(2.0))
+    np.testing.assert_allclose(
+        FREIBURG1.project_distorted(points), raw.reshape(-1, 2), rtol=0, atol=1e-9
+    )
+
+
+def test_without_distortion_pixels_are_copied() -> None:
+    pixels = RNG.uniform(0, 400, (5, 2))
+    same = CAMERA.undistort(pixels)
+    np.testing.assert_array_equal(same, pixels)
+    same[0] = -1
+    assert (pixels >= 0).all()
+    assert FREIBURG1.undistort(np.zeros((0, 2))).shape == (0, 2)
+    assert FREIBURG1.project_distorted(np.zeros((0, 3))).shape == (0, 2)
+
+
+def test_distortion_is_linear_in_its_coefficients() -> None:
+    normalised = RNG.uniform(-0.6, 0.6, (50, 2))
+    linear = normalised + distortion_terms(normalised) @ LENS
+    np.testing.assert_allclose(linear, distort_normalised(normalised, LENS), rtol=1e-12)

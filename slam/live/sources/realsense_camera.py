@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, distortion_terms
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.camera_source import CameraSource, Shot
 from bmask_slam.live.sources.checks import check_depth_scale
@@ -95,17 +95,13 @@ class RealSenseSource(CameraSource):
 def fit_distortion(camera: Camera, pixels: Array, rays: Array) -> Camera:
     """The camera with OpenCV's distortion by which undistorted ``rays`` (N, 2) reach the pixels.
 
-    The model is linear in k1, k2, p1, p2, k3: x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6)
-    + 2 p1 x y + p2 (r^2 + 2 x^2), and y_d likewise with p1 and p2 exchanged.
+    The model is linear in k1, k2, p1, p2, k3 (``graph.camera.distortion_terms``).
 
     Raises:
         InputError: they do not fit, as for a fisheye.
     """
-    x, y = rays.T
-    r2 = x**2 + y**2
-    for_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x**2, x * r2**3], axis=-1)
-    for_y = np.stack([y * r2, y * r2**2, r2 + 2 * y**2, 2 * x * y, y * r2**3], axis=-1)
-    A = np.concatenate([camera.fx * for_x, camera.fy * for_y])
+    terms = distortion_terms(rays)
+    A = np.concatenate([camera.fx * terms[:, 0], camera.fy * terms[:, 1]])
     shift = pixels - (rays * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     b = shift.T.ravel()
     solution = np.linalg.lstsq(A, b, rcond=None)[0]

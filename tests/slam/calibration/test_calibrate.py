@@ -12,8 +12,7 @@ from calibration_run import camera_path, make_run, room_depth
 from bmask_slam import cli
 from bmask_slam.calibration.calibrate import CalibrateOptions, calibrate_run
 from bmask_slam.calibration.report import format_calibration
-from bmask_slam.calibration.views import raw_pixels, smooth_value
-from bmask_slam.features.brisk import undistort
+from bmask_slam.calibration.views import smooth_value
 from bmask_slam.graph.calibration.model import TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -114,13 +113,6 @@ def test_the_next_run_reads_what_was_written(made: tuple[Path, Path], tmp_path: 
 
 
 # --- parts ----------------------------------------------------------------------------------------
-
-
-def test_raw_pixels_undo_the_undistortion() -> None:
-    distortion = (0.26, -0.95, -0.005, 0.0026, 1.16)
-    camera = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, distortion=distortion)
-    raw = np.random.default_rng(0).uniform([30, 30], [610, 450], (200, 2))
-    np.testing.assert_allclose(raw_pixels(undistort(camera, raw), camera), raw, atol=0.01)
 
 
 def test_a_plane_is_read_between_pixels_and_an_edge_is_refused() -> None:

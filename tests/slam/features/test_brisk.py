@@ -1,4 +1,4 @@
-"""Keypoints of a rendered plane: bucketing, depth, undistortion, sigmas, empty images."""
+"""Keypoints of a rendered plane: bucketing, depth, sigmas, empty images."""
 
 import dataclasses
 
@@ -14,7 +14,6 @@ from bmask_slam.features.brisk import (
     joined,
     sample_depth,
     spread_order,
-    undistort,
 )
 from bmask_slam.features.matching import hamming
 from bmask_slam.graph.camera import Camera
@@ -270,29 +269,6 @@ def test_depth_at_the_images_corners_and_of_nothing() -> None:
     corners = np.array([[0.0, 0.0], [639.0, 479.0], [639.0, 0.0]])
     np.testing.assert_array_equal(sample_depth(depth, corners, CONFIG)[0], 1.0)
     assert len(sample_depth(depth, np.zeros((0, 2)), CONFIG)[0]) == 0
-
-
-def test_undistortion_undoes_opencvs_distortion() -> None:
-    """Points projected WITH distortion by OpenCV come back to the pinhole's pixels."""
-    grid = np.stack(np.meshgrid(np.linspace(30, 610, 15), np.linspace(30, 450, 12)), -1)
-    points = FREIBURG1.backproject(grid.reshape(-1, 2), np.array(2.0))
-    none = np.zeros(3)
-    distorted, _ = cv2.projectPoints(
-        points, none, none, FREIBURG1.K, np.array(FREIBURG1.distortion)
-    )
-    distorted = distorted[:, 0]
-    assert np.abs(distorted - FREIBURG1.project(points)).max() > 5.0
-    back = undistort(FREIBURG1, distorted)
-    np.testing.assert_allclose(back, FREIBURG1.project(points), atol=0.05)
-
-
-def test_without_distortion_pixels_are_copied() -> None:
-    pixels = RNG.uniform(0, 400, (5, 2))
-    same = undistort(CAMERA, pixels)
-    np.testing.assert_array_equal(same, pixels)
-    same[0] = -1
-    assert (pixels >= 0).all()
-    assert undistort(FREIBURG1, np.zeros((0, 2))).shape == (0, 2)
 
 
 def test_a_reserve_is_what_a_larger_search_would_have_found_besides() -> None:
