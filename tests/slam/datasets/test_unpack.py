@@ -95,6 +95,14 @@ def test_a_name_that_comes_twice_is_refused(tmp_path):
         unpack(tar_of(tmp_path / "a", again), tmp_path / "out")
 
 
+@pytest.mark.parametrize("make", [tar_of, zip_of], ids=["tar", "zip"])
+@pytest.mark.parametrize("below", ["a", "a/b"])
+def test_a_file_below_a_file_is_refused(make, below, tmp_path):
+    archive = make(tmp_path / "x", files={"a": b"file", f"{below}/c": b"below"})
+    with pytest.raises(InputError, match=r"x: holds a file and a folder of one name"):
+        unpack(archive, tmp_path / "out")
+
+
 @pytest.mark.parametrize("keep", [0, 10, 60])
 def test_a_broken_archive_is_named(keep, tmp_path):
     content = tar_of(tmp_path / "a").read_bytes()

@@ -16,10 +16,10 @@ from bmask_slam.run_folder.landmark_file import write_landmarks
 from bmask_slam.run_folder.semantic_files import read_labels, write_labels
 from bmask_slam.semantics.beliefs.label_store import LabelEstimates
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.labels import LabelSet, label_set
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
-from semantics.labels import LabelSet, label_set
 
 FILE = Path("run/checkpoint")
 EDGE_M = 0.1  # world x: left of it on the plane is one thing, right of it another
