@@ -22,7 +22,7 @@ from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.live.health import Health
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.play import PlayOptions, play
-from bmask_slam.live.sources import SourceCounts
+from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.sequences.frame import Frame

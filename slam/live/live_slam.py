@@ -26,7 +26,7 @@ from bmask_slam.live.live_options import LiveOptions
 from bmask_slam.live.processes.dense_messages import MapWritten
 from bmask_slam.live.processes.start import start_system
 from bmask_slam.live.recorder import Recorder, rescued
-from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, measure, row, save

@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.live_slam import LiveSlam, Prepared
-from bmask_slam.live.sources import Newest, Source
+from bmask_slam.live.sources.source import Newest, Source
 from bmask_slam.runtime.progress import make_bar
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.sequences.frame import Frame

@@ -1,6 +1,1 @@
-"""Where live frames come from."""
-
-from bmask_slam.live.sources.counts import SourceCounts
-from bmask_slam.live.sources.source import Newest, RecordedSource, Source
-
-__all__ = ["Newest", "RecordedSource", "Source", "SourceCounts"]
+"""Sources of live frames: recordings, ROS bags, growing folders and cameras."""

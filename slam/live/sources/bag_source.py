@@ -13,7 +13,6 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.sources.bags import IMAGE_TYPES, INFO_TYPE, Bag, open_bag
 from bmask_slam.live.sources.checks import check_depth_scale, check_sizes
-from bmask_slam.live.sources.counts import SourceCounts
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pair, Pairer
 from bmask_slam.live.sources.ros_images import (
     DEPTH_SCALES,
@@ -23,7 +22,7 @@ from bmask_slam.live.sources.ros_images import (
     depth_image,
     stamp_s,
 )
-from bmask_slam.live.sources.source import paced
+from bmask_slam.live.sources.source import SourceCounts, paced
 from bmask_slam.sequences import read_camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.images import depth_in_metres

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live.sources.optional import import_optional
+from bmask_slam.live.sources.checks import import_optional
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _CURE = (

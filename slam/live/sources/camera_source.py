@@ -12,8 +12,8 @@ from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.live.sources.counts import SourceCounts
 from bmask_slam.live.sources.pairing import RGB, GapMeter, StreamClock
+from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.sequences.frame import Frame
 
 RETRY_S = 0.01

@@ -1,6 +1,9 @@
-"""What images from a device or a bag must be, where no file names can be blamed."""
+"""What a source needs before it is used: its library, and images that fit the camera."""
 
 from __future__ import annotations
+
+import importlib
+from types import ModuleType
 
 from numpy.typing import NDArray
 
@@ -8,14 +11,28 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 
 SCALE_TOLERANCE = 0.1
-"""A calibrated depth scale differs from the nominal one by less."""
+"""Largest relative difference between a calibrated depth scale and the nominal one."""
+
+
+def import_optional(name: str, extra: str, source: str) -> ModuleType:
+    """A module of a library that the pip extra ``extra`` installs.
+
+    Raises:
+        InputError: it is not installed; the text names the source that needs it and the cure.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            f"{source}: needs {name.partition('.')[0]} ({error}); pip install 'bmask-slam[{extra}]'"
+        ) from error
 
 
 def check_sizes(rgb: NDArray, stored: NDArray, camera: Camera, where: str) -> None:
-    """Colour (H, W, 3) and depth (H, W) have the camera's size.
+    """Check that colour (H, W, 3) and stored depth (H, W) have the camera's size.
 
     Raises:
-        InputError: they have not.
+        InputError: one has another size; ``where`` begins the text.
     """
     size = (camera.height, camera.width)
     if rgb.shape[:2] != size or stored.shape != size:
@@ -28,10 +45,10 @@ def check_sizes(rgb: NDArray, stored: NDArray, camera: Camera, where: str) -> No
 
 
 def check_depth_scale(camera: Camera, scale: float, given: str, where: str) -> None:
-    """A camera that is given states about the depth scale that the images are known to have.
+    """Check a camera file's depth scale against the scale that the images are known to have.
 
     Raises:
-        InputError: it does not.
+        InputError: they differ; ``given`` is the camera file, ``where`` the source.
     """
     if abs(camera.depth_scale / scale - 1) > SCALE_TOLERANCE:
         raise InputError(

@@ -17,8 +17,8 @@ import numpy as np
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory, check_seconds
-from bmask_slam.live.sources.counts import SourceCounts
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pairer
+from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.sequences.cameras import find_camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.images import read_depth, read_rgb

@@ -9,7 +9,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 
 from bmask_slam.graph.trajectory import associate_stamps, nearest_indices
-from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.live.sources.source import SourceCounts
 
 logger = logging.getLogger(__name__)
 

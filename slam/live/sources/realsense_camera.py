@@ -11,8 +11,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera, distortion_terms
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.camera_source import CameraSource, Shot
-from bmask_slam.live.sources.checks import check_depth_scale
-from bmask_slam.live.sources.optional import import_optional
+from bmask_slam.live.sources.checks import check_depth_scale, import_optional
 from bmask_slam.live.sources.pairing import MAX_DIFFERENCE_S
 from bmask_slam.sequences import read_camera
 from bmask_slam.sequences.images import depth_in_metres

@@ -1,4 +1,4 @@
-"""Where live frames come from, and what happens to those that there is no time for."""
+"""The protocol of a source of live frames, recordings as sources, and what drops old frames."""
 
 from __future__ import annotations
 
@@ -6,30 +6,60 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.live.sources.counts import SourceCounts
 from bmask_slam.sequences import Sequence
 from bmask_slam.sequences.frame import Frame
 
 T = TypeVar("T")
 
 MAX_AHEAD_S = 0.1
-"""Of a longer pause in a recording no more is slept through before the next frame is read."""
+"""Longest interval in half of which ``paced`` sleeps before it reads the next frame."""
 MAX_WAIT_S = 10.0
-"""A longer pause in a recording is not played."""
+"""A longer pause in a recording is skipped."""
+
+
+@dataclass
+class SourceCounts:
+    """What a source received that did not become a frame; counted as frames come.
+
+    Attributes:
+        unpaired_rgb, unpaired_depth: images without a partner near enough in time.
+        duplicates: images with the stamp of the image before.
+        late: images that came after one with a later stamp.
+        clock_jumps: how often the clock was set back.
+        gaps: steps between frames of more than three times the usual step.
+        broken: images or list lines that could not be read.
+    """
+
+    unpaired_rgb: int = 0
+    unpaired_depth: int = 0
+    duplicates: int = 0
+    late: int = 0
+    clock_jumps: int = 0
+    gaps: int = 0
+    broken: int = 0
+
+    def line(self) -> str:
+        """The counts that are not zero, as text; empty if all are zero."""
+        named = {name.replace("_", " "): count for name, count in asdict(self).items()}
+        return ", ".join(f"{count} {name}" for name, count in named.items() if count)
 
 
 class Source(Protocol):
-    """Frames that come when they come.
+    """A source of frames, live or recorded.
 
     Attributes:
-        name: for titles. camera: of the frames. groundtruth: where there is one.
-        counts: what was met that was no frame.
-        waits: whether frames wait until they are taken, as in a recording; a camera's do not.
+        name: for titles.
+        camera: of the frames.
+        groundtruth: trajectory of the camera, where it is known.
+        counts: what was received that did not become a frame.
+        waits: True: each frame waits until the consumer asks for it, as in a recording that is
+            played as fast as possible. False: frames come at their own rate, as a camera's do.
     """
 
     name: str
@@ -39,14 +69,14 @@ class Source(Protocol):
     waits: bool
 
     def frames(self) -> Iterator[Frame]:
-        """Frames in the order of their stamps, each as soon as it is there."""
+        """Frames in the order of their stamps, each as soon as it is available."""
 
     def close(self) -> None:
         """End ``frames`` soon, from any thread."""
 
 
 class RecordedSource:
-    """A recorded sequence, at the speed of its stamps if ``realtime``."""
+    """A recorded sequence, at the rate of its stamps if ``realtime``."""
 
     def __init__(self, sequence: Sequence, realtime: bool, max_frames: int | None = None) -> None:
         self.name, self.camera = sequence.name, sequence.camera
@@ -58,18 +88,18 @@ class RecordedSource:
         self._sequence, self._max_frames = sequence, max_frames
 
     def frames(self) -> Iterator[Frame]:
-        """Each frame, not before its time; decoded ahead, as a camera's driver would."""
+        """Each frame, not before its time if ``realtime``."""
         frames = self._sequence.frames(0, self._max_frames)
         for frame in frames if self.waits else paced(frames):
             self.counts.broken = len(self._sequence.skipped)
             yield frame
 
     def close(self) -> None:
-        """Nothing waits long."""
+        """Nothing to release: each frame opens and closes its own files."""
 
 
 class Limited:
-    """The first frames of another source."""
+    """The first ``max_frames`` frames of another source."""
 
     def __init__(self, source: Source, max_frames: int | None) -> None:
         self.name, self.camera = source.name, source.camera
@@ -78,19 +108,19 @@ class Limited:
         self._source, self._max_frames = source, max_frames
 
     def frames(self) -> Iterator[Frame]:
-        """Up to ``max_frames``; all if that is None."""
+        """Up to ``max_frames`` frames; all if that is None."""
         return islice(self._source.frames(), self._max_frames)
 
     def close(self) -> None:
-        """Close the other."""
+        """Close the other source."""
         self._source.close()
 
 
 def paced(frames: Iterator[Frame]) -> Iterator[Frame]:
-    """Each frame, not before its time by the stamps; the first at once.
+    """Each frame at the time that its stamp gives, relative to the first, which comes at once.
 
-    It is read in the second half of the time until then, as a camera would deliver it, and not
-    while the frame before is tracked.
+    A frame is read in the second half of the interval before it is due, as a camera's driver would
+    decode it, so that reading does not compete with the tracking of the frame before.
     """
     begin_s, last_s, interval_s = None, 0.0, 0.0
     while True:
@@ -114,12 +144,13 @@ def _sleep_until(time_s: float) -> None:
 
 
 class Newest(Generic[T]):
-    """Takes items from an iterator in a thread and keeps a few; one too many drives out the others.
+    """Reads an iterator in a thread and queues a few items; one too many drops all older ones.
 
-    So a short stall costs no item, and a lasting one no more delay than a short one.
+    A short stall of the consumer costs no item, and a long one adds no more delay than the queue
+    holds.
 
     Attributes:
-        dropped: items that nobody took in time.
+        dropped: items that the consumer did not fetch in time.
     """
 
     def __init__(self, items: Iterator[T], keep: int) -> None:
@@ -129,13 +160,14 @@ class Newest(Generic[T]):
         self._stopped = False
         self._changed = threading.Condition()
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="source")
-        self._end = self._thread.submit(self._take)
+        self._end = self._thread.submit(self._read_all)
         self._end.add_done_callback(lambda _: self._notify())
 
     def get(self, timeout_s: float) -> T | None:
-        """The oldest item kept; None if none comes in that time, or at the end.
+        """The oldest item in the queue; None if none comes in that time, or at the end.
 
-        Raises what the iterator raised, after the items that came before.
+        Raises:
+            Exception: what the iterator raised, after the items that it gave before.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._kept or self._end.done(), timeout_s)
@@ -147,16 +179,16 @@ class Newest(Generic[T]):
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will come, not even an error."""
+        """Whether no item and no error will come any more."""
         with self._changed:
             return not self._kept and self._end.done() and self._end.exception() is None
 
     def stop(self) -> None:
-        """Take no more."""
+        """Read no further item."""
         self._stopped = True
         self._thread.shutdown(wait=False)
 
-    def _take(self) -> None:
+    def _read_all(self) -> None:
         for item in self._items:
             if self._stopped:
                 return

@@ -25,7 +25,7 @@ from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import Patience
 from bmask_slam.live.recorder import HEALTH_S
-from bmask_slam.live.sources.counts import SourceCounts
+from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig

@@ -17,8 +17,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.live_slam import LiveSlam
 from bmask_slam.live.play import WAITING, PlayOptions, play
-from bmask_slam.live.sources import Newest
-from bmask_slam.live.sources.source import paced
+from bmask_slam.live.sources.source import Newest, paced
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult

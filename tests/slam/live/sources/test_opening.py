@@ -17,10 +17,10 @@ from bmask_slam.commands import live as live_command
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.graph.trajectory import read_tum
-from bmask_slam.live.sources import RecordedSource, Source
 from bmask_slam.live.sources.bag_source import BagSource, BagTopics
 from bmask_slam.live.sources.growing_folder import GrowingFolder
 from bmask_slam.live.sources.opening import SourceOptions, open_source
+from bmask_slam.live.sources.source import RecordedSource, Source
 from bmask_slam.sequences import Sequence, open_sequence, write_camera
 
 FRAMES = 8

@@ -7,8 +7,8 @@ import pytest
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.trajectory import associate_stamps
-from bmask_slam.live.sources.counts import SourceCounts
 from bmask_slam.live.sources.pairing import DEPTH, LATE_S, MAX_WAITING, RGB, Pair, Pairer
+from bmask_slam.live.sources.source import SourceCounts
 
 
 def pairs_of(
