@@ -1,4 +1,4 @@
-"""Frames from a ROS bag, read as they are needed."""
+"""Frames from a ROS bag, read message by message."""
 
 from __future__ import annotations
 
@@ -38,11 +38,12 @@ _FIELDS = {
 
 @dataclass(frozen=True)
 class BagTopics:
-    """Where a bag's images are; TUM's by default.
+    """Topics of a bag's images; by default those of the TUM RGB-D benchmark.
 
     Attributes:
-        rgb, depth: images, raw or compressed; depth registered to colour.
-        camera_info: of the colour camera; empty: the ``camera_info`` beside the colour topic.
+        rgb, depth: topics of images, raw or compressed; depth registered to colour.
+        camera_info: topic of the colour camera's intrinsics; empty: the ``camera_info`` beside the
+            colour topic.
     """
 
     rgb: str = "/camera/rgb/image_color"
@@ -54,8 +55,8 @@ class BagSource:
     """A recorded bag; colour and depth are paired by the stamps in their headers.
 
     Attributes:
-        counts: what was left out so far.
-        waits: whether frames wait until they are taken; if not, they come at their own speed.
+        counts: images that did not become frames so far.
+        waits: see ``Source``; False if ``realtime``.
     """
 
     def __init__(
@@ -65,11 +66,11 @@ class BagSource:
         camera: Path | None = None,
         realtime: bool = False,
     ) -> None:
-        """Look at the first message of each topic.
+        """Find the topics and read the first message of each.
 
         Raises:
-            InputError: a bag that cannot be read, a topic that is not there, images that are
-                none, or a camera that is not known.
+            InputError: a bag that cannot be read, a missing topic, messages that cannot be decoded
+                as images, or no usable camera intrinsics.
         """
         self.name = path.resolve().stem
         self.groundtruth: Trajectory | None = None
@@ -81,11 +82,11 @@ class BagSource:
             self.camera = _find_camera(bag, self._topics, camera)
 
     def frames(self) -> Iterator[Frame]:
-        """Each pair of images; what cannot be decoded is counted and left out."""
+        """A frame of each pair of images; what cannot be decoded is counted and skipped."""
         return self._frames() if self.waits else paced(self._frames())
 
     def close(self) -> None:
-        """Nothing is held open between frames."""
+        """Nothing to release: ``frames`` opens and closes the bag."""
 
     def _frames(self) -> Iterator[Frame]:
         index = 0
@@ -96,7 +97,7 @@ class BagSource:
                 check_sizes(rgb, stored, self.camera, f"{self._path} at {pair.stamp_s:.6f}")
             except InputError as error:
                 self.counts.broken += 1
-                logger.warning("left out: %s", error)
+                logger.warning("skipped: %s", error)
                 continue
             yield Frame(index, pair.stamp_s, rgb, depth_in_metres(stored, self.camera))
             index += 1
@@ -111,10 +112,10 @@ class BagSource:
 
 
 def find_topics(bag: Bag, wanted: BagTopics) -> BagTopics:
-    """The topics as they are in the bag: an image topic may be there in a compressed form only.
+    """The topics' names in the bag; an image topic may exist in a compressed form only.
 
     Raises:
-        InputError: one is not there or has no messages; names those that are.
+        InputError: a topic is missing or has no messages; the text lists the image topics.
     """
     found = {topic.name: topic.type for topic in bag.topics if topic.messages}
     images = [name for name, kind in found.items() if kind in IMAGE_TYPES]
@@ -132,13 +133,13 @@ def find_topics(bag: Bag, wanted: BagTopics) -> BagTopics:
 
 
 def _info_beside(rgb: str) -> str:
-    """The camera_info of an image topic, where image_transport puts it."""
+    """The camera_info topic of an image topic, where image_transport puts it."""
     base = rgb.removesuffix("/compressed")
     return f"{base.rpartition('/')[0]}/camera_info"
 
 
 def _find_camera(bag: Bag, topics: BagTopics, given: Path | None) -> Camera:
-    """The camera that is given, or that of the camera_info; fits the first images."""
+    """The given camera, or that of the camera_info; checked against the first images."""
     first = {name: _first(bag, name) for name in (topics.rgb, topics.depth)}
     rgb, depth = first[topics.rgb], first[topics.depth]
     scale = DEPTH_SCALES[depth_encoding(depth, topics.depth)]
@@ -170,7 +171,7 @@ def _camera_info(bag: Bag, name: str) -> Any:
 
 
 def _first(bag: Bag, name: str) -> Any:
-    """The first message of a topic, with all fields that its type must have."""
+    """The first message of a topic, checked for the fields that are read later."""
     for _, message in bag.messages(name):
         missing = _FIELDS[message.__msgtype__] - {field.lower() for field in vars(message)}
         if missing:

@@ -21,7 +21,7 @@ IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
 
 class Topic(NamedTuple):
-    """What a bag holds of a topic."""
+    """A topic of a bag: its name, message type and number of messages."""
 
     name: str
     type: str
@@ -29,12 +29,17 @@ class Topic(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path has the form of a bag; it may be broken."""
+    """Whether a path has the form of a bag; the contents may be broken."""
     return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in SUFFIXES
 
 
 class Bag:
-    """An open bag."""
+    """An open bag.
+
+    Attributes:
+        path: of the bag.
+        topics: all of them, sorted by name.
+    """
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path = path
@@ -45,14 +50,14 @@ class Bag:
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last, as they were recorded."""
+        """Time from the first message to the last, by the time of recording."""
         return max(float(self._reader.duration), 0.0) * 1e-9
 
     def messages(self, *names: str) -> Iterator[tuple[str, Any]]:
-        """The messages of these topics with their topic's name, in the order of recording.
+        """The messages of these topics, each with its topic's name, in the order of recording.
 
         Raises:
-            InputError: the bag is damaged; what came before was read.
+            InputError: the bag is damaged; the messages before the damage were yielded.
         """
         chosen = [c for c in self._reader.connections if c.topic in names]
         if not chosen:
@@ -71,7 +76,7 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """A bag to read from; messages are read one by one.
+    """Open a bag for reading; messages are read one by one.
 
     Raises:
         InputError: no such bag, one that cannot be read, or rosbags is not installed.
@@ -100,7 +105,7 @@ def format_topics(bag: Bag) -> str:
 
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
-    """What rosbags raises for bags that it cannot read, as InputError."""
+    """Convert what rosbags raises for bags that it cannot read into InputError."""
     one, two = (import_optional(f"rosbags.rosbag{k}", "ros", str(path)) for k in (1, 2))
     reader = import_optional("rosbags.rosbag2.reader", "ros", str(path))
     sqlite = import_optional("rosbags.rosbag2.storage_sqlite3", "ros", str(path))

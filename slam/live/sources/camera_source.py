@@ -1,4 +1,4 @@
-"""What all cameras that are plugged in have in common."""
+"""The base class of sources that read a connected camera."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bmask_slam.sequences.frame import Frame
 RETRY_S = 0.01
 
 
-class Shot(NamedTuple):
+class CameraImages(NamedTuple):
     """Colour (H, W, 3), red first, and registered depth (H, W) in metres, NaN where missing."""
 
     stamp_s: float
@@ -28,11 +28,11 @@ class Shot(NamedTuple):
 
 
 class CameraSource(ABC):
-    """Takes what a device gives, as long as it gives something.
+    """Reads a device until it is closed or gives no more frames.
 
     Attributes:
-        counts: what was left out so far.
-        waits: False: what tracking has no time for is dropped.
+        counts: images that did not become frames so far.
+        waits: False: frames that tracking has no time for are dropped.
     """
 
     camera: Camera
@@ -46,7 +46,7 @@ class CameraSource(ABC):
         self._closed = threading.Event()
 
     def frames(self) -> Iterator[Frame]:
-        """Each frame as it comes; the device is released at the end.
+        """Each frame as soon as it is captured; the device is released at the end.
 
         Raises:
             InputError: none came for ``silence_s``.
@@ -55,31 +55,34 @@ class CameraSource(ABC):
         index, heard_s = 0, time.monotonic()
         try:
             while not self._closed.is_set():
-                shot = self._take()
-                if shot is None:
+                images = self._capture_images()
+                if images is None:
                     self._check_silence(heard_s)
                     self._closed.wait(RETRY_S)
                     continue
                 heard_s = time.monotonic()
-                stamp_s = clock.place(RGB, shot.stamp_s)
+                stamp_s = clock.map_stamp(RGB, images.stamp_s)
                 if stamp_s is not None:
                     gaps.count(stamp_s)
-                    yield Frame(index, stamp_s, shot.rgb, shot.depth_m)
+                    yield Frame(index, stamp_s, images.rgb, images.depth_m)
                     index += 1
         finally:
             self._release()
 
     def close(self) -> None:
-        """Take no more; ``frames`` ends soon after."""
+        """End ``frames`` soon; may be called from any thread."""
         self._closed.set()
 
     @abstractmethod
-    def _take(self) -> Shot | None:
-        """The next images, soon; None if there are none, or counted if they are not whole."""
+    def _capture_images(self) -> CameraImages | None:
+        """The next images, within a short time; None if there are none.
+
+        Images without a partner are counted in ``counts``.
+        """
 
     @abstractmethod
     def _release(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
 
     def _check_silence(self, heard_s: float) -> None:
         if time.monotonic() - heard_s > self._silence_s:

@@ -1,4 +1,4 @@
-"""A TUM folder that is still being written, followed by looking again and again."""
+"""A folder in TUM layout that is still being written, read by polling its lists."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from bmask_slam.sequences.lists import image_name
 logger = logging.getLogger(__name__)
 
 FINISHED = ".finished"
-"""A file of this name says that nothing more will come."""
+"""Name of the file by which a recorder says that the folder is complete."""
 _FIRST_STAMPS = 5
-"""So many must look like seconds."""
+"""Stamps at the beginning that are checked to be in seconds."""
 _MAX_LINES = 5000
-"""Lines of one list that wait for the other: a recorder may write them in blocks."""
+"""Largest number of lines of one list that wait for the other, which may be written in blocks."""
 
 
 @dataclass(frozen=True)
 class FollowOptions:
-    """How long to wait.
+    """How long to wait for the recorder.
 
     Attributes:
-        silence_s: the folder is taken for finished when nothing is new for so long.
-        patience_s: an image that cannot be read so long after its line is left out.
-        poll_s: between two looks.
+        silence_s: the folder counts as complete when nothing new comes for so long.
+        image_timeout_s: an image that cannot be read so long after it was listed is skipped.
+        poll_s: interval of polling.
     """
 
     silence_s: float = 10.0
-    patience_s: float = 2.0
+    image_timeout_s: float = 2.0
     poll_s: float = 0.02
 
 
 class ListFollower:
-    """The lines of a list that grows; an unfinished one waits for its end."""
+    """Reads the lines of a growing list; a line without its line break is read later."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -58,7 +58,7 @@ class ListFollower:
         self._rest = b""
 
     def new_lines(self, finished: bool) -> list[str]:
-        """The lines since the last call; the unfinished one too if nothing more will come."""
+        """The lines since the last call; with ``finished``, a last one without a line break too."""
         try:
             with self.path.open("rb") as file:
                 file.seek(self._position)
@@ -73,15 +73,15 @@ class ListFollower:
 
 
 class _Image(NamedTuple):
-    """An image that is listed; of the stream RGB or DEPTH."""
+    """An image that is listed; ``stream`` is RGB or DEPTH."""
 
     stamp_s: float
     stream: int
     path: Path
 
 
-class _Waiting(NamedTuple):
-    """A pair of images, and when it was listed."""
+class _ListedPair(NamedTuple):
+    """A pair of images that are to be read, and when they were listed."""
 
     stamp_s: float
     rgb: Path
@@ -90,14 +90,14 @@ class _Waiting(NamedTuple):
 
 
 class GrowingFolder:
-    """A folder in TUM layout, from its first line on, as lists and images grow.
+    """A folder in TUM layout that is read from its first line on while it is being written.
 
-    Ends when a file ``.finished`` is there and all is read, or after a long silence. Lines must be
-    in the order of their stamps, as a recorder writes them.
+    It ends when a file ``.finished`` is there and everything is read, or when nothing new comes for
+    ``silence_s``. Lines must be in the order of their stamps.
 
     Attributes:
-        counts: what was left out so far.
-        waits: False: what tracking has no time for is dropped, as with a camera.
+        counts: images and lines that did not become frames so far.
+        waits: False: frames that tracking has no time for are dropped, as with a camera.
     """
 
     waits = False
@@ -108,7 +108,7 @@ class GrowingFolder:
         """Wait until the lists and the camera are there.
 
         Raises:
-            InputError: no such folder, or they are not there before ``silence_s`` is over.
+            InputError: there is no such folder, or they are missing for ``silence_s``.
         """
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; make it before it is followed")
@@ -124,12 +124,12 @@ class GrowingFolder:
         self._first_s: list[float] = []
 
     def frames(self) -> Iterator[Frame]:
-        """Each frame once both images can be read; what never can be is counted and left out.
+        """Each frame once both images can be read; unreadable ones are counted and skipped.
 
         Raises:
-            InputError: stamps that are not seconds.
+            InputError: the stamps are not in seconds.
         """
-        waiting: deque[_Waiting] = deque()
+        waiting: deque[_ListedPair] = deque()
         index, heard_s, finished = 0, time.monotonic(), False
         while not (finished or self._closed.is_set()):
             silent = time.monotonic() - heard_s > self._options.silence_s
@@ -137,8 +137,10 @@ class GrowingFolder:
             if listed := self._new_pairs(finished):
                 waiting.extend(listed)
                 heard_s = time.monotonic()
-            patience_s = 0.0 if finished else self._options.patience_s
-            while waiting and (frame := self._load(waiting[0], index, patience_s)) is not False:
+            image_timeout_s = 0.0 if finished else self._options.image_timeout_s
+            while (
+                waiting and (frame := self._load(waiting[0], index, image_timeout_s)) is not False
+            ):
                 waiting.popleft()
                 index += 1
                 if isinstance(frame, Frame):
@@ -148,7 +150,7 @@ class GrowingFolder:
                 self._closed.wait(self._options.poll_s)
 
     def close(self) -> None:
-        """Look no more."""
+        """End ``frames`` soon; may be called from any thread."""
         self._closed.set()
 
     def _await(self, given: Path | None) -> tuple[Camera, list[Path]]:
@@ -161,8 +163,8 @@ class GrowingFolder:
                     raise
             time.sleep(self._options.poll_s)
 
-    def _new_pairs(self, finished: bool) -> list[_Waiting]:
-        """The pairs that are certain by what was written since the last look."""
+    def _new_pairs(self, finished: bool) -> list[_ListedPair]:
+        """The pairs that are final by the lines since the last call."""
         listed_s = time.monotonic()
         kinds = (RGB, DEPTH) if len(self._lists) == 2 else (None,)
         new = [
@@ -174,12 +176,12 @@ class GrowingFolder:
             pairs += self._pairer.add(stream, stamp_s, path)
         if finished:
             pairs += self._pairer.finish()
-        return [_Waiting(pair.stamp_s, pair.rgb, pair.depth, listed_s) for pair in pairs]
+        return [_ListedPair(pair.stamp_s, pair.rgb, pair.depth, listed_s) for pair in pairs]
 
     def _images(self, kind: int | None, line: str, listed: ListFollower) -> list[_Image]:
-        """The images on a line; none of a broken one, which is counted.
+        """The images on a line; none of a broken line, which is counted.
 
-        ``kind`` is the stream of the list, None where lines hold both.
+        ``kind`` is the stream of the list; None where each line holds both.
         """
         columns = line.split() if kind is None else line.split(maxsplit=1)
         try:
@@ -188,7 +190,7 @@ class GrowingFolder:
             stamps_s = [np.nan]
         if len(columns) != (4 if kind is None else 2) or not np.isfinite(stamps_s).all():
             self.counts.broken += 1
-            logger.warning("%s: left out the line %r", listed.path, line[:60])
+            logger.warning("%s: skipped the line %r", listed.path, line[:60])
             return []
         files = columns[1::2]
         streams: tuple[int, ...] = (RGB, DEPTH)
@@ -207,16 +209,16 @@ class GrowingFolder:
             if len(self._first_s) == _FIRST_STAMPS:
                 check_seconds(np.sort(self._first_s), path)
 
-    def _load(self, pair: _Waiting, index: int, patience_s: float) -> Frame | bool:
-        """The frame; False if it may still come, True if it is given up and counted."""
+    def _load(self, pair: _ListedPair, index: int, image_timeout_s: float) -> Frame | bool:
+        """The frame; False if its images may still come, True if it is skipped and counted."""
         try:
             rgb = read_rgb(pair.rgb, self.camera)
             depth_m = read_depth(pair.depth, self.camera)
         except InputError as error:
-            if time.monotonic() - pair.listed_s < patience_s:
+            if time.monotonic() - pair.listed_s < image_timeout_s:
                 return False
             self.counts.broken += 1
-            logger.warning("left out: %s", error)
+            logger.warning("skipped: %s", error)
             return True
         return Frame(index, pair.stamp_s, rgb, depth_m, image_name(pair.rgb, self._folder))
 

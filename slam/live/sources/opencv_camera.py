@@ -1,4 +1,4 @@
-"""Frames from a camera that OpenCV captures with depth: OpenNI 2, as a Kinect or an Astra."""
+"""Frames from a depth camera by OpenCV and OpenNI 2, such as a Kinect or an Astra."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import cv2
 import numpy as np
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live.sources.camera_source import CameraSource, Shot
+from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
 from bmask_slam.live.sources.checks import check_depth_scale, check_sizes
 from bmask_slam.sequences import read_camera
 from bmask_slam.sequences.images import depth_in_metres
 
 DEPTH_SCALE = 1000.0
-"""OpenNI's depth is in millimetres."""
+"""Stored depth of one metre: OpenNI gives millimetres."""
 
 
 class OpenCvSource(CameraSource):
-    """Device N of OpenNI 2, depth registered to colour; stamps are the computer's."""
+    """Device N of OpenNI 2, depth registered to colour; stamps are this computer's clock."""
 
     def __init__(self, device: int, camera: Path | None, silence_s: float = 10.0) -> None:
         """Open the device.
 
         Raises:
-            InputError: no camera.yaml is given, which OpenCV does not know, or the device cannot
-                be opened or cannot register depth.
+            InputError: no camera.yaml is given (OpenCV does not know the intrinsics), or the device
+                cannot be opened or cannot register depth to colour.
         """
         super().__init__(f"opencv-{device}", silence_s)
         if camera is None:
@@ -44,7 +44,7 @@ class OpenCvSource(CameraSource):
             self._release()
             raise InputError(f"{self.name}: {reason}")
 
-    def _take(self) -> Shot | None:
+    def _capture_images(self) -> CameraImages | None:
         if not self._capture.grab():
             return None
         stamp_s = time.time()
@@ -56,7 +56,7 @@ class OpenCvSource(CameraSource):
             return None
         check_sizes(bgr, stored, self.camera, self.name)
         rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-        return Shot(stamp_s, rgb, depth_in_metres(stored, self.camera))
+        return CameraImages(stamp_s, rgb, depth_in_metres(stored, self.camera))
 
     def _release(self) -> None:
         self._capture.release()

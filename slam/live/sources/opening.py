@@ -1,4 +1,4 @@
-"""A source by what it is called on the command line."""
+"""Open the source that a name on the command line stands for."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ REALSENSE, OPENCV = "realsense:", "opencv:"
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a source is read; what does not concern it is ignored.
+    """How a source is read; each kind of source uses the options that apply to it.
 
     Attributes:
-        camera: file in place of the source's own camera.
-        realtime: a recording comes at its own speed.
-        max_frames: end after so many.
-        follow: a folder is still being written.
-        silence_s: it, or a camera, has ended when nothing comes for so long.
+        camera: camera file in place of the source's own camera.
+        realtime: play a recording at the rate of its stamps.
+        max_frames: end after so many frames.
+        follow: the folder is still being written.
+        silence_s: such a folder, or a camera, has ended when nothing new comes for so long.
         topics: of a bag.
     """
 
@@ -39,10 +39,10 @@ class SourceOptions:
 
 
 def open_source(text: str, options: SourceOptions) -> Source:
-    """A folder in TUM layout, a bag, ``realsense:`` or ``opencv:N``.
+    """Open a folder in TUM layout, a bag, ``realsense:`` or ``opencv:N``.
 
     Raises:
-        InputError: it is none of these, or cannot be opened.
+        InputError: the name is none of these, or the source cannot be opened.
     """
     path = Path(text)
     source: Source
@@ -60,7 +60,7 @@ def open_source(text: str, options: SourceOptions) -> Source:
         source = RecordedSource(sequence, options.realtime)
     else:
         raise InputError(
-            f"{text}: no source; give a folder in TUM layout, a .bag, a bag folder, a .mcap, "
+            f"{text}: not a source; give a folder in TUM layout, a .bag, a bag folder, a .mcap, "
             "realsense: or opencv:N"
         )
     return source if options.max_frames is None else Limited(source, options.max_frames)
@@ -69,5 +69,5 @@ def open_source(text: str, options: SourceOptions) -> Source:
 def _device(text: str) -> int:
     number = text.removeprefix(OPENCV)
     if not number.isdecimal():
-        raise InputError(f"{text}: no number of a device; write e.g. opencv:0")
+        raise InputError(f"{text}: not the number of a device; write e.g. opencv:0")
     return int(number)

@@ -1,4 +1,4 @@
-"""Stamps that come in: put on one clock that never goes back, colour and depth paired by them."""
+"""Pairing of colour and depth images by their stamps, on one clock that never goes back."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ T = TypeVar("T")
 RGB, DEPTH = 0, 1
 MAX_DIFFERENCE_S = 0.02
 LATE_S = 1.0
-"""A stamp is late if it is back by less; by more, the clock was set back."""
+"""A stamp that is earlier than the last by less is late; by more, the clock was set back."""
 GAP_STEPS = 3
 USUAL_FRAMES = 30
-"""Frames whose median step is the usual one."""
+"""Number of steps whose median is the usual step."""
 MAX_WAITING = 30
-"""Images of one stream that wait for the other: a second, which bounds the memory."""
+"""Largest number of images of one stream that wait for the other (1 s): bounds the memory."""
 
 
 class Pair(NamedTuple, Generic[T]):
-    """A colour and a depth image that belong together, at the colour image's time."""
+    """A colour and a depth image of one frame; the stamp is the colour image's."""
 
     stamp_s: float
     rgb: T
@@ -35,10 +35,10 @@ class Pair(NamedTuple, Generic[T]):
 
 
 class StreamClock:
-    """The stamps of two streams on one clock that only goes forward.
+    """Maps the stamps of two streams to one clock that only goes forward.
 
-    Where the clock of the streams is set back, it goes on ``LATE_S`` after the latest stamp, with
-    one shift for both streams: each is shifted from its own first stamp that is back.
+    When the streams' clock is set back, the mapped clock goes on ``LATE_S`` after its latest stamp.
+    Both streams get the same shift, each from its own first stamp after the clock was set back.
     """
 
     def __init__(self, counts: SourceCounts) -> None:
@@ -48,8 +48,8 @@ class StreamClock:
         self._last_s = [-np.inf, -np.inf]
         self._latest_s = -np.inf
 
-    def place(self, stream: int, stamp_s: float) -> float | None:
-        """The stamp in seconds on this clock; None for a duplicate and a late one."""
+    def map_stamp(self, stream: int, stamp_s: float) -> float | None:
+        """The mapped stamp in seconds; None for a duplicate or late one, which is counted."""
         last_s = self._last_s[stream]
         if stamp_s == last_s:
             self._counts.duplicates += 1
@@ -78,7 +78,7 @@ class StreamClock:
 
 
 class GapMeter:
-    """Counts steps between frames that are longer than usual."""
+    """Counts steps between frames that are much longer than the usual step."""
 
     def __init__(self, counts: SourceCounts) -> None:
         self._counts = counts
@@ -86,7 +86,7 @@ class GapMeter:
         self._steps_s: deque[float] = deque(maxlen=USUAL_FRAMES)
 
     def count(self, stamp_s: float) -> None:
-        """One more frame."""
+        """Count the step to the next frame."""
         if self._last_s is not None:
             step_s = stamp_s - self._last_s
             if self._steps_s and step_s > GAP_STEPS * float(np.median(self._steps_s)):
@@ -96,11 +96,11 @@ class GapMeter:
 
 
 class Pairer(Generic[T]):
-    """Pairs colour and depth by nearest stamp, each used once, as they come.
+    """Pairs colour and depth images by nearest stamp as they come; each image is used once.
 
-    A pair is given out once no image that may still come could fit either better: at once where
-    the stamps are equal, else with the next image of the stream whose stamp is the earlier. The
-    pairs are those of ``associate_stamps`` over all stamps, unless streams step by less than
+    A pair is returned as soon as no later image can fit either of its two better: at once where the
+    stamps are equal, else with the next image of the stream with the earlier stamp. The pairs are
+    those of ``associate_stamps`` over all stamps, unless the streams step by less than
     ``max_difference_s``.
     """
 
@@ -118,24 +118,24 @@ class Pairer(Generic[T]):
         self._heard_s = [-np.inf, -np.inf]
 
     def add(self, stream: int, stamp_s: float, item: T) -> list[Pair[T]]:
-        """An image of a stream, RGB or DEPTH; returns the pairs that are certain by it."""
-        placed_s = self._clock.place(stream, stamp_s)
+        """Add an image of a stream, RGB or DEPTH; returns the pairs that are final by it."""
+        placed_s = self._clock.map_stamp(stream, stamp_s)
         if placed_s is None:
             return []
         placed_s += self._offsets_s[stream]
         self._heard_s[stream] = placed_s
         self._waiting[stream].append((placed_s, item))
-        pairs = self._settled()
+        pairs = self._final_pairs()
         for each in (RGB, DEPTH):
             self._discard(each)
         return pairs
 
     def finish(self) -> list[Pair[T]]:
-        """What is left when nothing more will come."""
-        return self._take(len(self._waiting[RGB]), len(self._waiting[DEPTH]))
+        """The remaining pairs, when no further image will come."""
+        return self._pair_first(len(self._waiting[RGB]), len(self._waiting[DEPTH]))
 
-    def _settled(self) -> list[Pair[T]]:
-        """All up to the latest pair that nothing to come can break."""
+    def _final_pairs(self) -> list[Pair[T]]:
+        """The pairs up to the latest one that no later image can change."""
         rgb_s, depth_s = (np.array([s for s, _ in queue]) for queue in self._waiting)
         if not len(rgb_s) or not len(depth_s):
             return []
@@ -147,10 +147,10 @@ class Pairer(Generic[T]):
         found = np.flatnonzero(mutual)
         if not len(found):
             return []
-        return self._take(int(found[-1]) + 1, int(to_depth[found[-1]]) + 1)
+        return self._pair_first(int(found[-1]) + 1, int(to_depth[found[-1]]) + 1)
 
-    def _take(self, rgb_count: int, depth_count: int) -> list[Pair[T]]:
-        """Pair the first images of the queues; those that stay alone are unpaired."""
+    def _pair_first(self, rgb_count: int, depth_count: int) -> list[Pair[T]]:
+        """Pair the first images of the two queues; the others of them count as unpaired."""
         rgb = [self._waiting[RGB].popleft() for _ in range(rgb_count)]
         depth = [self._waiting[DEPTH].popleft() for _ in range(depth_count)]
         rgb_s, depth_s = (np.array([s for s, _ in images]) for images in (rgb, depth))
@@ -163,7 +163,7 @@ class Pairer(Generic[T]):
         return pairs
 
     def _discard(self, stream: int) -> None:
-        """Let go of images that nothing fits any more, and of the oldest of too many."""
+        """Drop images that no later image can fit, and the oldest where too many wait."""
         queue, others = self._waiting[stream], self._waiting[1 - stream]
         while queue:
             stamp_s = queue[0][0]

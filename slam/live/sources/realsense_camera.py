@@ -10,7 +10,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera, distortion_terms
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live.sources.camera_source import CameraSource, Shot
+from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
 from bmask_slam.live.sources.checks import check_depth_scale, import_optional
 from bmask_slam.live.sources.pairing import MAX_DIFFERENCE_S
 from bmask_slam.sequences import read_camera
@@ -20,18 +20,18 @@ SIZE = (640, 480)
 FPS = 30
 POLL_MS = 200
 MAX_RESIDUAL_PX = 0.5
-"""The device's distortion must be described to this by OpenCV's five numbers."""
+"""Largest error, over the image, of OpenCV's five distortion coefficients fitted to the device."""
 
 
 class RealSenseSource(CameraSource):
-    """The first device that is plugged in, 640x480 at 30 Hz."""
+    """The first connected device, 640x480 at 30 Hz."""
 
     def __init__(self, camera: Path | None = None, silence_s: float = 10.0) -> None:
         """Start the device.
 
         Raises:
-            InputError: pyrealsense2 is not installed, there is no device, or its distortion is not
-                OpenCV's.
+            InputError: pyrealsense2 is not installed, there is no device, or its distortion cannot
+                be described by OpenCV's model.
         """
         super().__init__("realsense", silence_s)
         self._rs: Any = import_optional("pyrealsense2", "realsense", "realsense:")
@@ -50,7 +50,7 @@ class RealSenseSource(CameraSource):
             self._release()
             raise
 
-    def _take(self) -> Shot | None:
+    def _capture_images(self) -> CameraImages | None:
         came, images = self._pipeline.try_wait_for_frames(POLL_MS)
         if not came:
             return None
@@ -62,13 +62,15 @@ class RealSenseSource(CameraSource):
             return None
         rgb = np.array(np.asanyarray(colour.get_data()), np.uint8)
         stored = np.asanyarray(depth.get_data())
-        return Shot(1e-3 * colour.get_timestamp(), rgb, depth_in_metres(stored, self.camera))
+        return CameraImages(
+            1e-3 * colour.get_timestamp(), rgb, depth_in_metres(stored, self.camera)
+        )
 
     def _release(self) -> None:
         self._pipeline.stop()
 
     def _find_camera(self, profile: Any, given: Path | None) -> Camera:
-        """The camera that is given, or the device's."""
+        """The given camera, or the device's own calibration."""
         scale = 1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale())
         if given is not None:
             camera = read_camera(given)
@@ -83,7 +85,7 @@ class RealSenseSource(CameraSource):
         return fit_distortion(plain, pixels, rays)
 
     def _samples(self, intrinsics: Any) -> tuple[Array, Array]:
-        """Pixels (N, 2) over the image, and their rays (N, 2) at z = 1 by the device's model."""
+        """Pixels (N, 2) on a grid, and their rays (N, 2) at z = 1 by the device's model."""
         steps = np.linspace(0.02, 0.98, 20)
         columns, rows = np.meshgrid(steps * intrinsics.width, steps * intrinsics.height)
         pixels = np.column_stack([columns.ravel(), rows.ravel()])
@@ -92,12 +94,15 @@ class RealSenseSource(CameraSource):
 
 
 def fit_distortion(camera: Camera, pixels: Array, rays: Array) -> Camera:
-    """The camera with OpenCV's distortion by which undistorted ``rays`` (N, 2) reach the pixels.
+    """The camera with the distortion that projects ``rays`` to ``pixels``, by least squares.
 
-    The model is linear in k1, k2, p1, p2, k3 (``graph.camera.distortion_terms``).
+    OpenCV's model is linear in k1, k2, p1, p2, k3 (``graph.camera.distortion_terms``).
+
+    Args:
+        pixels: (N, 2). rays: (N, 2) undistorted, at z = 1.
 
     Raises:
-        InputError: they do not fit, as for a fisheye.
+        InputError: the largest residual is too large, as for a fisheye lens.
     """
     terms = distortion_terms(rays)
     A = np.concatenate([camera.fx * terms[:, 0], camera.fy * terms[:, 1]])
@@ -118,7 +123,7 @@ def fit_distortion(camera: Camera, pixels: Array, rays: Array) -> Camera:
 
 
 def _lag_s(colour: Any, depth: Any) -> float:
-    """Between the two images; 0 where their clocks differ."""
+    """Time between the two images; 0 where their stamps are of different clocks."""
     if colour.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain():
         return 0.0
     return abs(1e-3 * (depth.get_timestamp() - colour.get_timestamp()))

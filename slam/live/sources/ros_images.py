@@ -24,7 +24,7 @@ _RAW: dict[str, tuple[str, int]] = {
     "bayer_gbrg8": ("u1", 1), "bayer_grbg8": ("u1", 1),
     "16UC1": ("u2", 1), "mono16": ("u2", 1), "32FC1": ("f4", 1),
 }  # fmt: skip
-"""Type and channels of the pixels by encoding."""
+"""Element type and channels of a pixel, by encoding."""
 _TO_RGB = {
     "rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "8UC3": cv2.COLOR_BGR2RGB,
     "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB,
@@ -35,9 +35,9 @@ _TO_RGB = {
 DEPTH_SCALES = {"16UC1": 1000.0, "mono16": 1000.0, "32FC1": 1.0}
 """Stored depth of one metre by encoding (REP 118: millimetres, or metres)."""
 _DEPTH_HEADER = "<iff"
-"""Before a compressedDepth image: format, and A and B of its inverse depth."""
+"""Header of a compressedDepth image: format, and A and B of its quantised inverse depth."""
 _FIVE = ("plumb_bob", "rational_polynomial", "")
-"""Distortion models that begin with OpenCV's k1, k2, p1, p2, k3."""
+"""Distortion models whose first five coefficients are OpenCV's k1, k2, p1, p2, k3."""
 
 
 def stamp_s(header: Any) -> float:
@@ -50,7 +50,7 @@ def colour_image(message: Any, where: str) -> Image:
     """The image (H, W, 3), red first.
 
     Raises:
-        InputError: an encoding that is no colour's, or broken data; beginning with ``where``.
+        InputError: an encoding that is not colour, or broken data; ``where`` begins the text.
     """
     if hasattr(message, "format"):
         image = decode_bytes(bytes(message.data), cv2.IMREAD_COLOR, where)
@@ -92,10 +92,10 @@ def depth_image(message: Any, where: str) -> NDArray:
 
 
 def depth_encoding(message: Any, where: str) -> str:
-    """Of a raw or compressed depth image: a key of DEPTH_SCALES.
+    """The encoding of a raw or compressed depth image: a key of DEPTH_SCALES.
 
     Raises:
-        InputError: anything else.
+        InputError: an encoding that is not depth, or depth compressed in another way than by PNG.
     """
     compressed = hasattr(message, "format")
     name = message.format.partition(";")[0].strip() if compressed else message.encoding
@@ -143,7 +143,7 @@ def camera_of(info: Any, depth_scale: float, rectified: bool, where: str) -> Cam
 
 
 def _field(info: Any, name: str) -> Any:
-    """Written in capitals in ROS 1."""
+    """A field of CameraInfo, whose name is upper case in ROS 1."""
     return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
 
 

@@ -1,4 +1,4 @@
-"""Bags that are really written, read back as frames."""
+"""Bags that are written to disk give their frames back."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FORMS = [("a.bag", ""), ("a.mcap", ""), ("folder", "sqlite3"), ("folder", "mcap"
 
 
 def assert_same(found: list[Frame], indices: list[int]) -> None:
-    """Frames are the views of these numbers, bit by bit; numbered from 0."""
+    """Check that frames are exactly the views of these numbers, with indices from 0."""
     assert [frame.index for frame in found] == list(range(len(indices)))
     for frame, index in zip(found, indices, strict=True):
         expected = view(index)
@@ -44,7 +44,7 @@ def assert_same(found: list[Frame], indices: list[int]) -> None:
 
 
 @pytest.mark.parametrize(("name", "storage"), FORMS)
-def test_every_form_of_bag_gives_the_frames_back(tmp_path: Path, name: str, storage: str) -> None:
+def test_every_bag_format_gives_the_frames_back(tmp_path: Path, name: str, storage: str) -> None:
     path = write_bag(tmp_path / name, storage=storage)
     assert is_bag(path)
     source = BagSource(path)
@@ -58,7 +58,7 @@ def test_every_form_of_bag_gives_the_frames_back(tmp_path: Path, name: str, stor
     assert camera.distortion == (0.1, -0.2, 0.001, 0.002, 0.05)
 
 
-def test_realtime_keeps_the_recordings_pace(tmp_path: Path) -> None:
+def test_realtime_gives_frames_at_the_recorded_rate(tmp_path: Path) -> None:
     import time
 
     source = BagSource(write_bag(tmp_path / "a.bag", 6), realtime=True)
@@ -68,7 +68,7 @@ def test_realtime_keeps_the_recordings_pace(tmp_path: Path) -> None:
     assert not source.waits
 
 
-def test_disorder_is_counted_and_left_out(tmp_path: Path) -> None:
+def test_unusable_images_are_counted_and_skipped(tmp_path: Path) -> None:
     """Frame 1 without depth, 2 twice, 4 broken, 6 and 7 missing, then the clock is set back."""
     path = tmp_path / "a.bag"
     with BagMaker(path) as bag:
@@ -115,7 +115,7 @@ def test_other_topics_and_compressed_images(tmp_path: Path) -> None:
         assert np.nanmax(np.abs(frame.depth_m - expected.depth_m)) < 0.00051
 
 
-def test_rectified_images_have_the_rectified_camera(tmp_path: Path) -> None:
+def test_rectified_images_have_the_camera_of_the_projection_matrix(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     with BagMaker(path) as bag:
         bag.write("/camera/rgb/camera_info", BEGIN_S, camera_info())
@@ -125,7 +125,7 @@ def test_rectified_images_have_the_rectified_camera(tmp_path: Path) -> None:
     assert (camera.fx, camera.distortion) == (100.0, (0, 0, 0, 0, 0))
 
 
-def test_a_camera_that_is_given_wins(tmp_path: Path) -> None:
+def test_a_given_camera_replaces_the_bags(tmp_path: Path) -> None:
     path, given = write_bag(tmp_path / "a.bag"), tmp_path / "camera.yaml"
     camera = Camera(160, 120, 140.0, 141.0, 80.0, 60.0, depth_scale=1.02, depth_offset_m=0.01)
     write_camera(given, camera)
@@ -138,7 +138,7 @@ def test_a_camera_that_is_given_wins(tmp_path: Path) -> None:
         BagSource(path, camera=given)
 
 
-def test_what_a_bag_lacks_is_named(tmp_path: Path) -> None:
+def test_missing_topics_are_named(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     with BagMaker(path) as bag:
         bag.write(RGB, BEGIN_S, image("rgb8", view(0).rgb))
@@ -153,7 +153,7 @@ def test_what_a_bag_lacks_is_named(tmp_path: Path) -> None:
         BagSource(path, BagTopics(depth=RGB, camera_info="/other/camera_info"))
 
 
-def test_depth_that_is_not_registered_is_refused_or_warned_of(tmp_path: Path, caplog) -> None:
+def test_unregistered_depth_is_refused_or_warned_of(tmp_path: Path, caplog) -> None:
     for name, depth_m in (("a.bag", view(0).depth_m), ("b.bag", view(0).depth_m[::2, ::2])):
         with BagMaker(tmp_path / name) as bag:
             bag.write(INFO, BEGIN_S, camera_info())
@@ -171,8 +171,8 @@ def file_of(path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("name", "storage"), FORMS)
-def test_damage_costs_images_or_is_refused(tmp_path: Path, name: str, storage: str) -> None:
-    """Bytes are changed in the headers at the begin, in the index at the end, and anywhere."""
+def test_a_damaged_bag_loses_images_or_is_refused(tmp_path: Path, name: str, storage: str) -> None:
+    """Random bytes are changed in the headers, in the index at the end, and anywhere."""
     path = write_bag(tmp_path / name, 3, storage)
     file, rng = file_of(path), np.random.default_rng(5)
     whole = np.frombuffer(file.read_bytes(), np.uint8)
@@ -190,9 +190,7 @@ def test_damage_costs_images_or_is_refused(tmp_path: Path, name: str, storage: s
 
 @pytest.mark.parametrize(("name", "storage"), FORMS)
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
-def test_a_bag_that_was_cut_off_is_refused(
-    tmp_path: Path, name: str, storage: str, share: float
-) -> None:
+def test_a_truncated_bag_is_refused(tmp_path: Path, name: str, storage: str, share: float) -> None:
     path = write_bag(tmp_path / name, storage=storage)
     file = file_of(path)
     data = file.read_bytes()
@@ -202,7 +200,7 @@ def test_a_bag_that_was_cut_off_is_refused(
     assert "\n" not in str(refusal.value)
 
 
-def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
+def test_files_that_are_not_bags_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such bag"):
         BagSource(tmp_path / "none.bag")
     for suffix in (".bag", ".mcap", ".db3"):
@@ -216,7 +214,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
         BagSource(tmp_path / "folder")
 
 
-def test_without_rosbags_the_cure_is_named(tmp_path: Path, monkeypatch) -> None:
+def test_without_rosbags_the_error_says_what_to_install(tmp_path: Path, monkeypatch) -> None:
     path = write_bag(tmp_path / "a.bag")
     for name in [name for name in sys.modules if name.startswith("rosbags")]:
         monkeypatch.setitem(sys.modules, name, None)

@@ -1,4 +1,4 @@
-"""Cameras, with stand-ins that answer as the libraries do."""
+"""Camera sources with fake devices in place of the libraries."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from bmask_slam.live.sources.realsense_camera import RealSenseSource, fit_distor
 from bmask_slam.sequences import write_camera
 
 SILENCE_S = 0.3
-UNPLUGGED = object()
+DISCONNECTED = object()
 
 
 def pixels_of(k: int, height: int = 480, width: int = 640) -> tuple[np.ndarray, np.ndarray]:
-    """Colour, red first, and millimetres with a hole."""
+    """Colour, red first, and depth in millimetres with missing values."""
     rgb = np.full((height, width, 3), (10 * k, 20, 200), np.uint8)
     stored = np.full((height, width), 1000 + k, np.uint16)
     stored[0] = 0
@@ -35,7 +35,7 @@ def pixels_of(k: int, height: int = 480, width: int = 640) -> tuple[np.ndarray, 
 
 
 class Device:
-    """What a stand-in for pyrealsense2 has plugged in: framesets (colour, depth), stamps in ms."""
+    """The device of a fake pyrealsense2: framesets (colour, depth), stamps in ms."""
 
     def __init__(self, framesets: list, coeffs: tuple = (0, 0, 0, 0, 0), scale: float = 0.001):
         self.framesets, self.coeffs, self.scale = framesets, coeffs, scale
@@ -58,7 +58,7 @@ def frameset(k: int, stamp_ms: float, lag_ms: float = 0.0) -> tuple:
 
 
 def plug_in(monkeypatch: pytest.MonkeyPatch, device: Device | None) -> None:
-    """A module pyrealsense2 with this device."""
+    """Install a fake module pyrealsense2 with this device."""
     rs = ModuleType("pyrealsense2")
     rs.stream = SimpleNamespace(color="color", depth="depth")
     rs.format = SimpleNamespace(rgb8="rgb8", z16="z16")
@@ -82,7 +82,7 @@ def plug_in(monkeypatch: pytest.MonkeyPatch, device: Device | None) -> None:
             )
 
         def try_wait_for_frames(self, timeout_ms):
-            if device.framesets and device.framesets[0] is not UNPLUGGED:
+            if device.framesets and device.framesets[0] is not DISCONNECTED:
                 return True, device.framesets.pop(0)
             time.sleep(timeout_ms / 1000)
             return False, None
@@ -145,8 +145,8 @@ def test_realsense_gives_metres_seconds_and_red_first(monkeypatch) -> None:
     assert device.stopped == 1
 
 
-def test_realsense_counts_what_is_not_whole(monkeypatch) -> None:
-    """Without depth, with the depth of an older frame, twice, and a clock that is set back."""
+def test_realsense_counts_incomplete_framesets(monkeypatch) -> None:
+    """Framesets without depth, with old depth, a duplicate, and a clock that is set back."""
     sets = [frameset(0, 10_000), (frameset(1, 10_033)[0], None), frameset(2, 10_066, lag_ms=-33)]
     sets += [frameset(3, 10_100), frameset(3, 10_100), frameset(4, 50.0)]
     plug_in(monkeypatch, Device(sets))
@@ -161,7 +161,7 @@ def test_realsense_counts_what_is_not_whole(monkeypatch) -> None:
     assert (counts.duplicates, counts.clock_jumps) == (1, 1)
 
 
-def test_realsense_that_is_not_there(monkeypatch, tmp_path: Path) -> None:
+def test_a_missing_realsense_is_refused(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(InputError, match=r"needs pyrealsense2.*bmask-slam\[realsense\]"):
         RealSenseSource()
@@ -176,7 +176,7 @@ def test_realsense_that_is_not_there(monkeypatch, tmp_path: Path) -> None:
     assert device.stopped == 1
 
 
-def test_the_devices_distortion_becomes_opencvs(monkeypatch) -> None:
+def test_the_devices_distortion_is_converted_to_opencvs(monkeypatch) -> None:
     """OpenCV's undistortion of a pixel must give the ray that the device gives."""
     coeffs = (-0.05, 0.06, 0.001, -0.0015, -0.02)
     plug_in(monkeypatch, Device([], coeffs))
@@ -191,7 +191,7 @@ def test_the_devices_distortion_becomes_opencvs(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_distortion_is_found_from_opencvs_own(seed: int) -> None:
+def test_the_fit_finds_opencvs_own_distortion(seed: int) -> None:
     rng = np.random.default_rng(seed)
     plain = Camera(640, 480, 525.0, 520.0, 318.0, 242.0)
     truth = rng.normal(0, [0.1, 0.05, 0.002, 0.002, 0.02])
@@ -211,7 +211,7 @@ def test_distortion_is_found_from_opencvs_own(seed: int) -> None:
 
 
 class Capture:
-    """A stand-in for cv2.VideoCapture on an OpenNI 2 device."""
+    """A fake cv2.VideoCapture on an OpenNI 2 device."""
 
     made: Capture
 
@@ -255,7 +255,7 @@ def camera_file(tmp_path: Path, monkeypatch) -> Path:
     return path
 
 
-def test_opencv_gives_metres_and_red_first_until_it_is_unplugged(camera_file: Path) -> None:
+def test_opencv_gives_metres_and_red_first_until_it_is_disconnected(camera_file: Path) -> None:
     source = OpenCvSource(2, camera_file, SILENCE_S)
     assert source.name == "opencv-2"
     Capture.made.missing = {(1, cv2.CAP_OPENNI_DEPTH_MAP)}
@@ -270,7 +270,7 @@ def test_opencv_gives_metres_and_red_first_until_it_is_unplugged(camera_file: Pa
     assert Capture.made.released
 
 
-def test_opencv_refuses_what_it_cannot_use(camera_file: Path) -> None:
+def test_opencv_refuses_devices_that_it_cannot_use(camera_file: Path) -> None:
     with pytest.raises(InputError, match="does not know the intrinsics; give --camera"):
         OpenCvSource(0, None)
     with pytest.raises(InputError, match="opencv-5: cannot be opened"):
@@ -283,7 +283,7 @@ def test_opencv_refuses_what_it_cannot_use(camera_file: Path) -> None:
         next(OpenCvSource(0, camera_file).frames())
 
 
-def test_closing_ends_it_and_releases_the_device(camera_file: Path) -> None:
+def test_close_ends_it_and_releases_the_device(camera_file: Path) -> None:
     source = OpenCvSource(0, camera_file, silence_s=60)
     threading.Timer(0.1, source.close).start()
     assert len(list(source.frames())) == 4

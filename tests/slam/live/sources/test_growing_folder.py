@@ -1,4 +1,4 @@
-"""A folder that another thread writes while it is followed."""
+"""A folder in TUM layout is read while another thread writes it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
 
 CAMERA = "{width: 32, height: 24, fx: 30, fy: 31, cx: 15, cy: 12, depth_scale: 1000}\n"
-QUICK = FollowOptions(silence_s=1.0, patience_s=0.3, poll_s=0.002)
+QUICK = FollowOptions(silence_s=1.0, image_timeout_s=0.3, poll_s=0.002)
 WRITE_S = 0.004
 
 
@@ -31,12 +31,12 @@ class Recorder:
         (folder / "camera.yaml").write_text(CAMERA)
 
     def lists(self, *names: str) -> None:
-        """Empty lists."""
+        """Make empty lists."""
         for name in names or ("rgb", "depth"):
             (self.folder / f"{name}.txt").touch()
 
     def line(self, name: str, text: str) -> None:
-        """More of a list, as it is given."""
+        """Append this text to a list."""
         with (self.folder / f"{name}.txt").open("a") as file:
             file.write(text)
 
@@ -52,12 +52,12 @@ class Recorder:
         }
 
     def write_images(self, k: int) -> None:
-        """Whole and at once."""
+        """Write both files of frame k."""
         for path, data in self.images(k).items():
             path.write_bytes(data)
 
     def frame(self, k: int, lag_s: float = 0.004) -> None:
-        """Images, then both lines."""
+        """Write the images of frame k, then both lines."""
         self.write_images(k)
         self.line("rgb", f"{k / 10:.6f} rgb/{k}.png\n")
         self.line("depth", f"{k / 10 + lag_s:.6f} depth/{k}.png\n")
@@ -72,7 +72,7 @@ def recorder(tmp_path: Path) -> Recorder:
 
 
 def follow_while(recorder: Recorder, write: Callable[[], None]) -> tuple[list[Frame], list[float]]:
-    """The frames that come while ``write`` runs in a thread, and when each came."""
+    """The frames that are read while ``write`` runs in a thread, and the time of each."""
     thread = threading.Thread(target=write)
     thread.start()
     try:
@@ -88,14 +88,14 @@ def follow_while(recorder: Recorder, write: Callable[[], None]) -> tuple[list[Fr
 
 
 def numbers(frames: list[Frame]) -> list[int]:
-    """Which frames they are; colour and depth must be of one."""
+    """The numbers of the frames, by their pixels; colour and depth must agree."""
     found = [int(frame.rgb[0, 0, 0]) // 10 for frame in frames]
     assert [round(10 * float(frame.depth_m[1, 0])) - 1 for frame in frames] == found
     assert all(np.isnan(frame.depth_m[0]).all() for frame in frames)
     return found
 
 
-def test_what_grows_is_what_is_read_afterwards(recorder: Recorder) -> None:
+def test_a_growing_folder_gives_the_frames_of_the_finished_one(recorder: Recorder) -> None:
     def write() -> None:
         recorder.lists()
         for k in range(12):
@@ -114,7 +114,7 @@ def test_what_grows_is_what_is_read_afterwards(recorder: Recorder) -> None:
     assert recorder.counts.line() == ""
 
 
-def test_a_frame_is_there_before_the_next_but_one_is_written(recorder: Recorder) -> None:
+def test_a_frame_is_given_before_the_next_but_one_is_written(recorder: Recorder) -> None:
     written_s = []
 
     def write() -> None:
@@ -130,7 +130,7 @@ def test_a_frame_is_there_before_the_next_but_one_is_written(recorder: Recorder)
     assert all(np.array(times_s[:3]) < written_s[2:])
 
 
-def test_lines_and_images_that_are_half_written_wait(recorder: Recorder) -> None:
+def test_half_written_lines_and_images_are_read_once_complete(recorder: Recorder) -> None:
     """Lines come in pieces and before their images, images in two halves."""
 
     def write() -> None:
@@ -155,7 +155,7 @@ def test_lines_and_images_that_are_half_written_wait(recorder: Recorder) -> None
     assert recorder.counts.line() == ""
 
 
-def test_an_image_that_never_comes_costs_only_itself(recorder: Recorder) -> None:
+def test_a_missing_image_costs_only_its_frame(recorder: Recorder) -> None:
     def write() -> None:
         recorder.lists()
         for k in range(4):
@@ -163,7 +163,7 @@ def test_an_image_that_never_comes_costs_only_itself(recorder: Recorder) -> None
             if k == 1:
                 (recorder.folder / "rgb" / "1.png").unlink()
         recorder.line("rgb", "no line\n")
-        time.sleep(2 * QUICK.patience_s)
+        time.sleep(2 * QUICK.image_timeout_s)
         recorder.frame(4)
         recorder.finish()
 
@@ -189,8 +189,8 @@ def test_associations_in_either_order(recorder: Recorder, line: str) -> None:
     assert numbers(frames) == [0, 1, 2, 3]
 
 
-def test_silence_ends_it_and_the_last_frame_is_not_lost(recorder: Recorder) -> None:
-    """The last depth image is the later one, whose pair is certain only at the end."""
+def test_it_ends_after_a_silence_with_the_last_frame(recorder: Recorder) -> None:
+    """The last depth image has the later stamp, so that its pair is final only at the end."""
 
     def write() -> None:
         recorder.lists()
@@ -218,7 +218,7 @@ def test_a_list_may_be_far_ahead_of_the_other(recorder: Recorder) -> None:
     assert numbers(frames) == [k % 4 for k in range(100)]
 
 
-def test_closing_ends_it_at_once(recorder: Recorder) -> None:
+def test_close_ends_it_at_once(recorder: Recorder) -> None:
     recorder.lists()
     source = GrowingFolder(recorder.folder, options=FollowOptions(silence_s=60))
     threading.Timer(0.1, source.close).start()
@@ -227,7 +227,7 @@ def test_closing_ends_it_at_once(recorder: Recorder) -> None:
     assert time.monotonic() - begin_s < 5
 
 
-def test_it_waits_for_lists_and_camera_but_not_for_ever(tmp_path: Path) -> None:
+def test_missing_lists_and_camera_are_waited_for_until_a_timeout(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         GrowingFolder(tmp_path / "none", options=QUICK)
     short = FollowOptions(silence_s=0.05)

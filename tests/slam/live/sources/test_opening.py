@@ -1,4 +1,4 @@
-"""What a source is called decides what it is; ``bmask-slam live`` runs on each that can be made."""
+"""``open_source`` picks the kind of source by its name; ``bmask-slam live`` runs on it."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ from bmask_slam.live.sources.source import RecordedSource, Source
 from bmask_slam.sequences import Sequence, open_sequence, write_camera
 
 FRAMES = 8
-
-
 TRUTH = [se3_exp(np.array([0, 0.01 * k, 0, 0.02 * k, 0, 0])) for k in range(FRAMES)]
 
 
@@ -49,7 +47,7 @@ def recording(tmp_path_factory) -> Sequence:
 
 @pytest.fixture(scope="module")
 def bag(recording: Sequence) -> Path:
-    """The recording as a bag; its third colour image lacks depth, the fifth comes twice."""
+    """The recording as a bag; its third colour image has no depth, the fifth comes twice."""
     path = recording.folder.parent / "plane.bag"
     with BagMaker(path) as made:
         info, camera = camera_info((0.0,) * 5), recording.camera
@@ -68,7 +66,9 @@ def source_of(path: Path | str, **options) -> Source:
     return open_source(str(path), SourceOptions(**options))
 
 
-def test_the_form_decides(recording: Sequence, bag: Path, tmp_path: Path) -> None:
+def test_the_name_decides_the_kind_of_source(
+    recording: Sequence, bag: Path, tmp_path: Path
+) -> None:
     assert isinstance(source_of(recording.folder), RecordedSource)
     assert isinstance(source_of(recording.folder, follow=True), GrowingFolder)
     assert isinstance(source_of(bag), BagSource)
@@ -76,34 +76,34 @@ def test_the_form_decides(recording: Sequence, bag: Path, tmp_path: Path) -> Non
     assert isinstance(source_of(write_bag(tmp_path / "a.mcap")), BagSource)
 
 
-def test_recordings_wait_unless_they_play_at_their_own_speed(recording, bag: Path) -> None:
+def test_recordings_wait_unless_they_are_played_in_realtime(recording, bag: Path) -> None:
     for path in (recording.folder, bag):
         assert source_of(path).waits
         assert not source_of(path, realtime=True).waits
     assert not source_of(recording.folder, follow=True).waits
 
 
-def test_any_source_can_be_cut_short(recording: Sequence, bag: Path) -> None:
+def test_any_source_can_be_limited(recording: Sequence, bag: Path) -> None:
     for path, follow in ((recording.folder, False), (recording.folder, True), (bag, False)):
         source = source_of(path, max_frames=3, follow=follow)
         assert [frame.index for frame in source.frames()] == [0, 1, 2]
         source.close()
 
 
-def test_a_folder_counts_what_has_no_partner(recording: Sequence) -> None:
+def test_a_folder_counts_unpaired_images(recording: Sequence) -> None:
     assert source_of(recording.folder).counts.line() == ""
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("nowhere", "no source; give a folder"),
+        ("nowhere", "not a source; give a folder"),
         ("nowhere.bag", "no such bag"),
         ("opencv:x", "write e.g. opencv:0"),
         ("opencv:0", "give --camera F"),
     ],
 )
-def test_what_is_no_source_is_refused(text: str, reason: str) -> None:
+def test_other_names_are_refused(text: str, reason: str) -> None:
     with pytest.raises(InputError, match=reason):
         source_of(text)
 

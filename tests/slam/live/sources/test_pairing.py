@@ -1,4 +1,4 @@
-"""Images paired as they come, as they would be if all were known."""
+"""Images are paired as they come with the result of pairing all of them at once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def pairs_of(
 
 
 def by_time(rgb_s: Array, depth_s: Array) -> Array:
-    """The order in which images come if none is delayed."""
+    """The order of the images by their stamps."""
     streams = np.repeat([RGB, DEPTH], (len(rgb_s), len(depth_s)))
     return streams[np.argsort(np.concatenate([rgb_s, depth_s]), kind="stable")]
 
@@ -37,8 +37,8 @@ def delayed(rgb_s: Array, depth_s: Array, rng: np.random.Generator) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_as_if_all_stamps_were_known(seed: int) -> None:
-    """Two clocks that drift against each other, jitter, losses, delays: the pairs of TUM's rule."""
+def test_pairs_are_those_of_all_stamps_at_once(seed: int) -> None:
+    """Two clocks that drift, jitter, losses and delays give the pairs of ``associate_stamps``."""
     rng = np.random.default_rng(seed)
     rgb_s = 1e9 + np.arange(150) / 30 + rng.uniform(-0.004, 0.004, 150)
     depth_s = 1e9 + rng.uniform(0, 0.04) + np.arange(150) / 29.7 + rng.uniform(-0.004, 0.004, 150)
@@ -53,7 +53,7 @@ def test_as_if_all_stamps_were_known(seed: int) -> None:
     assert counts.duplicates == counts.late == counts.clock_jumps == 0
 
 
-def test_a_pair_is_given_as_soon_as_it_is_certain() -> None:
+def test_a_pair_is_returned_as_soon_as_it_is_final() -> None:
     pairer = Pairer[str](SourceCounts())
     assert not pairer.add(DEPTH, 1.000, "d0")
     assert pairer.add(RGB, 1.000, "c0") == [Pair(1.000, "c0", "d0")]
@@ -64,7 +64,7 @@ def test_a_pair_is_given_as_soon_as_it_is_certain() -> None:
     assert pairer.add(DEPTH, 1.078, "d3") == [Pair(1.066, "c2", "d2")]
 
 
-def test_images_too_far_apart_are_no_pair() -> None:
+def test_images_too_far_apart_in_time_are_not_paired() -> None:
     counts = SourceCounts()
     rgb_s, depth_s = np.array([0.0, 0.1, 0.2]), np.array([0.0201, 0.1199, 0.25])
     pairs = pairs_of(rgb_s, depth_s, by_time(rgb_s, depth_s), counts)
@@ -79,7 +79,7 @@ def test_a_known_delay_of_depth_is_added_to_its_stamps() -> None:
     assert pairer.add(DEPTH, 1.05, "of 1.00") == [Pair(1.00, "c0", "of 1.00")]
 
 
-def test_duplicates_and_late_images_are_left_out_and_counted() -> None:
+def test_duplicates_and_late_images_are_skipped_and_counted() -> None:
     counts = SourceCounts()
     rgb_s = np.array([0.0, 0.0, 0.1, 0.05, 0.2])
     depth_s = np.array([0.0, 0.1, 0.1, 0.2])
@@ -89,7 +89,7 @@ def test_duplicates_and_late_images_are_left_out_and_counted() -> None:
     assert counts.unpaired_rgb == counts.unpaired_depth == 0
 
 
-def test_time_goes_on_where_the_clock_was_set_back(caplog) -> None:
+def test_stamps_go_forward_after_the_clock_was_set_back(caplog) -> None:
     """Depth reaches the jump two images later than colour; nothing is paired across it."""
     rgb_s = np.concatenate([100 + np.arange(10) / 10, 40 + np.arange(10) / 10])
     depth_s = rgb_s + 0.003
@@ -105,7 +105,7 @@ def test_time_goes_on_where_the_clock_was_set_back(caplog) -> None:
     assert "set back by 60.9" in caplog.text
 
 
-def test_gaps_are_counted_by_the_usual_step() -> None:
+def test_gaps_are_counted_relative_to_the_usual_step() -> None:
     counts = SourceCounts()
     stamps_s = np.cumsum([0, 0.1, 0.1, 0.25, 0.1, 0.5, 0.1, 60, 0.1])
     assert len(pairs_of(stamps_s, stamps_s, by_time(stamps_s, stamps_s), counts)) == 9
@@ -113,7 +113,7 @@ def test_gaps_are_counted_by_the_usual_step() -> None:
     assert counts.line() == "2 gaps"
 
 
-def test_a_stream_that_stays_away_costs_no_memory() -> None:
+def test_images_without_the_other_stream_use_bounded_memory() -> None:
     counts = SourceCounts()
     pairer = Pairer[int](counts)
     for k in range(1000):

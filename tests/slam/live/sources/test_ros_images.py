@@ -1,4 +1,4 @@
-"""Messages of every encoding give the picture that was put in."""
+"""Messages of every encoding are decoded to the image that was encoded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_raw_colour(encoding: str, pixels: np.ndarray, padding: int) -> None:
     assert np.array_equal(colour_image(image(encoding, pixels, padding), "here"), RGB)
 
 
-def test_data_of_other_libraries() -> None:
+def test_data_may_be_bytes_or_an_array() -> None:
     message = image("rgb8", RGB)
     for data in (message.data.tobytes(), array.array("B", message.data.tobytes())):
         message.data = data
@@ -46,7 +46,7 @@ def test_grey_is_expanded() -> None:
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_patterns_give_the_colours_back(pattern: str) -> None:
+def test_bayer_patterns_are_decoded_to_the_colours(pattern: str) -> None:
     """The pattern names the first two pixels of the first row, then of the second."""
     colours = np.zeros((24, 32, 3), np.uint8)
     colours[:, :16], colours[:, 16:] = (200, 90, 20), (30, 60, 220)
@@ -124,12 +124,12 @@ def test_broken_colour_is_refused(message: object, reason: str | None) -> None:
         compressed("16UC1; compressedDepth png", ".png", RGB, bytes(12)),
     ],
 )
-def test_what_is_no_depth_is_refused(message: object) -> None:
+def test_messages_that_are_not_depth_are_refused(message: object) -> None:
     with pytest.raises(InputError, match=r"^here: "):
         depth_image(message, "here")
 
 
-def test_the_camera_is_that_of_the_image() -> None:
+def test_the_camera_of_raw_and_rectified_images() -> None:
     camera = camera_of(camera_info(), 1.0, rectified=False, where="here")
     assert (camera.width, camera.height) == (160, 120)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (131.25, 130.0, 79.625, 60.375)
@@ -139,7 +139,7 @@ def test_the_camera_is_that_of_the_image() -> None:
     assert not any(rectified.distortion)
 
 
-def test_a_camera_that_is_not_known_is_refused() -> None:
+def test_an_uncalibrated_or_unsupported_camera_is_refused() -> None:
     info = camera_info()
     info.distortion_model = "equidistant"
     with pytest.raises(InputError, match=r"here: distortion 'equidistant'.*--camera"):
@@ -152,7 +152,7 @@ def test_a_camera_that_is_not_known_is_refused() -> None:
         camera_of(zeros, 1.0, rectified=False, where="here")
 
 
-def test_opencv_and_ros_agree_on_what_blue_first_means() -> None:
+def test_blue_first_means_the_same_in_opencv_and_ros() -> None:
     red = np.zeros((8, 8, 3), np.uint8)
     red[..., 2] = 255  # OpenCV's red
     data = cv2.imencode(".png", red)[1]
