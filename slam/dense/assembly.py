@@ -12,12 +12,13 @@ import numpy as np
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.fusion import FusionCounts, dense_config
-from bmask_slam.dense.input import MappedRun, open_run, run_semantics
+from bmask_slam.dense.input import MappedRun, open_run
 from bmask_slam.dense.keyframes import KeyframeWork, OpenMap
 from bmask_slam.dense.options import MapOptions
 from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW, DepthSource
+from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.semantics.beliefs.movability import read_priors
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
@@ -38,7 +39,7 @@ def open_map(options: MapOptions) -> OpenMap:
         InputError: the run, its sequence or the masks cannot be used, or a class is not known.
     """
     run = open_run(options.run, options.sequence)
-    masks = options.masks or run_semantics(options.run / "config.yaml").segmenter
+    masks = options.masks or run_semantics(options.run).segmenter
     segmenter = make_segmenter(masks, run.sequence.folder, find_weights)
     return assembled(run, segmenter, dataclasses.replace(options, masks=masks))
 

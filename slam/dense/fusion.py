@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.input import run_semantics, undistorted_labels
+from bmask_slam.dense.input import undistorted_labels
 from bmask_slam.dense.options import MapOptions
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.arrays import Array, Ints, Mask
@@ -25,6 +25,7 @@ from bmask_slam.mapping.inverse_depth.dense_mapper import (
 from bmask_slam.mapping.inverse_depth.depth_map import DepthNoise, from_sensor
 from bmask_slam.mapping.products.submaps import Submap, make_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence, keyframe_labels, widened
+from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.labels import LabelSet
 
@@ -85,7 +86,7 @@ class KeyframeFusion:
         self._camera, self._folder, self._options = camera, folder, options
         self._classes = len(labels)
         self._moving = [labels.number(name) for name in options.without or ()]
-        self._semantics = run_semantics(options.run / "config.yaml")
+        self._semantics = run_semantics(options.run)
         self._mapper = DenseMapper(camera, dense_config(options))
         self._evidence: dict[int, InstanceEvidence] = {}
         self._segment: int | None = None

@@ -10,19 +10,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.keyframe_view import SeenKeyframe, seen
-from bmask_slam.graph.arrays import Array, Arrays, Floats, Image, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import part
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.labelling.semantic_mapper import SemanticsConfig
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DepthSource
-from bmask_slam.run_folder.map_file import read_map
+from bmask_slam.run_folder.map_file import RunLabels, read_map, saved_labels
 from bmask_slam.run_folder.origin import find_sequence
-from bmask_slam.semantics.beliefs.label_store import LabelStore
-from bmask_slam.semantics.labels import LabelSet, label_set
+from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.right_images import RightImages
@@ -80,14 +77,6 @@ class MappedRun(SavedMap):
     right: RightImages | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class RunLabels:
-    """The label store of a run, by landmark ids, and its label set."""
-
-    names: LabelSet
-    store: LabelStore
-
-
 def open_run(path: Path, sequence: Path | None = None) -> MappedRun:
     """Open a finished run; the sequence is that of the run unless it has moved.
 
@@ -107,22 +96,8 @@ def read_saved_map(path: Path) -> SavedMap:
     state, camera = read_map(path)
     world = world_of(part(state, "mapper.world"))
     keyframes = world.in_segment(world.largest_segment())
-    labels = _labels(part(state, "semantics"), path / "config.yaml")
+    labels = saved_labels(part(state, "semantics"), path)
     return SavedMap(path, world, keyframes, camera, labels)
-
-
-def run_semantics(config: Path) -> SemanticsConfig:
-    """Where a run's masks came from, and what was believed of them."""
-    return resolve(SemanticsConfig, config, section="semantics")
-
-
-def _labels(state: Arrays, config: Path) -> RunLabels | None:
-    names = LabelSet(tuple(state["names"].tolist())) if state else label_set(())
-    if len(names) < 2:
-        return None
-    store = LabelStore(len(names), run_semantics(config).labels)
-    store.restore(part(state, "labels"))
-    return RunLabels(names, store)
 
 
 def load(

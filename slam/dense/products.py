@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.input import MappedRun, SavedMap, load, run_semantics
+from bmask_slam.dense.input import MappedRun, SavedMap, load
 from bmask_slam.dense.keyframes import OpenMap
 from bmask_slam.dense.options import MapOptions
 from bmask_slam.graph.arrays import Array, Image
@@ -27,6 +27,7 @@ from bmask_slam.mapping.products.mesh import View, sampled, truncation_voxels, t
 from bmask_slam.mapping.products.object_clouds import ObjectClouds, ObjectRegion
 from bmask_slam.mapping.products.pictures import Picture, palette, with_legend
 from bmask_slam.mapping.products.surface_labels import LabelTable
+from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.world.world_map import Keyframe
@@ -189,7 +190,7 @@ def label_table(opened: FusedMap, keyframes: list[Keyframe]) -> LabelTable:
     They hold what the run's label store believes at this moment, so that a label that changes
     there changes in the map.
     """
-    fusion = run_semantics(opened.run.path / "config.yaml").labels
+    fusion = run_semantics(opened.run.path).labels
     prior = fusion.prior(len(opened.labels))
     rows = []
     for keyframe in keyframes:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
-from bmask_slam.graph.smoother.isam2 import SolverError
-from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.graph.whole_file import whole_file
+
+if TYPE_CHECKING:
+    from bmask_slam.graph.smoother.smoother import Smoother
 
 logger = logging.getLogger(__name__)
 
@@ -37,9 +39,12 @@ class KeyframeCovariances:
 
 
 def find_covariances(smoother: Smoother, stamps_s: dict[int, float]) -> KeyframeCovariances:
-    """How sure the graph is of keyframes with these stamps; none, and a line in the log, if GTSAM
-    fails.
+    """Covariances of the keyframes with these stamps, by the graph.
+
+    Empty, with an error in the log, if the graph is singular.
     """
+    from bmask_slam.graph.smoother.isam2 import SolverError  # noqa: PLC0415 - loads GTSAM
+
     try:
         found = smoother.marginals()
     except SolverError as error:

@@ -1,12 +1,16 @@
-"""landmarks.ply: the landmarks of a map, written, and read back as arrays."""
+"""landmarks.ply, written and read back as arrays; dense clouds, read."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bmask_slam.graph.files.ply import write_ply
+from bmask_slam.graph.arrays import Array, Bytes, Ints
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.labelling.results import LandmarkCloud
 
 LANDMARKS = "landmarks.ply"
@@ -26,3 +30,105 @@ def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:
         columns["probability"] = found.probability.astype(np.float32)
         columns["entropy"] = found.entropy.astype(np.float32)
     write_ply(path, columns, LANDMARKS_COMMENT)
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """The landmarks of a run, N of them.
+
+    Attributes:
+        ids: (N,).
+        points_world: (N, 3) in metres.
+        colours: (N, 3) uint8, red first.
+        observations: (N,), number of keyframes that observed each.
+        labels: (N,) class names, "unknown" where a landmark is on no known object; None if the run
+            had no segmenter.
+        probabilities: (N,) of the label, or None.
+        entropies: (N,) of the distribution over all labels in nats, or None.
+    """
+
+    ids: Ints
+    points_world: Array
+    colours: Bytes
+    observations: Ints
+    labels: NDArray[np.str_] | None = None
+    probabilities: Array | None = None
+    entropies: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def read_landmarks(path: Path, names: tuple[str, ...] | None) -> Landmarks:
+    """Read what `write_landmarks` wrote; ``names`` are those of the labels, None without any.
+
+    Raises:
+        InputError: no such file, a column that is missing, or a label without a name.
+    """
+    columns = _columns(path, ("id", "observations"))
+    found = Landmarks(
+        columns["id"].astype(np.int64),
+        columns["xyz"],
+        columns["rgb"],
+        columns["observations"].astype(np.int64),
+    )
+    if names is None or "label" not in columns:
+        return found
+    labels = _named(columns["label"], names, path)
+    probabilities, entropies = (columns[n].astype(float) for n in ("probability", "entropy"))
+    return replace(found, labels=labels, probabilities=probabilities, entropies=entropies)
+
+
+@dataclass(frozen=True, eq=False)
+class DenseCloud:
+    """A dense cloud that ``bmask-slam map`` made, N points.
+
+    Attributes:
+        points_world: (N, 3) in metres.
+        normals_world: (N, 3), unit vectors towards the camera.
+        colours: (N, 3) uint8, red first.
+        labels: (N,) class names, "background" on no object.
+        probabilities: (N,) of the label.
+        sigmas_m: (N,), standard deviation along the ray.
+    """
+
+    points_world: Array
+    normals_world: Array
+    colours: Bytes
+    labels: NDArray[np.str_]
+    probabilities: Array
+    sigmas_m: Array
+
+    def __len__(self) -> int:
+        return len(self.points_world)
+
+
+def read_dense_cloud(path: Path, names: tuple[str, ...]) -> DenseCloud:
+    """Read a cloud of a dense folder, whose labels have these names. Raises InputError."""
+    columns = _columns(path, ("nx", "ny", "nz", "label", "probability", "sigma"))
+    return DenseCloud(
+        columns["xyz"],
+        np.stack([columns[f"n{axis}"] for axis in "xyz"], axis=1).astype(float),
+        columns["rgb"],
+        _named(columns["label"], names, path),
+        columns["probability"].astype(float),
+        columns["sigma"].astype(float),
+    )
+
+
+def _columns(path: Path, needed: tuple[str, ...]) -> dict[str, NDArray]:
+    """Columns of a PLY file, and "xyz" (N, 3) and "rgb" (N, 3) of its points."""
+    columns = read_ply(path)
+    position, colour = ("x", "y", "z"), ("red", "green", "blue")
+    missing = [name for name in (*position, *colour, *needed) if name not in columns]
+    if missing:
+        raise InputError(f"{path}: has no column {missing[0]!r}; make it again")
+    columns["xyz"] = np.stack([columns[name] for name in position], axis=1).astype(float)
+    columns["rgb"] = np.stack([columns[name] for name in colour], axis=1)
+    return columns
+
+
+def _named(labels: NDArray, names: tuple[str, ...], path: Path) -> NDArray[np.str_]:
+    if len(labels) and not 0 <= labels.min() <= labels.max() < len(names):
+        raise InputError(f"{path}: a label beyond the {len(names)} of the run; make it again")
+    return np.array(names, np.str_)[labels]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,12 +19,18 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
+from bmask_slam.graph.files.array_file import FileKind, part, read_arrays, write_arrays
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.marginals.landmark_marginalisation import reinstate
 from bmask_slam.graph.smoother.storage import read_camera, read_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
+from bmask_slam.run_folder.origin import CONFIG
+from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.labels import LabelSet, label_set
+
+if TYPE_CHECKING:
+    from bmask_slam.labelling.semantic_mapper import SemanticsConfig
 
 MAP_FILE = FileKind("map", 4, compressed=True)
 MAP = "map"
@@ -126,3 +133,28 @@ def _check_same_run(run: SavedRun) -> None:
         f"{run.path}: keyframes.txt and graph do not belong together; give the folder as the run "
         "left it"
     )
+
+
+@dataclass(frozen=True, eq=False)
+class RunLabels:
+    """The label set of a run and its label store, whose ids are those of landmarks."""
+
+    names: LabelSet
+    store: LabelStore
+
+
+def run_semantics(path: Path) -> SemanticsConfig:
+    """The section ``semantics`` of a run's configuration. Raises InputError."""
+    from bmask_slam.labelling.semantic_mapper import SemanticsConfig  # noqa: PLC0415 - loads GTSAM
+
+    return resolve(SemanticsConfig, path / CONFIG, section="semantics")
+
+
+def saved_labels(state: Arrays, path: Path) -> RunLabels | None:
+    """What the part ``semantics`` of a map says of landmarks; None without a segmenter."""
+    names = LabelSet(tuple(state["names"].tolist())) if state else label_set(())
+    if len(names) < 2:
+        return None
+    store = LabelStore(len(names), run_semantics(path).labels)
+    store.restore(part(state, "labels"))
+    return RunLabels(names, store)

@@ -15,7 +15,6 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
-from bmask_slam.run_folder.object_picture import draw_objects
 from bmask_slam.semantics.instances.overlay import class_colour
 from bmask_slam.semantics.objects.boxes3d import EDGES, OrientedBox
 from bmask_slam.semantics.objects.object_map import MapObject
@@ -51,6 +50,8 @@ def semantic_writers(
     cloud: LandmarkCloud, objects: MapObjects, trajectory: Trajectory
 ) -> dict[str, Callable[[Path], None]]:
     """A function that writes a file, by the file's name."""
+    from bmask_slam.run_folder.object_picture import draw_objects  # noqa: PLC0415 - matplotlib
+
     return {
         LABELS: lambda path: write_labels(path, cloud),
         OBJECTS: lambda path: write_objects(path, objects),

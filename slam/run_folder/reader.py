@@ -1,0 +1,276 @@
+"""``Run(path)``: a run folder as numpy arrays, each part read when it is first asked for."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory, read_tum
+from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
+from bmask_slam.run_folder.folder import CHECKPOINT, FILES
+from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
+from bmask_slam.run_folder.landmark_file import (
+    LANDMARKS,
+    DenseCloud,
+    Landmarks,
+    read_dense_cloud,
+    read_landmarks,
+)
+from bmask_slam.run_folder.origin import CONFIG, read_origin
+from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, read_objects
+
+if TYPE_CHECKING:
+    from bmask_slam.system_config import SystemConfig
+
+_MAX_STAMP_ERROR_S = 1e-5  # stamps have six decimals
+_DENSE = "dense"
+
+
+class Metric(NamedTuple):
+    """A number of metrics.json; unit "1" is a share."""
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframes:
+    """The keyframes of a run, K of them, in the order of their stamps.
+
+    Attributes:
+        ids: (K,); -1 for a keyframe that frames.csv does not have.
+        timestamps_s: (K,).
+        poses_world_camera: (K, 4, 4), ``p_world = T_world_camera @ p_camera``.
+        reasons: K texts, why each was made.
+    """
+
+    ids: Ints
+    timestamps_s: Array
+    poses_world_camera: Array
+    reasons: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+class Run:
+    """The folder of a run, also of one that goes on or was stopped; whatever is there can be read.
+
+    Every property is read from its file when it is first asked for, and kept. World coordinates
+    are those of the run's map: metres, in the camera frame of its first keyframe. ``os.fspath``
+    gives the folder, so that a run can be given wherever a path can.
+
+    Raises:
+        InputError: no such folder or no run in it; each property, if its file is missing or
+            broken, names the file and the command that makes it.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise InputError(f"{self.path}: no such folder; give the folder of a run")
+        if not any((self.path / name).exists() for name in (*FILES, CHECKPOINT)):
+            raise InputError(
+                f"{self.path}: holds no run; make one by: bmask-slam run SEQUENCE --out {self.path}"
+            )
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run came to its end and wrote all its results."""
+        return (self.path / "metrics.json").is_file() and not (self.path / CHECKPOINT).exists()
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Every frame with a pose in the largest map segment; of a run that goes on, so far."""
+        return read_tum(self._file("trajectory.txt"))
+
+    @cached_property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """Every map segment, each in a world frame of its own; the largest is first."""
+        others = sorted(self.path.glob("trajectory_segment_*.txt"))
+        return (self.trajectory, *(read_tum(path) for path in others))
+
+    @cached_property
+    def keyframes(self) -> Keyframes:
+        """The keyframes of the largest map segment."""
+        trajectory = read_tum(self._file("keyframes.txt"))
+        frames, stamps_s = self.frames, trajectory.timestamps_s
+        rows = np.searchsorted(frames.timestamps_s + _MAX_STAMP_ERROR_S, stamps_s)
+        rows = np.minimum(rows, max(len(frames) - 1, 0))
+        ids, reasons = np.full(len(stamps_s), -1), [""] * len(stamps_s)
+        for k, row in enumerate(rows.tolist() if len(frames) else ()):
+            if abs(frames.timestamps_s[row] - stamps_s[k]) <= _MAX_STAMP_ERROR_S:
+                ids[k], reasons[k] = frames.keyframe_ids[row], frames.keyframe_reasons[row]
+        return Keyframes(ids, stamps_s, trajectory.poses_world_camera, tuple(reasons))
+
+    @cached_property
+    def frames(self) -> FrameTable:
+        """Status, matches, inliers and times of every frame; of a run that goes on, so far."""
+        return read_frames(self._file(FRAMES))
+
+    @cached_property
+    def landmarks(self) -> Landmarks:
+        """The landmarks of the largest map segment, with labels if there was a segmenter."""
+        names = self.label_names if (self.path / OBJECTS).is_file() else None
+        return read_landmarks(self._file(LANDMARKS), names)
+
+    @cached_property
+    def objects(self) -> tuple[SavedObject, ...]:
+        """The objects of the largest map segment."""
+        return tuple(self._label_names_and_objects[1])
+
+    @cached_property
+    def label_names(self) -> tuple[str, ...]:
+        """The C class names of the run's segmenter; the first is "unknown"."""
+        return self._label_names_and_objects[0]
+
+    @cached_property
+    def label_distributions(self) -> Array:
+        """Probabilities (N, C) of ``label_names`` for the N ``landmarks``."""
+        from bmask_slam.graph.files.array_file import part  # noqa: PLC0415
+        from bmask_slam.run_folder.map_file import read_map, saved_labels  # noqa: PLC0415
+
+        found = saved_labels(part(read_map(self._file("map"))[0], "semantics"), self.path)
+        if found is None:
+            raise InputError(
+                f"{self.path / 'map'}: has no labels; {self._again('--segmenter light')}"
+            )
+        return found.store.probabilities(self.landmarks.ids)
+
+    @cached_property
+    def keyframe_covariances(self) -> Array:
+        """Covariances (K, 6, 6) of the ``keyframes``, NaN where the graph knows none.
+
+        Of ``[rotation rad, translation m]`` in the camera's frame: the true pose is about
+        ``T_world_camera @ se3_exp(xi)``, xi ~ N(0, covariance). Read from covariances.txt, or
+        computed from the graph.
+        """
+        if (self.path / COVARIANCES).is_file():
+            saved = read_covariances(self.path / COVARIANCES)
+            return _rows_of(self.keyframes.ids, saved.keyframe_ids, saved.covariances)
+        ids, covariances = self._marginals(np.zeros(0, np.int64))[0]
+        return _rows_of(self.keyframes.ids, ids, covariances)
+
+    @cached_property
+    def landmark_covariances(self) -> Array:
+        """Covariances (N, 3, 3) of the ``landmarks`` in m^2, world axes; computed from the graph.
+
+        NaN for a landmark that is not in the graph at the end of the run. The computation takes
+        from less than a second to a minute.
+        """
+        ids, covariances = self._marginals(self.landmarks.ids)[1]
+        return _rows_of(self.landmarks.ids, ids, covariances)
+
+    @cached_property
+    def dense_cloud(self) -> DenseCloud:
+        """The dense cloud, after ``map_run``."""
+        return read_dense_cloud(self._file(f"{_DENSE}/cloud.ply"), self._dense_names)
+
+    @cached_property
+    def object_clouds(self) -> dict[int, DenseCloud]:
+        """The dense cloud of each object by its id, after ``map_run``."""
+        names = self._dense_names
+        files = sorted((self.path / _DENSE / "objects").glob("*-*.ply"))
+        return {int(f.name.partition("-")[0]): read_dense_cloud(f, names) for f in files}
+
+    @cached_property
+    def metrics(self) -> dict[str, Metric]:
+        """Value and unit of every number in metrics.json by its name."""
+        path = self._file("metrics.json")
+        try:
+            rows = json.loads(path.read_text(encoding="utf-8"))
+            return {row["name"]: Metric(row["value"], str(row["unit"])) for row in rows}
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: cannot be read ({error}); {self._again()}") from error
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera that the run was made with."""
+        from bmask_slam.graph.smoother.storage import read_graph  # noqa: PLC0415
+
+        return read_graph(self._file("graph"))[1]
+
+    @cached_property
+    def config(self) -> SystemConfig:
+        """The resolved configuration of the run."""
+        from bmask_slam.config.configuration import resolve  # noqa: PLC0415
+        from bmask_slam.system_config import SystemConfig  # noqa: PLC0415 - loads GTSAM
+
+        return resolve(SystemConfig, self._file(CONFIG))
+
+    @cached_property
+    def sequence(self) -> Path | None:
+        """The folder of the sequence that the run was made from; None for a camera or a bag."""
+        return read_origin(self.path).sequence
+
+    @cached_property
+    def log(self) -> tuple[str, ...]:
+        """The lines of log.txt."""
+        text = self._file("log.txt").read_text(encoding="utf-8", errors="replace")
+        return tuple(text.splitlines())
+
+    @cached_property
+    def _label_names_and_objects(self) -> tuple[tuple[str, ...], list[SavedObject]]:
+        self._file(OBJECTS, "--segmenter light")
+        return read_objects(self.path)
+
+    @cached_property
+    def _dense_names(self) -> tuple[str, ...]:
+        """Class names of the labels of the dense clouds."""
+        path = self._file(f"{_DENSE}/legend.json")
+        return tuple(json.loads(path.read_text(encoding="utf-8")))
+
+    def _marginals(self, landmark_ids: Ints) -> tuple[tuple[Ints, Array], tuple[Ints, Array]]:
+        """Ids and covariances of the graph's keyframes, and of those landmarks that it has."""
+        from bmask_slam.config.configuration import resolve  # noqa: PLC0415
+        from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig  # noqa: PLC0415
+
+        config = resolve(SmootherConfig, self._file(CONFIG), section="graph")
+        smoother = Smoother.load(self._file("graph"), config)
+        known = np.intersect1d(landmark_ids, smoother.state()["landmark_ids"])
+        found = smoother.marginals(known)
+        return (found.keyframe_ids, found.keyframes), (found.landmark_ids, found.landmarks)
+
+    def _file(self, name: str, option: str = "") -> Path:
+        """The path of a file of the run. Raises InputError if it is not there."""
+        path = self.path / name
+        if path.exists():
+            return path
+        if name.startswith(_DENSE):
+            raise InputError(f"{path}: no such file; make it by: bmask-slam map {self.path}")
+        if (self.path / CHECKPOINT).exists():
+            cure = f"finish the run by: bmask-slam run --resume {self.path}"
+            raise InputError(f"{path}: no such file yet; {cure}")
+        raise InputError(f"{path}: no such file; {self._again(option)}")
+
+    def _again(self, option: str = "") -> str:
+        """The command that makes the run once more."""
+        sequence = self.sequence or "SEQUENCE"
+        words = ("bmask-slam run", str(sequence), option, f"--out {self.path} --overwrite")
+        return f"make it by: {' '.join(filter(None, words))}"
+
+
+def _rows_of(wanted: Ints, ids: Ints, values: Array) -> Array:
+    """Rows (N, ...) of the wanted ids (N,) from those of rising ids (M,); NaN for an unknown id."""
+    found = np.full((len(wanted), *values.shape[1:]), np.nan)
+    order = np.argsort(ids)
+    at = np.searchsorted(ids[order], wanted)
+    known = np.flatnonzero(at < len(ids))
+    known = known[ids[order][at[known]] == wanted[known]]
+    found[known] = values[order][at[known]]
+    return found
