@@ -1,5 +1,5 @@
 # make demo    sets everything up in .venv, runs, maps, asks and compares on a rendered sequence, offline and live
-# make test    sets up and runs the tests
+# make test    sets up and runs the tests; TESTS="tests/graph -x" passes other arguments to pytest
 # make check   lint, format, types and tests (with the layer rule)
 # make typing  makes build/typing, the tree that mypy (and an editor) reads the package from
 # make bench   measures and writes docs/results/benchmarks.md; BENCH="..." passes arguments
@@ -8,6 +8,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BENCH ?=
+TESTS ?= --numprocesses 2 --dist worksteal
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEMO := runs/demo-sequence
@@ -31,13 +32,13 @@ $(DEMO): | $(READY)
 	@$(BIN)/bmask-slam render office --frames 200 --out $@
 
 test: $(READY)
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest $(TESTS)
 
 check: $(READY) typing
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest $(TESTS)
 
 # The four folders as the one package that they are installed as, for mypy and editors; made anew
 # each time, so that a file that is gone leaves no link.

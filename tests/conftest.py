@@ -2,12 +2,60 @@
 
 from __future__ import annotations
 
-from bmask_slam.labelling import semantic_mapper as semantic_mapping
+import fcntl
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from bmask_slam.rendering.sequence import RenderConfig
+
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
 def pytest_configure() -> None:
-    """Runs are without a segmenter where a test does not ask for one.
+    """One thread a process, and no segmenter in runs where a test does not ask for one.
 
-    A network in each would take minutes; what a user gets is tested in processes of their own.
+    The workers of pytest-xdist share the cores. A network in each run would take minutes; what a
+    user gets is tested in processes of their own.
     """
-    semantic_mapping.DEFAULT_SEGMENTER = "none"
+    for variable in ONE_THREAD:  # read when numpy, OpenCV and torch are loaded
+        os.environ.setdefault(variable, "1")
+    from bmask_slam.labelling import semantic_mapper
+
+    semantic_mapper.DEFAULT_SEGMENTER = "none"
+
+
+@pytest.fixture(scope="session")
+def rendered(
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Callable[[RenderConfig], Path]:
+    """Returns the folder of a rendered sequence, which all tests of all workers share: read only.
+
+    A configuration is rendered once a session, when a test first asks for it.
+    """
+    from bmask_slam.rendering.sequence import render_sequence
+
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if hasattr(request.config, "workerinput") else base  # of pytest-xdist
+
+    def folder(config: RenderConfig) -> Path:
+        name = f"{config.name}-{hashlib.sha1(repr(config).encode()).hexdigest()[:8]}"
+        with (shared / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            path = shared / name / config.name
+            return path if path.is_dir() else render_sequence(config, path)
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def office(rendered: Callable[[RenderConfig], Path]) -> Path:
+    """The first half second of the rendered office in small images, with the true depth."""
+    from bmask_slam.rendering.sequence import RenderConfig
+
+    return rendered(RenderConfig("office", frames=15, width=160, height=120, true_depth=True))

@@ -5,39 +5,29 @@ from __future__ import annotations
 import runpy
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 from recorded_bags import image
 from repository import ROOT
 from scipy.spatial.transform import Rotation
 from synthetic_view import CAMERA, render_plane
 
-from bmask_slam.cli import main
 from bmask_slam.graph.geometry import inverse, se3_exp
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("example") / "office"
-    assert main(["render", "office", "--frames", "8", "--out", str(path)]) == 0
-    return path
-
-
-def test_live(recording, tmp_path) -> None:
+def test_live(office, tmp_path) -> None:
     done = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / "live.py"), str(recording)],
+        [sys.executable, str(ROOT / "examples" / "live.py"), str(office)],
         cwd=tmp_path,
         capture_output=True,
         text=True,
         check=True,
     )
     lines = done.stdout.splitlines()
-    assert len(lines) == 9
-    assert all(" OK " in line for line in lines[:8])
+    assert len(lines) == 16
+    assert all(" OK " in line for line in lines[:15])
     assert (tmp_path / "runs" / "live" / "trajectory.txt").is_file()
 
 

@@ -22,7 +22,6 @@ from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 from bmask_slam.rendering.classes import CLASSES
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.sequences import open_sequence
 
@@ -31,17 +30,10 @@ NAMES = label_set(CLASSES)
 WRONG = 4  # every fourth label
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("truth") / "office"
-    config = RenderConfig("office", frames=3, width=160, height=120, fps=15, true_depth=True)
-    return render_sequence(config, path)
-
-
 @pytest.fixture
-def run(folder, tmp_path):
-    """A run folder whose landmarks are pixels of the first frame, labelled right but for some."""
-    sequence = open_sequence(folder)
+def run(office, tmp_path):
+    """A run office whose landmarks are pixels of the first frame, labelled right but for some."""
+    sequence = open_sequence(office)
     truth = sequence.groundtruth
     write_tum(tmp_path / "keyframes.txt", truth.moved(T_WORLD_TRUTH))
     (tmp_path / "config.yaml").write_text("semantics: {segmenter: {name: truth}}\n")
@@ -54,10 +46,10 @@ def run(folder, tmp_path):
         [(columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z, z]
     )
     points = transform(T_WORLD_TRUTH @ truth.poses_world_camera[0], points)
-    file = folder / "instances" / sequence.pairs.rgb_files[0].name
+    file = office / "instances" / sequence.pairs.rgb_files[0].name
     instances = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[rows, columns]
     labels = [
-        NAMES.of_thing(k) for k in true_classes(folder, NAMES)[instances.astype(int)].tolist()
+        NAMES.of_thing(k) for k in true_classes(office, NAMES)[instances.astype(int)].tolist()
     ]
     labels = ["umbrella" if k % WRONG == 0 else name for k, name in enumerate(labels)]
     columns = dict(zip("xyz", points.T.astype(np.float32), strict=True))
@@ -69,34 +61,34 @@ def run(folder, tmp_path):
     return tmp_path
 
 
-def test_labels_in_another_world(run, folder):
+def test_labels_in_another_world(run, office):
     """Three of four are right, up to landmarks at edges that most frames show as something else."""
-    assert label_accuracy(run, open_sequence(folder)) == pytest.approx(1 - 1 / WRONG, abs=0.03)
+    assert label_accuracy(run, open_sequence(office)) == pytest.approx(1 - 1 / WRONG, abs=0.03)
 
 
-def test_labels_of_a_wrong_world_are_wrong(run, folder):
+def test_labels_of_a_wrong_world_are_wrong(run, office):
     """Keyframes that are not where the landmarks believe them to be."""
-    sequence = open_sequence(folder)
+    sequence = open_sequence(office)
     moved = sequence.groundtruth.moved(T_WORLD_TRUTH @ se3_exp([0, 0.5, 0, 0, 0, 0]))
     write_tum(run / "keyframes.txt", moved)
     found = label_accuracy(run, sequence)
     assert found is None or found < 0.6
 
 
-def test_a_run_without_labels_has_no_figure(run, folder):
+def test_a_run_without_labels_has_no_figure(run, office):
     (run / "labels.csv").unlink()
-    assert label_accuracy(run, open_sequence(folder)) is None
-    assert depth_ratio(run, open_sequence(folder)) is None
+    assert label_accuracy(run, open_sequence(office)) is None
+    assert depth_ratio(run, open_sequence(office)) is None
 
 
-def test_the_mean_transform(folder):
-    truth = open_sequence(folder).groundtruth
+def test_the_mean_transform(office):
+    truth = open_sequence(office).groundtruth
     found = truth_from_world(truth.moved(T_WORLD_TRUTH), truth)
     np.testing.assert_allclose(found, inverse(T_WORLD_TRUTH), atol=1e-9)
 
 
-def test_hidden_points_are_not_visible(folder):
-    camera = open_sequence(folder).camera
+def test_hidden_points_are_not_visible(office):
+    camera = open_sequence(office).camera
     depth_m = np.full((camera.height, camera.width), 2.0)
     points = np.array([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 1.0], [0, 0, -2.0], [9, 0, 2.0]])
     rows, pixels = visible(points, depth_m, camera)
@@ -104,9 +96,9 @@ def test_hidden_points_are_not_visible(folder):
     assert pixels.tolist() == [[round(camera.cx), round(camera.cy)]]
 
 
-def test_depth_against_the_sensor(run, folder, monkeypatch):
+def test_depth_against_the_sensor(run, office, monkeypatch):
     """A map that halves the sensor's error gives one half; NaN and outliers do not count."""
-    sequence = open_sequence(folder)
+    sequence = open_sequence(office)
     (run / "frames.csv").write_text("index,keyframe\n0,0\n1,\n2,1\n")
     (run / "dense").mkdir()
     (run / "dense/dense.json").write_text(json.dumps({}))

@@ -20,7 +20,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.run_folder.map_file import read_map, write_map
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter
@@ -39,9 +39,8 @@ def truth_file(run: MappedRun) -> Path:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = RenderConfig("office", frames=40, width=160, height=120, true_depth=True)
-    return render_sequence(config, tmp_path_factory.mktemp("dense") / "office")
+def room(rendered) -> Path:
+    return rendered(RenderConfig("office", frames=40, width=160, height=120, true_depth=True))
 
 
 @pytest.fixture(scope="module")

@@ -16,16 +16,14 @@ from scipy.spatial import cKDTree
 from bmask_slam.cli import main
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.rendering.sequence import RenderConfig
 
 FRAMES = 24
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("recording") / "office"
-    command = ["render", "office", "--frames", str(FRAMES), "--fps", "8", "--out", str(path)]
-    assert main([*command, "--quiet"]) == 0
-    return path
+def recording(rendered) -> Path:
+    return rendered(RenderConfig("office", FRAMES, fps=8.0, width=320, height=240))
 
 
 def start(recording: Path, out: Path, *options: str) -> subprocess.Popen[str]:
