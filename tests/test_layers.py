@@ -90,8 +90,6 @@ PENDING: dict[str, set[str]] = {
         "slam/moving/motion_state.py",
         "slam/offline/segment_folder.py",
         "slam/refinement/optimised_map.py",
-        "slam/rendering/classes.py",
-        "slam/rendering/true_boxes.py",
         "slam/run_folder/object_picture.py",
     },
     "docstrings": {
@@ -125,9 +123,6 @@ PENDING: dict[str, set[str]] = {
         "slam/moving/__init__.py",
         "slam/offline/__init__.py",
         "slam/refinement/__init__.py",
-        "slam/rendering/engine/__init__.py",
-        "slam/rendering/rooms/__init__.py",
-        "slam/rendering/things/__init__.py",
         "slam/run_folder/__init__.py",
         "slam/runtime/__init__.py",
         "slam/tracking/__init__.py",

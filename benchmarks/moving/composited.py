@@ -28,7 +28,7 @@ from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.rendering.annotations import FrameMarks, coco, frame_marks
+from bmask_slam.rendering.annotations import VisibleInstance, coco, visible_instances
 from bmask_slam.rendering.writer import new_folder, stored_depth, write_json, write_lists, write_png
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.cameras import write_camera
@@ -90,7 +90,7 @@ def make(folder: Path, frames: int) -> None:
     stamps_s = truth.timestamps_s[:frames]
     places = walk(poses, stamps_s)
     men = [read_pair(PAIRS / "test1")[0], read_pair(PAIRS / "test2")[0]]
-    camera, marks = kitchen.camera, list[FrameMarks]()
+    camera, marks = kitchen.camera, list[list[VisibleInstance]]()
     stamps = [f"{t:.6f}" for t in stamps_s]
     for i in range(frames):
         frame = kitchen.load(i)
@@ -105,7 +105,7 @@ def make(folder: Path, frames: int) -> None:
         write_png(folder / "rgb" / name, np.ascontiguousarray(new.rgb))
         write_png(folder / "depth" / name, stored_depth(new.depth_m, camera.depth_scale))
         write_png(folder / "instances" / name, instances)
-        marks.append(frame_marks(instances))
+        marks.append(visible_instances(instances))
     write_lists(folder, stamps, poses)
     write_camera(folder / "camera.yaml", camera)
     scene = SimpleNamespace(categories=("person",))

@@ -21,7 +21,7 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Image, Mask
 from bmask_slam.moving.moving_object_filter import StaticFeatures
-from bmask_slam.rendering.classes import CATEGORY_IDS
+from bmask_slam.rendering.annotations import CATEGORY_IDS
 from bmask_slam.rendering.things.people import PULLED_S
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 from bmask_slam.sequences import open_sequence

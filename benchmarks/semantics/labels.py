@@ -28,8 +28,8 @@ from benchmarks.semantics.imperfect_masks import Errors, ImperfectSegmenter
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
+from bmask_slam.rendering.annotations import OBJECTS_TRUTH
 from bmask_slam.rendering.engine.sensor import depth_sigma_m
-from bmask_slam.rendering.true_boxes import OBJECTS_TRUTH
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around, box_iou
 from bmask_slam.semantics.objects.object_map import MapObject, pixel_rays

@@ -15,7 +15,13 @@ from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
-from bmask_slam.rendering.annotations import FrameMarks, coco, frame_marks
+from bmask_slam.rendering.annotations import (
+    OBJECTS_TRUTH,
+    VisibleInstance,
+    coco,
+    true_boxes,
+    visible_instances,
+)
 from bmask_slam.rendering.engine.builder import SceneBuilder
 from bmask_slam.rendering.engine.lighting import Lighting
 from bmask_slam.rendering.engine.path import CameraPath, camera_poses
@@ -23,8 +29,7 @@ from bmask_slam.rendering.engine.raycast import Renderer, View, to_image
 from bmask_slam.rendering.engine.scene import Scene, build_scene
 from bmask_slam.rendering.engine.sensor import blur, exposure_gain, measure_depth, optical_flow
 from bmask_slam.rendering.rooms.random_room import draw_room
-from bmask_slam.rendering.things.people import Cast, Role, hire
-from bmask_slam.rendering.true_boxes import OBJECTS_TRUTH, true_boxes
+from bmask_slam.rendering.things.people import Cast, Role, add_people
 from bmask_slam.rendering.writer import (
     new_folder,
     stored_depth,
@@ -61,14 +66,14 @@ class RenderConfig:
         rounds: how often the path is walked; more than once in a scene of CLOSED only.
         seed: of people, noise, textures and the hand's tremor, and of a random room.
         people: how many people stand, sit, walk and carry things in the scene.
-        carry: the first of them carries a box, of no class, and pulls a chair along for a while.
+        carry: the first of them carries a box without a class, and pulls a chair for a while.
         noise: apply the Kinect's depth noise and holes, and image noise of 2 grey levels.
         exposure_change: let the brightness vary slowly.
         motion_blur: blur along the image motion while the shutter is open.
         fps: frame rate in hertz.
         depth_delay_ms: take each depth image so much later than the colour image whose stamp
-            it gets; ``camera.yaml`` does not tell.
-        sweeping: tilt, pan, roll and move the camera beside its path, as for calibrating it.
+            it gets; ``camera.yaml`` does not say so.
+        sweeping: add tilt, pan, roll and translation to the path, as for a calibration.
         width, height: image size in pixels; the field of view stays the Kinect's.
         true_depth: also write the noise-free depth to ``depth_true/``.
         normals: also write camera-frame normals to ``normals/`` as round(127.5 n + 127.5).
@@ -115,14 +120,14 @@ def render_sequence(
     _check(config)
     with new_folder(Path(out)) as folder:
         job = _prepare(config, folder)
-        marks: list[FrameMarks] = []
+        visible: list[list[VisibleInstance]] = []
         for found in _draw_all(job):
-            marks.append(found)
+            visible.append(found)
             if progress is not None:
-                progress(len(marks), len(job.poses))
+                progress(len(visible), len(job.poses))
         write_lists(folder, job.stamps, job.poses)
         write_camera(folder / "camera.yaml", job.camera)
-        write_json(folder / "annotations.json", coco(marks, job.stamps, job.camera, job.scene))
+        write_json(folder / "annotations.json", coco(visible, job.stamps, job.camera, job.scene))
     return Path(out)
 
 
@@ -159,7 +164,7 @@ def _check(config: RenderConfig) -> None:
     if config.people < 0:
         raise InputError(f"people={config.people}: must not be negative")
     if config.carry and not config.people:
-        raise InputError("carry: nobody is there to carry anything; ask for people=1")
+        raise InputError("carry: there is nobody to carry anything; ask for people=1")
     if not 0.1 <= config.fps <= 1000:
         raise InputError(f"fps={config.fps}: must be between 0.1 and 1000")
     if not abs(config.depth_delay_ms) <= 1000:
@@ -209,7 +214,7 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     roles = plan.roles
     if config.carry:
         roles = (replace(roles[0], carries="box", pulls=True), *roles[1:])
-    cast = hire(builder, roles[: config.people], plan.lighting, plan.path)
+    cast = add_people(builder, roles[: config.people], plan.lighting, plan.path)
     scene = build_scene(builder, plan.lighting, cast.parts, config.seed)
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]
@@ -217,9 +222,9 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     return _Job(config, folder, camera, poses, depth_poses, stamps, scene, cast, renderer)
 
 
-def _draw_all(job: _Job) -> Iterator[FrameMarks]:
+def _draw_all(job: _Job) -> Iterator[list[VisibleInstance]]:
     """Draw and write frames on worker threads; annotations come in order."""
-    waiting: deque[Future[FrameMarks]] = deque()
+    waiting: deque[Future[list[VisibleInstance]]] = deque()
     with ThreadPoolExecutor(_WORKERS) as pool:
         for i in range(len(job.poses)):
             waiting.append(pool.submit(_draw, job, i))
@@ -229,7 +234,7 @@ def _draw_all(job: _Job) -> Iterator[FrameMarks]:
             yield waiting.popleft().result()
 
 
-def _draw(job: _Job, i: int) -> FrameMarks:
+def _draw(job: _Job, i: int) -> list[VisibleInstance]:
     """Draw, disturb and write frame ``i``: a function of the configuration and ``i`` alone."""
     time_s = i / job.config.fps
     view = _view(job, job.poses[i], time_s)
@@ -250,17 +255,17 @@ def _draw(job: _Job, i: int) -> FrameMarks:
         write_png(job.folder / "depth_true" / name, true)
     if job.config.normals:
         write_png(job.folder / "normals" / name, to_image(127.5 * view.normals + 127.5))
-    return frame_marks(view.instances)
+    return visible_instances(view.instances)
 
 
 def _view(job: _Job, T_world_camera: Array, time_s: float) -> View:
-    """What a perfect camera sees from this pose at this time."""
+    """The view of a perfect camera at this pose and time."""
     moving = job.cast.geometry(time_s, job.scene) if job.cast.parts else None
     return job.renderer.render(T_world_camera, moving)
 
 
 def _exposed(job: _Job, i: int, view: View, rng: np.random.Generator) -> Image:
-    """The picture the camera takes: blurred, exposed, noisy, (H, W, 3) uint8."""
+    """The colour image (H, W, 3) uint8 with motion blur, exposure and noise."""
     config, rgb = job.config, view.rgb
     if config.motion_blur:
         pair = job.poses[max(i - 1, 0)], job.poses[min(i + 1, len(job.poses) - 1)]

@@ -24,7 +24,7 @@ _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A temporary sibling of ``out`` that takes its place when the block ends well.
+    """A temporary folder beside ``out``, renamed to ``out`` when the block ends without an error.
 
     Raises:
         InputError: ``out`` is a file, holds something, or cannot be written.

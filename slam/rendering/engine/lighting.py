@@ -1,7 +1,7 @@
-"""Light that does not depend on the viewer, baked into textures once per scene.
+"""Light that does not depend on the view point, baked into textures once per scene.
 
-Lambert's law for lamps with soft shadows, plus an ambient term with occlusion: exactly what a
-diffuse room looks like, at no cost per frame.
+Lambert's law for lamps with soft shadows, plus an ambient term with occlusion: exact for diffuse
+surfaces, at no cost per frame.
 """
 
 from __future__ import annotations

@@ -41,8 +41,8 @@ def join(shapes: list[Shape]) -> Shape:
 def quad(origin: Array, edge_u: Array, edge_v: Array) -> Shape:
     """A parallelogram whose picture has its top left corner at ``origin``.
 
-    ``edge_u`` runs to the right of the picture and ``edge_v`` down; the normal, toward who sees
-    the picture upright, is ``edge_v x edge_u``.
+    ``edge_u`` runs to the right of the picture and ``edge_v`` down; the normal ``edge_v x edge_u``
+    points to the side from which the picture is upright.
     """
     origin, edge_u, edge_v = (np.asarray(a, float) for a in (origin, edge_u, edge_v))
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])

@@ -17,8 +17,8 @@ SWEEP = np.array(
         *((0.10, 0.29), (0.10, 0.37), (0.12, 0.21)),
     ]
 )
-"""Amplitudes [rad, m] and frequencies [Hz] about and along x, y and z of one who calibrates: tilt,
-pan, roll, and steps aside, up and forth, on top of the path."""
+"""Amplitudes [rad, m] and frequencies [Hz] of a motion for calibration, added to the path: tilt,
+pan and roll about x, y and z, then translation along them."""
 _FINE = 4000
 
 
@@ -53,8 +53,7 @@ def camera_poses(
 ) -> Array:
     """All poses T_world_camera (F, 4, 4) along the path, with the tremor of a hand.
 
-    With ``delay_s`` those of the same motion that much later than each frame; ``sweeping``: see
-    SWEEP.
+    ``delay_s`` samples the same motion that much later than each frame; ``sweeping`` adds SWEEP.
     """
     stamps = np.arange(int(_share_times_s(path)[-1] * fps) + 1) / fps + delay_s
     poses = steady_poses(path, stamps)
@@ -71,12 +70,12 @@ def steady_poses(path: CameraPath, times_s: Array) -> Array:
 
 
 def duration_s(path: CameraPath) -> float:
-    """How long the camera takes, the slow start included."""
+    """Duration of the path, with the slow start."""
     return float(_share_times_s(path)[-1]) + 0.5
 
 
 def _share_times_s(path: CameraPath) -> Array:
-    """When each of _FINE equal shares of the path is reached."""
+    """The time at which each of _FINE equal shares of the path is reached."""
     fine = _at(path, np.linspace(0, 1, _FINE))
     step_m = np.linalg.norm(np.diff(fine[:, :3, 3], axis=0), axis=1)
     relative = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]

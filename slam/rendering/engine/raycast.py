@@ -17,7 +17,7 @@ _MISS = np.uint32(0xFFFFFFFF)
 _QUARTERS = (
     (-0.25, -0.25, 0.125), (0.25, -0.25, 0.625), (-0.25, 0.25, 0.875), (0.25, 0.25, 0.375),
 )  # fmt: skip
-"""Offsets in x and y within the pixel, and what is added to the mip level before truncation."""
+"""Offsets in x and y within the pixel, and offsets of the mip level before truncation."""
 _EDGE_CONTRAST = 14.0
 
 
@@ -28,7 +28,7 @@ class Geometry:
     Attributes:
         scene: Open3D's RaycastingScene; built by one thread, so that it is always the same.
         rows: (T, 16) float32: three rows (gradient, constant) of the functions u, v and light of
-            the world point, then the unit normal, then nothing.
+            the world point, then the unit normal, then padding.
         texture: (T,) int32 index in the atlas.
         instance: (T,) int32 id, 0 for background.
     """
@@ -84,7 +84,7 @@ def _affine(corners: Array, values: Array) -> Array:
 
 
 class Renderer:
-    """Draws a static scene, and what moves in it, from given poses."""
+    """Draws a static scene, and moving things in it, from given poses."""
 
     def __init__(self, camera: Camera, atlas: Atlas, static: Geometry) -> None:
         self._camera, self._atlas, self._static = camera, atlas, static

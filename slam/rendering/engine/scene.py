@@ -15,7 +15,7 @@ from bmask_slam.rendering.engine.raycast import Geometry, build_geometry
 
 @dataclass(frozen=True)
 class Scene:
-    """What the renderer needs of a scene.
+    """Everything that the renderer needs of a scene.
 
     Attributes:
         atlas: every texture, those of moving things last.

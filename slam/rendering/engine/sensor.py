@@ -1,4 +1,4 @@
-"""What a Kinect makes of a perfect view: noise, holes, quantised depth, exposure and blur."""
+"""Model of a Kinect: depth noise, holes and quantisation; exposure and motion blur of colour."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bmask_slam.graph.arrays import Array, Floats, Mask
 from bmask_slam.graph.camera import Camera
 
 RANGE_M = (0.5, 5.0)
-"""Depth outside is not measured."""
+"""Range of depth that is measured."""
 GRAZING_COSINE = 0.17
 """Surfaces seen at less than about 10 degrees return nothing."""
 _JITTER_PX = 0.35
@@ -28,10 +28,10 @@ def depth_sigma_m(depth_m: NDArray[Any]) -> NDArray[Any]:
 def measure_depth(
     depth_m: Floats, normals: Floats, camera: Camera, rng: np.random.Generator
 ) -> Floats:
-    """The depth a Kinect reports, (H, W) float32 with NaN where it reports none.
+    """The depth (H, W) that a Kinect would measure: float32, NaN where it measures none.
 
-    Disparity bf/z is read at a place that is off by a fraction of a pixel, disturbed by a noise
-    that is alike in neighbouring pixels, and rounded to an eighth of a pixel. Missing: out of
+    Disparity bf/z is read at a position that is off by a fraction of a pixel, gets noise that is
+    correlated between neighbouring pixels, and is rounded to an eighth of a pixel. Missing: out of
     range, grazing, in the projector's shadow, and a ragged rim along edges.
     """
     h, w = depth_m.shape
@@ -69,7 +69,7 @@ def _smooth_noise(shape: tuple[int, ...], sigma_px: float, rng: np.random.Genera
 
 
 def _grazing(normals: Floats, camera: Camera, rng: np.random.Generator) -> Mask:
-    """Surfaces seen too flat, with a random limit, (H, W)."""
+    """Pixels (H, W) of surfaces at too flat an angle; the limit has a random part."""
     h, w = normals.shape[:2]
     v, u = np.mgrid[:h, :w].astype(np.float32)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
@@ -80,20 +80,20 @@ def _grazing(normals: Floats, camera: Camera, rng: np.random.Generator) -> Mask:
 
 
 def _in_shadow(depth_m: Floats, camera: Camera) -> Mask:
-    """Pixels whose surface the projector, a baseline to the right, does not see, (H, W).
+    """Pixels (H, W) whose surface is hidden from the projector, a baseline to the right.
 
-    A pixel's column in the projector is u - bf/z. Somewhere to the right a nearer surface with a
-    smaller column stands in the way.
+    A pixel's column in the projector is u - bf/z. It is hidden where a pixel further to the right
+    has a smaller column: that surface is nearer and blocks the light.
     """
     u = np.arange(depth_m.shape[1], dtype=np.float32)
     column = u - np.float32(camera.stereo_bf_px_m) / np.nan_to_num(depth_m, nan=1e3)
     nearest = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
-    tables: Mask = column > nearest + _SHADOW_PX
-    return tables
+    hidden: Mask = column > nearest + _SHADOW_PX
+    return hidden
 
 
 def _ragged(depth_m: Floats, rng: np.random.Generator) -> Mask:
-    """A random rim, about a pixel wide, on the far side of jumps in depth, (H, W)."""
+    """Pixels (H, W) of a random rim, about a pixel wide, along jumps in depth."""
     z = np.nan_to_num(depth_m, nan=0.0)
     jump = cv2.dilate(z, np.ones((3, 3))) - cv2.erode(z, np.ones((3, 3))) > 0.05 * np.maximum(
         z, 0.3

@@ -1,4 +1,4 @@
-"""The office with people who walk to and fro before a camera that stays at the door side."""
+"""The office with people who walk to and fro in front of a camera near the door."""
 
 from __future__ import annotations
 
@@ -33,4 +33,4 @@ ROLES = (
     Role("walk", ((4.4, 3.4), (3.8, 3.36), (3.2, 3.4), (3.2, 3.52), (3.8, 3.55), (4.4, 3.52)),
          carries="book", speed_m_s=0.7, patched=True),
 )  # fmt: skip
-"""Each walks in a lane of their own, in a shirt that is as rich in corners as the room."""
+"""Each walks in a separate lane, in a shirt with as many corners as the room."""

@@ -47,7 +47,7 @@ ROLES = (
     Role("stand", ((0.45, 5.6),), 100, "cup"),
     Role("walk", _ROUND, speed_m_s=0.8),
 )
-"""Who may be there, in the order in which they come; walkers go clockwise, along the block."""
+"""People, in the order in which they are added; they walk clockwise, along the block."""
 
 
 def _ring() -> Array:
@@ -63,7 +63,7 @@ def _ring() -> Array:
 
 
 def path(rounds: int = 1) -> CameraPath:
-    """So often around and 0.6 m on, weaving a little and glancing at the walls."""
+    """``rounds`` rounds and 0.6 m more, weaving a little, with views of the walls."""
     ring = _ring()
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))]
 

@@ -1,4 +1,4 @@
-"""The busy office with people who keep step with the camera, so close that much is hidden."""
+"""The busy office with people who walk close in front of the camera and hide much of the view."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ furnish = busy_office.furnish
 
 
 def _in_step(right_m: float, ahead_m: float) -> Role:
-    """Somebody who keeps a place before the camera to within a hand's breadth."""
+    """A person at a constant place in front of the camera, to within 5 cm."""
     sway = ((0.05, 0.0), (0.0, 0.04), (-0.05, 0.0), (0.0, -0.04))
     places = tuple((right_m + x, ahead_m + y) for x, y in sway)
     return Role("walk", places, speed_m_s=0.05, patched=True, escorts=True)
 
 
 ROLES = (_in_step(0.0, 0.95), _in_step(-0.45, 1.5), *busy_office.ROLES[2:])
-"""The first two walk along with the camera, as who shows it around does; the others walk in their
-lanes behind."""
+"""The first two walk along with the camera, like guides; the others walk in their lanes behind."""

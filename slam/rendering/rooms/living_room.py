@@ -48,7 +48,7 @@ ROLES = (
         "walk", ((1.7, 3.4), (1.7, 4.3), (2.8, 4.4), (2.5, 3.6)), carries="umbrella", speed_m_s=0.6
     ),
 )
-"""Who may be there, in the order in which they come."""
+"""People, in the order in which they are added."""
 
 
 def furnish(b: SceneBuilder) -> None:

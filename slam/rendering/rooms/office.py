@@ -42,7 +42,7 @@ ROLES = (
     Role("sit", ((4.92, 2.25),), 90),
     Role("stand", ((2.4, 0.7),), 190, "cell phone"),
 )  # fmt: skip
-"""Who may be there, in the order in which they come."""
+"""People, in the order in which they are added."""
 
 
 def furnish(b: SceneBuilder) -> None:
@@ -60,7 +60,7 @@ def furnish(b: SceneBuilder) -> None:
 
 
 def workplace(b: SceneBuilder, screens: int = 1, chair_yaw_deg: float = 200.0) -> None:
-    """A desk with its computer, its chair and a day's clutter; who works there looks to +y."""
+    """A desk with its computer, its chair and clutter; whoever works there looks along +y."""
     rng = b.rng
     with b.at(pose(0, 0), "desk"):
         f.desk(b)

@@ -1,4 +1,4 @@
-"""What stands and hangs in a random room, each in a colour of its own and with its clutter."""
+"""Furniture and wall decoration of random rooms, in random colours and with clutter."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from bmask_slam.rendering.things.prints import painting, poster, whiteboard, win
 from bmask_slam.rendering.things.surfaces import Colour, wood
 
 SEAT_M = (-0.15, -1.07)
-"""Where the chair of a workplace stands, in the workplace's frame."""
+"""Position (x, y) of a workplace's chair in the workplace's frame."""
 
 DEVICES: dict[str, Callable[[SceneBuilder], None]] = {
     "air conditioner": f.air_conditioner,
     "switchbox": o.switchbox,
     "jackboard": o.jackboard,
 }
-"""What hangs on walls and has a class, by its name."""
+"""Devices on walls, by the name of their class."""
 
 _WOODS: tuple[Colour, ...] = (f.OAK, f.WALNUT, (206, 196, 180), (142, 104, 70), (88, 66, 52))
 _THINGS = ("cup", "bottle", "cell phone", "book", "books", "trophy", "plant", "drone", "sheet")
@@ -53,7 +53,7 @@ def add_piece(b: SceneBuilder, kind: Kind) -> None:
 
 
 def add_hanging(b: SceneBuilder, hanging: Hanging) -> None:
-    """Build what hangs on a wall, in a frame at the middle of its foot, front along -y."""
+    """Build a thing on a wall in its frame: in the middle of its lower edge, front along -y."""
     if hanging.name in DEVICES:
         with b.at(np.eye(4), hanging.name):
             DEVICES[hanging.name](b)
@@ -70,7 +70,7 @@ def add_hanging(b: SceneBuilder, hanging: Hanging) -> None:
 
 
 def scatter(b: SceneBuilder, width: float, depth: float, count: int, taken: list[_Disc]) -> None:
-    """Lay up to ``count`` things on a table top of the given size, clear of ``taken`` discs."""
+    """Lay up to ``count`` things on a table top of the given size, outside the ``taken`` discs."""
     discs = list(taken)
     for name in b.rng.choice(_THINGS, count, p=_ODDS):
         radius = _RADIUS_M[name]

@@ -1,4 +1,4 @@
-"""Where things stand in a random room: footprints that do not meet, round a free camera path."""
+"""Layout of a random room: footprints that do not overlap and keep off the camera's path."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Kind:
     Attributes:
         name: what it is.
         rects: footprints in metres, those of chairs that belong to it included.
-        height_m: up to where it hides the wall behind it.
-        focus_m: the height at which it is worth looking at.
+        height_m: height up to which it hides the wall behind it.
+        focus_m: height at which the camera looks at it.
         width_m: its own width, for kinds of several widths.
     """
 
@@ -39,7 +39,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class Piece:
-    """A kind of furniture in its place."""
+    """A piece of furniture at its pose."""
 
     kind: Kind
     T_world_piece: Array
@@ -48,7 +48,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Hanging:
-    """Something on a wall, (width, height) in metres; its frame is at the middle of its foot."""
+    """A thing on a wall, (width, height) in metres, its frame in the middle of its lower edge."""
 
     name: str
     T_world_hanging: Array
@@ -84,12 +84,12 @@ def wall_poses(room: Room) -> tuple[Array, ...]:
 
 @dataclass
 class Layout:
-    """A room that fills up: each thing finds a free place by trial, or none.
+    """A room while it is furnished: each thing gets a free place by random trials, or none.
 
     Attributes:
         room: its size.
-        path_world: (N, 2) where the camera walks; everything keeps away from it.
-        rng: the source of all choices.
+        path_world: (N, 2) floor points of the camera's path; everything keeps away from it.
+        rng: random numbers of all choices.
     """
 
     room: Room
@@ -101,7 +101,7 @@ class Layout:
     _walls: list[list[Rect]] = field(default_factory=lambda: [[], [], [], []])
 
     def stand_at_wall(self, kind: Kind) -> bool:
-        """Stand a piece with its back to a wall; whether there was room."""
+        """Place a piece with its back to a wall; returns whether there was room."""
         low, high = min(r[0] for r in kind.rects), max(r[2] for r in kind.rects)
         for _ in range(_TRIES):
             wall = int(self.rng.integers(4))
@@ -109,16 +109,16 @@ class Layout:
             u = self.rng.uniform(0.02 - low, length - high - 0.02)
             if length < high - low + 0.1:
                 continue
-            tables = (u + kind.rects[0][0], 0.0, u + kind.rects[0][2], kind.height_m)
-            if any(overlap(tables, other, _GAP_M) for other in self._walls[wall]):
+            on_wall = (u + kind.rects[0][0], 0.0, u + kind.rects[0][2], kind.height_m)
+            if any(overlap(on_wall, other, _GAP_M) for other in self._walls[wall]):
                 continue
             if self._stand(kind, wall_poses(self.room)[wall] @ pose(u, 0)):
-                self._walls[wall].append(tables)
+                self._walls[wall].append(on_wall)
                 return True
         return False
 
     def stand_free(self, kind: Kind, turns_deg: tuple[float, ...] = ()) -> bool:
-        """Stand a piece anywhere, at one of the given yaws or at any; whether there was room."""
+        """Place a piece anywhere, at a given yaw or any; returns whether there was room."""
         for _ in range(_TRIES):
             x, y = self.rng.uniform((0.2, 0.2), (self.room.width - 0.2, self.room.depth - 0.2))
             yaw = self.rng.choice(turns_deg) if turns_deg else self.rng.uniform(0, 360)
@@ -127,7 +127,7 @@ class Layout:
         return False
 
     def keep_free(self, width_m: float, depth_m: float) -> Rect | None:
-        """Reserve a rectangle of floor for somebody, off the camera's path, if there is one."""
+        """Reserve a rectangle of floor off the camera's path for a person; None if none is free."""
         for _ in range(_TRIES):
             size = np.array([width_m, depth_m] if self.rng.random() < 0.5 else [depth_m, width_m])
             low = self.rng.uniform((0.1, 0.1), (self.room.width, self.room.depth) - size - 0.1)
@@ -138,7 +138,7 @@ class Layout:
         return None
 
     def hang(self, name: str, size_m: tuple[float, float], foot_m: tuple[float, float]) -> bool:
-        """Hang a thing with its foot between two heights; whether there was room."""
+        """Hang a thing with its lower edge between two heights; returns whether there was room."""
         w, h = size_m
         for _ in range(_TRIES):
             wall = int(self.rng.integers(4))

@@ -30,7 +30,7 @@ _LOADS = ("", "suitcase", "cup", "book", "cell phone", "umbrella")
 
 @dataclass(frozen=True)
 class RandomRoom:
-    """A room as drawn: what ``furnish`` builds, where the camera goes and who may be there."""
+    """A random room: its layout, the camera's path, the people and the lamps."""
 
     layout: Layout
     path: CameraPath
@@ -106,7 +106,7 @@ def _targets(layout: Layout, eyes: Array, rng: np.random.Generator) -> Array:
 
 
 def _interest(layout: Layout, point: Array) -> float:
-    """The height worth looking at near a point (2,): of furniture, or of a device on the wall."""
+    """The height to look at near a point (2,): that of furniture, or of a device on the wall."""
     rng = layout.rng
     away = [min(distance_m(r, point[None])[0] for r in p.rects_world) for p in layout.pieces]
     nearest = int(np.argmin(away))
@@ -233,7 +233,7 @@ def _hang_things(layout: Layout) -> None:
 def _roles(
     layout: Layout, rounds: list[Rect | None], stands: list[Rect | None]
 ) -> tuple[Role, ...]:
-    """Who walks in the free places, who stands, and who sits at the desks, taking turns."""
+    """People: in turn one who walks in a free place, one who stands and one who sits at a desk."""
     rng, loads = layout.rng, cycle(layout.rng.permutation(_LOADS).tolist())
     walk = [Role("walk", _round(r, rng), 0.0, next(loads), 0.6) for r in rounds if r]
     stand = [

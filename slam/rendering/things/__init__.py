@@ -1,1 +1,1 @@
-"""TODO."""
+"""Materials, furniture, small objects and people that scenes are made of."""

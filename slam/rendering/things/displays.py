@@ -1,4 +1,4 @@
-"""What screens show, and keyboards."""
+"""Painters of screens and keyboards."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _KEYS = tuple(string.ascii_uppercase + string.digits)
 
 
 def desktop() -> Painter:
-    """What a computer shows: windows with code, a picture, a bar of icons."""
+    """A computer's screen: windows with code, a picture, a bar of icons."""
 
     def paint(rows: int, columns: int, px_per_m: float, rng: np.random.Generator) -> Image:
         picture = landscape(rows, columns, rng)
@@ -64,7 +64,7 @@ def desktop() -> Painter:
 
 
 def broadcast() -> Painter:
-    """What a television shows: a news picture with a caption."""
+    """A television's screen: a news picture with a caption."""
 
     def paint(rows: int, columns: int, px_per_m: float, rng: np.random.Generator) -> Image:
         picture = landscape(rows, columns, rng)

@@ -1,4 +1,4 @@
-"""Books, sheets and what is pinned to a notice board."""
+"""Painters of books, sheets and notice boards."""
 
 from __future__ import annotations
 

@@ -17,6 +17,7 @@ from bmask_slam.rendering.engine.raycast import Geometry
 from bmask_slam.rendering.engine.scene import Scene, assemble
 from bmask_slam.rendering.things import objects as o
 from bmask_slam.rendering.things import skeleton as sk
+from bmask_slam.rendering.things.drawing import random_colour
 from bmask_slam.rendering.things.furniture import lying_book, office_chair
 from bmask_slam.rendering.things.prints import patchwork
 from bmask_slam.rendering.things.surfaces import (
@@ -36,17 +37,17 @@ _HAIR: tuple[Colour, ...] = ((40, 30, 24), (92, 60, 36), (150, 112, 62), (120, 1
 
 @dataclass(frozen=True)
 class Role:
-    """What somebody does in a scene.
+    """What a person does in a scene.
 
     Attributes:
         action: "stand", "sit" or "walk".
         places: (x, y) in metres: one to stand or sit at, or a closed round to walk.
-        escorts: whether the round goes along with the camera: x to its right, y ahead of it.
-        facing_deg: where who stands or sits looks, 0 along -y, counter-clockwise.
+        escorts: whether the round moves with the camera: x to its right, y ahead of it.
+        facing_deg: heading of a standing or sitting person, 0 along -y, counter-clockwise.
         carries: "", "suitcase", "book", "cup", "cell phone", "umbrella" or "box".
         speed_m_s: walking speed.
-        patched: whether the shirt is of patches, rich in corners.
-        pulls: whether a chair comes along from PULLED_S[0] to PULLED_S[1]; then it stays there.
+        patched: whether the shirt is of patches, with many corners.
+        pulls: whether the person pulls a chair from PULLED_S[0] to PULLED_S[1], where it stays.
     """
 
     action: str
@@ -61,9 +62,9 @@ class Role:
 
 @dataclass(frozen=True)
 class Person:
-    """Somebody with a role; ``phase`` in [0, 1) tells apart who does the same.
+    """A person with a role; ``phase`` in [0, 1) makes the motion of people with equal roles differ.
 
-    ``escort`` is the walk of who goes along with the camera.
+    ``escort`` is the walk of a person that moves with the camera.
     """
 
     role: Role
@@ -111,16 +112,16 @@ _GRIPS = {
 }
 
 PULLED_S = (5.0, 7.0)
-"""When a chair is pulled along."""
+"""First and last time at which a chair is pulled."""
 _BESIDE = pose(-0.75, 0.3, 0.0, 30)
 
 
 @dataclass(frozen=True)
 class Cast:
-    """Everybody in a scene.
+    """All people in a scene.
 
     Attributes:
-        people: who.
+        people: the people, in order of their instances.
         parts: surfaces of bodies and carried things, each in its bone's frame.
         owners: for each part the number of its person and the name of its bone.
         lighting: the scene's lamps.
@@ -146,8 +147,10 @@ class Cast:
         return assemble(placed, lights, scene.first_moving_texture)
 
 
-def hire(b: SceneBuilder, roles: tuple[Role, ...], lighting: Lighting, path: CameraPath) -> Cast:
-    """Dress a person for each role; each is an instance of the builder."""
+def add_people(
+    b: SceneBuilder, roles: tuple[Role, ...], lighting: Lighting, path: CameraPath
+) -> Cast:
+    """Make a person for each role; each is an instance of the builder."""
     people, parts, owners = [], [], []
     for who, role in enumerate(roles):
         phase, scale = b.rng.random(), b.rng.uniform(0.94, 1.06)
@@ -162,8 +165,8 @@ def hire(b: SceneBuilder, roles: tuple[Role, ...], lighting: Lighting, path: Cam
     return Cast(tuple(people), parts, owners, lighting)
 
 
-def _taken(b: SceneBuilder, category: str, build: Callable[[], None]) -> list[Part]:
-    """The parts that ``build`` adds as one new instance, taken out of the static scene."""
+def _moving_parts(b: SceneBuilder, category: str, build: Callable[[], None]) -> list[Part]:
+    """The parts that ``build`` adds as one new instance, removed from the static scene."""
     first = len(b.parts)
     with b.at(np.eye(4), category):
         build()
@@ -182,16 +185,16 @@ def _body(b: SceneBuilder, scale: float, patched: bool) -> list[tuple[str, Part]
             b.solid(larger, painter, (np.pi * float(extent[:2].max()), float(extent[2])), 600)
             names.append(bone)
 
-    parts = _taken(b, "person", build)
+    parts = _moving_parts(b, "person", build)
     return list(zip(names, parts, strict=True))
 
 
 def _limbs(rng: np.random.Generator, patched: bool) -> list[tuple[str, Shape, Painter]]:
     """Bone, shape in the bone's frame and painter of every limb, for a person of 1.72 m."""
     skin, hair = _SKIN[rng.integers(4)], _HAIR[rng.integers(4)]
-    shirt = fabric(_cloth(rng, 60, 230), _cloth(rng, 20, 240))
+    shirt = fabric(random_colour(rng, 60, 230), random_colour(rng, 20, 240))
     shirt = patchwork() if patched else shirt
-    trousers, shoes = fabric(_cloth(rng, 25, 110)), plain(_cloth(rng, 20, 90))
+    trousers, shoes = fabric(random_colour(rng, 25, 110)), plain(random_colour(rng, 20, 90))
     profile = [(0.11, -0.01), (0.138, 0.02), (0.134, 0.08), (0.125, 0.18), (0.15, 0.36),
                (0.148, 0.44), (0.1, 0.5), (0.05, 0.53)]  # fmt: skip
     torso = lathe(np.array(profile), 20, (1.22, 0.8))
@@ -222,11 +225,6 @@ def _limbs(rng: np.random.Generator, patched: bool) -> list[tuple[str, Shape, Pa
 
 def _shoe() -> Shape:
     return ellipsoid((0.05, 0.055, 0.145), 14).moved(pose(0, 0.025, 0.07))
-
-
-def _cloth(rng: np.random.Generator, low: int, high: int) -> Colour:
-    r, g, b = rng.integers(low, high, 3)
-    return float(r), float(g), float(b)
 
 
 def _face(skin: Colour, hair: Colour) -> Painter:
@@ -267,34 +265,34 @@ def _features(picture: Floats, hair: Colour, tone: Colour) -> None:
 
 
 def _load(b: SceneBuilder, carries: str) -> list[tuple[str, Part]]:
-    """What the right hand carries, in the frame of its grip: z up, -y to the front."""
+    """The parts in the right hand, in the frame of its grip: z up, -y to the front."""
     if not carries:
         return []
 
     def build() -> None:
         if carries == "suitcase":
             with b.at(pose(-0.06, 0, -0.71, 90)):
-                o.suitcase(b, _cloth(b.rng, 30, 200), pulled_out=False)
+                o.suitcase(b, random_colour(b.rng, 30, 200), pulled_out=False)
         elif carries == "book":
             with b.at(pose(0.06, -0.05, 0.03) @ tilt("x", 25)):
                 lying_book(b)
         elif carries == "cup":
             with b.at(pose(0, -0.04, -0.02)):
-                o.cup(b, _cloth(b.rng, 60, 230))
+                o.cup(b, random_colour(b.rng, 60, 230))
         elif carries == "box":
             with b.at(pose(0.2, -0.1, -0.1)):
                 o.parcel(b)
         elif carries == "umbrella":
             with b.at(pose(0, 0, 0) @ tilt("x", 180) @ pose(0, 0, -0.84)):
-                o.umbrella(b, _cloth(b.rng, 60, 230), opened=True)
+                o.umbrella(b, random_colour(b.rng, 60, 230), opened=True)
         else:
             with b.at(tilt("x", 80)):
                 o.cell_phone(b)
 
     category = UNLABELLED if carries == "box" else carries
-    return [("right grip", part) for part in _taken(b, category, build)]
+    return [("right grip", part) for part in _moving_parts(b, category, build)]
 
 
 def _pulled(b: SceneBuilder) -> list[tuple[str, Part]]:
-    parts = _taken(b, "chair", lambda: office_chair(b, (150, 60, 44)))
+    parts = _moving_parts(b, "chair", lambda: office_chair(b, (150, 60, 44)))
     return [("pulled", part) for part in parts]

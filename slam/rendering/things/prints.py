@@ -1,4 +1,4 @@
-"""Things that hang, lie or stick: posters, paintings, windows, boards, rugs, signs, labels."""
+"""Painters of flat things: posters, paintings, windows, boards, rugs, signs, labels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a person's limbs are while standing, sitting, walking and carrying something.
+"""Poses of a person's limbs while standing, sitting, walking and carrying something.
 
 The person's frame has its origin on the floor, z up, and looks along -y; the right hand is at
 -x. Angles in the body's plane of symmetry count from straight down, forward positive.

@@ -1,4 +1,4 @@
-"""Procedural materials: plaster, wood, carpet, brick, fabric. Nothing repeats.
+"""Procedural materials that never repeat: plaster, wood, carpet, brick, fabric.
 
 Each function returns a painter, see ``builder.Painter``. All are sums of smooth random fields of
 several cell sizes, so that corners exist at every scale a detector looks at.

@@ -1,4 +1,4 @@
-"""Where who walks is: rounds on the floor, fixed in the room or going along with the camera."""
+"""Walks of people: closed rounds on the floor, fixed in the room or moving with the camera."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ Places = tuple[tuple[float, float], ...]
 
 _STEPS_HZ = 50.0
 _TURN_S = 0.3
-"""Turns are spread over so long."""
+"""Standard deviation of the smoothing of headings."""
 _BEYOND_S = 2.0
-"""How much later than the camera's last frame somebody may be drawn."""
+"""How long after the camera's last frame an escort still has a pose."""
 
 
 def on_round(places: Places, walked_m: float, phase: float) -> tuple[Array, float]:
-    """The pose T_world_person (4, 4) of who has walked so far, begun at a share of the round.
+    """The pose T_world_person (4, 4) after this distance, from a start at a share of the round.
 
-    The person looks ahead, which is -y of its own frame. Also returns the distance from the
-    round's first place.
+    The person looks ahead, along -y of the person's frame. Also returns the distance from the
+    round's first way point.
     """
     curve = _closed(places)
     distance_m = walked_m + phase * curve.x[-1]
@@ -34,13 +34,13 @@ def on_round(places: Places, walked_m: float, phase: float) -> tuple[Array, floa
 
 
 class Escort:
-    """A round that goes along with the camera: its places are to the camera's right and ahead.
+    """A round that moves with the camera: its way points are (right, ahead) of the camera.
 
-    Who walks it looks where the motion in the room goes, and steps as long as that is.
+    The person faces along its motion in the room, and its stride follows the distance walked there.
     """
 
     def __init__(self, path: CameraPath, places: Places, speed_m_s: float, phase: float) -> None:
-        """``speed_m_s`` is that along the round, as the camera sees it."""
+        """``speed_m_s`` is the speed along the round, relative to the camera."""
         self._times_s = np.arange(0.0, duration_s(path) + _BEYOND_S, 1 / _STEPS_HZ)
         curve = _closed(places)
         walked_m = speed_m_s * self._times_s + phase * curve.x[-1]

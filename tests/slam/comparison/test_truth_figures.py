@@ -21,7 +21,7 @@ from bmask_slam.graph.files.ply import write_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
-from bmask_slam.rendering.classes import CLASSES
+from bmask_slam.rendering.annotations import CLASSES
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.sequences import open_sequence
 

@@ -12,8 +12,7 @@ import pytest
 
 from bmask_slam.cli import main
 from bmask_slam.graph.camera import Camera
-from bmask_slam.rendering.annotations import coco, frame_marks
-from bmask_slam.rendering.classes import CLASSES
+from bmask_slam.rendering.annotations import CLASSES, coco, visible_instances
 
 
 @pytest.fixture
@@ -24,7 +23,7 @@ def rendered(tmp_path: Path) -> Path:
     instances = np.zeros((2, 24, 32), np.uint16)
     instances[:, 3:9, 4:20] = 1
     instances[0, 12:20, 10:18] = 2
-    frames = [frame_marks(picture) for picture in instances]
+    frames = [visible_instances(picture) for picture in instances]
     camera = Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
     scene = SimpleNamespace(categories=["desk", "cup"])
     content = coco(frames, ["0.0", "0.1"], camera, scene)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bmask_slam.graph.arrays import Image
-from bmask_slam.rendering.classes import CLASSES
+from bmask_slam.rendering.annotations import CLASSES
 from bmask_slam.rendering.engine.builder import Painter, SceneBuilder
 from bmask_slam.rendering.engine.meshes import pose
 from bmask_slam.rendering.engine.path import camera_poses
@@ -20,7 +20,7 @@ from bmask_slam.rendering.rooms.random_layout import distance_m, moved_rect, ove
 from bmask_slam.rendering.rooms.random_room import RandomRoom, draw_room
 from bmask_slam.rendering.rooms.room import Room
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
-from bmask_slam.rendering.things.people import Person, hire
+from bmask_slam.rendering.things.people import Person, add_people
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_every_class_occurs(rooms: list[RandomRoom]) -> None:
     assert set(found) <= set(CLASSES)
     assert min(n for name, n in counts.items() if name != "person") >= 10, counts
     builder = _Bare(0)
-    hire(builder, rooms[0].roles, rooms[0].lighting, 1)
+    add_people(builder, rooms[0].roles, rooms[0].lighting, 1)
     assert "person" in builder.categories
 
 

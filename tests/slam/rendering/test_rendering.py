@@ -18,8 +18,7 @@ from repository import ROOT
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, rotation_from_quaternion, so3_exp, so3_log, transform
-from bmask_slam.rendering.annotations import run_lengths
-from bmask_slam.rendering.classes import CATEGORY_IDS
+from bmask_slam.rendering.annotations import CATEGORY_IDS, run_lengths
 from bmask_slam.rendering.engine.atlas import build_atlas
 from bmask_slam.rendering.engine.meshes import quad
 from bmask_slam.rendering.engine.path import CameraPath, camera_poses, look_at
