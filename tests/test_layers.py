@@ -66,7 +66,6 @@ PENDING: dict[str, set[str]] = {
         "bmask_slam.moving.depth_view_buffer -> bmask_slam.back_end.mapper",
         "bmask_slam.moving.moving_object_filter -> bmask_slam.back_end.mapper",
         "bmask_slam.moving.static_verification -> bmask_slam.back_end.pruning",
-        "bmask_slam.system_interface -> bmask_slam.run_folder.landmark_file",
         "bmask_slam.tracking.camera_tracker -> bmask_slam.back_end.landmark_management",
         "bmask_slam.tracking.relocalisation -> bmask_slam.back_end.landmark_management",
     },
@@ -74,15 +73,15 @@ PENDING: dict[str, set[str]] = {
         "graph/factors/noise.py",
         "mapping/inverse_depth/depth_files.py",
         "mapping/inverse_depth/search_range.py",
-        "semantics/downloads.py",
         "semantics/instances/mask_order.py",
         "semantics/network/backbone/pyramid.py",
         "slam/back_end/segment_joining.py",
         "slam/comparison/experiment/provenance.py",
         "slam/comparison/jobs/ray_pool.py",
         "slam/comparison/report/html.py",
+        "slam/comparison/report/report.py",
         "slam/datasets/icl_nuim.py",
-        "slam/live/incoming.py",
+        "slam/dense/following.py",
         "slam/live/live_options.py",
         "slam/live/processes/remote_pruner.py",
         "slam/live/processes/start.py",
@@ -130,7 +129,6 @@ PENDING: dict[str, set[str]] = {
     },
     "folders": {
         "slam/commands",
-        "slam/live/sources",
     },
     "functions": {
         "graph/g2o/landmark_reader.py read_landmark_graph",
@@ -165,9 +163,7 @@ PENDING: dict[str, set[str]] = {
     "full names": {
         "slam/comparison/experiment/fingerprint.py ",
     },
-    "circles": {
-        "bmask_slam.semantics.segmenters.ray_segmenter -> bmask_slam.semantics.segmenters.segmenter_table",  # noqa: E501
-    },
+    "circles": set(),
 }
 
 
