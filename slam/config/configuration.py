@@ -1,33 +1,41 @@
 """Configuration: nested frozen dataclasses, defaults < YAML file < ``--set a.b=c``.
 
-The defaults live in the code, beside the class that they configure. This module only turns text
-into such an object, checks every value against its field's type, and writes the result back.
+The defaults live in the code, beside the class that they configure. Here the given values are
+merged over them by dotted path, and pydantic checks the result against the types of the fields.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import math
 import re
-import types
+import sys
 from collections.abc import Iterator, Mapping, Sequence
-from enum import Enum
+from enum import EnumType
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails, to_jsonable_python
+
+from bmask_slam.config.renamed import RENAMED, with_present_names
 from bmask_slam.config.yaml import format_yaml, parse_yaml, read_yaml
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 
 Config = TypeVar("Config")
-
-
-class _Given(NamedTuple):
-    """A checked value and where it was given, for the messages."""
-
-    value: Any
-    source: str
+EXPECTED = {
+    "bool_type": "true or false",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "string_type": "a text (quote it)",
+    "tuple_type": "a list",
+}
+"""What a user must write, by pydantic's type of the error."""
 
 
 def find_config(name: str) -> Path:
@@ -45,28 +53,28 @@ def resolve(
 ) -> Config:
     """The configuration ``cls()`` with a file's values and then ``a.b=c`` overrides applied.
 
-    Of the file only one ``section`` is looked at if it is given.
+    With ``section`` only this group of the file is read. Older names of settings are accepted in
+    files (`config.renamed`).
 
     Raises:
         InputError: an unreadable file, an unknown key, a value of the wrong type, or one that
             the class itself refuses (ValueError); names the dotted path, the value and the cure.
     """
-    given: dict[str, _Given] = {}
+    given = _GivenValues(cls)
     if file is not None:
-        content = read_yaml(file)
+        content = with_present_names(read_yaml(file))
         if section is not None and isinstance(content, dict):
             content = content.get(section) or {}
-        given |= _flatten(cls, content, str(file))
+        given.add(content, str(file))
     for text in overrides:
         path, separator, value = text.partition("=")
         if not separator or not path.strip():
             raise InputError(f"--set {text}: write it as key.subkey=value")
-        source = f"--set {text}"
-        tree: Any = parse_yaml(value, source)
+        tree: Any = parse_yaml(value, f"--set {text}")
         for key in reversed(path.strip().split(".")):
             tree = {key: tree}
-        given |= _flatten(cls, tree, source)
-    return _build(cls, None, given)
+        given.add(tree, f"--set {text}")
+    return given.build()
 
 
 def from_tree(cls: type[Config], tree: Any, source: str) -> Config:
@@ -75,17 +83,28 @@ def from_tree(cls: type[Config], tree: Any, source: str) -> Config:
     Raises:
         InputError: as `resolve`.
     """
-    return _build(cls, None, _flatten(cls, tree, source))
+    given = _GivenValues(cls)
+    given.add(tree, source)
+    return given.build()
+
+
+def from_text(cls: type[Config], text: str, source: str) -> Config:
+    """The configuration that `dump` wrote as ``text``, today or before settings were renamed.
+
+    Raises:
+        InputError: as `resolve`.
+    """
+    return from_tree(cls, with_present_names(parse_yaml(text, source)), source)
 
 
 def dump(config: Any) -> str:
     """YAML text of a resolved configuration; resolving it gives an equal configuration."""
-    return format_yaml(_plain(config))
+    return format_yaml(to_jsonable_python(config))
 
 
 def differences(config: Any, other: Any) -> dict[str, Any]:
     """Plain values of ``config`` by dotted path where ``other``, of the same class, has another."""
-    values, others = (dict(_leaves(_plain(c))) for c in (config, other))
+    values, others = (dict(_leaves(to_jsonable_python(c))) for c in (config, other))
     return {path: value for path, value in values.items() if value != others[path]}
 
 
@@ -98,62 +117,91 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{path}{key}", value
 
 
-def _plain(value: Any) -> Any:
-    """A configuration value as what YAML can hold."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
-    if isinstance(value, Enum):
-        return value.value
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
+# --- From trees of plain values to a checked configuration ---------------------------------------
 
 
-# --- From a tree of plain values to checked ones, by dotted path ---------------------------------
+@cache
+def _adapter(cls: type) -> TypeAdapter[Any]:
+    return TypeAdapter(cls)
 
 
-def _fields(cls: type) -> dict[str, Any]:
+@cache
+def _fields(cls: Any) -> dict[str, Any]:
     """Name and resolved type of each field that the constructor takes."""
     hints = get_type_hints(cls)
     return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.init}
 
 
-def _nested(hint: Any) -> type | None:
+def _nested(hint: Any) -> Any:
     """The dataclass in ``X`` or ``X | None``, or None."""
-    options = [hint, *(get_args(hint) if _is_union(hint) else ())]
-    return next((o for o in options if isinstance(o, type) and dataclasses.is_dataclass(o)), None)
+    return next((h for h in (hint, *get_args(hint)) if dataclasses.is_dataclass(h)), None)
 
 
-def _is_union(hint: Any) -> bool:
-    return get_origin(hint) in (Union, types.UnionType)
+class _GivenValues:
+    """The values given for a configuration, merged over the defaults of the groups they are in."""
+
+    def __init__(self, cls: type) -> None:
+        self._cls = cls
+        self._tree: dict[str, Any] = {}
+        self._sources: dict[str, str] = {}  # where each value was given, by dotted path
+
+    def add(self, tree: Any, source: str) -> None:
+        """Merge a nested mapping; its values replace those given before. Raises InputError."""
+        self._add(self._cls, self._tree, tree, source, "")
+
+    def build(self) -> Any:
+        """The configuration. Raises InputError for a value that does not fit."""
+        try:  # as JSON, where pydantic's strict types take a list as a tuple and a text as a path
+            return _adapter(self._cls).validate_json(json.dumps(self._tree), strict=True)
+        except ValidationError as error:
+            raise InputError(_refusal(error.errors()[0], self._sources, self._cls)) from error
+
+    def _add(self, cls: Any, merged: dict[str, Any], tree: Any, source: str, prefix: str) -> None:
+        if not isinstance(tree, Mapping):
+            keys = ", ".join(f"{prefix}{name}" for name in _fields(cls))
+            where = prefix.rstrip(".") or "the whole"
+            raise InputError(
+                f"{source}: {where} is a group of keys, not {tree!r}; there are: {keys}"
+            )
+        for key, value in tree.items():
+            path, hint = f"{prefix}{key}", _fields(cls).get(key)
+            if hint is None:
+                cure = _suggestion(self._cls, prefix, str(key))
+                raise InputError(f"{source}: unknown key {path}; {cure}")
+            nested = _nested(hint)
+            if nested is None or (value is None and nested is not hint):
+                merged[key] = _checked(value, hint, f"{source}: {path}")
+                self._sources[path] = source
+            else:
+                if merged.get(key) is None:
+                    merged[key] = _default(cls, key)
+                self._add(nested, merged[key], value, source, f"{path}.")
 
 
-def _flatten(
-    cls: type, tree: Any, source: str, prefix: str = "", root: type | None = None
-) -> dict[str, _Given]:
-    """Checked values of a nested mapping by dotted path from the root class."""
-    root = root or cls
-    if not isinstance(tree, Mapping):
-        keys = ", ".join(f"{prefix}{name}" for name in _fields(cls))
-        where = prefix.rstrip(".") or "the whole"
-        raise InputError(f"{source}: {where} is a group of keys, not {tree!r}; there are: {keys}")
-    given: dict[str, _Given] = {}
-    fields = _fields(cls)
-    for key, value in tree.items():
-        path = f"{prefix}{key}"
-        if key not in fields:
-            raise InputError(f"{source}: unknown key {path}; {_suggestion(root, prefix, str(key))}")
-        nested = _nested(fields[key])
-        if nested is not None and nested is not fields[key] and value is None:
-            given[path] = _Given(None, source)
-        elif nested is None:
-            given[path] = _Given(_check(value, fields[key], path, source), source)
-        else:
-            given |= _flatten(nested, value, source, f"{path}.", root)
-    return given
+def _checked(value: Any, hint: Any, where: str) -> Any:
+    """The value, if it is not NaN or too large for a float; of an enum's name its value."""
+    for item in value if isinstance(value, list) else [value]:
+        too_large = isinstance(item, int) and abs(item) > sys.float_info.max
+        if too_large or (isinstance(item, float) and math.isnan(item)):
+            raise InputError(f"{where} = {format_yaml(value, flow=True)} is not a number")
+    if isinstance(hint, EnumType) and isinstance(value, str) and value in hint.__members__:
+        return hint[value].value
+    return value
 
 
-def _paths(cls: type, prefix: str = "") -> Iterator[str]:
+def _default(cls: Any, name: str) -> Any:
+    """Plain values of a group's default, {} where it has none."""
+    field = next(f for f in dataclasses.fields(cls) if f.name == name)
+    value = None if field.default is dataclasses.MISSING else field.default
+    if field.default_factory is not dataclasses.MISSING:
+        value = field.default_factory()
+    return to_jsonable_python(value) or {}
+
+
+# --- Messages ------------------------------------------------------------------------------------
+
+
+def _paths(cls: Any, prefix: str = "") -> Iterator[str]:
     """Every dotted path of a configuration class, groups before their members."""
     for name, hint in _fields(cls).items():
         yield f"{prefix}{name}"
@@ -162,9 +210,11 @@ def _paths(cls: type, prefix: str = "") -> Iterator[str]:
             yield from _paths(nested, f"{prefix}{name}.")
 
 
-def _suggestion(root: type, prefix: str, key: str) -> str:
+def _suggestion(root: Any, prefix: str, key: str) -> str:
     """The cure for an unknown key: the closest of its group, else of all, else the group's keys."""
     every = list(_paths(root))
+    if present := RENAMED.get(f"{prefix}{key}"):
+        return f"it is called {prefix}{present} now"
     siblings = [p for p in every if p.startswith(prefix) and "." not in p[len(prefix) :]]
     close = difflib.get_close_matches(prefix + key, siblings, 1, 0.7)
     if not close:
@@ -173,129 +223,22 @@ def _suggestion(root: type, prefix: str, key: str) -> str:
     return f"did you mean {close[0]}?" if close else f"there are: {', '.join(siblings)}"
 
 
-def _build(cls: type, base: Any, given: Mapping[str, _Given], prefix: str = "") -> Any:
-    """``base`` (the defaults, or ``cls()``) with the given values of the group ``prefix``."""
-    changes: dict[str, Any] = {}
-    sources: list[str] = []
-    for name, hint in _fields(cls).items():
-        path = f"{prefix}{name}"
-        if path in given:
-            changes[name] = given[path].value
-            sources.append(given[path].source)
-        nested = _nested(hint)
-        if nested is not None and any(p.startswith(f"{path}.") for p in given):
-            inner = getattr(base if base is not None else cls(), name)
-            changes[name] = _build(nested, inner, given, f"{path}.")
-            sources += [g.source for p, g in given.items() if p.startswith(f"{path}.")]
-    try:
-        return cls(**changes) if base is None else dataclasses.replace(base, **changes)
-    except ValueError as error:
-        where = ", ".join(dict.fromkeys(sources)) or cls.__name__
-        raise InputError(f"{where}: {prefix.rstrip('.') or cls.__name__}: {error}") from error
-
-
-# --- One value against its type ------------------------------------------------------------------
-
-
-def _check(value: Any, hint: Any, path: str, source: str) -> Any:
-    """The value as its field's type, or InputError."""
-    try:
-        return _convert(value, hint)
-    except _MismatchError:
-        message = f"{source}: {path} = {format_yaml(value, flow=True)} is not {_describe(hint)}"
-        raise InputError(message) from None
-
-
-class _MismatchError(Exception):
-    """A value that does not fit a type."""
-
-
-def _convert(value: Any, hint: Any) -> Any:
-    """The value as ``hint``: whole numbers are taken for floats, nothing else is converted."""
-    arguments = get_args(hint)
-    if _is_union(hint):
-        return _first(value, arguments)
-    if get_origin(hint) is tuple:
-        return _convert_tuple(value, arguments)
-    if get_origin(hint) is Literal:
-        return _member(value, {argument: argument for argument in arguments})
-    return _convert_plain(value, hint)
-
-
-def _convert_plain(value: Any, hint: Any) -> Any:
-    """The value as None, an enum's member, a number, a text or a path."""
-    if hint is type(None):
-        return _member(value, {None: None})
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        return _member(value, {m.name: m for m in hint} | {m.value: m for m in hint})
-    if hint not in (bool, int, float, str, Path):
-        raise TypeError(f"a configuration field cannot be of type {hint}")
-    if hint is float and type(value) is int:
-        value = _as_float(value)
-    if hint is Path and type(value) is str:
-        value = Path(value)
-    if not isinstance(value, hint) or (type(value) is bool and hint is not bool):
-        raise _MismatchError
-    if hint is float and math.isnan(value):  # infinity may switch a limit off
-        raise _MismatchError
-    return value
-
-
-def _first(value: Any, hints: Sequence[Any]) -> Any:
-    """The value as the first of several types that takes it unchanged, else with conversion."""
-    fits = []
-    for hint in hints:
-        try:
-            fits.append(_convert(value, hint))
-        except _MismatchError:
-            continue
-    if not fits:
-        raise _MismatchError
-    return next((f for f in fits if type(f) is type(value)), fits[0])
-
-
-def _member(value: Any, members: Mapping[Any, Any]) -> Any:
-    """The member that equals the value and is of its type (1 is not True)."""
-    for key, member in members.items():
-        if type(key) is type(value) and key == value:
-            return member
-    raise _MismatchError
-
-
-def _convert_tuple(value: Any, hints: tuple[Any, ...]) -> tuple[Any, ...]:
-    """A list as ``tuple[X, Y]`` or ``tuple[X, ...]``."""
-    if not isinstance(value, (list, tuple)):
-        raise _MismatchError
-    if hints[-1:] == (...,):
-        hints = hints[:1] * len(value)
-    if len(value) != len(hints):
-        raise _MismatchError
-    return tuple(_convert(item, hint) for item, hint in zip(value, hints, strict=True))
-
-
-def _as_float(value: int) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        raise _MismatchError from None
-
-
-_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text (quote it)"}
-
-
-def _describe(hint: Any) -> str:
-    """What a user must write for a type."""
-    arguments = get_args(hint)
-    if _is_union(hint):
-        return " or ".join(_describe(a) for a in arguments)
-    if get_origin(hint) is Literal:
-        return f"one of: {', '.join(str(a) for a in arguments)}"
-    if get_origin(hint) is tuple:
-        some = arguments[-1] is ...
-        items = f"{_describe(arguments[0])}, ..." if some else ", ".join(map(_describe, arguments))
-        return f"a list [{items}]"
-    if hint is type(None):
-        return "null"
-    if issubclass(hint, Enum):
-        return f"one of: {', '.join(str(m.value) for m in hint)}"
-    return _NAMES.get(hint, "a path")
+def _refusal(error: ErrorDetails, sources: Mapping[str, str], cls: type) -> str:
+    """One line for an error that pydantic found: where it was given, path, value and cure."""
+    path = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in error["loc"])[1:]
+    group = f"{path.partition('[')[0]}.".lstrip(".")
+    concerned = [
+        s for p, s in sources.items() if f"{p}.".startswith(group) or group.startswith(f"{p}.")
+    ]
+    where = ", ".join(dict.fromkeys(concerned)) or cls.__name__
+    kind, context = error["type"], error.get("ctx", {})
+    if kind == "value_error":
+        return f"{where}: {path or cls.__name__}: {context['error']}"
+    if kind == "missing":
+        return f"{where}: {path} is missing"
+    value = f"{where}: {path} = {format_yaml(error['input'], flow=True)}"
+    if kind in EXPECTED:
+        return f"{value} is not {EXPECTED[kind]}"
+    if "expected" in context:
+        return f"{value} is not one of: {context['expected']}"
+    return f"{value}: {error['msg']}"

@@ -1,69 +1,44 @@
-"""YAML text by the rules of YAML 1.2, where ``1e-3`` is a number and ``off`` is a word.
+"""YAML text by the rules of YAML 1.2, where ``1e-3`` is a number and ``off`` is a text.
 
-PyYAML reads YAML 1.1: there ``1e-3`` is a text, ``off`` is false, ``010`` is eight and ``1:30`` is
-ninety, and a key given twice is taken without a word. None of it suits configuration files.
+Read and written by ruamel.yaml, with three differences: a date is a text, as YAML 1.2 has it; a
+list is written on one line; line breaks other than a newline are escaped.
 """
 
 from __future__ import annotations
 
-import re
+import io
 from pathlib import Path
 from typing import Any
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.constructor import DuplicateKeyError, SafeConstructor
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import ScalarNode, SequenceNode
+from ruamel.yaml.representer import SafeRepresenter
 
 from bmask_slam.graph.errors import InputError
 
-_INT = re.compile(r"[-+]?[0-9]+$")
-_FLOAT = re.compile(
-    r"([-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN))$"
-)
-_BOOL = re.compile(r"(true|True|TRUE|false|False|FALSE)$")
-_NULL = re.compile(r"(~|null|Null|NULL|)$")
-_TAG = "tag:yaml.org,2002:"
+
+class _Constructor(SafeConstructor):
+    """Safe types, without dates."""
 
 
-class _Loader(yaml.SafeLoader):
-    """SafeLoader with YAML 1.2's scalars, refusing a key that is given twice."""
-
-    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - PyYAML's own name
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for position, key in enumerate(keys):
-            if key in keys[:position]:
-                mark = node.value[position][0].start_mark
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is given twice", mark
-                )
-        return super().construct_mapping(node, deep)
-
-
-class _Dumper(yaml.SafeDumper):
-    """SafeDumper whose plain scalars read back under the same rules; lists are on one line."""
-
-    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - PyYAML's own name
+class _Representer(SafeRepresenter):
+    """Lists on one line, and escapes where a plain text would not read back."""
 
     def represent_sequence(
-        self, tag: str, sequence: Any, flow_style: bool | None = None
-    ) -> yaml.SequenceNode:
+        self, tag: Any, sequence: Any, flow_style: bool | None = None
+    ) -> SequenceNode:
         return super().represent_sequence(tag, sequence, flow_style=True)
 
-    def represent_scalar(self, tag: str, value: str, style: str | None = None) -> yaml.ScalarNode:
-        escaped = any(c in value for c in "\x85\u2028\u2029")  # line breaks, unless escaped
-        return super().represent_scalar(tag, value, '"' if escaped else style)
+    def represent_scalar(
+        self, tag: Any, value: Any, style: str | None = None, anchor: Any = None
+    ) -> ScalarNode:
+        escaped = any(c in value for c in "\x85\u2028\u2029")
+        return super().represent_scalar(tag, value, '"' if escaped else style, anchor)
 
 
-def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
-    return int(loader.construct_scalar(node))
-
-
-for _class in (_Loader, _Dumper):
-    _class.add_implicit_resolver(f"{_TAG}int", _INT, list("-+0123456789"))
-    _class.add_implicit_resolver(f"{_TAG}float", _FLOAT, list("-+0123456789."))
-    _class.add_implicit_resolver(f"{_TAG}bool", _BOOL, list("tTfF"))
-    _class.add_implicit_resolver(f"{_TAG}null", _NULL, ["~", "n", "N", ""])
-_Loader.add_constructor(f"{_TAG}int", _construct_int)
+_Constructor.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
 
 
 def parse_yaml(text: str, source: str) -> Any:
@@ -72,12 +47,16 @@ def parse_yaml(text: str, source: str) -> Any:
     Raises:
         InputError: not YAML, or a key given twice; names the line.
     """
+    reader = YAML(typ="safe", pure=True)
+    reader.Constructor = _Constructor
     try:
-        return yaml.load(text, _Loader)
-    except yaml.MarkedYAMLError as error:
+        return reader.load(text)
+    except MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise InputError(f"{source}{line}: {error.problem}") from error
-    except (yaml.YAMLError, ValueError) as error:
+        problem = (error.problem or "not a YAML text").partition(" with value")[0]
+        cure = "; remove one of the two" if isinstance(error, DuplicateKeyError) else ""
+        raise InputError(f"{source}{line}: {problem}{cure}") from error
+    except (YAMLError, ValueError) as error:
         raise InputError(f"{source}: not a YAML text: {error}") from error
 
 
@@ -99,12 +78,10 @@ def read_yaml(file: Path) -> Any:
 
 def format_yaml(document: Any, flow: bool = False) -> str:
     """YAML text of plain values in their own order; ``flow`` puts it on one line."""
-    text = yaml.dump(
-        document,
-        Dumper=_Dumper,
-        sort_keys=False,
-        allow_unicode=True,
-        width=100 if not flow else 10**6,
-        default_flow_style=flow,
-    )
-    return text.removesuffix("...\n").strip() if flow else text
+    writer = YAML(typ="safe", pure=True)
+    writer.Representer = _Representer
+    writer.default_flow_style, writer.width = flow, 10**6 if flow else 100
+    writer.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    out = io.StringIO()
+    writer.dump(document, out)
+    return out.getvalue().removesuffix("...\n").strip() if flow else out.getvalue()

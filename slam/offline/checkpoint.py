@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam import __version__
-from bmask_slam.config.configuration import dump, resolve
+from bmask_slam.config.configuration import dump, from_text, resolve
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -149,7 +149,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     header, arrays = read_arrays(path, CHECKPOINT_FILE)
     config = resolve(SystemConfig, folder / "config.yaml")
     try:
-        if header["config"] != dump(config):
+        if from_text(SystemConfig, header["config"], str(path)) != config:
             raise InputError(
                 f"{folder / 'config.yaml'}: not the configuration that {path.name} was made with; "
                 "restore it, or start a new run"

@@ -68,7 +68,7 @@ def test_every_key_is_read(tmp_path):
         ),
         ("verdicts: [ate_rmse]", "verdicts: [loops_closed]", "cannot be judged"),
         ("frames: 20", "frame: 20", r"sequences.office.render: unknown key frame; did you mean"),
-        ("frames: 20", "frames: few", r"frames = few is not a whole number or null"),
+        ("frames: 20", "frames: few", r"frames = few is not a whole number"),
         ("frames: 20", "seed: 2", r"render: seed = 2 is each cell's own; write it in seeds"),
         ("name: office", "name: attic", r"name = 'attic' is no scene; there are: office"),
         ("folder: kitchen, ", "", r"sequences.kitchen: give either folder or render"),

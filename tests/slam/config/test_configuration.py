@@ -12,9 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bmask_slam.config.configuration import dump, find_config, resolve
+from bmask_slam.config.configuration import differences, dump, find_config, from_text, resolve
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.system_config import SystemConfig
 
 
 class Kernel(Enum):
@@ -130,11 +132,14 @@ def test_an_optional_group_appears_when_it_is_given() -> None:
         ("tracking.sigma_px=", "tracking.sigma_px = null is not a number"),
         ("tracking.use_depth=1", "is not true or false"),
         ("tracking.use_depth=yes", "is not true or false"),
-        ("tracking.kernel=cauchy", "is not one of: huber, off"),
-        ("mode=4", "mode = 4 is not one of: all, none, 3"),
-        ("limit_s=never", "is not a number or null"),
-        ("scales=1", "is not a list [a number, ...]"),
-        ("size=[1, 2, 3]", "size = [1, 2, 3] is not a list [a whole number, a whole number]"),
+        ("tracking.kernel=cauchy", "is not one of: 'huber' or 'off'"),
+        ("mode=4", "mode = 4 is not one of: 'all', 'none' or 3"),
+        ("limit_s=never", "limit_s = never is not a number"),
+        ("scales=1", "scales = 1 is not a list"),
+        ("size=[1, 2, 3]", "size = [1, 2, 3]: Tuple should have at most 2 items"),
+        ("size=[1]", "size[1] is missing"),
+        ("scales=[1, fast]", "scales[1] = fast is not a number"),
+        ("scales=[1, .nan]", "is not a number"),
         ("name=12", "is not a text"),
         ("tracking=3", "tracking is a group of keys"),
         ("name.first=3", "name = {first: 3} is not a text"),
@@ -162,7 +167,7 @@ def test_a_refusal_in_a_file_names_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("name: a\nname: b\n", "line 2: the key 'name' is given twice"),
+        ("name: a\nname: b\n", 'line 2: found duplicate key "name"; remove one'),
         ("name: [a\n", "line 2"),
         ("- 1\n", "is a group of keys"),
         ("1: 2\n", "unknown key 1"),
@@ -214,3 +219,39 @@ def test_shipped_configurations_are_found_by_name() -> None:
     assert find_config("a/b.yaml") == Path("a/b.yaml")
     for path in data_path("configs").glob("*.yaml"):
         assert find_config(path.stem) == path
+
+
+def test_an_older_file_is_read_with_the_present_names_of_its_settings(tmp_path: Path) -> None:
+    """Written by the program before settings were renamed, with all defaults."""
+    older = Path(__file__).with_name("before_renaming.yaml")
+    differing = differences(resolve(SystemConfig, older), SystemConfig())
+    assert set(differing) <= {"semantics.segmenter.name"}, "which conftest.py sets for the tests"
+    read = from_text(SystemConfig, older.read_text(encoding="utf-8"), "here")
+    assert read == resolve(SystemConfig, older)
+    assert resolve(SmootherConfig, older, section="graph") == SystemConfig().graph
+    text = "dynamics: {suspects: {frames: 7}}\nfactor_selection: {retire_batch: 9}\n"
+    config = resolve(SystemConfig, write(tmp_path, text))
+    assert config.moving_objects.static_verification.frames == 7
+    assert config.factor_selection.marginalise_batch == 9
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("dynamics.labels=false", "unknown key dynamics; it is called moving_objects now"),
+        ("feed.retire_batch=3", "unknown key feed; it is called factor_selection now"),
+        ("graph.max_recoveries=3", "it is called graph.max_repairs now"),
+    ],
+)
+def test_an_older_name_on_the_command_line_is_refused_with_the_present_one(
+    override: str, expected: str
+) -> None:
+    with pytest.raises(InputError) as error:
+        resolve(SystemConfig, None, [override])
+    assert expected in str(error.value)
+
+
+def test_an_older_and_the_present_name_in_one_file_are_refused(tmp_path: Path) -> None:
+    file = write(tmp_path, "feed: {}\nfactor_selection: {}\n")
+    with pytest.raises(InputError, match="unknown key feed; it is called factor_selection now"):
+        resolve(SystemConfig, file)
