@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
+from ruamel.yaml import YAML, YAMLError
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.graph.data_files import data_path
@@ -157,8 +157,8 @@ def read_priors(name: str) -> MovabilityPriors:
     """
     path = data_path("labels", f"{name}.yaml") if re.fullmatch(r"[\w-]+", name) else Path(name)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, YAMLError) as error:
         raise InputError(f"{path}: cannot be read as YAML; write a line 'class: prior'") from error
     if not isinstance(content, dict) or not {UNKNOWN, "other"} <= content.keys():
         raise InputError(f"{path}: needs lines 'class: prior', '{UNKNOWN}' and 'other' among them")

@@ -21,7 +21,6 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails, to_jsonable_python
 
-from bmask_slam.config.renamed import RENAMED, with_present_names
 from bmask_slam.config.yaml import format_yaml, parse_yaml, read_yaml
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
@@ -36,6 +35,16 @@ EXPECTED = {
     "tuple_type": "a list",
 }
 """What a user must write, by pydantic's type of the error."""
+RENAMED = {
+    "dynamics": "moving_objects",
+    "moving_objects.suspects": "static_verification",
+    "feed": "factor_selection",
+    "factor_selection.retire_batch": "marginalise_batch",
+    "graph.max_recoveries": "max_repairs",
+    "graph.bridge_sigma_rotation_rad": "anchor_sigma_rotation_rad",
+    "graph.bridge_sigma_translation_m": "anchor_sigma_translation_m",
+}
+"""Present name of a setting by its older path, in which the groups have their present names."""
 
 
 def find_config(name: str) -> Path:
@@ -54,7 +63,7 @@ def resolve(
     """The configuration ``cls()`` with a file's values and then ``a.b=c`` overrides applied.
 
     With ``section`` only this group of the file is read. Older names of settings are accepted in
-    files (`config.renamed`).
+    files (RENAMED).
 
     Raises:
         InputError: an unreadable file, an unknown key, a value of the wrong type, or one that
@@ -62,7 +71,7 @@ def resolve(
     """
     given = _GivenValues(cls)
     if file is not None:
-        content = with_present_names(read_yaml(file))
+        content = _with_present_names(read_yaml(file))
         if section is not None and isinstance(content, dict):
             content = content.get(section) or {}
         given.add(content, str(file))
@@ -94,7 +103,7 @@ def from_text(cls: type[Config], text: str, source: str) -> Config:
     Raises:
         InputError: as `resolve`.
     """
-    return from_tree(cls, with_present_names(parse_yaml(text, source)), source)
+    return from_tree(cls, _with_present_names(parse_yaml(text, source)), source)
 
 
 def dump(config: Any) -> str:
@@ -106,6 +115,18 @@ def differences(config: Any, other: Any) -> dict[str, Any]:
     """Plain values of ``config`` by dotted path where ``other``, of the same class, has another."""
     values, others = (dict(_leaves(to_jsonable_python(c))) for c in (config, other))
     return {path: value for path, value in values.items() if value != others[path]}
+
+
+def _with_present_names(tree: Any, prefix: str = "") -> Any:
+    """A document with older names of settings replaced; not where the present name is given too."""
+    if not isinstance(tree, dict):
+        return tree
+    found = {}
+    for key, value in tree.items():
+        name = RENAMED.get(f"{prefix}{key}", key)
+        name = key if name in tree else name
+        found[name] = _with_present_names(value, f"{prefix}{name}.")
+    return found
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -7,8 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import yaml
-
+from bmask_slam.config.yaml import format_yaml
 from bmask_slam.datasets.catalogue import Recording
 from bmask_slam.datasets.icl_nuim import to_tum_layout
 from bmask_slam.datasets.unpack import unpack
@@ -88,6 +87,6 @@ def _completed(unpacked: Path, recording: Recording) -> Path:
     if recording.layout == "icl-nuim":
         to_tum_layout(root)
     if recording.camera and not (root / "camera.yaml").exists():
-        text = yaml.safe_dump(recording.camera, sort_keys=False)
+        text = format_yaml(recording.camera)
         (root / "camera.yaml").write_text(text, encoding="utf-8")
     return root

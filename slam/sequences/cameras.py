@@ -7,8 +7,7 @@ import math
 import re
 from pathlib import Path
 
-import yaml
-
+from bmask_slam.config.yaml import format_yaml, parse_yaml
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.whole_file import whole_file
@@ -85,14 +84,13 @@ def read_camera(path: Path) -> Camera:
         InputError: naming the key, its value and the cure.
     """
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = parse_yaml(path.read_text(encoding="utf-8"), path.name)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); give a camera.yaml"
         ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not YAML ({reason}); write e.g. {CAMERA_EXAMPLE}") from error
+    except (InputError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not YAML ({error}); write e.g. {CAMERA_EXAMPLE}") from error
     if not isinstance(values, dict):
         raise InputError(f"{path}: {values!r} is no mapping; write e.g. {CAMERA_EXAMPLE}")
     for key in values:
@@ -123,7 +121,7 @@ def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
     values |= {"distortion": list(camera.distortion)}
     values |= {key: getattr(camera, name) for key, name in OPTIONAL.items()}
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
-    lines.append(yaml.safe_dump(values, sort_keys=False, default_flow_style=None).rstrip())
+    lines.append(format_yaml(values).rstrip())
     try:
         with whole_file(path) as temporary:
             temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

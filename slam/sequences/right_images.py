@@ -6,8 +6,7 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import yaml
-
+from bmask_slam.config.yaml import read_yaml
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -87,6 +86,6 @@ def _stereo_bf(path: Path) -> float:
     if not path.is_file():
         raise InputError(f"{path}: no such file; {cure}")
     camera = read_camera(path)
-    if "stereo_bf" not in yaml.safe_load(path.read_text(encoding="utf-8")):
+    if "stereo_bf" not in read_yaml(path):
         raise InputError(f"{path}: stereo_bf is missing; {cure}")
     return camera.stereo_bf_px_m

@@ -1,1 +1,1 @@
-"""TODO."""
+"""What is compared: experiment files, where their data is, and what a comparison holds."""

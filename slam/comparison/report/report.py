@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import jinja2
+from markupsafe import Markup
+
 from bmask_slam.comparison.experiment.result import Comparison
-from bmask_slam.comparison.report.html import html_text
 from bmask_slam.comparison.report.section import Section, slug
 from bmask_slam.comparison.report.sections import make_sections, summary
 from bmask_slam.comparison.report.table import metric_tables
@@ -15,6 +17,7 @@ from bmask_slam.graph.whole_file import whole_file
 
 PAGE = "report.html"
 FIGURES = "figures"
+TEMPLATES = Path(__file__).parent
 
 
 def write_report(comparison: Comparison, folder: Path) -> list[Path]:
@@ -29,7 +32,7 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
     tables += verdict_tables(comparison)
     title = comparison.title or comparison.name
     texts = {
-        PAGE: html_text(title, comparison.description, sentences, sections),
+        PAGE: _html_text(title, comparison.description, sentences, sections),
         "tables.csv": csv_text(comparison),
         "tables.md": markdown_text(tables, title),
         "tables.tex": latex_text(tables),
@@ -56,3 +59,18 @@ def _write(path: Path, data: bytes) -> Path:
     with whole_file(path) as temporary:
         temporary.write_bytes(data)
     return path
+
+
+def _html_text(title: str, description: str, sentences: list[str], sections: list[Section]) -> str:
+    """The page; every text is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+    style = Markup((TEMPLATES / "page.css").read_text(encoding="utf-8"))  # our own file
+    page = environment.get_template("page.html.j2")
+    return page.render(
+        title=title, description=description, summary=sentences, sections=sections, style=style
+    )

@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison
 from bmask_slam.comparison.report.curves import network_pictures
 from bmask_slam.comparison.report.figures import error_pictures
@@ -28,6 +26,7 @@ from bmask_slam.comparison.report.verdict_tables import (
     verdict_sentences,
     verdict_tables,
 )
+from bmask_slam.config.yaml import format_yaml
 
 LOG_LINES = 15
 LINE_CHARACTERS = 400
@@ -162,7 +161,7 @@ def _without_empty(value: Any) -> Any:
 
 
 def _as_text(value: Any) -> str:
-    return yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=100).strip()
+    return format_yaml(value).strip()
 
 
 def _count(things: tuple[object, ...], name: str) -> str:

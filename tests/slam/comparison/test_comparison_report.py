@@ -145,7 +145,7 @@ def test_the_provenance_is_told_in_full_without_what_is_empty(comparison, tmp_pa
     }
     *_, made = make_sections(replace(comparison, provenance=given), tmp_path)
     told = {listing.title: listing.text for listing in made.listings}
-    assert told == {"Run": "commit: abc\nworkers: 2", "Experiment": "seeds:\n- 0"}
+    assert told == {"Run": "commit: abc\nworkers: 2", "Experiment": "seeds: [0]"}
 
 
 def test_pending_cells_and_partial_truth_are_said(comparison):

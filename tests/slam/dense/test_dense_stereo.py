@@ -11,10 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
 from true_run import make_run
 
 from bmask_slam.cli import main
+from bmask_slam.config.yaml import format_yaml, read_yaml
 from bmask_slam.dense.assembly import assembled, fuse_run
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.input import open_run
@@ -164,9 +164,9 @@ def test_broken_right_images_leave_a_keyframe_out_or_to_the_sensor(
 
 
 def without_bf(folder: Path) -> None:
-    values = yaml.safe_load((folder / "camera.yaml").read_text())
+    values = read_yaml(folder / "camera.yaml")
     del values["stereo_bf"]
-    (folder / "camera.yaml").write_text(yaml.safe_dump(values))
+    (folder / "camera.yaml").write_text(format_yaml(values))
 
 
 def negative_bf(folder: Path) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
 from repository import ROOT
 
+from bmask_slam.config.yaml import read_yaml
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, rotation_from_quaternion, so3_exp, so3_log, transform
@@ -126,7 +126,7 @@ def test_files_follow_the_tum_layout(sequence: Path) -> None:
         depth = cv2.imread(str(sequence / "depth" / f"{stamp}.png"), cv2.IMREAD_UNCHANGED)
         assert rgb.shape == (120, 160, 3) and rgb.dtype == np.uint8
         assert depth.shape == (120, 160) and depth.dtype == np.uint16
-    camera = yaml.safe_load((sequence / "camera.yaml").read_text())
+    camera = read_yaml(sequence / "camera.yaml")
     assert camera["fx"] == pytest.approx(525 / 4) and camera["cx"] == pytest.approx(79.5)
     assert camera["depth_scale"] == 5000 and camera["distortion"] == [0] * 5
 
