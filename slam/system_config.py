@@ -8,7 +8,7 @@ from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
-from bmask_slam.labelling.semantic_mapper import SemanticsConfig
+from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.loops.closing import LoopClosingConfig
 from bmask_slam.moving.config import MovingObjectConfig
 from bmask_slam.tracking.keyframe_decision import KeyframeConfig

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
@@ -30,9 +31,20 @@ class SystemResults(ABC):
 
     camera: Camera
     config: SystemConfig
-    mapper: Mapper
+    map: MapBackend
     semantics: SemanticMapper
     _first_keyframe: int
+
+    @property
+    def mapper(self) -> Mapper:
+        """The owner of map and graph, where they are in this process.
+
+        Raises:
+            RuntimeError: another process has them; a live system brings them home at its end.
+        """
+        if not isinstance(self.map, Mapper):
+            raise RuntimeError("map and graph are in another process until the run is finished")
+        return self.map
 
     @abstractmethod
     def state(self) -> Arrays:
@@ -46,24 +58,24 @@ class SystemResults(ABC):
 
     def segments(self) -> dict[int, Trajectory]:
         """The frames of every map segment that was not joined, each in a frame of its own."""
-        return self.mapper.history.trajectories(self.mapper.world)
+        return self.map.history.trajectories(self.map.world)
 
     def keyframe_trajectory(self) -> Trajectory:
         """The keyframes of the largest segment that this session made."""
-        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        chosen = self.map.world.in_segment(largest(self.segments()))
         chosen = [k for k in chosen if k.id >= self._first_keyframe]
         poses = np.array([k.T_world_camera for k in chosen]).reshape(-1, 4, 4)
         return Trajectory(np.array([k.timestamp_s for k in chosen]), poses)
 
     def keyframe_covariances(self) -> KeyframeCovariances:
         """How sure the graph is of the keyframes of the largest segment."""
-        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        chosen = self.map.world.in_segment(largest(self.segments()))
         return find_covariances(self.mapper.smoother, {k.id: k.timestamp_s for k in chosen})
 
     def landmarks(self) -> LandmarkCloud:
         """The living landmarks of the largest segment, with their colours."""
-        table = self.mapper.world.landmarks
-        chosen = self.mapper.world.in_segment(largest(self.segments()))
+        table = self.map.world.landmarks
+        chosen = self.map.world.in_segment(largest(self.segments()))
         hosts = [k.id for k in chosen]
         ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
         labels = self.semantics.landmark_labels(ids)
@@ -72,7 +84,7 @@ class SystemResults(ABC):
 
     def objects(self) -> MapObjects:
         """The objects of the largest segment."""
-        return self.semantics.map_objects(self.mapper.world.in_segment(largest(self.segments())))
+        return self.semantics.map_objects(self.map.world.in_segment(largest(self.segments())))
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """What it saves so that it loads again: a function that writes a file, by its name."""
@@ -93,8 +105,8 @@ class SystemResults(ABC):
     def statistics(self) -> dict[str, float | list[float]]:
         """Sizes of the map and the time of every graph update in milliseconds."""
         return {
-            "keyframes": len(self.mapper.world.keyframes),
-            "landmarks": int(self.mapper.world.landmarks.alive.sum()),
+            "keyframes": len(self.map.world.keyframes),
+            "landmarks": int(self.map.world.landmarks.alive.sum()),
             "loops_closed": len(self.mapper.loops.closed),
             "isam2_update_ms": list(self.mapper.update_ms),
         }

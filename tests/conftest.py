@@ -25,9 +25,9 @@ def pytest_configure() -> None:
     """
     for variable in ONE_THREAD:  # read when numpy, OpenCV and torch are loaded
         os.environ.setdefault(variable, "1")
-    from bmask_slam.labelling import semantic_mapper
+    from bmask_slam.labelling import config
 
-    semantic_mapper.DEFAULT_SEGMENTER = "none"
+    config.DEFAULT_SEGMENTER = "none"
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,7 @@ import argparse
 import csv
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -31,11 +31,10 @@ from benchmarks.moving.moving_points import KINDS, NEAR_PX, MovingTruth, Watched
 from benchmarks.pages import table
 from bmask_slam.config.configuration import resolve
 from bmask_slam.datasets.weights import find_weights
-from bmask_slam.features.brisk import Features, select
+from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.moving.feature_replenishment import FeatureReplenishment
-from bmask_slam.moving.moving_object_filter import StaticFeatures
+from bmask_slam.moving.static_features import FeatureReplenishment, StaticFeatures
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
@@ -73,8 +72,7 @@ class Outcome:
         ate_mm: root mean square over all frames.
         tracked_share: of the frames.
         left_out: share of keypoints left out, by what they are on; None where it is not there.
-        check_ms: median time of the dynamic check in a frame, and its 95 % quantile.
-        fill_ms: the same of finding other keypoints in place of those left out.
+        check_ms: median time of the moving-object filter in a frame, and its 95 % quantile.
         mostly_moving: frames in which nearly everything seemed to move.
         covered: share of each picture that moves.
     """
@@ -85,7 +83,6 @@ class Outcome:
     tracked_share: float
     left_out: dict[str, float | None]
     check_ms: tuple[float, float]
-    fill_ms: tuple[float, float]
     mostly_moving: int
     covered: list[float]
 
@@ -93,19 +90,12 @@ class Outcome:
 class IdealSystem(WatchedSystem):
     """Leaves out what the truth says, in every frame."""
 
-    def _static_features(self, frame: Frame, features: Features) -> StaticFeatures:
-        static, moving = super()._static_features(frame, features), self._on_moving(frame, features)
-        return StaticFeatures(select(features, np.flatnonzero(~moving)), moving, False, static.view)
-
-    def _replenish(
-        self, frame: Frame, features: Features, static: StaticFeatures
-    ) -> StaticFeatures:
-        super()._replenish(frame, features, static)
+    def _without_moving(self, frame: Frame, features: Features) -> StaticFeatures:
+        static, moving = super()._without_moving(frame, features), self._on_moving(frame, features)
         replenishment = FeatureReplenishment(self.camera, self.config.features)
         judge = partial(self._on_moving, frame)
-        return replace(
-            static, features=replenishment.replenished(frame, features, static.moving, judge)
-        )
+        left = replenishment.replenished(frame, features, moving, judge)
+        return StaticFeatures(left, moving, False, static.view)
 
     def _on_moving(self, frame: Frame, features: Features) -> Mask:
         """Which features (N,) lie on or near what moves in truth."""
@@ -171,9 +161,7 @@ def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespac
         cv2.imwrite(str(out.with_suffix(".png")), strip(systems[0].pictures[:PICTURES]))
     with (out / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
-    check_ms, fill_ms = (
-        np.percentile(times, [50, 95]) for times in (systems[0].check_ms, systems[0].fill_ms)
-    )
+    check_ms = np.percentile(systems[0].check_ms, [50, 95])
     shares = {kind: systems[0].total(kind).share for kind in (*KINDS, "rest")}
     return Outcome(
         scene=scene,
@@ -182,7 +170,6 @@ def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespac
         tracked_share=metrics["tracked_share"],
         left_out={k: None if np.isnan(share) else share for k, share in shares.items()},
         check_ms=(float(check_ms[0]), float(check_ms[1])),
-        fill_ms=(float(fill_ms[0]), float(fill_ms[1])),
         mostly_moving=sum(int(row["mostly_moving"]) for row in rows),
         covered=systems[0].covered,
     )
@@ -194,13 +181,13 @@ def report(outcomes: Sequence[Outcome]) -> str:
         (o.ate_mm for o in outcomes if (o.scene, o.variant) == ("nobody", "nothing")), float("nan")
     )
     header = ("scene", "with", "ATE mm", "x clean", "tracked", *(f"{k} left out" for k in KINDS),
-              "rest left out", "check ms: median, 95 %", "refill ms")  # fmt: skip
+              "rest left out", "check ms: median, 95 %")  # fmt: skip
     rows = [
         (
             *(o.scene, o.variant, f"{o.ate_mm:.2f}", f"{o.ate_mm / clean_mm:.2f}"),
             f"{100 * o.tracked_share:.0f} %",
             *("" if s is None else f"{100 * s:.1f} %" for s in o.left_out.values()),
-            *("{:.2f}, {:.2f}".format(*times) for times in (o.check_ms, o.fill_ms)),
+            "{:.2f}, {:.2f}".format(*o.check_ms),
         )
         for o in outcomes
     ]

@@ -68,7 +68,7 @@ def moving_points(
     second = replace(pair[1], index=1, timestamp_s=1 / CAMERA.fps)
     features = system.prepare(second)
     pose = system.process(second, features).T_world_camera
-    views = system.moving_objects.memory.posed(0, system.mapper)
+    views = system.moving_objects.keyframe_views.posed(0, system.map)
     static = system.moving_objects.static_features_at(second, features, pose, views)
     return features.image_pixels, static.moving
 

@@ -20,7 +20,7 @@ import numpy as np
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Image, Mask
-from bmask_slam.moving.moving_object_filter import StaticFeatures
+from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.rendering.annotations import CATEGORY_IDS
 from bmask_slam.rendering.things.people import PULLED_S
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
@@ -106,7 +106,7 @@ class WatchedSystem(SlamSystem):
     """The system; keeps the counts of every frame, and pictures of every ``every``-th.
 
     ``check_ms`` is the processor's time that a frame's dynamic check took, which other programs
-    do not change; ``fill_ms`` that of finding keypoints in place of those left out. ``covered`` is
+    do not change, with finding keypoints in place of those left out. ``covered`` is
     the share of each frame that what moves covers.
     """
 
@@ -119,7 +119,6 @@ class WatchedSystem(SlamSystem):
         self.counts: list[dict[str, Count]] = []
         self.pictures: list[Image] = []
         self.check_ms: list[float] = []
-        self.fill_ms: list[float] = []
         self.covered: list[float] = []
         return self
 
@@ -127,9 +126,9 @@ class WatchedSystem(SlamSystem):
         """Of all frames but the first, which has nothing to be compared with."""
         return sum((c[kind] for c in self.counts[1:]), Count())
 
-    def _static_features(self, frame: Frame, features: Features) -> StaticFeatures:
+    def _without_moving(self, frame: Frame, features: Features) -> StaticFeatures:
         begun_s = time.thread_time()
-        static = super()._static_features(frame, features)
+        static = super()._without_moving(frame, features)
         self.check_ms.append(1e3 * (time.thread_time() - begun_s))
         masks = self.truth.masks(frame)
         seen = features.image_pixels, static.moving
@@ -139,18 +138,11 @@ class WatchedSystem(SlamSystem):
             self.pictures.append(picture(frame, seen, masks))
         return static
 
-    def _replenish(
-        self, frame: Frame, features: Features, static: StaticFeatures
-    ) -> StaticFeatures:
+    def _learn_motion(self, frame: Frame, tracked: Tracked, static: StaticFeatures) -> bool:
         begun_s = time.thread_time()
-        filled = super()._replenish(frame, features, static)
-        self.fill_ms.append(1e3 * (time.thread_time() - begun_s))
-        return filled
-
-    def _watch(self, time_s: float, tracked: Tracked, static: StaticFeatures) -> None:
-        begun_s = time.thread_time()
-        super()._watch(time_s, tracked, static)
+        restored = super()._learn_motion(frame, tracked, static)
         self.check_ms[-1] += 1e3 * (time.thread_time() - begun_s)
+        return restored
 
 
 def strip(pictures: list[Image], columns: int = 4) -> Image:
@@ -182,7 +174,6 @@ def main() -> None:
         if frame.index % 10 == 0:
             print(frame.index, {k: (c.on, c.left_out) for k, c in system.counts[-1].items()})
     print("check ms: median {:.2f}, 95 % {:.2f}".format(*np.percentile(system.check_ms, [50, 95])))
-    print("fill ms: median {:.2f}, 95 % {:.2f}".format(*np.percentile(system.fill_ms, [50, 95])))
     for kind in (*KINDS, "rest"):
         total = system.total(kind)
         print(f"{kind}: left out {total.share:.3f} of {total.on}")

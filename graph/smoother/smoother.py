@@ -138,12 +138,15 @@ class Smoother:
 
     def relative_pose_errors(self, kind: str) -> RelativePoseErrors:
         """Chi-square of every relative pose of a kind at the current estimate."""
-        factors = [
+        return relative_pose_errors(self.relative_poses(kind), self._tables.keyframes)
+
+    def relative_poses(self, kind: str) -> tuple[RelativePose, ...]:
+        """Every relative pose of a kind that is in the graph, oldest first."""
+        return tuple(
             entry.factor
             for _, entry in sorted(self._tables.pose_factors.items())
             if isinstance(entry.factor, RelativePose) and entry.factor.kind == kind
-        ]
-        return relative_pose_errors(factors, self._tables.keyframes)
+        )
 
     def marginal_covariance(self, keyframe_id: int) -> Array:
         """Covariance (6, 6) of a pose's ``[rotation rad, translation m]`` on its right side.

@@ -13,6 +13,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import transform
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
+from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
@@ -28,8 +29,7 @@ class MappingConfig:
     ``redundant_views`` others.
     """
 
-    local_keyframes: int = 15
-    local_min_shared: int = 15
+    local_map: LocalMapConfig = field(default_factory=LocalMapConfig)
     fuse_neighbours: int = 5
     fuse_radius_px: float = 4.0
     min_found_ratio: float = 0.25
@@ -38,17 +38,6 @@ class MappingConfig:
     redundant_share: float = 0.9
     redundant_views: int = 3
     triangulation: TriangulationConfig = field(default_factory=TriangulationConfig)
-
-
-def local_landmarks(world: WorldMap, seen_ids: Ints, config: MappingConfig) -> Ints:
-    """Ids of the landmarks of the keyframes that share most with the seen ones, sorted."""
-    strong = world.covisible(seen_ids, config.local_min_shared)[: config.local_keyframes]
-    if not strong:
-        return np.unique(seen_ids)
-    chosen = np.zeros(len(world.landmarks) + 1, bool)  # the last entry answers for id -1
-    for ids in (*(keyframe.landmark_ids for _, keyframe in strong), seen_ids):
-        chosen[ids] = True
-    return np.flatnonzero(chosen[:-1] & world.landmarks.alive)
 
 
 def create_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> Ints:

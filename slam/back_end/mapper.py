@@ -1,9 +1,9 @@
-"""The map's owner: keyframes go in, the graph is optimised, segments are joined."""
+"""The owner of map and graph: keyframes go in, the graph is optimised, segments are joined."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,14 @@ from bmask_slam.back_end.landmark_management import (
     cull_landmarks,
     fuse_into,
     fuse_into_neighbours,
-    local_landmarks,
     redundant_keyframe,
 )
+from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.back_end.pruning import MapPruner
 from bmask_slam.back_end.segment_joining import join_segment
 from bmask_slam.back_end.triangulation import triangulate_landmarks
-from bmask_slam.features.brisk import Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.arrays import Arrays, Ints
+from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import GraphEstimate
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -37,41 +36,61 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.tracker import Tracked, Tracker
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.landmark_table import Patches
+from bmask_slam.world.local_map import local_landmarks
 from bmask_slam.world.map_state import world_of, world_state
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
 
-MEDIAN_CHI2_6DOF = 5.348
+
+@dataclass(frozen=True)
+class BackEndConfig:
+    """Settings of the map, of what enters the graph, of the graph, and of its loops."""
+
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    factor_selection: FactorSelectionConfig = field(default_factory=FactorSelectionConfig)
+    graph: SmootherConfig = field(default_factory=SmootherConfig)
+    loops: LoopClosingConfig = field(default_factory=LoopClosingConfig)
 
 
 class Mapper:
-    """Holds map, graph and frame history, and keeps the three consistent."""
+    """Holds map, graph and frame history in this process, and keeps the three consistent.
+
+    Attributes:
+        world: keyframes and landmarks. history: of all tracked frames. smoother: the graph.
+        loops: finds loops, and knows those that were closed.
+        update_ms: wall time of every graph update.
+    """
 
     def __init__(
         self,
         camera: Camera,
         tracker: Tracker,
-        config: tuple[MappingConfig, FactorSelectionConfig, SmootherConfig, LoopClosingConfig],
+        config: BackEndConfig,
     ):
         self.camera = camera
         self.world = WorldMap()
         self.history = FrameHistory()
-        self.smoother = Smoother(camera, config[2])
-        self.loops = LoopCloser(camera, config[3])
+        self.smoother = Smoother(camera, config.graph)
+        self.loops = LoopCloser(camera, config.loops)
         self.update_ms: list[float] = []
         self._tracker = tracker
-        self._mapping, self._graph_config = config[0], config[2]
-        self._factor_selector = FactorSelector(config[1])
+        self._mapping, self._graph_config = config.mapping, config.graph
+        self._factor_selector = FactorSelector(config.factor_selection)
 
     @property
     def places(self) -> DescriptorIndex:
-        """What finds the keyframes that look like a frame."""
+        """Finds the keyframes that look like a frame."""
         return self.loops.index
 
     @property
     def idle(self) -> bool:
         """Whether it waits for work: always, since every update ends before the next frame."""
+        return True
+
+    @property
+    def accepts_keyframes(self) -> bool:
+        """Whether a keyframe will be worked on: always."""
         return True
 
     def state(self) -> Arrays:
@@ -140,7 +159,8 @@ class Mapper:
         self._change_graph(relative_poses=self.loops.relative_poses(confirmed))
         believed = self.loops.is_strong(confirmed)
         self.loops.closed |= {loop.ends: believed for loop in confirmed}
-        refuted = self._refuted_loops()
+        errors = self.smoother.relative_pose_errors("loop")
+        refuted = self.loops.refuted(errors, self.world)
         kept = [loop for loop in confirmed if loop.ends not in refuted]
         self.loops.waiting += [loop for loop in confirmed if loop.ends in refuted]
         self._remove_loops(refuted, {loop.ends for loop in confirmed})
@@ -154,19 +174,31 @@ class Mapper:
         Returns the frame as it is seen in the joined map.
         """
         joined = join_segment(self.world, segment, tracked, recognised)
+        loops = self.smoother.relative_poses("loop")
         self.smoother = Smoother(self.camera, self._graph_config)
-        self._apply(self.smoother.update(self._factor_selector.whole_update(self.world)))
+        update = self._factor_selector.whole_update(self.world)
+        self._apply(self.smoother.update(replace(update, relative_poses=loops)))
         return joined
 
     def pruner(self) -> MapPruner:
-        """Takes things out of map and graph, such as what a mask covers, at any time."""
+        """Takes observations out of map and graph together, at any time."""
         return MapPruner(self.world, self.smoother, self.camera)
 
-    def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
-        """Keypoints (N,) of a keyframe that were masked observe landmarks after all.
+    def prune_mask(self, keyframe_id: int, mask: Mask, widen_px: int) -> None:
+        """Take out what a keyframe observes under a mask (H, W), widened by ``widen_px``."""
+        pruner = replace(self.pruner(), border_px=-widen_px)
+        report = pruner.prune_mask(keyframe_id, mask)
+        logger.info("mask of keyframe %d: %s", keyframe_id, report)
 
-        Those that the map has by now, or new ones; either have the patches (N) of what the
-        keypoints observed before, unless they have others.
+    def prune_landmarks(self, landmark_ids: Ints) -> None:
+        """Take landmarks (N,) out of map and graph, with all their observations."""
+        logger.info("landmarks that move: %s", self.pruner().prune_landmarks(landmark_ids))
+
+    def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
+        """Keypoints (N,) of a keyframe that were masked observe landmarks again.
+
+        They observe landmarks that the map has by now, or new ones. Either get the image patches
+        (N) of what the keypoints observed before, unless they have patches already.
         """
         world = self.world
         keyframe = world.keyframes.get(keyframe_id)
@@ -174,7 +206,7 @@ class Mapper:
             return
         world.unmask(keyframe, keypoints)
         _, seen = world.observed(keyframe)
-        known = np.setdiff1d(local_landmarks(world, seen, self._mapping), seen)
+        known = np.setdiff1d(local_landmarks(world, seen, self._mapping.local_map), seen)
         radius_px = self._mapping.fuse_radius_px
         fused = fuse_into(world, [keyframe], known, self._tracker, radius_px)
         self._factor_selector.forget_landmarks(fused)
@@ -201,28 +233,6 @@ class Mapper:
             self._factor_selector.map_update(self.world), max_iterations=rounds, **changes
         )
         self._apply(self.smoother.update(update))
-
-    def _refuted_loops(self) -> set[tuple[int, int]]:
-        """Loops that are not in the graph, or do not fit it.
-
-        A strong set is believed against the path, but not one of its loops against the others:
-        their bound is as much wider as their median says that the set fits worse than it should.
-        """
-        errors = self.smoother.relative_pose_errors("loop")
-        pairs = list(zip(errors.keyframe_a.tolist(), errors.keyframe_b.tolist(), strict=True))
-        believed = np.array([self.loops.closed.get(pair, False) for pair in pairs], bool)
-        wider = np.ones(len(pairs))
-        if believed.any():
-            ratio = float(np.median(errors.chi2[believed])) / MEDIAN_CHI2_6DOF
-            wider[believed] = max(ratio, 1.0)
-        fits = (errors.chi2 <= wider * self.loops.config.gate).tolist()
-        inside = dict(zip(pairs, fits, strict=True))
-        return {
-            pair
-            for pair in self.loops.closed
-            if self.world.keyframes.keys() >= set(pair)  # else it left with a culled keyframe
-            and not inside.get(pair, False)
-        }
 
     def _remove_loops(self, refuted: set[tuple[int, int]], fresh: set[tuple[int, int]]) -> None:
         """Take loops out of the graph, and apart what those that are not fresh have fused."""
@@ -257,9 +267,9 @@ class Mapper:
         old_ids, new_side = [], {}
         for loop in loops:
             _, seen = world.observed(world.keyframes[loop.keyframe_a])
-            old_ids.append(local_landmarks(world, seen, self._mapping))
+            old_ids.append(local_landmarks(world, seen, self._mapping.local_map))
             _, seen = world.observed(world.keyframes[loop.keyframe_b])
-            near = world.covisible(seen, self._mapping.local_min_shared)[:count]
+            near = world.covisible(seen, self._mapping.local_map.min_shared)[:count]
             new_side.update({k.id: k for _, k in near})
         return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
 
@@ -284,23 +294,3 @@ class Mapper:
         self._factor_selector.forget_keyframe(redundant.id)
         self._factor_selector.forget_landmarks(cull_landmarks(self.world, ids, self._mapping))
         self.loops.remove(redundant.id)
-
-
-def add_keyframe(world: WorldMap, frame: Frame, tracked: Tracked, segment: int) -> Keyframe:
-    """Put a tracked frame into a map; it observes nothing yet."""
-    keyframe = Keyframe(
-        id=world.next_keyframe_id,
-        frame_index=frame.index,
-        timestamp_s=frame.timestamp_s,
-        segment=segment,
-        T_world_camera=tracked.T_world_camera,
-        features=tracked.features,
-        landmark_ids=np.full(len(tracked.features), -1, np.int64),
-    )
-    world.add_keyframe(keyframe)
-    return keyframe
-
-
-def without_image(features: Features) -> Features:
-    """The features without their picture, which a keyframe needs no more once patches are cut."""
-    return replace(features, gray=np.zeros((0, 0), np.uint8))

@@ -11,11 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
-import cv2
 import numpy as np
 
 from bmask_slam.back_end.factor_selection import read_back
-from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.arrays import Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
@@ -25,6 +24,7 @@ from bmask_slam.graph.factors.graph_update import (
     RemovalPolicy,
 )
 from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.world.masked_keypoints import keypoints_under
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
@@ -79,21 +79,6 @@ class PruneReport:
     anchored_keyframes: Ints = field(default_factory=_no_ids)
 
 
-def covered(mask: Mask, image_pixels: Array, border_px: int) -> Ints:
-    """Indices of the pixels (N, 2), as detected, that lie in a mask (H, W) less its border.
-
-    A negative border widens the mask. The image's own edge is no border of the mask.
-    """
-    side = 2 * abs(border_px) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    change = cv2.erode if border_px > 0 else cv2.dilate
-    inner = change(mask.astype(np.uint8), disc)
-    columns, rows = np.rint(image_pixels).astype(np.int64).T
-    height, width = mask.shape
-    inside = inner[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-    return np.flatnonzero(inside)
-
-
 @dataclass(frozen=True)
 class MapPruner:
     """Takes things out of one map and its graph, and leaves both consistent.
@@ -122,12 +107,12 @@ class MapPruner:
             return PruneReport(refused=f"the mask is {given}, the image needs bool {expected}")
         keyframe = self.world.keyframes.get(keyframe_id)
         if keyframe is not None:
-            keypoints = covered(mask, keyframe.features.image_pixels, self.border_px)
+            keypoints = keypoints_under(mask, keyframe.features.image_pixels, self.border_px)
             return self._prune_view(keyframe, keypoints, scope)
         culled = self.world.culled.get(keyframe_id)
         if culled is None:
             return PruneReport(refused=f"keyframe {keyframe_id} is not in the map")
-        keypoints = covered(mask, culled.image_pixels, self.border_px)
+        keypoints = keypoints_under(mask, culled.image_pixels, self.border_px)
         ids = culled.landmark_ids[keypoints]
         if scope is MaskScope.LANDMARKS:
             return self.prune_landmarks(ids[ids >= 0])

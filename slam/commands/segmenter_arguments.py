@@ -36,7 +36,7 @@ def segmenter_options(arguments: argparse.Namespace, base: SegmenterOptions) -> 
     on labels: a detector of photographs is too often wrong there. In the red kitchen its weak books
     became the table.
     """
-    from bmask_slam.labelling.semantic_mapper import SemanticsConfig
+    from bmask_slam.labelling.config import SemanticsConfig
 
     given = {name: getattr(arguments, name) for name in ("weights", "labels", "ray")}
     given["name"] = arguments.segmenter

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.world.world_map import Keyframe
+from bmask_slam.world.map_editor import MapReader
+from bmask_slam.world.world_map import Keyframe, WorldMap
 
 _REACH = 0.02
 """How far off the depth image a landmark may lie, as a share of its depth."""
@@ -33,10 +33,10 @@ class Observed:
     def T_world_camera(self) -> Array:
         return self.anchor.T_world_camera @ self.T_anchor_camera
 
-    def located(self, mapper: Mapper) -> VisibleLandmarks:
-        """The landmarks where the keyframe is."""
+    def located(self, world: WorldMap) -> VisibleLandmarks:
+        """Its landmarks with their depths at its present pose."""
         T_world_camera = self.T_world_camera
-        points = mapper.world.landmarks.points_world[self.landmark_ids]
+        points = world.landmarks.points_world[self.landmark_ids]
         z_m = transform(inverse(T_world_camera), points)[:, 2]
         return VisibleLandmarks(
             self.pixels, z_m, self.landmark_ids, T_world_camera, self.anchor.segment
@@ -66,7 +66,7 @@ class VisibleLandmarks:
         self,
         depth_m: Floats,
         camera: Camera,
-        mapper: Mapper,
+        world: WorldMap,
         wanted: Mask | None = None,
     ) -> VisibleLandmarks:
         """These and all others of the segment that lie where the keyframe's depth shows surface.
@@ -76,11 +76,11 @@ class VisibleLandmarks:
         depth image both ways, of which the nearest nine are looked at; ``wanted`` says which of
         all landmarks are asked for, else all that live are.
         """
-        landmarks = mapper.world.landmarks
+        landmarks = world.landmarks
         others = (landmarks.alive if wanted is None else wanted).copy()
         others[self.landmark_ids] = False
         ids = np.flatnonzero(others)
-        hosts = [k.id for k in mapper.world.in_segment(self.segment)]
+        hosts = [k.id for k in world.in_segment(self.segment)]
         ids = ids[np.isin(landmarks.host[ids], hosts)]
         local = transform(inverse(self.T_world_camera), landmarks.points_world[ids])
         ahead = np.flatnonzero(local[:, 2] > 0.1)
@@ -103,15 +103,15 @@ class VisibleLandmarks:
         )
 
 
-def observed_by(keyframe_id: int, mapper: Mapper) -> Observed | None:
+def observed_by(keyframe_id: int, map_reader: MapReader) -> Observed | None:
     """What a keyframe of the map, or a culled one, sees of the landmarks that live."""
-    world = mapper.world
+    world = map_reader.world
     keyframe = world.keyframes.get(keyframe_id)
     if keyframe is not None:
         rows, ids = world.observed(keyframe)
         return Observed(keyframe.features.image_pixels[rows], ids, keyframe, np.eye(4))
     culled = world.culled.get(keyframe_id)
-    parent_id, T_parent_keyframe = mapper.history.parent(keyframe_id)
+    parent_id, T_parent_keyframe = map_reader.history.parent(keyframe_id)
     parent = world.keyframes.get(parent_id)
     if culled is None or parent is None:
         return None

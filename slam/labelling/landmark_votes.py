@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.labelling.landmark_visibility import Observed, VisibleLandmarks, observed_by
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, VoteConfig, vote
 from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.world.map_editor import MapReader
 
 RECENT = 8
 """Of so many keyframes the masks vote on landmarks that are made later."""
@@ -29,8 +29,8 @@ class LabelVotes:
 
     _recent: dict[int, PixelAssignment]
 
-    def __init__(self, camera: Camera, config: VoteConfig) -> None:
-        self._camera, self._config = camera, config
+    def __init__(self, camera: Camera, config: VoteConfig, map_reader: MapReader) -> None:
+        self._camera, self._config, self._map = camera, config, map_reader
         self._recent = {}
 
     def take(
@@ -38,19 +38,19 @@ class LabelVotes:
         keyframe_id: int,
         assignment: PixelAssignment,
         observed: Observed,
-        mapper: Mapper,
         store: LabelStore,
     ) -> Ints:
         """All of a keyframe's instances vote on all landmarks in sight; the ids (N,) of those."""
-        new = mapper.world.landmarks.alive.copy()
+        world = self._map.world
+        new = world.landmarks.alive.copy()
         new[store.known()] = False
         for earlier_id, earlier in self._recent.items():
-            seen = observed_by(earlier_id, mapper)
+            seen = observed_by(earlier_id, self._map)
             if seen is not None:
-                matched = seen.located(mapper).among(new)
-                located = matched.with_visible(earlier.depth_m, self._camera, mapper, new)
+                matched = seen.located(world).among(new)
+                located = matched.with_visible(earlier.depth_m, self._camera, world, new)
                 self._vote(earlier, located, store)
-        located = observed.located(mapper).with_visible(assignment.depth_m, self._camera, mapper)
+        located = observed.located(world).with_visible(assignment.depth_m, self._camera, world)
         ids = self._vote(assignment, located, store)
         without = [replace(i, mask=_NO_MASK) for i in assignment.instances]
         self._recent[keyframe_id] = replace(assignment, instances=tuple(without))

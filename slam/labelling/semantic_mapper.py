@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Arrays, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
+from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
 from bmask_slam.labelling.landmark_votes import LabelVotes
 from bmask_slam.labelling.results import LandmarkLabels, MapObjects
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
-from bmask_slam.moving.moving_object_filter import MovingObjectFilter
-from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.votes import (
     PixelAssignment,
-    VoteConfig,
     assign_pixels,
     check_instances,
     vote,
@@ -32,39 +30,19 @@ from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.gravity import GravityEstimator
 from bmask_slam.semantics.objects.object_map import (
     KeyframeView,
-    ObjectConfig,
     ObjectMap,
     pixel_rays,
 )
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter, Segmenter
-from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_SEGMENTER = "light"
 DEPTH_STEP = 2
 """Of a keyframe's depth image every second pixel each way waits for its masks."""
 MAX_WAITING = 100
-VOTE_SCORE = 0.1
-
-
-@dataclass(frozen=True)
-class SemanticsConfig:
-    """Where masks come from, and what is believed of them.
-
-    Of instances with a class score below ``object_score`` the votes count, but nothing else: they
-    make no objects and nothing moves for them.
-    """
-
-    segmenter: SegmenterOptions = field(
-        default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER, min_score=VOTE_SCORE)
-    )
-    object_score: float = 0.5
-    votes: VoteConfig = field(default_factory=VoteConfig)
-    labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)
-    objects: ObjectConfig = field(default_factory=ObjectConfig)
 
 
 @dataclass(frozen=True)
@@ -95,8 +73,8 @@ class _Waiting:
 class SemanticMapper:
     """Segments keyframes and keeps what their masks say about the map, also when they come late.
 
-    Without a segmenter and without masks it does nothing. The map is changed by
-    ``moving_objects`` alone, which is told what the masks say.
+    Without a segmenter and without masks it does nothing. It reads the map and does not change it;
+    what masks say about motion is passed to ``on_masks``.
     """
 
     _done: set[int]
@@ -106,10 +84,12 @@ class SemanticMapper:
         self,
         camera: Camera,
         config: SemanticsConfig,
+        map_reader: MapReader,
         segmenter: Segmenter | None = None,
-        moving_objects: MovingObjectFilter | None = None,
+        on_masks: Callable[[KeyframeMasks], None] | None = None,
     ) -> None:
-        self._moving_objects = moving_objects
+        self._map = map_reader
+        self._on_masks = on_masks
         self.camera = camera
         self.config = config
         self.segmenter = segmenter or NoSegmenter()
@@ -121,32 +101,32 @@ class SemanticMapper:
         """Whether there are labels to tell apart."""
         return len(self.names) > 1
 
-    def observe(self, frame: Frame, keyframe: Keyframe, mapper: Mapper) -> None:
-        """Segment a keyframe and let its masks speak; follow what became of the map.
+    def observe(self, frame: Frame, keyframe: Keyframe) -> None:
+        """Follow the map's changes, then segment a keyframe and use its masks.
 
         Raises:
             InputError: the first keyframe cannot be segmented; later ones are passed over.
         """
-        self.follow(mapper)
+        self.follow_map()
         if not len(self.segmenter.labels) > 1:
             return
-        self.expect(keyframe, kept_depth(frame.depth_m))
+        self.await_masks(keyframe, kept_depth(frame.depth_m))
         try:
             instances = self.segmenter.segment(frame.rgb, frame.name)
-            self.attach(keyframe.id, instances, mapper)
+            self.attach(keyframe.id, instances)
         except InputError as error:
             if not self._done:
                 raise
             logger.warning("keyframe %d has no masks: %s", keyframe.id, error)
 
-    def expect(self, keyframe: Keyframe, depth_m: Floats) -> None:
+    def await_masks(self, keyframe: Keyframe, depth_m: Floats) -> None:
         """Keep of a keyframe what its masks will need, its ``kept_depth``, until they come."""
         self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, depth_m)
         self._gravity.add(keyframe.id, depth_m, self._rays)
         if len(self._waiting) > MAX_WAITING:
             del self._waiting[min(self._waiting)]
 
-    def attach(self, keyframe_id: int, instances: Sequence[Instance], mapper: Mapper) -> Attachment:
+    def attach(self, keyframe_id: int, instances: Sequence[Instance]) -> Attachment:
         """Use the masks of a keyframe, at any time after it was made, once.
 
         Fused landmarks are followed; a culled keyframe's masks still reach its landmarks.
@@ -156,7 +136,7 @@ class SemanticMapper:
         """
         size = (self.camera.height, self.camera.width)
         check_instances(instances, size, self.names, f"keyframe {keyframe_id}")
-        observed = observed_by(keyframe_id, mapper)
+        observed = observed_by(keyframe_id, self._map)
         refused = "" if observed is not None else "it is not in the map"
         if keyframe_id in self._done:
             refused = "it has its masks already"
@@ -168,29 +148,29 @@ class SemanticMapper:
         waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
         strong = [i for i in instances if i.class_score >= self.config.object_score]
         assignment = assign_pixels(strong, waiting.depth_m, size, self.config.votes)
-        seen = observed.located(mapper)
+        seen = observed.located(self._map.world)
         votes = vote(assignment, seen.pixels, seen.z_m, len(self.names), self.config.votes)
         ids = observed.landmark_ids[votes.rows[votes.sure]]
         on = votes.instances[votes.sure]
         everything = assign_pixels(instances, waiting.depth_m, size, self.config.votes, True)
-        spoken = self._label_votes.take(keyframe_id, everything, observed, mapper, self.labels)
+        spoken = self._label_votes.take(keyframe_id, everything, observed, self.labels)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
-            objects = self._add_objects((keyframe_id, waiting), assignment, observed, mapper)[on]
+            objects = self._add_objects((keyframe_id, waiting), assignment, observed)[on]
             self.objects.place_landmarks(ids[objects >= 0], objects[objects >= 0])
-        if self._moving_objects is not None:
+        if self._on_masks is not None:
             about = (ids, on, self.labels.probabilities(ids))
             view = (assignment, waiting.depth_m, observed.T_world_camera)
             masks = KeyframeMasks(keyframe_id, self.names, *view, *about)
-            self._moving_objects.see(masks, mapper)
+            self._on_masks(masks)
         return Attachment(keyframe_id, len(instances), spoken)
 
-    def follow(self, mapper: Mapper) -> None:
-        """Keep up with the map.
+    def follow_map(self) -> None:
+        """Keep up with what became of landmarks and keyframes.
 
         Landmarks that were fused take what was known of them along, culled ones lose it; points
-        of objects in a culled keyframe's frame go on in its heir's.
+        of objects in a culled keyframe's frame go on in its parent's.
         """
-        landmarks, keyframes = mapper.world.landmarks, mapper.world.keyframes
+        landmarks, keyframes = self._map.world.landmarks, self._map.world.keyframes
         known = np.union1d(self.labels.known(), self.objects.points.landmarks())
         gone = known[~landmarks.alive[known]]
         if len(gone):
@@ -201,7 +181,7 @@ class SemanticMapper:
             self.objects.points.rename_landmarks(gone, np.where(alive, parents, -1))
         for keyframe_id in self.objects.points.anchors():
             if keyframe_id not in keyframes:
-                self.objects.points.hand_over(keyframe_id, *mapper.history.parent(keyframe_id))
+                self.objects.points.hand_over(keyframe_id, *self._map.history.parent(keyframe_id))
         self._gravity.keep(keyframes.keys() | self._waiting.keys())
 
     def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
@@ -266,7 +246,7 @@ class SemanticMapper:
         """Know nothing yet."""
         self.names = names
         self.labels = LabelStore(len(names), self.config.labels)
-        self._label_votes = LabelVotes(self.camera, self.config.votes)
+        self._label_votes = LabelVotes(self.camera, self.config.votes, self._map)
         self.objects = ObjectMap(self.camera, len(names), self.config.objects, self.config.labels)
         self._gravity = GravityEstimator()
         self._done = set()
@@ -277,11 +257,10 @@ class SemanticMapper:
         waited: tuple[int, _Waiting],
         assignment: PixelAssignment,
         observed: Observed,
-        mapper: Mapper,
     ) -> Ints:
-        """The object of each of the claims' instances (K,) and -1 for the last, "none"."""
+        """The object of each of the assignment's instances (K,), and -1 for "none" as the last."""
         keyframe_id, waiting = waited
-        here = mapper.world.in_segment(observed.anchor.segment)
+        here = self._map.world.in_segment(observed.anchor.segment)
         T_world_camera = observed.T_world_camera
         view = KeyframeView(
             keyframe_id,

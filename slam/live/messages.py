@@ -115,7 +115,7 @@ class PruneMask:
 
     keyframe_id: int
     mask: PackedMask
-    border_px: int
+    widen_px: int
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,6 @@ from pathlib import Path
 import faiss
 import numpy as np
 
-from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
@@ -30,12 +29,10 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
-from bmask_slam.tracking.tracker import Tracked, Tracker
+from bmask_slam.tracking.tracker import Tracked
 from bmask_slam.world.frame_history import NOBODY
 from bmask_slam.world.world_map import Keyframe
 
-MAX_PENDING = 3
-"""Keyframes that wait for the map; with so many no further one is promised."""
 FIRST_MAP_S = 5.0
 """How long the frame that begins a map may wait for its landmarks."""
 SWITCH_S = 0.0005
@@ -87,22 +84,19 @@ class LiveSystem(SlamSystem):
         with ExitStack() as undo:
             self.remote = RemoteMapper(camera, config, self._names, folder)
             undo.callback(self.remote.close)
-            super().__init__(camera, config)
+            super().__init__(camera, config, back_end=self.remote)
             self.remote.wait_until_ready(Patience().start_s)
             if dense is not None:
                 dense.wait_until_ready()
-            self.semantics = _Asked(self)
+            self.semantics = _RemoteSemantics(self)
             undo.enter_context(settings_for_tracking())
             self._resources = undo.pop_all()
-
-    def _make_mapper(self, tracker: Tracker) -> Mapper:
-        return self.remote  # type: ignore[return-value]  # it has what the step asks for
 
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Take in what the other processes have found, then the same step as offline."""
         self.catch_up()
         result = super().process(frame, features)
-        first = self._reference
+        first = self.camera_tracker.reference
         if result.keyframe_id is None or first is None:
             return result
         if self.remote.world.in_segment(first.segment) == [first]:
@@ -113,10 +107,10 @@ class LiveSystem(SlamSystem):
 
     def catch_up(self) -> None:
         """Bring the map's copy up to date, pass masks on, and stay where the map has moved to."""
-        reference, changes = self._reference, self.remote.changes
+        reference, changes = self.camera_tracker.reference, self.remote.changes
         T_before = None if reference is None else reference.T_world_camera
         for masks in self.remote.catch_up():
-            self.moving_objects.see(masks, self.mapper)
+            self.moving_objects.observe_masks(masks)
         for found in self.segmenter.answers() if self.segmenter else ():
             self.remote.tell(found)
             if self.dense is not None:
@@ -131,16 +125,17 @@ class LiveSystem(SlamSystem):
 
         If the keyframe was lost with its place, the next frame begins the segment anew.
         """
+        tracker = self.camera_tracker
         parent_id, T_parent_reference = self.remote.history.parent(reference.id)
         if parent_id == NOBODY:
-            self._reference = None
-            self.camera_tracker.forget(0)
+            tracker.reference = None
+            tracker.reset(0)
             return
         parent = self.remote.world.keyframes[parent_id]
         T_now = parent.T_world_camera @ T_parent_reference
-        self.camera_tracker.moved(T_before, T_now, self.remote.world)
-        self.camera_tracker.new_local_map(self.remote.world, parent)
-        self._reference, self._segment = parent, parent.segment
+        tracker.follow_map(T_before, T_now)
+        tracker.refer_to(parent)
+        tracker.segment = parent.segment
 
     def _follow(self, dense: RemoteDenseMapper, moved: bool) -> None:
         """Let the dense map follow the map."""
@@ -167,8 +162,9 @@ class LiveSystem(SlamSystem):
 
     def insert(self, frame: Frame, tracked: Tracked, local_ids: Ints) -> tuple[Tracked, Keyframe]:
         """Make a frame a keyframe; segments are joined by the map's process."""
-        self.remote.reference = self._reference
-        return tracked, self.remote.insert(frame, tracked, self._segment, local_ids)
+        self.remote.reference = self.camera_tracker.reference
+        segment = self.camera_tracker.segment
+        return tracked, self.remote.insert(frame, tracked, segment, local_ids)
 
     def finish(self) -> None:
         """Let the other processes end their work; from then on this is an offline system."""
@@ -181,7 +177,7 @@ class LiveSystem(SlamSystem):
         own = nested(dynamics=self.moving_objects.state())
         whole = SlamSystem(self.camera, self.config, LabelledNothing(self._names))
         whole.restore({**state, **own}, path)
-        self.mapper, self.camera_tracker = whole.mapper, whole.camera_tracker
+        self.map, self.camera_tracker = whole.map, whole.camera_tracker
         self.semantics, self.moving_objects = whole.semantics, whole.moving_objects
         self._end()
 
@@ -197,20 +193,15 @@ class LiveSystem(SlamSystem):
         if self.segmenter is not None:
             self.segmenter.close()
 
-    def _keyframe_reason(self, tracked: Tracked) -> str:
-        """None while the map has too much to do: what is promised will be kept."""
-        busy = self.remote.pending >= MAX_PENDING or self.remote.given_up
-        return "" if busy else super()._keyframe_reason(tracked)
 
-
-class _Asked(SemanticMapper):
-    """On tracking's side: asks for a keyframe's masks and submap, which others make."""
+class _RemoteSemantics(SemanticMapper):
+    """On tracking's side: asks other processes for a keyframe's masks and submap."""
 
     def __init__(self, system: LiveSystem) -> None:
-        super().__init__(system.camera, system.config.semantics)
+        super().__init__(system.camera, system.config.semantics, system.map)
         self._system = system
 
-    def observe(self, frame: Frame, keyframe: Keyframe, mapper: Mapper) -> None:
+    def observe(self, frame: Frame, keyframe: Keyframe) -> None:
         """Ask, and do not wait."""
         if self._system.segmenter is not None:
             self._system.segmenter.ask(ImageToSegment(keyframe.id, frame.rgb, frame.name))

@@ -17,7 +17,7 @@ from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import mahalanobis
-from bmask_slam.graph.factors.graph_update import RelativePose
+from bmask_slam.graph.factors.graph_update import RelativePose, RelativePoseErrors
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.pose_graph.loop_consistency import cycle_chi2
@@ -26,6 +26,8 @@ from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, lo
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
+
+MEDIAN_CHI2_6DOF = 5.348
 
 
 @dataclass(frozen=True)
@@ -196,6 +198,28 @@ class LoopCloser:
         return tuple(
             RelativePose(*k.ends, k.T_a_b, self._loop_covariance(k), robust, "loop") for k in loops
         )
+
+    def refuted(self, errors: RelativePoseErrors, world: WorldMap) -> set[tuple[int, int]]:
+        """Ends of the closed loops that are not in the graph, or do not fit it.
+
+        A strong set is believed against the path, but not one of its loops against the others:
+        their bound is as much wider as their median says that the set fits worse than it should.
+        ``errors`` are those of all loops in the graph.
+        """
+        pairs = list(zip(errors.keyframe_a.tolist(), errors.keyframe_b.tolist(), strict=True))
+        believed = np.array([self.closed.get(pair, False) for pair in pairs], bool)
+        wider = np.ones(len(pairs))
+        if believed.any():
+            ratio = float(np.median(errors.chi2[believed])) / MEDIAN_CHI2_6DOF
+            wider[believed] = max(ratio, 1.0)
+        fits = (errors.chi2 <= wider * self.config.gate).tolist()
+        inside = dict(zip(pairs, fits, strict=True))
+        return {
+            pair
+            for pair in self.closed
+            if world.keyframes.keys() >= set(pair)  # else it left with a culled keyframe
+            and not inside.get(pair, False)
+        }
 
     def _loop_covariance(self, loop: LoopConstraint) -> Array:
         """Covariance (6, 6) of a loop with what its inliers do not know of."""

@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.arrays import Array, Arrays, Mask
 from bmask_slam.moving.depth_segments import MovingSpace
 from bmask_slam.moving.free_space_check import DepthView
+from bmask_slam.world.map_editor import MapReader
 
 
 @dataclass(frozen=True, eq=False)
-class RememberedView:
+class BufferedView:
     """The depth that a frame saw, and when; ``view`` is without what moved, ``seen`` with it.
 
     Its pose is ``T_keyframe_camera`` (4, 4) from a keyframe, which is mostly itself.
@@ -46,7 +46,7 @@ class DepthViewBuffer:
 
     def __init__(self, count: int, interval_s: float) -> None:
         self.count, self.interval_s = count, interval_s
-        self.views: list[RememberedView] = []
+        self.views: list[BufferedView] = []
 
     def add(
         self,
@@ -65,29 +65,29 @@ class DepthViewBuffer:
         seen = view.thinned(THINNED)
         told = seen.thinned(1)
         if moving is not None:
-            _forget(told, moving.covers(told.nearest_m, told.step))
+            _clear(told, moving.covers(told.nearest_m, told.step))
         pose = np.eye(4) if T_keyframe_camera is None else T_keyframe_camera
-        self.views.append(RememberedView(keyframe_id, timestamp_s, told, seen, pose))
+        self.views.append(BufferedView(keyframe_id, timestamp_s, told, seen, pose))
         del self.views[: -self.count]
 
-    def posed(self, segment: int, mapper: Mapper) -> list[PosedView]:
+    def posed(self, segment: int, map_reader: MapReader) -> list[PosedView]:
         """What is remembered of a map segment, with poses as optimised since."""
         found = []
         for kept in self.views:
-            parent_id, T_parent_keyframe = mapper.history.parent(kept.keyframe_id)
-            parent = mapper.world.keyframes.get(parent_id)
+            parent_id, T_parent_keyframe = map_reader.history.parent(kept.keyframe_id)
+            parent = map_reader.world.keyframes.get(parent_id)
             if parent is not None and parent.segment == segment:
                 pose = parent.T_world_camera @ T_parent_keyframe @ kept.T_keyframe_camera
                 when = kept.keyframe_id, kept.timestamp_s
                 found.append(PosedView(*when, kept.view, kept.seen, pose))
         return found
 
-    def forget_space(self, keyframe_id: int, covered: Mask) -> None:
+    def clear_depth(self, keyframe_id: int, covered: Mask) -> None:
         """A keyframe's view says nothing about space where something (H, W) moved."""
         for kept in self._of(keyframe_id):
-            _forget(kept.view, _thinned_to(kept.view, covered))
+            _clear(kept.view, _thinned_to(kept.view, covered))
 
-    def recall_space(self, keyframe_id: int, covered: Mask) -> None:
+    def restore_depth(self, keyframe_id: int, covered: Mask) -> None:
         """A keyframe's view says all it saw where something (H, W) stood after all."""
         for kept in self._of(keyframe_id):
             where = _thinned_to(kept.view, covered)
@@ -127,10 +127,10 @@ class DepthViewBuffer:
         ):
             seen = DepthView(near.copy(), far.copy(), step)
             view = seen.thinned(1)
-            _forget(view, ~told)
-            self.views.append(RememberedView(i, stamp_s, view, seen, T))
+            _clear(view, ~told)
+            self.views.append(BufferedView(i, stamp_s, view, seen, T))
 
-    def _of(self, keyframe_id: int) -> list[RememberedView]:
+    def _of(self, keyframe_id: int) -> list[BufferedView]:
         return [kept for kept in self.views if kept.keyframe_id == keyframe_id]
 
 
@@ -140,6 +140,6 @@ def _thinned_to(view: DepthView, mask: Mask) -> Mask:
     return mask[:: view.step, :: view.step][:height, :width]
 
 
-def _forget(view: DepthView, where: Mask) -> None:
+def _clear(view: DepthView, where: Mask) -> None:
     """Let a view say nothing at some of its pixels (h, w)."""
     view.nearest_m[where] = view.farthest_m[where] = 0.0

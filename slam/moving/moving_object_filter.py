@@ -1,24 +1,21 @@
-"""What moves: kept out of tracking and of the map, taken out of the graph where it was put in."""
+"""Moving things, by depth and by masks: kept out of tracking, taken out of map and graph."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import FeatureConfig, Features, select
-from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.moving.config import MovingObjectConfig
-from bmask_slam.moving.depth_segments import MovingSpace
 from bmask_slam.moving.depth_view_buffer import DepthViewBuffer, PosedView
 from bmask_slam.moving.feature_motion import FeatureMotion, FeatureMotions
-from bmask_slam.moving.feature_replenishment import FeatureReplenishment
 from bmask_slam.moving.free_space_check import (
     DepthView,
     FreeSpaceCheck,
@@ -27,97 +24,78 @@ from bmask_slam.moving.free_space_check import (
 )
 from bmask_slam.moving.instance_motion import InstanceMotion
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, surfaces
+from bmask_slam.moving.landmark_motion import LandmarkMotion
+from bmask_slam.moving.static_features import FeatureReplenishment, StaticFeatures
 from bmask_slam.moving.static_verification import StaticVerification
-from bmask_slam.semantics.beliefs.movability import MovabilityFilter, log_odds, read_priors
+from bmask_slam.semantics.beliefs.movability import log_odds, read_priors
 from bmask_slam.semantics.tracks.instance_track import Sighting, Track
 from bmask_slam.semantics.tracks.instance_tracks import InstanceTracks
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.camera_tracker import CameraTracker
+from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.tracking.tracker import Tracked
-from bmask_slam.world.world_map import Keyframe, WorldMap
+from bmask_slam.world.map_editor import MapEditor
+from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class StaticFeatures:
-    """A frame without what moves.
+class MovingObjectFilter:
+    """Keeps which landmarks and instances move, and keeps what moves out of tracking and map.
 
     Attributes:
-        features: those that are left, and others in place of the rest once it is filled up; the
-            frame's own where ``mostly_moving``.
-        moving: (N,) of the frame's own features, those on moving things.
-        mostly_moving: too few would have been left.
-        view: what the frame's depth says about space; None if geometry is switched off.
-        standing: how many features lie where views saw a surface.
-        T_world_camera: (4, 4) that they were judged at; None if nothing was left out.
-        space: where the frame moves; None if that is not known.
+        landmarks: which of them move.
+        tracks: instances that may move, over time.
+        keyframe_views: depth that the last keyframes saw; recent_views: that of the last frames.
+        static_verification: what is left out for its class alone, until it is seen to stand.
     """
 
-    features: Features
-    moving: Mask
-    mostly_moving: bool
-    view: DepthView | None
-    standing: int = 0
-    T_world_camera: Array | None = None
-    space: MovingSpace | None = None
-
-    @property
-    def ignored(self) -> int:
-        """How many features were left out."""
-        return 0 if self.mostly_moving else int(np.count_nonzero(self.moving))
-
-
-class MovingObjectFilter:
-    """Keeps which landmarks and instances move; map and graph belong to the caller."""
-
     def __init__(
-        self, camera: Camera, config: MovingObjectConfig, features: FeatureConfig | None = None
+        self,
+        camera: Camera,
+        config: MovingObjectConfig,
+        features: FeatureConfig,
+        map_editor: MapEditor,
+        camera_tracker: CameraTracker,
     ) -> None:
-        features = features or FeatureConfig()
         self.camera = camera
         self.config = config
         self.priors = read_priors(config.priors)
-        self.movability = MovabilityFilter(self.priors.unknown, config.movability)
         self.tracks = InstanceTracks(config.tracks)
-        self.memory = DepthViewBuffer(config.check.views, config.check.interval_s)
-        self.recent = DepthViewBuffer(
-            config.static_verification.recent, config.static_verification.interval_s
-        )
+        verification = config.static_verification
+        self.keyframe_views = DepthViewBuffer(config.check.views, config.check.interval_s)
+        self.recent_views = DepthViewBuffer(verification.recent, verification.interval_s)
+        self._map = map_editor
+        self._camera_tracker = camera_tracker
         self._check = FreeSpaceCheck(camera, features.disparity_sigma_px, config.check)
-        watched = config.min_judged, config.mask_border_px
+        self.landmarks = LandmarkMotion(self._check, self.priors, config.movability, map_editor)
         self.static_verification = StaticVerification(
-            self._check, config.static_verification, *watched
+            self._check, verification, config.min_judged, config.mask_border_px
         )
-        self._features = FeatureMotion(camera, self._check, config.regions)
+        self._feature_motion = FeatureMotion(camera, self._check, config.regions)
         self._replenishment = FeatureReplenishment(camera, features)
-        rules = config.movability.step, config.min_judged
-        self._instance_motion = InstanceMotion(camera, self._check, self.priors, *rules)
+        self._instance_motion = InstanceMotion(
+            camera, self._check, self.priors, config.movability.step, config.min_judged
+        )
 
-    def leave_out(
-        self,
-        frame: Frame,
-        features: Features,
-        camera_tracker: CameraTracker | None,
-        segment: int,
-        mapper: Mapper,
-    ) -> StaticFeatures:
-        """Leave out the features on moving things, by the predicted pose, if there is one.
+    def filter(self, frame: Frame, features: Features) -> StaticFeatures:
+        """A frame's features (N,) without those on moving things, and others in place of these.
 
-        If most seem to move, all are tracked first, and used if even they give no pose.
+        Features are judged at the predicted pose, if there is one. If most seem to move, all are
+        tracked first, and used if even they give no pose.
         """
         self.tracks.expire(frame.timestamp_s)
-        views = self.memory.posed(segment, mapper)
-        predicted = camera_tracker.prediction() if camera_tracker is not None else None
+        views = self.keyframe_views.posed(self._camera_tracker.segment, self._map)
+        predicted = self._camera_tracker.prediction()
         static = self.static_features_at(frame, features, predicted, views)
         doubted = static.moving.sum() > self.config.doubt_share * len(features)
         settled = max(self.config.min_static, self.config.settled_share * len(features))
-        if camera_tracker is None or not doubted or static.standing >= settled:
-            return static
-        found = camera_tracker.preview(features, mapper.world)
-        if found is None:
-            return replace(static, features=features, mostly_moving=True)
-        return self.static_features_at(frame, features, found, views)
+        if predicted is not None and doubted and static.standing < settled:
+            found = self._camera_tracker.preview(features)
+            if found is None:
+                return replace(static, features=features, mostly_moving=True)
+            static = self.static_features_at(frame, features, found, views)
+        return self._replenished(frame, features, static, views)
 
     def static_features_at(
         self,
@@ -126,31 +104,115 @@ class MovingObjectFilter:
         T_world_camera: Array | None,
         views: list[PosedView],
     ) -> StaticFeatures:
-        """Leave out the features on moving things, given a pose; none without it."""
+        """A frame's features without those on moving things at a pose; all of them without one."""
         geometry = self.config.geometry
         view = depth_view(frame.depth_m, self.config.check.window_px) if geometry else None
         if T_world_camera is None:
             return StaticFeatures(features, np.zeros(len(features), bool), False, view)
-        point_motions, space = self._judge(frame, features, T_world_camera, views)
-        moving = point_motions == PointMotion.MOVING
+        motions, space = self._judge(frame, features, T_world_camera, views)
+        moving = motions == PointMotion.MOVING
         if not moving.any():
             return StaticFeatures(features, moving, False, view, space=space)
         if np.count_nonzero(~moving) < self.config.min_static:
             logger.info("frame %d: nearly everything moves; all is used", frame.index)
             return StaticFeatures(features, moving, True, view)
-
-        standing = int(np.count_nonzero(point_motions == PointMotion.STATIC))
+        standing = int(np.count_nonzero(motions == PointMotion.STATIC))
         left = select(features, np.flatnonzero(~moving))
         return StaticFeatures(left, moving, False, view, standing, T_world_camera, space)
 
-    def replenish(
-        self, frame: Frame, features: Features, static: StaticFeatures, segment: int, mapper: Mapper
+    def learn(self, timestamp_s: float, tracked: Tracked, static: StaticFeatures) -> bool:
+        """What a tracked frame's depth says about landmarks and about what is being verified.
+
+        Landmarks that are believed to move are not tracked against from now on. Returns whether
+        observations were restored that belong to something static: the frame was tracked without
+        them, so that it cannot say how much of the map it shows.
+        """
+        if tracked.status is TrackingStatus.LOST:
+            return False
+        moving = self.landmarks.observe_frame(tracked, static.view)
+        self._camera_tracker.exclude_landmarks(moving)
+        reference, view = self._camera_tracker.reference, static.view
+        if reference is None or view is None:
+            return False
+        restored = self._reinstate(timestamp_s, tracked.T_world_camera, view, reference)
+        if restored:
+            self._camera_tracker.refer_to(reference)
+        return restored
+
+    def remember_keyframe(self, keyframe: Keyframe, static: StaticFeatures) -> None:
+        """A keyframe was made: landmarks that move leave map and graph, its depth is kept.
+
+        Depth on what moves is not kept: the same thing would be found at that surface next.
+        """
+        self.landmarks.follow_map()
+        self.landmarks.remove_moving(self.landmarks.movability.known())
+        if static.view is not None:
+            self.keyframe_views.add(keyframe.id, keyframe.timestamp_s, static.view, static.space)
+
+    def observe_masks(self, masks: KeyframeMasks) -> None:
+        """A keyframe's masks, now or late: what is on moving things leaves map and graph."""
+        if not self.config.labels:
+            return
+        keyframe = self._map.world.keyframes.get(masks.keyframe_id)
+        views: list[PosedView] = []
+        recent: list[PosedView] = []
+        if keyframe is not None and self.config.geometry:
+            views = self.keyframe_views.posed(keyframe.segment, self._map)
+            recent = self.recent_views.posed(keyframe.segment, self._map)
+        now_s = np.nan if keyframe is None else keyframe.timestamp_s
+        seen = surfaces(self.camera, masks, self.config.check.window_px, self.config.min_judged)
+        stood = self.static_verification.stood(masks, seen, recent, now_s)
+        sightings = self._instance_motion.sightings(masks, seen, stood, views, now_s)
+        moving, tracks = self._tracked_instances(masks, sightings, now_s)
+        still = [
+            s is not None and (s.still or (track is not None and track.stood))
+            for s, track in zip(sightings, tracks, strict=True)
+        ]
+        self.landmarks.observe_masks(masks, sightings, still)
+        standing = np.isin(masks.assignment.owner, np.flatnonzero(still))
+        self.keyframe_views.restore_depth(masks.keyframe_id, standing)
+        if not moving.any():
+            return
+        moves = np.isin(masks.assignment.owner, np.flatnonzero(moving))
+        self.keyframe_views.clear_depth(masks.keyframe_id, moves)
+        if keyframe is not None and self.config.geometry:
+            by_class = [t if _by_class(t) else None for t in tracks]
+            self.static_verification.add(masks, seen, by_class, self._map.world)
+        self._map.prune_mask(masks.keyframe_id, moves, self.config.mask_border_px)
+        self.landmarks.remove_moving(masks.landmark_ids)
+
+    def begin_session(self) -> None:
+        """Forget what moved in an earlier recording; landmarks stay what they are."""
+        self.static_verification.clear()
+        self.keyframe_views.clear()
+        self.recent_views.clear()
+        self.tracks.clear()
+
+    def state(self) -> Arrays:
+        """All that was learned, as named arrays."""
+        return nested(
+            movability=self.landmarks.state(),
+            tracks=self.tracks.state(),
+            memory=self.keyframe_views.state(),
+            recent=self.recent_views.state(),
+            suspects=self.static_verification.state(),
+        )
+
+    def restore(self, state: Arrays) -> None:
+        """Go on from a state."""
+        self.landmarks.restore(part(state, "movability"))
+        self.tracks.restore(part(state, "tracks"))
+        self.keyframe_views.restore(part(state, "memory"))
+        self.recent_views.restore(part(state, "recent"))
+        self.static_verification.restore(part(state, "suspects"))
+
+    def _replenished(
+        self, frame: Frame, features: Features, static: StaticFeatures, views: list[PosedView]
     ) -> StaticFeatures:
         """With further keypoints of the frame in place of its features that were left out."""
         pose = static.T_world_camera
         if pose is None or static.mostly_moving:
             return static
-        views = self.memory.posed(segment, mapper)
 
         def moving(others: Features) -> Mask:
             return self._judge(frame, others, pose, views).point_motions == PointMotion.MOVING
@@ -158,109 +220,27 @@ class MovingObjectFilter:
         found = self._replenishment.replenished(frame, features, static.moving, moving)
         return replace(static, features=found)
 
-    def watch(self, tracked: Tracked, view: DepthView | None, world: WorldMap) -> Ints:
-        """Evidence of a tracked frame about landmarks; returns those in view believed moving."""
-        ids = tracked.visible_ids
-        if view is None or not len(ids):
-            return ids[self.movability.moving(ids)]
-        points = world.landmarks.points_world[ids]
-        gone = self._check.judge(points, view, tracked.T_world_camera) == PointMotion.MOVING
-        tracked_now = np.zeros(len(world.landmarks), bool)
-        tracked_now[tracked.landmark_ids] = True
-        found = tracked_now[ids]
-        gone &= ~found
-        told = found | gone
-        self.movability.update(ids[told], gone[told], self.config.movability.frame_power)
-        return ids[self.movability.moving(ids)]
-
-    def remember(self, keyframe: Keyframe, static: StaticFeatures, mapper: Mapper) -> None:
-        """A keyframe was made: landmarks that move leave map and graph, its depth is kept.
-
-        Not that of what moves: it would be a surface that the same thing is found at next.
-        """
-        self._follow(mapper.world)
-        self._remove(self.movability.known(), mapper)
-        if static.view is not None:
-            self.memory.add(keyframe.id, keyframe.timestamp_s, static.view, static.space)
-
-    def see(self, masks: KeyframeMasks, mapper: Mapper) -> None:
-        """A keyframe's masks, now or late: what is on moving things leaves map and graph."""
-        if not self.config.labels:
-            return
-        keyframe = mapper.world.keyframes.get(masks.keyframe_id)
-        views: list[PosedView] = []
-        recent: list[PosedView] = []
-        if keyframe is not None and self.config.geometry:
-            views = self.memory.posed(keyframe.segment, mapper)
-            recent = self.recent.posed(keyframe.segment, mapper)
-        now_s = np.nan if keyframe is None else keyframe.timestamp_s
-        rules = self.config.check.window_px, self.config.min_judged
-        seen = surfaces(self.camera, masks, *rules)
-        stood = self.static_verification.stood(masks, seen, recent, now_s)
-        sightings = self._instance_motion.sightings(masks, seen, stood, views, now_s)
-        moving, tracks = self._tracked(masks, sightings, now_s)
-        still = [
-            s is not None and (s.still or (track is not None and track.stood))
-            for s, track in zip(sightings, tracks, strict=True)
-        ]
-        self._believe(masks, sightings, still)
-        standing = np.isin(masks.assignment.owner, np.flatnonzero(still))
-        self.memory.recall_space(masks.keyframe_id, standing)
-        if not moving.any():
-            return
-        moves = np.isin(masks.assignment.owner, np.flatnonzero(moving))
-        self.memory.forget_space(masks.keyframe_id, moves)
-        pruner = replace(mapper.pruner(), border_px=-self.config.mask_border_px)
-        if keyframe is not None and self.config.geometry:
-            by_class = [t if _by_class(t) else None for t in tracks]
-            self.static_verification.add(masks, seen, by_class, mapper.world)
-        pruner.prune_mask(masks.keyframe_id, moves)
-        self._remove(masks.landmark_ids, mapper)
-
-    def reinstate(
-        self, time_s: float, T_world_camera: Array, view: DepthView, near: Keyframe, mapper: Mapper
+    def _reinstate(
+        self, time_s: float, T_world_camera: Array, view: DepthView, near: Keyframe
     ) -> bool:
-        """What was left out for its class alone, and stands, comes back; whether anything did.
+        """Restore what was left out for its class alone, and stands; whether anything was.
 
-        A tracked frame with this view says so; it is remembered by its pose from a keyframe.
+        The frame's view is kept by its pose from a keyframe near it.
         """
         T_keyframe_camera = inverse(near.T_world_camera) @ T_world_camera
-        self.recent.add(near.id, time_s, view, T_keyframe_camera=T_keyframe_camera)
-        standing = self.static_verification.watch(time_s, view, T_world_camera, mapper.world)
+        self.recent_views.add(near.id, time_s, view, T_keyframe_camera=T_keyframe_camera)
+        world = self._map.world
+        standing = self.static_verification.verify(time_s, view, T_world_camera, world)
         for pending in standing:
             logger.info("track %d stands: its class does not count", pending.track_id)
             self.tracks.reinstate(pending.track_id, float(log_odds(self.priors.unknown)))
             for removed in pending.removed:
-                self.memory.recall_space(removed.keyframe_id, removed.mask.unpacked())
-                free = self.static_verification.without_watched(removed)
-                back = removed.keypoints[free], removed.patches[free]
-                mapper.restore_observations(removed.keyframe_id, *back)
+                self.keyframe_views.restore_depth(removed.keyframe_id, removed.mask.unpacked())
+                free = self.static_verification.not_pending(removed)
+                self._map.restore_observations(
+                    removed.keyframe_id, removed.keypoints[free], removed.patches[free]
+                )
         return bool(standing)
-
-    def begin_session(self) -> None:
-        """Forget what moved in an earlier recording; landmarks stay what they are."""
-        self.static_verification.clear()
-        self.memory.clear()
-        self.recent.clear()
-        self.tracks.clear()
-
-    def state(self) -> Arrays:
-        """All that was learned, as named arrays."""
-        return nested(
-            movability=self.movability.state(),
-            tracks=self.tracks.state(),
-            memory=self.memory.state(),
-            recent=self.recent.state(),
-            suspects=self.static_verification.state(),
-        )
-
-    def restore(self, state: Arrays) -> None:
-        """Go on from a state."""
-        self.movability.restore(part(state, "movability"))
-        self.tracks.restore(part(state, "tracks"))
-        self.memory.restore(part(state, "memory"))
-        self.recent.restore(part(state, "recent"))
-        self.static_verification.restore(part(state, "suspects"))
 
     def _judge(
         self, frame: Frame, features: Features, T_world_camera: Array, views: list[PosedView]
@@ -268,9 +248,9 @@ class MovingObjectFilter:
         """What views and the tracks' boxes say about features (N,)."""
         boxes_world = self.tracks.moving_boxes(frame.timestamp_s)
         views = views if self.config.geometry else []
-        return self._features.judge(frame, features, T_world_camera, views, boxes_world)
+        return self._feature_motion.judge(frame, features, T_world_camera, views, boxes_world)
 
-    def _tracked(
+    def _tracked_instances(
         self, masks: KeyframeMasks, sightings: Sequence[Sighting | None], now_s: float
     ) -> tuple[Mask, list[Track | None]]:
         """Which of a keyframe's sightings (K,) move, by their tracks, if they have one; these.
@@ -286,46 +266,13 @@ class MovingObjectFilter:
         ids = self.tracks.see(now_s, list(movable.values()), masks.T_world_camera[:3, :3])
         ahead = [self.tracks.predicted(track, now_s) for track in self.tracks.tracks]
         by_id = {track.id: track for track in ahead}
-        for k, track_id in zip(movable, ids, strict=False):
+        for k, track_id in zip(movable, ids, strict=True):
             tracks[k] = by_id[track_id]
             moving[k] = by_id[track_id].moving
         self.tracks.miss(
             now_s, [track for track in ahead if self._instance_motion.shows(masks, track)]
         )
         return moving, tracks
-
-    def _believe(
-        self, masks: KeyframeMasks, sightings: Sequence[Sighting | None], standing: Sequence[bool]
-    ) -> None:
-        """Landmarks on instances have their classes' priors, and move if views say so of their
-        instance; of what stood still for long the class says nothing.
-        """
-        ids, first = np.unique(masks.landmark_ids, return_index=True)
-        priors = masks.label_distributions[first] @ self.priors.of(masks.names)
-        instances = masks.instances[first]
-        still = np.array([*standing, False])
-        evidence = np.array([0.0 if s is None else s.evidence for s in sightings] + [0.0])
-        priors[still[instances]] = np.minimum(priors[still[instances]], self.priors.unknown)
-        self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
-        told = evidence[instances] != 0
-        self.movability.update(ids[told], evidence[instances[told]] > 0)
-
-    def _remove(self, ids: Ints, mapper: Mapper) -> None:
-        """Take those of the landmarks (N,) that move out of map and graph."""
-        ids = mapper.world.landmarks.living(ids)
-        ids = ids[self.movability.moving(ids)]
-        if len(ids):
-            mapper.pruner().prune_landmarks(ids)
-            self.movability.drop(ids)
-
-    def _follow(self, world: WorldMap) -> None:
-        """Landmarks that were fused take what was known of them along; culled ones lose it."""
-        known = self.movability.known()
-        gone = known[~world.landmarks.alive[known]]
-        parents = world.landmarks.current(gone)
-        alive = world.landmarks.alive[parents]
-        self.movability.move(gone[alive], parents[alive])
-        self.movability.drop(gone[~alive])
 
 
 def _by_class(track: Track | None) -> bool:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bmask_slam.back_end.pruning import covered
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.geometry import transform
 from bmask_slam.moving.depth_view_buffer import PosedView
@@ -20,6 +19,7 @@ from bmask_slam.moving.keyframe_masks import KeyframeMasks, Surface
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.semantics.tracks.instance_track import Track
 from bmask_slam.world.landmark_table import LandmarkTable, Patches
+from bmask_slam.world.masked_keypoints import keypoints_under
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
@@ -105,7 +105,7 @@ class StaticVerification:
         self, check: FreeSpaceCheck, config: StaticVerificationConfig, at_least: int, border_px: int
     ) -> None:
         self.config = config
-        self.watched: list[PendingMovable] = []
+        self.pending: list[PendingMovable] = []
         self._check = check
         self._at_least, self._border_px = at_least, border_px
 
@@ -131,10 +131,10 @@ class StaticVerification:
             points = surface.points[surface.complete]
             when = keyframe.id, keyframe.timestamp_s
             pending = PendingMovable(track.id, *when, points, (removed,))
-            before = [s for s in self.watched if s.track_id == track.id and s.gone <= s.there]
+            before = [s for s in self.pending if s.track_id == track.id and s.gone <= s.there]
             if before:
                 pending = replace(before[0], removed=(*before[0].removed, removed))
-            self.watched = [s for s in self.watched if s.track_id != track.id] + [pending]
+            self.pending = [s for s in self.pending if s.track_id != track.id] + [pending]
 
     def stood(
         self,
@@ -160,12 +160,12 @@ class StaticVerification:
             stood.append(self.config.stands(*self._there_or_gone(points_world, views)))
         return stood
 
-    def watch(
+    def verify(
         self, time_s: float, view: DepthView, T_world_camera: Array, world: WorldMap
     ) -> list[PendingMovable]:
         """What a tracked frame's depth says; returns the things that stand, not watched further."""
         oldest_s = time_s - self.config.patience_s
-        recent = [s for s in self.watched if s.time_s >= oldest_s]
+        recent = [s for s in self.pending if s.time_s >= oldest_s]
         kept = [s for s in recent if s.keyframe_id in world.keyframes]
         told = [
             self._told(s, view, T_world_camera, world)
@@ -174,21 +174,21 @@ class StaticVerification:
             for s in kept
         ]
         stand = [self.config.stands(s.there, s.gone) for s in told]
-        self.watched = [s for s, stands in zip(told, stand, strict=True) if not stands]
+        self.pending = [s for s, stands in zip(told, stand, strict=True) if not stands]
         return [s for s, stands in zip(told, stand, strict=True) if stands]
 
-    def without_watched(self, removed: Removed) -> Mask:
+    def not_pending(self, removed: Removed) -> Mask:
         """Which of the keypoints (N,) that were taken out nothing else that is watched covers."""
-        others = [r.keypoints for s in self.watched for r in s.removed if _same(r, removed)]
+        others = [r.keypoints for s in self.pending for r in s.removed if _same(r, removed)]
         return ~np.isin(removed.keypoints, np.concatenate([np.zeros(0, np.int64), *others]))
 
     def clear(self) -> None:
         """Watch nothing: another recording."""
-        self.watched = []
+        self.pending = []
 
     def state(self) -> Arrays:
         """All that is watched, as named arrays."""
-        every = self.watched
+        every = self.pending
         removed = [r for s in every for r in s.removed]
         no_patches = LandmarkTable().patches_of(np.zeros(0, np.int64))
         points, keypoints = [s.points for s in every], [r.keypoints for r in removed]
@@ -217,12 +217,14 @@ class StaticVerification:
         bits = state["bits"].reshape(max(len(ids), 1), -1)
         shape = self._check.camera.height, self._check.camera.width
         masks = [PackedMask(of_one, shape) for of_one in bits]
-        removed = [Removed(*row) for row in zip(ids, keypoints, patches, masks, strict=False)]
-        self.watched = []
-        rows = zip(state["counts"].tolist(), state["times_s"].tolist(), points, strict=False)
+        parts = (part[: len(ids)] for part in (keypoints, patches, masks))  # split gives at least 1
+        removed = [Removed(*row) for row in zip(ids, *parts, strict=True)]
+        self.pending = []
+        counts = state["counts"].tolist()
+        rows = zip(counts, state["times_s"].tolist(), points[: len(counts)], strict=True)
         for (track_id, keyframe_id, there, gone, count), time_s, of_one in rows:
             mine, removed = tuple(removed[:count]), removed[count:]
-            self.watched.append(
+            self.pending.append(
                 PendingMovable(track_id, keyframe_id, time_s, of_one, mine, there, gone)
             )
 
@@ -256,7 +258,7 @@ def _about_to_be_removed(
     mask: Mask, keyframe: Keyframe, landmarks: LandmarkTable, border_px: int
 ) -> Removed:
     """What a mask (H, W), widened, covers of a keyframe that is not masked yet."""
-    keypoints = covered(mask, keyframe.features.image_pixels, -border_px)
+    keypoints = keypoints_under(mask, keyframe.features.image_pixels, -border_px)
     free = keypoints[~keyframe.masked[keypoints]]
     patches = landmarks.patches_of(keyframe.landmark_ids[free])
     return Removed(keyframe.id, free, patches, PackedMask.of(mask))

@@ -10,7 +10,7 @@ import numpy as np
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.runtime.stage_clock import StageClock
+from bmask_slam.runtime.stage_clock import stage
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
@@ -34,23 +34,19 @@ class MapLocalisation(SlamSystem):
 
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
         """Find a frame in the map."""
-        clock = StageClock()
-        self.camera_tracker.expect(frame.timestamp_s)
-        with clock.stage("features"):
-            features = features if features is not None else self.prepare(frame)
-        with clock.stage("tracking"):
-            assert self._reference is not None, "restore a map and begin a session first"
-            tracked = self.camera_tracker.track(features, self.mapper.world, self._reference)
-            T_world_camera = self._follow(frame, tracked)
+        frame = self._begin(frame)
+        features = self._extract(frame, features)
+        tracked = self._find(features)
+        T_world_camera = self._follow(frame, tracked)
         return FrameResult(
             index=frame.index,
             timestamp_s=frame.timestamp_s,
             status=tracked.status,
             T_world_camera=T_world_camera,
-            segment=self._segment,
+            segment=self.camera_tracker.segment,
             matches=tracked.matches,
             inliers=len(tracked.landmark_ids),
-            stage_ms=clock.stage_ms,
+            stage_ms=self.stage_ms,
         )
 
     def finish(self) -> None:
@@ -59,22 +55,27 @@ class MapLocalisation(SlamSystem):
     def segments(self) -> dict[int, Trajectory]:
         """The frames that were found, all in the map's largest segment."""
         stamps_s, poses = [stamp_s for stamp_s, _ in self._found], [T for _, T in self._found]
-        return {self._segment: Trajectory(np.array(stamps_s), np.array(poses))} if poses else {}
+        segment = self.camera_tracker.segment
+        return {segment: Trajectory(np.array(stamps_s), np.array(poses))} if poses else {}
 
     def files(self) -> dict[str, Callable[[Path], None]]:
         """None: the map is as it was."""
         return {}
 
+    @stage("tracking")
+    def _find(self, features: Features) -> Tracked:
+        return self.camera_tracker.track_in_map(features)
+
+    @stage("tracking")
     def _follow(self, frame: Frame, tracked: Tracked) -> Array | None:
         if tracked.status is TrackingStatus.LOST:
             return None
-        T, ids, world = tracked.T_world_camera, tracked.landmark_ids, self.mapper.world
-        self.camera_tracker.moved_on(T, T, ids)
+        T, ids, world = tracked.T_world_camera, tracked.landmark_ids, self.map.world
+        self.camera_tracker.update_motion(T, T, ids)
         self._found.append((frame.timestamp_s, T))
         self._frames_since_refresh += 1
         elsewhere = not np.isin(ids, self.camera_tracker.local_ids).all()
         if elsewhere or self._frames_since_refresh >= REFRESH_FRAMES:
             self._frames_since_refresh = 0
-            self._reference = world.covisible(ids, 1)[0][1]
-            self.camera_tracker.new_local_map(world, self._reference)
+            self.camera_tracker.refer_to(world.covisible(ids, 1)[0][1])
         return T

@@ -5,6 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from bmask_slam.graph.arrays import Ints
+from bmask_slam.graph.camera import Camera
+from bmask_slam.tracking.camera_tracker import CameraTracker
+from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.world.map_editor import MapReader
+from bmask_slam.world.world_map import Keyframe
+
+CLOSE_BASELINES = 40
+"""A point is close within so many baselines (ORB-SLAM2, section III.A)."""
+
 
 @dataclass(frozen=True)
 class KeyframeConfig:
@@ -58,6 +69,63 @@ class KeyframeEvidence:
     shared: float
     close_tracked: int
     close_new: int
+
+
+class KeyframeDecision:
+    """Decides which tracked frames become keyframes.
+
+    Attributes:
+        frames_since: frames since the last keyframe was made.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: KeyframeConfig,
+        map_reader: MapReader,
+        camera_tracker: CameraTracker,
+    ) -> None:
+        self.config = config
+        self.frames_since = 0
+        self._close_m = CLOSE_BASELINES * camera.baseline_m
+        self._map = map_reader
+        self._camera_tracker = camera_tracker
+
+    def reason(self, tracked: Tracked) -> str:
+        """Why a tracked frame should become a keyframe, or "" if it should not."""
+        reference = self._camera_tracker.reference
+        if tracked.status is TrackingStatus.LOST:
+            return ""
+        if reference is None:
+            return "first frame" if self._camera_tracker.segment == 0 else "new segment"
+        self.frames_since += 1
+        if not self._map.accepts_keyframes:
+            return ""
+        reason = keyframe_reason(self._evidence(tracked, reference), self.config)
+        return "" if reason and self._known_view(tracked.landmark_ids, reference) else reason
+
+    def _evidence(self, tracked: Tracked, reference: Keyframe) -> KeyframeEvidence:
+        _, points = self._map.world.observed(reference)
+        close = tracked.features.depth_m < self._close_m
+        close_tracked = int(close[tracked.keypoints].sum())
+        return KeyframeEvidence(
+            frames_since=self.frames_since,
+            mapping_idle=self._map.idle,
+            tracked=len(tracked.landmark_ids),
+            shared=len(tracked.landmark_ids) / max(len(points), 1),
+            close_tracked=close_tracked,
+            close_new=int(close.sum()) - close_tracked,
+        )
+
+    def _known_view(self, landmark_ids: Ints, reference: Keyframe) -> bool:
+        """Whether another keyframe shows most of these landmarks; it is the reference then."""
+        if self.config.max_shared >= 1:
+            return False
+        strong = self._map.world.covisible(landmark_ids, 1)
+        if not strong or strong[0][1] is reference:
+            return False
+        self._camera_tracker.refer_to(strong[0][1])
+        return True
 
 
 def keyframe_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from bmask_slam.back_end.landmark_management import MappingConfig, local_landmarks
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.features.matching import MatchConfig, consistent_rotation, match_brute_force
@@ -15,6 +14,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.tracking.tracker import Tracked, Tracker
+from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
@@ -43,22 +43,22 @@ def relocalise(
     candidates: list[Keyframe],
     world: WorldMap,
     tracker: Tracker,
-    config: tuple[RelocalisationConfig, MappingConfig],
+    config: RelocalisationConfig,
+    local_map: LocalMapConfig,
 ) -> Tracked | None:
     """The frame against the first of some keyframes that fits, or None if none does.
 
     Descriptors are matched without a prior, the pose is found by P3P in RANSAC (OpenCV, whose
     random numbers are seeded, so that runs repeat), then refined on that keyframe's local map.
     """
-    rules, mapping = config
-    for keyframe in candidates[: rules.candidates]:
-        T_world_camera = _pose_from(keyframe, features, world, tracker, rules)
+    for keyframe in candidates[: config.candidates]:
+        T_world_camera = _pose_from(keyframe, features, world, tracker, config)
         if T_world_camera is None:
             continue
-        _, seen = world.observed(keyframe)
-        local_ids = local_landmarks(world, seen, mapping)
+        _, observed = world.observed(keyframe)
+        local_ids = local_landmarks(world, observed, local_map)
         tracked = tracker.refine(features, T_world_camera, local_ids, world)
-        enough = len(tracked.landmark_ids) >= rules.min_inliers
+        enough = len(tracked.landmark_ids) >= config.min_inliers
         if tracked.status is not TrackingStatus.LOST and enough:
             return tracked
     return None

@@ -32,7 +32,7 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.landmark_table import PATCHES, LandmarkTable, Patches
 
 FILE = Path("run/checkpoint")
-SCRATCH = {"elapsed_s"}  # means nothing between two frames
+SCRATCH = {"elapsed_s", "stage_ms"}  # mean nothing between two frames
 OPAQUE = ("cv2", "gtsam", "faiss")  # made anew from configuration or state
 SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
     *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0"),
@@ -90,7 +90,9 @@ def system() -> SlamSystem:
         LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
         for k in range(2)
     ]
-    system.semantics.expect(system.mapper.world.keyframes[first], kept_depth(FRAMES[3].depth_m))
+    system.semantics.await_masks(
+        system.mapper.world.keyframes[first], kept_depth(FRAMES[3].depth_m)
+    )
     sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
     system.moving_objects.tracks.see(FRAMES[19].timestamp_s, [sighting])
     removed = [
@@ -99,7 +101,7 @@ def system() -> SlamSystem:
         )
         for k in (first, second)
     ]
-    system.moving_objects.static_verification.watched = [
+    system.moving_objects.static_verification.pending = [
         PendingMovable(1, first, 0.25, np.ones((4, 3)), tuple(removed), 2, 1),
         PendingMovable(2, second, 0.5, np.full((3, 3), 0.5), (removed[1],), 1, 3),
     ]
@@ -209,11 +211,11 @@ def test_what_is_compared_by_contents_has_no_other_attributes(system: SlamSystem
     tables, table = system.mapper.smoother._tables, system.mapper.world.landmarks
     pose_factors = {"pose_factors", "pose_factors_of", "_next_number"}
     assert vars(tables).keys() == {
-        *("keyframes", "landmarks", "observations", "archive"),
+        *("keyframes", "landmarks", "observations", "marginalised"),
         *pose_factors,
     }
     rows = {"of_keyframe", "of_landmark", "_free", "_columns", "_slots", "_used"}
     assert vars(tables.observations).keys() == rows
     columns = table._store.keys() | table._appearance.keys()
-    assert vars(table).keys() == {"_size", "_store", "_looks", "_free", *columns}
+    assert vars(table).keys() == {"_size", "_store", "_appearance", "_free", *columns}
     assert columns - {"alive", "place"} == table.state().keys() - {"size", "ids"}

@@ -143,8 +143,8 @@ def test_a_place_walked_again_needs_no_more_keyframes() -> None:
     assert made[: len(there)].sum() == 6
     assert not made[len(there) :].any()
     assert largest_error_m(system, poses) < 0.003
-    assert system._reference is not None
-    assert system._reference.id <= 2  # near the start again, not the last of six
+    assert system.camera_tracker.reference is not None
+    assert system.camera_tracker.reference.id <= 2  # near the start again, not the last of six
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
@@ -40,8 +39,6 @@ from bmask_slam.live.messages import (
     StateSaved,
 )
 from bmask_slam.live.replica import DeltaMaker
-from bmask_slam.moving.keyframe_masks import KeyframeMasks
-from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
@@ -65,18 +62,6 @@ class LabelledNothing(NoSegmenter):
         self.labels = LabelSet(names)
 
 
-class _Told(MovingObjectFilter):
-    """Passes what masks say on to tracking's side, where it is known what moves."""
-
-    def __init__(self, channel: Channel, camera: Camera, config: SystemConfig) -> None:
-        super().__init__(camera, config.moving_objects)
-        self._channel = channel
-
-    def see(self, masks: KeyframeMasks, mapper: Mapper) -> None:
-        """Send them."""
-        self._channel.send(masks)
-
-
 def serve_map(
     channel: Channel,
     camera: Camera,
@@ -89,7 +74,11 @@ def serve_map(
     segmenter = LabelledNothing(names)
     system = SlamSystem(camera, config, segmenter)
     system.semantics = SemanticMapper(
-        camera, config.semantics, segmenter, _Told(channel, camera, config)
+        camera,
+        config.semantics,
+        system.map,
+        segmenter,
+        on_masks=channel.send,  # to tracking's side, where it is known what moves
     )
     if state is not None:
         system.restore(read_arrays(state, STATE_FILE)[1], state)
@@ -122,13 +111,13 @@ class MapKeeper:
             case PruneLandmarks():
                 ids = self.system.mapper.world.landmarks.living(message.ids)
                 if len(ids):
-                    self.system.mapper.pruner().prune_landmarks(ids)
+                    self.system.map.prune_landmarks(ids)
             case PruneMask():
-                pruner = replace(self.system.mapper.pruner(), border_px=message.border_px)
-                pruner.prune_mask(message.keyframe_id, message.mask.unpacked())
+                mask = message.mask.unpacked()
+                self.system.map.prune_mask(message.keyframe_id, mask, message.widen_px)
             case RestoreObservations():
                 back = message.keypoints, message.patches
-                self.system.mapper.restore_observations(message.keyframe_id, *back)
+                self.system.map.restore_observations(message.keyframe_id, *back)
                 self.tell(-1, done=False)
             case SaveState():
                 self.save(number, message.path)
@@ -165,16 +154,16 @@ class MapKeeper:
             message.frame_index, message.timestamp_s, np.zeros((0, 0, 3), np.uint8), nothing
         )
         self._deltas.has_features(message.id)
-        system.continue_segment(segment)
+        system.camera_tracker.segment = segment
         _, keyframe = system.insert(frame, tracked, message.local_ids)
         assert keyframe.id == message.id, "tracking and map count keyframes differently"
         if system.semantics.enabled:
-            system.semantics.expect(keyframe, message.depth_m)
+            system.semantics.await_masks(keyframe, message.depth_m)
         self.tell(message.id, done=False)
         system.mapper.optimise(keyframe)
         system.mapper.close_loops(keyframe)
         if system.semantics.enabled:
-            system.semantics.follow(system.mapper)
+            system.semantics.follow_map()
         elapsed_ms = 1e3 * (time.perf_counter() - started_s)
         self.tell(message.id, done=True, update_ms=elapsed_ms)
 
@@ -195,9 +184,8 @@ class MapKeeper:
 
     def attach(self, message: Masks) -> None:
         """Use a keyframe's masks; those that cannot be used are passed over."""
-        semantics, mapper = self.system.semantics, self.system.mapper
         try:
-            semantics.attach(message.keyframe_id, message.instances, mapper)
+            self.system.semantics.attach(message.keyframe_id, message.instances)
         except InputError as error:
             logger.warning("keyframe %d has no masks: %s", message.keyframe_id, error)
 

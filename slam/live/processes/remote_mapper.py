@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from bmask_slam.back_end.mapper import add_keyframe, without_image
+from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.features.descriptor_index import DescriptorIndex
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
@@ -26,17 +26,19 @@ from bmask_slam.live.messages import (
     LostKeyframe,
     MapChanged,
     NewKeyframe,
+    PruneLandmarks,
+    PruneMask,
     Ready,
     RestoreObservations,
     SaveState,
     Sightings,
     StateSaved,
 )
-from bmask_slam.live.processes.remote_pruner import RemotePruner
 from bmask_slam.live.processes.supervision import late_start
 from bmask_slam.live.processes.worker import Failure, Worker
 from bmask_slam.live.replica import apply_delta
 from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.tracker import Tracked
@@ -48,12 +50,14 @@ logger = logging.getLogger(__name__)
 
 SAVE_EVERY = 20
 """Keyframes from one saved state to the next."""
+MAX_PENDING = 3
+"""Keyframes that wait for the process; with so many no further one is accepted."""
 MAX_DEATHS = 3
 """Deaths without a saved state between them, after which the map is given up."""
 
 
 class RemoteMapper:
-    """Stands where an offline system has its ``Mapper``.
+    """The back end of a live system: a copy of the map, and the process that keeps the original.
 
     Attributes:
         world: the copy, with keyframes that the process has not answered yet.
@@ -108,6 +112,11 @@ class RemoteMapper:
         return not self._pending
 
     @property
+    def accepts_keyframes(self) -> bool:
+        """Whether a keyframe will be worked on soon: not while too many wait."""
+        return self.pending < MAX_PENDING and not self.given_up
+
+    @property
     def given_up(self) -> bool:
         """Whether the process died too often to be started again."""
         return self._deaths_in_a_row >= MAX_DEATHS
@@ -146,9 +155,14 @@ class RemoteMapper:
         """The process does it."""
         return []
 
-    def pruner(self) -> RemotePruner:
-        """Takes things out of the map."""
-        return RemotePruner(self.world, self.tell)
+    def prune_mask(self, keyframe_id: int, mask: Mask, widen_px: int) -> None:
+        """As ``Mapper.prune_mask``; the map is changed when the answer comes."""
+        self.tell(PruneMask(keyframe_id, PackedMask.of(mask), widen_px))
+
+    def prune_landmarks(self, landmark_ids: Ints) -> None:
+        """As ``Mapper.prune_landmarks``; tracking drops them at once."""
+        self.world.landmarks.alive[landmark_ids] = False
+        self.tell(PruneLandmarks(landmark_ids))
 
     def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """As ``Mapper.restore_observations``; the map is changed when the answer comes."""

@@ -18,12 +18,12 @@ from bmask_slam.back_end.landmark_management import (
     create_landmarks,
     cull_landmarks,
     fuse_into_neighbours,
-    local_landmarks,
     redundant_keyframe,
 )
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
+from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 CONFIG = MappingConfig()
@@ -109,5 +109,5 @@ def test_local_map_holds_the_landmarks_of_covisible_keyframes() -> None:
     world.attach(second, np.arange(20), a[:20])
     b = world.make_landmarks(second, np.arange(40, 60), points_world[40:])
     world.landmarks.remove(b[:3])
-    local = local_landmarks(world, a[:20], CONFIG)
+    local = local_landmarks(world, a[:20], LocalMapConfig())
     assert local.tolist() == sorted([*a, *b[3:]])

@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 from synthetic_view import CAMERA, add_keyframe, make_features, points_before, random_descriptors
 
-from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
-from bmask_slam.back_end.mapper import Mapper
-from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.back_end.mapper import BackEndConfig, Mapper
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.loops.closing import LoopClosingConfig
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
@@ -23,8 +21,10 @@ STEP = se3_exp(np.array([0.0, 0.01, 0.0, 0.03, 0.0, 0.0]))
 def row_of_keyframes(count: int, mapping: MappingConfig) -> Mapper:
     """Keyframes that all see the same 60 points, each of them three more of its own."""
     tracker = Tracker(CAMERA, TrackingConfig())
-    rules = (replace(mapping, redundant_share=2.0), FactorSelectionConfig(), SmootherConfig())
-    mapper = Mapper(CAMERA, tracker, (*rules, LoopClosingConfig(enabled=False)))
+    rules = BackEndConfig(
+        replace(mapping, redundant_share=2.0), loops=LoopClosingConfig(enabled=False)
+    )
+    mapper = Mapper(CAMERA, tracker, rules)
     rng = np.random.default_rng(5)
     points, descriptors = points_before(np.eye(4), 60, rng), random_descriptors(60, rng)
     T, world, shared = np.eye(4), mapper.world, None

@@ -18,7 +18,7 @@ from synthetic_view import (
 )
 
 from bmask_slam.back_end.factor_selection import FactorSelectionConfig, FactorSelector, read_back
-from bmask_slam.back_end.pruning import KeptReason, MapPruner, MaskScope, covered
+from bmask_slam.back_end.pruning import KeptReason, MapPruner, MaskScope
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose, RemovalPolicy
@@ -28,6 +28,7 @@ from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.world.map_state import world_of, world_state
+from bmask_slam.world.masked_keypoints import keypoints_under
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 COUNT = 60
@@ -141,9 +142,9 @@ def test_a_mask_covers_pixels_of_the_recorded_image_and_its_border_is_left_out()
     pixels = np.array(
         [[350, 150], [301.4, 150], [303, 150], [150, 350], [639.4, 479.4], [297, 150]]
     )
-    assert covered(mask, pixels, 2).tolist() == [0, 2, 4]  # the image's edge is no border
-    assert covered(mask, pixels, 0).tolist() == [0, 1, 2, 4]
-    assert covered(mask, pixels, -4).tolist() == [0, 1, 2, 4, 5]
+    assert keypoints_under(mask, pixels, 2).tolist() == [0, 2, 4]  # the image's edge is no border
+    assert keypoints_under(mask, pixels, 0).tolist() == [0, 1, 2, 4]
+    assert keypoints_under(mask, pixels, -4).tolist() == [0, 1, 2, 4, 5]
 
 
 def test_masks_are_looked_up_in_the_distorted_image() -> None:
@@ -338,7 +339,7 @@ def test_masked_keypoints_stay_out_of_the_running_system() -> None:
     masked = [k for k in world.keyframes.values() if k.masked.any()]
     assert len(masked) >= 2 and len(pruned) > 200
     for keyframe in masked:
-        under = covered(mask, keyframe.features.image_pixels, 2)
+        under = keypoints_under(mask, keyframe.features.image_pixels, 2)
         assert (keyframe.landmark_ids[under] == -1).all()
     assert not pruned & in_graph(system.mapper.smoother)
     assert in_graph(system.mapper.smoother) <= in_map(world)

@@ -21,8 +21,8 @@ def world(points_world: np.ndarray) -> Any:
     alive[-2], host[-1] = False, 7
     keyframe = SimpleNamespace(id=4)
     landmarks = SimpleNamespace(points_world=points_world, alive=alive, host=host)
-    here = SimpleNamespace(landmarks=landmarks, in_segment=lambda s: [keyframe] if s == 2 else [])
-    return SimpleNamespace(world=here)
+    in_segment = {2: [keyframe]}.get
+    return SimpleNamespace(landmarks=landmarks, in_segment=in_segment)
 
 
 def test_what_lies_where_the_depth_shows_surface_is_seen_too() -> None:

@@ -118,7 +118,7 @@ def test_late_masks_in_any_order_say_the_same(at_once: SlamSystem) -> None:
     order = np.random.default_rng(0).permutation(sorted(numbers))
     for k in order.tolist():
         instances = system.semantics.segmenter.instances(numbers[k])  # type: ignore[attr-defined]
-        done = system.semantics.attach(k, instances, system.mapper)
+        done = system.semantics.attach(k, instances)
         assert done.refused == ""
         assert len(done.landmark_ids) > (0 if k in culled else 100)
     assert right_share(system) > 0.995
@@ -136,9 +136,9 @@ def keyframe_number(system: SlamSystem, keyframe_id: int) -> int:
 def test_masks_that_come_twice_count_once(at_once: SlamSystem) -> None:
     semantics, before = at_once.semantics, at_once.semantics.state()
     for k in (3, *list(at_once.mapper.world.culled)[:2]):
-        done = semantics.attach(k, Sides(FRAMES).instances(k), at_once.mapper)
+        done = semantics.attach(k, Sides(FRAMES).instances(k))
         assert "already" in done.refused
-    unknown = semantics.attach(4711, Sides(FRAMES).instances(0), at_once.mapper)
+    unknown = semantics.attach(4711, Sides(FRAMES).instances(0))
     assert "not in the map" in unknown.refused
     after = semantics.state()
     assert all(np.array_equal(after[name], before[name]) for name in before)
@@ -149,22 +149,22 @@ def test_masks_of_another_size_are_refused_and_change_nothing() -> None:
     small = np.ones((10, 10), bool)
     bad = Instance(small, mask_box(small), 1, certain(1, 3), 1.0, 1.0)
     with pytest.raises(InputError, match="shape"):
-        system.semantics.attach(3, [bad], system.mapper)
+        system.semantics.attach(3, [bad])
     assert system.semantics.labels.known().tolist() == []
-    assert system.semantics.attach(3, Sides(FRAMES).instances(3), system.mapper).refused == ""
+    assert system.semantics.attach(3, Sides(FRAMES).instances(3)).refused == ""
 
 
 def test_fused_and_culled_landmarks_are_followed(at_once: SlamSystem) -> None:
     """No label is kept of what is not in the map any more."""
     semantics, landmarks = at_once.semantics, at_once.mapper.world.landmarks
-    semantics.follow(at_once.mapper)
+    semantics.follow_map()
     assert landmarks.alive[semantics.labels.known()].all()
     a, b, gone = semantics.labels.known()[[3, 8, 12]]
     both = semantics.labels.estimates(np.array([a, b])).views.sum()
     world = at_once.mapper.world
     world.replace_landmarks(np.array([a]), np.array([b]))
     landmarks.remove(np.array([gone]))
-    semantics.follow(at_once.mapper)
+    semantics.follow_map()
     assert semantics.labels.estimates(np.array([a, b, gone])).views.tolist() == [
         0,
         both,
@@ -256,7 +256,7 @@ def test_the_two_sides_are_two_objects_with_their_landmarks(at_once: SlamSystem)
 def test_late_masks_make_the_same_objects(at_once: SlamSystem) -> None:
     system = late_system()
     for k in sorted((*system.mapper.world.keyframes, *system.mapper.world.culled), reverse=True):
-        system.semantics.attach(k, Sides(FRAMES).instances(k), system.mapper)
+        system.semantics.attach(k, Sides(FRAMES).instances(k))
     pairs = zip(at_once.objects().objects, system.objects().objects, strict=True)
     for a, b in pairs:
         assert a.label == b.label

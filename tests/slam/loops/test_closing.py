@@ -9,12 +9,10 @@ import pytest
 from synthetic_view import CAMERA, add_keyframe, make_features, random_descriptors
 
 import bmask_slam.back_end.mapper
-from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
-from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.back_end.mapper import BackEndConfig, Mapper
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_update import RelativePoseErrors
-from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, so3_exp, transform
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.verification import LoopConstraint
@@ -48,7 +46,7 @@ class Ring:
         self.descriptors = random_descriptors(1500, rng)
         tracker = Tracker(STRETCHED, TrackingConfig())
         mapping = MappingConfig(redundant_share=2.0)
-        rules = (mapping, FactorSelectionConfig(), SmootherConfig(), self.config)
+        rules = BackEndConfig(mapping, loops=self.config)
         self.mapper = Mapper(STRETCHED, tracker, rules)
         self.landmark_of: dict[int, tuple[int, int]] = {}  # point: landmark, newest keyframe
         self.points_of: dict[int, Array] = {}
@@ -262,7 +260,7 @@ def test_a_loop_that_left_with_its_keyframe_is_not_refuted() -> None:
     ring = Ring()
     loops = ring.run(ONCE_ROUND)
     mapper = ring.mapper
-    assert mapper._refuted_loops() == set()
+    assert refuted(mapper) == set()
     gone = loops[-1].keyframe_a
     mapper.world.remove_keyframe(mapper.world.keyframes[gone], mapper.world.keyframes[gone + 1])
     mapper._factor_selector.forget_keyframe(gone)
@@ -270,7 +268,11 @@ def test_a_loop_that_left_with_its_keyframe_is_not_refuted() -> None:
     ring.step()
     in_graph = mapper.smoother.relative_pose_errors("loop")
     assert gone not in in_graph.keyframe_a
-    assert mapper._refuted_loops() == set()
+    assert refuted(mapper) == set()
+
+
+def refuted(mapper: Mapper) -> set[tuple[int, int]]:
+    return mapper.loops.refuted(mapper.smoother.relative_pose_errors("loop"), mapper.world)
 
 
 def test_keyframes_at_the_ends_of_loops_are_never_culled(monkeypatch: pytest.MonkeyPatch) -> None:

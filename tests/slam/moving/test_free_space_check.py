@@ -133,7 +133,7 @@ def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
         pose = se3_exp(np.full(6, 0.1 * k)) if k > 3 else None
         memory.add(k, 0.1 * k, depth_view(box_before_wall() + k, 5), T_keyframe_camera=pose)
     assert [v.keyframe_id for v in memory.views] == [3, 6, 9]
-    memory.forget_space(6, np.ones(box_before_wall().shape, bool))
+    memory.clear_depth(6, np.ones(box_before_wall().shape, bool))
     other.restore(memory.state())
     for a, b in zip(memory.views, other.views, strict=True):
         assert (a.keyframe_id, a.timestamp_s, a.view.step) == (
@@ -160,9 +160,9 @@ def test_what_moves_is_not_remembered_but_was_seen() -> None:
     assert not kept.view.nearest_m[there].any()
     assert not kept.view.farthest_m[there].any()
     np.testing.assert_array_equal(kept.view.nearest_m[~there], kept.seen.nearest_m[~there])
-    memory.recall_space(1, np.ones(depth_m.shape, bool))
+    memory.restore_depth(1, np.ones(depth_m.shape, bool))
     assert not kept.view.nearest_m[there].any()
-    memory.recall_space(0, np.ones(depth_m.shape, bool))
+    memory.restore_depth(0, np.ones(depth_m.shape, bool))
     np.testing.assert_array_equal(kept.view.nearest_m, kept.seen.nearest_m)
     np.testing.assert_array_equal(kept.view.farthest_m, kept.seen.farthest_m)
     assert all(v.seen.nearest_m.any() for v in memory.views)

@@ -13,7 +13,7 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
-from bmask_slam.moving.moving_object_filter import StaticFeatures
+from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.tracks.instance_track import Sighting
@@ -73,8 +73,8 @@ class WatchedSystem(SlamSystem):
 
     counts: list[tuple[int, int, int, int]]
 
-    def _static_features(self, frame: Frame, features: Features) -> StaticFeatures:
-        static = super()._static_features(frame, features)
+    def _without_moving(self, frame: Frame, features: Features) -> StaticFeatures:
+        static = super()._without_moving(frame, features)
         u, v = features.image_pixels.T
         _, columns = card(frame.index)
         right = min(columns.stop, 640)
@@ -206,7 +206,7 @@ def test_a_person_whom_only_one_keyframe_shows_is_not_looked_for_any_longer() ->
     system = SlamSystem(CAMERA, config, once)
     left_out = []
     for frame in standing(30):
-        static = SlamSystem._static_features(system, frame, system.prepare(frame))
+        static = system.moving_objects.filter(frame, system.prepare(frame))
         left_out.append(static.ignored)
         if system.process(frame).keyframe_id is not None:
             calls.append(frame.name)
@@ -240,9 +240,7 @@ def test_what_is_seen_to_stand_still_is_used_in_a_walkers_box_too(frames: list[F
     system.moving_objects.tracks.see(frames[7].timestamp_s, [someone])
     features = system.prepare(frames[8])
     left_out = {
-        geometry: SlamSystem._static_features(
-            replaced(system, geometry), frames[8], features
-        ).moving.sum()
+        geometry: replaced(system, geometry).moving_objects.filter(frames[8], features).moving.sum()
         for geometry in (True, False)
     }
     assert left_out[False] > 50
@@ -274,7 +272,7 @@ def test_a_mask_that_comes_late_takes_out_what_was_put_in(frames: list[Frame]) -
     before = landmarks_on_card(system)
     in_graph = len(system.mapper.smoother.estimate().landmark_ids)
     for keyframe_id, frame in waiting.items():
-        attach(keyframe_id, CardSegmenter(1).segment(frame.rgb, frame.name), system.mapper)
+        attach(keyframe_id, CardSegmenter(1).segment(frame.rgb, frame.name))
     assert before > 50
     assert landmarks_on_card(system) < 0.05 * before
     assert len(system.mapper.smoother.estimate().landmark_ids) < in_graph
@@ -306,7 +304,7 @@ def test_much_that_is_seen_to_stand_settles_the_doubt(
     asked = []
     system.camera_tracker.preview = lambda *a: asked.append(1)  # type: ignore
     features = system.prepare(frames[22])
-    static = SlamSystem._static_features(system, frames[22], features)
+    static = system.moving_objects.filter(frames[22], features)
     assert static.moving.sum() > 20
     assert bool(asked) is (settled_share == 1.0)
 
@@ -318,7 +316,7 @@ def test_where_the_prediction_is_far_off_the_room_does_not_move() -> None:
     jumped = pose(4) @ se3_exp(np.array([0, 0, 0, 0, 0, 0.35]))
     frame = render_plane(jumped, 4)
     features = system.prepare(frame)
-    views = system.moving_objects.memory.posed(0, system.mapper)
+    views = system.moving_objects.keyframe_views.posed(0, system.map)
     static = system.moving_objects.static_features_at(
         frame, features, system.camera_tracker.prediction(), views
     )

@@ -84,7 +84,7 @@ def add(
     )
 
 
-def watched(
+def verified(
     static_verification: StaticVerification, world: WorldMap, images: list[Array], hz: float = 30
 ) -> list[int]:
     """In which of some frames something is found to stand."""
@@ -92,14 +92,14 @@ def watched(
     return [
         k
         for k, view in enumerate(views)
-        if static_verification.watch((k + 1) / hz, view, np.eye(4), world)
+        if static_verification.verify((k + 1) / hz, view, np.eye(4), world)
     ]
 
 
-def test_what_stands_is_found_after_a_while_and_watched_no_further() -> None:
+def test_what_stands_is_found_after_a_while_and_pending_no_longer() -> None:
     static_verification, world = watching()
-    assert watched(static_verification, world, [depth()] * 30) == [13]  # 0.4 s and two frames more
-    assert static_verification.watched == []
+    assert verified(static_verification, world, [depth()] * 30) == [13]  # 0.4 s and two frames more
+    assert static_verification.pending == []
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_what_stands_is_found_after_a_while_and_watched_no_further() -> None:
 )
 def test_what_walks_a_third_of_a_metre_a_second_is_not(images: list[Array]) -> None:
     static_verification, world = watching()
-    assert watched(static_verification, world, images) == []
+    assert verified(static_verification, world, images) == []
 
 
 def test_noise_and_lost_depth_do_not_make_it_move() -> None:
@@ -124,30 +124,30 @@ def test_noise_and_lost_depth_do_not_make_it_move() -> None:
         image[rng.random(image.shape) < 0.001] = np.nan
         images.append(image)
     static_verification, world = watching()
-    assert watched(static_verification, world, images) == [13]
+    assert verified(static_verification, world, images) == [13]
 
 
 def test_it_tells_what_was_taken_out_for_it_but_not_what_another_still_covers() -> None:
     static_verification, world = watching()
-    (removed,) = static_verification.watched[0].removed
+    (removed,) = static_verification.pending[0].removed
     assert removed.keypoints.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(removed.mask.unpacked(), depth() < WALL_M)
-    assert static_verification.without_watched(removed).tolist() == [False] * 3
+    assert static_verification.not_pending(removed).tolist() == [False] * 3
     view = depth_view(depth(), CHECK.config.window_px)
     for time_s in (0.5, 0.6):
-        assert not static_verification.watch(time_s, view, np.eye(4), world)
-    (found,) = static_verification.watch(0.7, view, np.eye(4), world)
-    assert static_verification.without_watched(found.removed[0]).tolist() == [True] * 3
+        assert not static_verification.verify(time_s, view, np.eye(4), world)
+    (found,) = static_verification.verify(0.7, view, np.eye(4), world)
+    assert static_verification.not_pending(found.removed[0]).tolist() == [True] * 3
 
 
-def test_seen_again_it_is_watched_from_the_first_time_on_unless_it_had_moved() -> None:
+def test_seen_again_it_is_verified_from_the_first_time_on_unless_it_had_moved() -> None:
     for moved, since_s, taken in ((False, 0.0, 2), (True, 0.1, 1)):
         static_verification, world = watching()
         world.add_keyframe(keyframe(1))
         if moved:
-            watched(static_verification, world, [depth(400)] * 15)
+            verified(static_verification, world, [depth(400)] * 15)
         add(static_verification, world, masks_of(keyframe_id=1), track())
-        (one,) = static_verification.watched
+        (one,) = static_verification.pending
         assert (one.time_s, len(one.removed)) == (since_s, taken)
 
 
@@ -157,32 +157,32 @@ def test_what_is_out_of_view_or_whose_keyframe_was_culled_is_given_up() -> None:
     turned[:3, :3] = np.diag([-1, 1, -1])
     view = depth_view(depth(), CHECK.config.window_px)
     for k in range(80):
-        assert not static_verification.watch(0.5 + 0.03 * k, view, turned, world)
-    assert len(static_verification.watched) == 1
-    assert not static_verification.watch(3.1, view, turned, world)
-    assert static_verification.watched == []
+        assert not static_verification.verify(0.5 + 0.03 * k, view, turned, world)
+    assert len(static_verification.pending) == 1
+    assert not static_verification.verify(3.1, view, turned, world)
+    assert static_verification.pending == []
     static_verification, _ = watching()
-    assert not static_verification.watch(0.5, view, np.eye(4), WorldMap())
-    assert static_verification.watched == []
+    assert not static_verification.verify(0.5, view, np.eye(4), WorldMap())
+    assert static_verification.pending == []
 
 
 def test_a_restored_state_goes_on_as_if_nothing_had_happened() -> None:
     static_verification, world = watching()
     world.add_keyframe(keyframe(1))
     add(static_verification, world, masks_of(400, 1), track(9))
-    watched(static_verification, world, [depth()] * 13)
+    verified(static_verification, world, [depth()] * 13)
     other = StaticVerification(CHECK, CONFIG, 20, 5)
     other.restore(static_verification.state())
     same(other.state(), static_verification.state())
-    assert [s.track_id for s in other.watched] == [7, 9]
-    assert [s.there for s in other.watched] == [2, 0]
+    assert [s.track_id for s in other.pending] == [7, 9]
+    assert [s.there for s in other.pending] == [2, 0]
     view = depth_view(depth(), CHECK.config.window_px)
     for one in (other, static_verification):
-        (found,) = one.watch(14 / 30, view, np.eye(4), world)
+        (found,) = one.verify(14 / 30, view, np.eye(4), world)
         assert found.removed[0].keypoints.tolist() == [0, 1, 2]
     empty = StaticVerification(CHECK, CONFIG, 20, 5)
     other.restore(empty.state())
-    assert other.watched == []
+    assert other.pending == []
 
 
 @pytest.mark.parametrize(
@@ -215,9 +215,9 @@ def same(a: Arrays, b: Arrays) -> None:
         np.testing.assert_array_equal(a[key], b[key], err_msg=key)
 
 
-def test_switched_off_nothing_is_watched() -> None:
+def test_switched_off_nothing_is_pending() -> None:
     static_verification, _ = watching(StaticVerificationConfig(stands_s=0))
-    assert static_verification.watched == []
+    assert static_verification.pending == []
 
 
 def test_values_without_sense_are_refused() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_view import T_NEW_OLD, add_keyframe, make_features
+from synthetic_view import T_NEW_OLD, add_keyframe, make_features, points_before
 
-from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.features.brisk import Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array
@@ -18,6 +18,8 @@ from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.tracking.rolling_shutter import PreviousPose
 from bmask_slam.tracking.tracker import Tracked, lost, untracked
+from bmask_slam.world.frame_history import FrameHistory
+from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import WorldMap
 
 STEP = se3_exp(np.array([0.05, -0.1, 0.2, 0.3, 0.1, -0.2]))
@@ -38,73 +40,106 @@ class RecordingTracker:
         return (lost if self.is_lost else untracked)(T_predicted, features)
 
 
-def scene() -> tuple[CameraTracker, RecordingTracker, WorldMap, Features]:
+@dataclass
+class StillMap:
+    """A map with one keyframe, whose owner is ready or busy."""
+
+    world: WorldMap = field(default_factory=WorldMap)
+    history: FrameHistory = field(default_factory=FrameHistory)
+    places: DescriptorIndex = field(default_factory=DescriptorIndex)
+    idle: bool = True
+    accepts_keyframes: bool = True
+
+
+def scene(map_reader: StillMap | None = None) -> tuple[CameraTracker, RecordingTracker, Features]:
     features = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
-    world, tracker = WorldMap(), RecordingTracker()
-    add_keyframe(world, np.eye(4), features)
+    map_reader, tracker = map_reader or StillMap(), RecordingTracker()
     camera_tracker = CameraTracker(
-        tracker, DescriptorIndex(), (RelocalisationConfig(), MappingConfig())
-    )  # type: ignore[arg-type]
-    return camera_tracker, tracker, world, features
+        tracker,  # type: ignore[arg-type]
+        map_reader,
+        RelocalisationConfig(),
+        LocalMapConfig(),
+    )
+    camera_tracker.refer_to(add_keyframe(map_reader.world, np.eye(4), features))
+    return camera_tracker, tracker, features
 
 
 def test_the_camera_is_expected_to_go_on_in_its_own_frame() -> None:
-    camera_tracker, tracker, world, features = scene()
-    camera_tracker.moved_on(T_NEW_OLD, T_NEW_OLD, NO_IDS)
-    camera_tracker.moved_on(T_NEW_OLD @ STEP, T_NEW_OLD @ STEP, NO_IDS)
-    camera_tracker.track(features, world, world.keyframes[0])
+    camera_tracker, tracker, features = scene()
+    camera_tracker.update_motion(T_NEW_OLD, T_NEW_OLD, NO_IDS)
+    camera_tracker.update_motion(T_NEW_OLD @ STEP, T_NEW_OLD @ STEP, NO_IDS)
+    camera_tracker.track(features)
     assert np.allclose(tracker.predictions[-1], T_NEW_OLD @ STEP @ STEP)
 
 
 @pytest.mark.parametrize(
-    ("stamp_s", "steps"), [(2.0, 1.0), (2.1, 1.0), (3.0, 2.0), (1.5, 0.5), (60.0, 4.0)]
+    ("stamp_s", "steps"),
+    [(2.0, 1.0), (2.1, 1.0), (3.0, 2.0), (1.5, 0.5), (60.0, 4.0), (0.5, 0.0), (-60.0, 0.0)],
 )
 def test_a_frame_that_comes_later_is_expected_farther_on(stamp_s: float, steps: float) -> None:
-    camera_tracker, tracker, world, features = scene()
+    camera_tracker, tracker, features = scene()
     for time_s, pose in ((0.0, T_NEW_OLD), (1.0, T_NEW_OLD @ STEP)):
-        camera_tracker.expect(time_s)
-        camera_tracker.moved_on(pose, pose, NO_IDS)
-    camera_tracker.expect(stamp_s)
-    camera_tracker.track(features, world, world.keyframes[0])
+        camera_tracker.begin_frame(time_s)
+        camera_tracker.update_motion(pose, pose, NO_IDS)
+    camera_tracker.begin_frame(stamp_s)
+    camera_tracker.track(features)
     ahead = se3_exp(steps * se3_log(STEP))
     assert np.allclose(tracker.predictions[-1], T_NEW_OLD @ STEP @ ahead)
 
 
 def test_the_speed_is_of_tracking_the_place_of_the_optimised_keyframe() -> None:
-    camera_tracker, tracker, world, features = scene()
+    camera_tracker, tracker, features = scene()
     correction = se3_exp(np.array([0, 0, 0, 0.01, 0.02, 0.0]))
-    camera_tracker.moved_on(np.eye(4), np.eye(4), NO_IDS)
-    camera_tracker.moved_on(STEP, correction @ STEP, NO_IDS)
-    camera_tracker.track(features, world, world.keyframes[0])
+    camera_tracker.update_motion(np.eye(4), np.eye(4), NO_IDS)
+    camera_tracker.update_motion(STEP, correction @ STEP, NO_IDS)
+    camera_tracker.track(features)
     assert np.allclose(tracker.predictions[-1], correction @ STEP @ STEP)
 
 
 def test_the_tracker_is_told_where_the_camera_was_a_moment_ago() -> None:
-    camera_tracker, tracker, world, features = scene()
+    camera_tracker, tracker, features = scene()
     correction = se3_exp(np.array([0, 0, 0, 0.01, 0.02, 0.0]))
     for stamp_s in (5.00, 5.04, 6.00):
-        camera_tracker.expect(stamp_s)
-        camera_tracker.track(features, world, world.keyframes[0])
-        camera_tracker.moved_on(STEP, correction @ STEP, NO_IDS)
+        camera_tracker.begin_frame(stamp_s)
+        camera_tracker.track(features)
+        camera_tracker.update_motion(STEP, correction @ STEP, NO_IDS)
     first, second, late = tracker.previous
     assert first is None and late is None
     assert second is not None and second.ago_s == pytest.approx(0.04)
     np.testing.assert_array_equal(second.T_world_camera, correction @ STEP)
     tracker.is_lost = True
     for stamp_s in (6.04, 6.08):
-        camera_tracker.expect(stamp_s)
-        camera_tracker.track(features, world, world.keyframes[0])
+        camera_tracker.begin_frame(stamp_s)
+        camera_tracker.track(features)
     before_lost, lost_already = tracker.previous[-2:]
     assert before_lost is not None and lost_already is None
 
 
 def test_a_lost_camera_is_expected_where_it_was_last_seen() -> None:
-    camera_tracker, tracker, world, features = scene()
-    camera_tracker.moved_on(np.eye(4), np.eye(4), NO_IDS)
-    camera_tracker.moved_on(STEP, STEP, NO_IDS)
+    camera_tracker, tracker, features = scene()
+    camera_tracker.update_motion(np.eye(4), np.eye(4), NO_IDS)
+    camera_tracker.update_motion(STEP, STEP, NO_IDS)
     tracker.is_lost = True
     for number in (1, 2):
-        tracked = camera_tracker.track(features, world, world.keyframes[0])
+        tracked = camera_tracker.track(features)
         assert tracked.status is TrackingStatus.LOST
         assert camera_tracker.lost_frames == number
     assert np.allclose(tracker.predictions[-1], STEP)
+
+
+def test_a_frame_begins_no_map_segment_while_the_back_end_accepts_no_keyframe() -> None:
+    """Such a frame has no pose: it must be LOST, however long tracking was lost before."""
+    map_reader = StillMap(accepts_keyframes=False)
+    camera_tracker, tracker, _ = scene(map_reader)
+    points = points_before(np.eye(4), 200, np.random.default_rng(1))
+    features = make_features(np.eye(4), points, np.zeros((200, 8), np.uint64))
+    features = replace(features, depth_m=points[:, 2])
+    tracker.is_lost = True
+    patience = RelocalisationConfig().patience_frames
+    for _ in range(2 * patience):
+        assert camera_tracker.track(features).status is TrackingStatus.LOST
+    map_reader.accepts_keyframes = True
+    assert camera_tracker.track(features).status is TrackingStatus.OK
+    assert camera_tracker.segment == 1
+    map_reader.accepts_keyframes = False
+    assert camera_tracker.track(features).status is TrackingStatus.LOST

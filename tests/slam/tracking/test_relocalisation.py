@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, render_plane
 
-from bmask_slam.back_end.landmark_management import MappingConfig, create_landmarks
+from bmask_slam.back_end.landmark_management import create_landmarks
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from bmask_slam.tracking.tracker import Tracked, Tracker, TrackingConfig
+from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 EXTRACTOR = BriskExtractor(CAMERA, FeatureConfig())
 TRACKER = Tracker(CAMERA, TrackingConfig())
-RULES = (RelocalisationConfig(), MappingConfig())
+RULES = (RelocalisationConfig(), LocalMapConfig())
 
 
 def at(x_m: float, turn_rad: float = 0.0) -> Array:
@@ -49,7 +50,7 @@ def places(world: WorldMap) -> DescriptorIndex:
 def find(world: WorldMap, T_world_camera: Array) -> Tracked | None:
     features = EXTRACTOR.extract(render_plane(T_world_camera))
     candidates = similar_keyframes(features, list(world.keyframes.values()), places(world), 2.0)
-    return relocalise(features, candidates, world, TRACKER, RULES)
+    return relocalise(features, candidates, world, TRACKER, *RULES)
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, 0.5])

@@ -7,7 +7,7 @@ from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
 from bmask_slam.graph.arrays import Mask
-from bmask_slam.moving.feature_replenishment import FeatureReplenishment
+from bmask_slam.moving.static_features import FeatureReplenishment
 
 CONFIG = FeatureConfig(max_keypoints=300)
 FRAME = render_plane(np.eye(4))

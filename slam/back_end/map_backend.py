@@ -1,0 +1,59 @@
+"""What the front end asks of the owner of the map, and what its implementations share.
+
+There are two: `back_end.mapper.Mapper` in the same process, and `RemoteMapper` of `live.processes`,
+whose map and graph are in a process of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Ints
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.world.map_editor import MapEditor
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+
+class MapBackend(MapEditor, Protocol):
+    """Takes keyframes in, and keeps map, graph and frame history consistent."""
+
+    def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
+        """Make a tracked frame a keyframe of a map segment: landmarks are made, fused and culled.
+
+        ``local_ids`` (N,) are the landmarks that it was tracked against.
+        """
+
+    def optimise(self, keyframe: Keyframe) -> None:
+        """Put a keyframe into the graph and read all poses and points back."""
+
+    def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
+        """Look for known places from a keyframe; loops that hold move the map.
+
+        Returns the loops that were closed, as far as they are known at once.
+        """
+
+
+def add_keyframe(world: WorldMap, frame: Frame, tracked: Tracked, segment: int) -> Keyframe:
+    """Put a tracked frame into a map; it observes nothing yet."""
+    keyframe = Keyframe(
+        id=world.next_keyframe_id,
+        frame_index=frame.index,
+        timestamp_s=frame.timestamp_s,
+        segment=segment,
+        T_world_camera=tracked.T_world_camera,
+        features=tracked.features,
+        landmark_ids=np.full(len(tracked.features), -1, np.int64),
+    )
+    world.add_keyframe(keyframe)
+    return keyframe
+
+
+def without_image(features: Features) -> Features:
+    """The features without their grey image, which a keyframe needs until patches are cut."""
+    return replace(features, gray=np.zeros((0, 0), np.uint8))

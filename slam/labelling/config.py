@@ -1,0 +1,31 @@
+"""Settings of the semantics: where masks come from, and how they become labels and objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
+from bmask_slam.semantics.beliefs.votes import VoteConfig
+from bmask_slam.semantics.objects.object_map import ObjectConfig
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+
+DEFAULT_SEGMENTER = "light"
+VOTE_SCORE = 0.1
+"""Instances with a lower class score are not asked of the default segmenter."""
+
+
+@dataclass(frozen=True)
+class SemanticsConfig:
+    """Where masks come from, and what is believed of them.
+
+    Instances with a class score below ``object_score`` vote on labels only: they make no objects,
+    and are no evidence of motion.
+    """
+
+    segmenter: SegmenterOptions = field(
+        default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER, min_score=VOTE_SCORE)
+    )
+    object_score: float = 0.5
+    votes: VoteConfig = field(default_factory=VoteConfig)
+    labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)
+    objects: ObjectConfig = field(default_factory=ObjectConfig)

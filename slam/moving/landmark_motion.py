@@ -1,0 +1,95 @@
+"""Which landmarks move, by the depth of frames and by the masks of keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bmask_slam.graph.arrays import Arrays, Ints
+from bmask_slam.moving.free_space_check import DepthView, FreeSpaceCheck, PointMotion
+from bmask_slam.moving.keyframe_masks import KeyframeMasks
+from bmask_slam.semantics.beliefs.movability import (
+    MovabilityConfig,
+    MovabilityFilter,
+    MovabilityPriors,
+)
+from bmask_slam.semantics.tracks.instance_track import Sighting
+from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.world.map_editor import MapEditor
+
+
+class LandmarkMotion:
+    """P(moving) of landmarks; those that move are taken out of the map.
+
+    Attributes:
+        movability: the binary Bayes filter of each landmark, by id.
+    """
+
+    def __init__(
+        self,
+        check: FreeSpaceCheck,
+        priors: MovabilityPriors,
+        config: MovabilityConfig,
+        map_editor: MapEditor,
+    ) -> None:
+        self.movability = MovabilityFilter(priors.unknown, config)
+        self._check, self._priors, self._config = check, priors, config
+        self._map = map_editor
+
+    def state(self) -> Arrays:
+        """What is known of every landmark, as named arrays."""
+        return self.movability.state()
+
+    def restore(self, state: Arrays) -> None:
+        """Go on from a state."""
+        self.movability.restore(state)
+
+    def observe_frame(self, tracked: Tracked, view: DepthView | None) -> Ints:
+        """Landmarks in view (N,) that are believed to move, with a frame's evidence counted."""
+        ids = tracked.visible_ids
+        if view is None or not len(ids):
+            return ids[self.movability.moving(ids)]
+        landmarks = self._map.world.landmarks
+        motions = self._check.judge(landmarks.points_world[ids], view, tracked.T_world_camera)
+        gone = motions == PointMotion.MOVING
+        tracked_now = np.zeros(len(landmarks), bool)
+        tracked_now[tracked.landmark_ids] = True
+        found = tracked_now[ids]
+        gone &= ~found
+        judged = found | gone
+        self.movability.update(ids[judged], gone[judged], self._config.frame_power)
+        return ids[self.movability.moving(ids)]
+
+    def observe_masks(
+        self, masks: KeyframeMasks, sightings: Sequence[Sighting | None], standing: Sequence[bool]
+    ) -> None:
+        """Landmarks on instances have their classes' priors, and move if views say so of their
+        instance; of what stood still for long the class says nothing.
+        """
+        ids, first = np.unique(masks.landmark_ids, return_index=True)
+        priors = masks.label_distributions[first] @ self._priors.of(masks.names)
+        instances = masks.instances[first]
+        still = np.array([*standing, False])
+        evidence = np.array([0.0 if s is None else s.evidence for s in sightings] + [0.0])
+        priors[still[instances]] = np.minimum(priors[still[instances]], self._priors.unknown)
+        self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
+        told = evidence[instances] != 0
+        self.movability.update(ids[told], evidence[instances[told]] > 0)
+
+    def remove_moving(self, ids: Ints) -> None:
+        """Take those of the landmarks (N,) that move out of map and graph."""
+        ids = self._map.world.landmarks.living(ids)
+        ids = ids[self.movability.moving(ids)]
+        if len(ids):
+            self._map.prune_landmarks(ids)
+            self.movability.drop(ids)
+
+    def follow_map(self) -> None:
+        """What is known of fused landmarks goes to what they became; of removed ones it goes."""
+        landmarks, known = self._map.world.landmarks, self.movability.known()
+        gone = known[~landmarks.alive[known]]
+        current = landmarks.current(gone)
+        alive = landmarks.alive[current]
+        self.movability.move(gone[alive], current[alive])
+        self.movability.drop(gone[~alive])
