@@ -1,1 +1,1 @@
-"""What surfaces look like: inverse-depth maps, fusion, submaps."""
+"""Dense surfaces: inverse-depth maps of keyframes, their fusion, and what is made of them."""

@@ -32,10 +32,9 @@ from benchmarks.mapping.dense_surface import (
     surface_errors,
 )
 from benchmarks.mapping.dense_time import ROUNDS, step_times_ms
-from bmask_slam.dense.fusion import dense_config
-from bmask_slam.dense.input import MappedRun, open_run
 from bmask_slam.dense.map_run import map_run
-from bmask_slam.dense.options import MapOptions
+from bmask_slam.dense.options import MapOptions, fusion_config
+from bmask_slam.dense.saved_map import MappedRun, open_run
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.runner import run
@@ -47,7 +46,7 @@ ROOMS, FRAMES = "office,living_room", 150
 
 def measure(run: MappedRun, options: MapOptions) -> dict[str, Any]:
     """Everything, as plain data."""
-    truths, config = read_truth(run), dense_config(options)
+    truths, config = read_truth(run), fusion_config(options)
     steps = Steps(run, config)
     maps = ablation(steps)
     everywhere = [np.ones(t.depth_m.shape, bool) for t in truths]

@@ -11,11 +11,16 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.mapping.dense_surface import Truth
-from bmask_slam.dense.input import MappedRun, load
+from bmask_slam.dense.keyframe_input import load_keyframe
+from bmask_slam.dense.saved_map import MappedRun
 from bmask_slam.graph.geometry import inverse
-from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, DenseKeyframe, neighbours
+from bmask_slam.mapping.inverse_depth.dense_mapper import (
+    DenseConfig,
+    DenseKeyframe,
+    choose_neighbours,
+)
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap, from_sensor
-from bmask_slam.mapping.inverse_depth.fusion import Fused, fuse, stated
+from bmask_slam.mapping.inverse_depth.fusion import Fused, fuse, with_calibrated_variance
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.inverse_depth.warping import View
 
@@ -55,7 +60,7 @@ class Steps:
     def __init__(self, run: MappedRun, config: DenseConfig, lost: float = 0.0) -> None:
         """``lost`` is a share of each keyframe's depth that the sensor does not give."""
         self.camera = run.camera
-        loaded = [load(run, k)[0] for k in run.keyframes]
+        loaded = [load_keyframe(run, k)[0] for k in run.keyframes]
         self.keyframes: list[DenseKeyframe] = [without_patches(k, lost) for k in loaded]
         self.raw = [from_sensor(k.depth_m, run.camera, config.noise) for k in self.keyframes]
         self.images = [
@@ -76,7 +81,7 @@ class Steps:
                     T_own_world @ k.T_world_camera,
                     self.images[index[k.id]].float() if colours else None,
                 )
-                for k in neighbours(own, window, count)
+                for k in choose_neighbours(own, window, count)
             ]
             results.append(fuse(maps[i], views, self.camera, self.images[i].float()))
         return results
@@ -100,7 +105,7 @@ def patchy(run: MappedRun, truths: list[Truth], config: DenseConfig) -> dict[str
     """Depth before and after all Steps with a sensor that loses PATCHES of every image."""
     steps = Steps(run, config, PATCHES)
     fused = steps.fused([regularise(m) for m in steps.raw])
-    final = [stated(regularise(f.map), f) for f in fused]
+    final = [with_calibrated_variance(regularise(f.map), f) for f in fused]
     everywhere = [np.ones(t.depth_m.shape, bool) for t in truths]
     return {
         "sensor": depth_errors(steps.raw, truths, everywhere),
@@ -120,7 +125,7 @@ def ablation(steps: Steps) -> dict[str, list[Map]]:
         "Step 3": step3,
         "Steps 3, 4": [f.map for f in step4],
         "Steps 3, 4, 5": step5,
-        ALL_STEPS: [stated(m, f) for m, f in zip(step5, step4, strict=True)],
+        ALL_STEPS: [with_calibrated_variance(m, f) for m, f in zip(step5, step4, strict=True)],
         "without 3": [regularise(f.map) for f in without3],
         "without 4": [regularise(m) for m in step3],
         "two neighbours": [regularise(f.map) for f in two],

@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.input import load, open_run
+from bmask_slam.dense.keyframe_input import load_keyframe
+from bmask_slam.dense.saved_map import open_run
 from bmask_slam.graph.arrays import Image
 
 MAX_WIDTH_PX = 1400
@@ -39,9 +40,9 @@ def side_by_side(files: list[Path]) -> Image:
 
 def coverage(run_folder: Path) -> tuple[float, float]:
     """Share of the keyframes' pixels with depth, of the sensor and fused."""
-    run, folder = open_run(run_folder), DenseFolder.opened(run_folder)
+    run, folder = open_run(run_folder), DenseFolder.open(run_folder)
     done = [k for k in run.keyframes if folder.is_done(k.id)]
-    before = [np.isfinite(load(run, k)[0].depth_m).mean() for k in done]
+    before = [np.isfinite(load_keyframe(run, k)[0].depth_m).mean() for k in done]
     after = [folder.fused(k.id).known.float().mean().item() for k in done]
     return float(np.mean(before)), float(np.mean(after))
 

@@ -22,12 +22,12 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.input import undistorted
+from bmask_slam.dense.keyframe_input import undistort_images
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DenseMapper, FusedKeyframe
-from bmask_slam.mapping.products.cloud import merged, spill
+from bmask_slam.mapping.products.cloud import PlacedSubmap, merge_blocks, sort_into_blocks
 from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.mapping.products.submaps import Submap, make_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence, LabelTable
@@ -47,7 +47,7 @@ NOTHING = InstanceEvidence(
 
 def keyframe(sequence: Sequence, index: int, number: int, T_world_camera: Array) -> DenseKeyframe:
     """A frame as a keyframe that shares landmarks with those made just before and after it."""
-    rgb, depth_m = undistorted(sequence.load(index), sequence.camera)
+    rgb, depth_m = undistort_images(sequence.load(index), sequence.camera)
     ids = np.arange(number, number + SHARED)
     return DenseKeyframe(number, T_world_camera, rgb, depth_m, ids, np.full(SHARED, 2.0))
 
@@ -77,7 +77,7 @@ def fuse_all(sequence: Sequence, poses: Array) -> Iterator[FusedKeyframe]:
     """Every keyframe, fused where these poses put it."""
     mapper = DenseMapper(sequence.camera)
     for k, T in enumerate(poses):
-        yield from mapper.push(keyframe(sequence, k * STRIDE, k, T))
+        yield from mapper.add(keyframe(sequence, k * STRIDE, k, T))
     yield from mapper.flush()
 
 
@@ -150,7 +150,7 @@ def session(sequence: Sequence, count: int) -> Iterator[str]:
             poses.append(T)
             given = keyframe(sequence, index * STRIDE, number, T)
             started_s = time.perf_counter()
-            finished = mapper.push(given)
+            finished = mapper.add(given)
             _save(finished, folder, sequence.camera)
             fused_s += time.perf_counter() - started_s
             if (number + 1) % (count // 6) == 0:
@@ -175,10 +175,10 @@ def _write_cloud(folder: DenseFolder, poses: list[Array], temporary: Path) -> in
     """Points in the cloud of all submaps, which is written as by bmask-slam map."""
     read: Callable[[int], Submap] = folder.submap
     table = LabelTable.of([NOTHING.log_likelihoods] * len(poses), LabelStoreConfig())
-    submaps = ((read(k), T, k) for k, T in enumerate(poses))
+    submaps = (PlacedSubmap(read(k), T, k) for k, T in enumerate(poses))
     with CloudWriter(folder.path / "cloud") as writer:
-        files = spill(submaps, VOXEL_M, temporary)
-        for block in merged(files, VOXEL_M, table):
+        files = sort_into_blocks(submaps, VOXEL_M, temporary)
+        for block in merge_blocks(files, VOXEL_M, table):
             writer.write(block)
     return writer.count
 

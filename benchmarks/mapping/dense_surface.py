@@ -10,14 +10,15 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from bmask_slam.dense.input import MappedRun, image_name
+from bmask_slam.dense.keyframe_input import image_name
+from bmask_slam.dense.saved_map import MappedRun
 from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.geometry import make_pose, transform
 from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
-from bmask_slam.mapping.products.mesh import integrated
-from bmask_slam.mapping.products.submaps import nearest_a_voxel
+from bmask_slam.mapping.products.mesh import DepthView, integrated
+from bmask_slam.mapping.products.submaps import surest_per_voxel
 from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter
 
 F_SCORE_M = 0.01
@@ -78,7 +79,7 @@ def surface(truths: list[Truth], run: MappedRun, max_depth_m: float = 5.0) -> di
         points.append(transform(truth.T_world_camera, grid.numpy()[keep].astype(float)))
         normals.append(normal.numpy()[keep] @ truth.T_world_camera[:3, :3].T)
     p, n, label = (np.concatenate(a) for a in (points, normals, labels))
-    kept = nearest_a_voxel(p.astype(np.float32), np.zeros(len(p), np.float32), VOXEL_M / 2)
+    kept = surest_per_voxel(p.astype(np.float32), np.zeros(len(p), np.float32), VOXEL_M / 2)
     return {"points": p[kept], "normals": n[kept], "labels": label[kept]}
 
 
@@ -91,7 +92,7 @@ def surface_errors(points: Array, true: dict[str, Any]) -> dict[str, float]:
     error = np.where(near, along, distance)
     precision = float(np.mean(error < F_SCORE_M))
     thin = true["points"][
-        nearest_a_voxel(
+        surest_per_voxel(
             true["points"].astype(np.float32), np.zeros(len(true["points"]), np.float32), VOXEL_M
         )
     ]
@@ -108,7 +109,7 @@ def surface_errors(points: Array, true: dict[str, Any]) -> dict[str, float]:
 
 def open3d_points(run: MappedRun, keyframes: list[DenseKeyframe]) -> Array:
     """Points (N, 3) of Open3D's TSDF of the sensor's depth."""
-    views = [(k.depth_m, k.rgb, k.T_world_camera) for k in keyframes]
+    views = [DepthView(k.depth_m, k.rgb, k.T_world_camera) for k in keyframes]
     volume = integrated(views, run.camera, VOXEL_M, 4.0)
     cloud = volume.extract_point_cloud(weight_threshold=1.0)
     return np.asarray(cloud.point.positions.numpy(), float)

@@ -12,12 +12,16 @@ import torch
 
 from benchmarks.mapping.dense_depth import Map, Steps
 from benchmarks.mapping.dense_surface import VOXEL_M, open3d_points
-from bmask_slam.dense.input import MappedRun
+from bmask_slam.dense.saved_map import MappedRun
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
-from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, FusedKeyframe, neighbours
+from bmask_slam.mapping.inverse_depth.dense_mapper import (
+    DenseConfig,
+    FusedKeyframe,
+    choose_neighbours,
+)
 from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
-from bmask_slam.mapping.inverse_depth.fusion import Fused, fuse, stated
+from bmask_slam.mapping.inverse_depth.fusion import Fused, fuse, with_calibrated_variance
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.inverse_depth.warping import View
 from bmask_slam.mapping.products.submaps import make_submap
@@ -76,7 +80,7 @@ class _Single:
         self._image = steps.images[i].float()
         self._views = [
             View(maps[index[k.id]], T @ k.T_world_camera, steps.images[index[k.id]].float())
-            for k in neighbours(own, window, 6)
+            for k in choose_neighbours(own, window, 6)
         ]
 
     def works(self) -> dict[str, Callable[[], Any]]:
@@ -84,13 +88,13 @@ class _Single:
         raw = self._sensor()
         step3 = regularise(raw)
         step4 = self._fused(step3)
-        step5 = stated(regularise(step4.map), step4)
+        step5 = with_calibrated_variance(regularise(step4.map), step4)
         submap = FusedKeyframe(self._own, step5, step4.views.numpy())
         return {
             "sensor": self._sensor,
             "Step 3": lambda: regularise(raw),
             "Step 4": lambda: self._fused(step3),
-            "Step 5": lambda: stated(regularise(step4.map), step4),
+            "Step 5": lambda: with_calibrated_variance(regularise(step4.map), step4),
             "Step 6": lambda: self._points(step5),
             "submap": lambda: make_submap(submap, self._camera, VOXEL_M),
         }
@@ -98,7 +102,7 @@ class _Single:
     def all_steps(self) -> Any:
         """From the sensor's depth to points and normals."""
         fused = self._fused(regularise(self._sensor()))
-        return self._points(stated(regularise(fused.map), fused))
+        return self._points(with_calibrated_variance(regularise(fused.map), fused))
 
     def _sensor(self) -> Map:
         return from_sensor(self._own.depth_m, self._camera, self._noise)

@@ -7,16 +7,15 @@ from torch import Tensor
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
-from bmask_slam.mapping.inverse_depth.pixelwise import gate, windowed
-from bmask_slam.mapping.inverse_depth.warping import image_grid
+from bmask_slam.mapping.inverse_depth.pixelwise import image_grid, nan_where_negative, windowed
 
 NORMAL_WINDOW_PX = 5
 MAX_STEP = 0.05
-"""Of the inverse depth, from pixel to pixel but one: beyond it is another surface."""
+"""Largest relative change of inverse depth over two pixels on one surface."""
 
 
 def back_project(given: InverseDepthMap, camera: Camera) -> Tensor:
-    """Points (H, W, 3) in metres by paper eq. (9), NaN where nothing is known.
+    """Points (H, W, 3) in metres by paper eq. (9), NaN where depth is unknown.
 
     z = 1 / rho, x = (u - cx) z / fx, y = (v - cy) z / fy.
     """
@@ -30,9 +29,9 @@ def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
     """Unit normals (H, W, 3) towards the camera.
 
     The image of a plane n x = d has rho = n K^-1 (u, v, 1) / d, so that its gradient (a, b) gives
-    n ~ K^T (a, b, rho - a u - b v). The gradient is a mean of central differences over a window:
-    unlike normals, these are not drawn towards the camera by noise. NaN at the border, where one of
-    the four neighbours is missing and where they belong to different surfaces.
+    n ~ K^T (a, b, rho - a u - b v). The gradient is a mean of central differences over a window;
+    unlike a mean of normals, it has no bias towards the camera under noise. NaN at the border,
+    where one of the four neighbours is missing, and where they belong to different surfaces.
     """
     rho = given.rho
     inner = rho[1:-1, 1:-1]
@@ -43,7 +42,7 @@ def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
         windowed(torch.add, plane, NORMAL_WINDOW_PX // 2)
         for plane in (across.nan_to_num_() * share, down.nan_to_num_() * share, share)
     )
-    weight = (0.5 / weight).add_(gate(share - 1))
+    weight = (0.5 / weight).add_(nan_where_negative(share - 1))
     a *= weight
     b *= weight
     u, v = image_grid(rho)
@@ -56,7 +55,7 @@ def surface_normals(given: InverseDepthMap, camera: Camera) -> Tensor:
 
 
 def _interleaved(*planes: Tensor) -> Tensor:
-    """Planes (H, W) as one (H, W, C), faster than `torch.stack`."""
+    """Planes (H, W) as one image (H, W, C), faster than `torch.stack`."""
     together = torch.empty((*planes[0].shape, len(planes)), device=planes[0].device)
     for k, plane in enumerate(planes):
         together[..., k] = plane

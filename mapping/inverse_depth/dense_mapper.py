@@ -1,4 +1,4 @@
-"""Algorithm 1 over a stream of keyframes, the fusion delayed until neighbours exist."""
+"""Algorithm 1 on a stream of keyframes; each is fused once its later neighbours have come."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from bmask_slam.graph.arrays import Array, Bytes, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.inverse_depth.depth_map import DepthNoise, InverseDepthMap, from_sensor
-from bmask_slam.mapping.inverse_depth.fusion import MAX_NEIGHBOURS, fuse, stated
-from bmask_slam.mapping.inverse_depth.plane_sweep import completed, sweep
+from bmask_slam.mapping.inverse_depth.fusion import MAX_NEIGHBOURS, fuse, with_calibrated_variance
+from bmask_slam.mapping.inverse_depth.plane_sweep import fill_missing, sweep
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.inverse_depth.search_range import search_range
 from bmask_slam.mapping.inverse_depth.stereo import match_stereo
@@ -27,12 +27,12 @@ from bmask_slam.mapping.inverse_depth.warping import View
 DepthSource = Literal["sensor", "both", "stereo", "motion"]
 MIN_BASELINE_M, SWEEP_VIEWS = 0.03, 2
 WINDOW = 6
-"""Keyframes on either side among which neighbours are chosen."""
+"""Neighbours are chosen among so many keyframes before and after."""
 
 
 @dataclass(frozen=True, eq=False)
 class DenseKeyframe:
-    """What dense mapping needs of a keyframe.
+    """A keyframe as input of dense mapping.
 
     Attributes:
         id: its number in the map.
@@ -41,10 +41,10 @@ class DenseKeyframe:
         depth_m: (H, W) float32 of the sensor, undistorted, NaN where missing.
         landmark_ids: (L,) landmarks that it observes.
         landmark_depths_m: (L,) their z in its camera.
-        instances: (H, W) uint16, number of the instance that each pixel shows, 0 for none; or None.
+        instances: (H, W) uint16, number of the instance at each pixel, 0 for none; or None.
         right: (H, W, 3) uint8, the right image of a rectified pair whose left one is ``rgb``, with
             the camera's bf: u_right = u_left - bf / z; or None.
-        unmatched: (H, W) bool, pixels to which matching images must give no depth; or None.
+        unmatched: (H, W) bool, pixels that get no depth from matching of images; or None.
     """
 
     id: int
@@ -63,9 +63,9 @@ class FusedKeyframe:
     """A keyframe after Step 5.
 
     Attributes:
-        keyframe: what it was made of.
-        map: inverse depth with its honest variance.
-        views: (H, W) uint8, keyframes that each estimate rests on; 0 where Step 5 filled.
+        keyframe: the input.
+        map: inverse depth with a calibrated variance.
+        views: (H, W) uint8, number of keyframes in each estimate; 0 where Step 5 filled a hole.
     """
 
     keyframe: DenseKeyframe
@@ -75,14 +75,15 @@ class FusedKeyframe:
 
 @dataclass(frozen=True)
 class DenseConfig:
-    """How keyframes are fused.
+    """Configuration of the fusion.
 
     Attributes:
         noise: of the depth sensor.
-        neighbours: at most so many are fused with a keyframe.
-        source: "sensor"; "stereo", keyframes' right images; "motion", a plane sweep between
-            keyframes; or "both", where the sensor has nothing the right image, or else the sweep.
-        device: torch's name of where it is computed.
+        neighbours: largest number of keyframes that are fused with a keyframe.
+        source: "sensor"; "stereo", the keyframes' right images; "motion", a plane sweep between
+            keyframes; or "both": the sensor, and where it has no depth the right image, or without
+            one the sweep.
+        device: torch's name of the device that computes it.
     """
 
     noise: DepthNoise = field(default_factory=DepthNoise)
@@ -101,10 +102,10 @@ class _Prepared:
 
 
 class DenseMapper:
-    """Takes keyframes one after the other and gives each back, fused, once six later ones came.
+    """Receives keyframes one by one and returns each one fused after six later ones.
 
-    Memory is bounded: thirteen keyframes are held, in the order of their ids. One that comes after
-    a later one still finds its place; those that are fused by then did without it.
+    Memory is bounded: at most thirteen keyframes are held, ordered by id. A keyframe may come late,
+    after one with a higher id; keyframes that were fused before it came were fused without it.
     """
 
     def __init__(self, camera: Camera, config: DenseConfig | None = None) -> None:
@@ -113,10 +114,10 @@ class DenseMapper:
         self._held: list[_Prepared] = []
         self._wanted: set[int] = set()
 
-    def push(self, keyframe: DenseKeyframe, wanted: bool = True) -> list[FusedKeyframe]:
-        """Take a keyframe in; the one for which all neighbours exist by that comes back.
+    def add(self, keyframe: DenseKeyframe, wanted: bool = True) -> list[FusedKeyframe]:
+        """Add a keyframe; returns the keyframe whose neighbours are complete now, fused.
 
-        One that is not ``wanted`` serves its neighbours only.
+        A keyframe that is not ``wanted`` is only a neighbour of others and is not returned.
         """
         bisect.insort(self._held, self._prepare(keyframe), key=lambda p: p.keyframe.id)
         if wanted:
@@ -124,7 +125,7 @@ class DenseMapper:
         return self._finished(len(self._held) - WINDOW)
 
     def _prepare(self, keyframe: DenseKeyframe) -> _Prepared:
-        """Steps 1 to 3 of a keyframe, with those that came before it."""
+        """Steps 1 to 3 of a keyframe, with the keyframes before it."""
         config, measured = self.config, None
         image = as_image(keyframe.rgb, config.device)
         if config.source in ("sensor", "both"):
@@ -133,12 +134,12 @@ class DenseMapper:
             matched = self._matched(keyframe, image)
             if keyframe.unmatched is not None:
                 matched = matched.where(~torch.from_numpy(keyframe.unmatched).to(image.device))
-            measured = matched if measured is None else completed(measured, matched)
+            measured = matched if measured is None else fill_missing(measured, matched)
         assert measured is not None
         return _Prepared(keyframe, regularise(measured), image)
 
     def _matched(self, keyframe: DenseKeyframe, image: Tensor) -> InverseDepthMap:
-        """Steps 1 and 2 with the right image, or else the last keyframes that stood elsewhere."""
+        """Steps 1 and 2 with the right image, or else with the last keyframes apart from it."""
         window = search_range(keyframe.landmark_depths_m)
         if window is not None and keyframe.right is not None:
             right = as_image(keyframe.right, self.config.device)
@@ -151,37 +152,39 @@ class DenseMapper:
             return InverseDepthMap(empty, empty)
         return sweep(image, apart[-SWEEP_VIEWS:], self.camera, window)
 
-    def move(self, poses: Mapping[int, Array]) -> None:
-        """Take over the T_world_camera (4, 4) of keyframes by their ids, as optimised since."""
+    def update_poses(self, poses: Mapping[int, Array]) -> None:
+        """Replace the poses of held keyframes by T_world_camera (4, 4), by id."""
         for k, held in enumerate(self._held):
             T = poses.get(held.keyframe.id)
             if T is not None and T is not held.keyframe.T_world_camera:
                 self._held[k] = replace(held, keyframe=replace(held.keyframe, T_world_camera=T))
 
-    def relabel(self, keyframe_id: int, instances: NDArray[np.uint16], moves: Mask) -> None:
-        """Take over the instances (H, W) of a keyframe, and what moves in it (H, W).
+    def relabel(self, keyframe_id: int, instances: NDArray[np.uint16], hidden: Mask) -> None:
+        """Replace the instances (H, W) of a keyframe and remove the depth of its hidden pixels.
 
-        For those that wait for neighbours; any other keyframe is passed over.
+        Nothing happens if the keyframe does not wait for neighbours.
         """
         for k, held in enumerate(self._held):
             if held.keyframe.id == keyframe_id and keyframe_id in self._wanted:
-                depth_m = np.where(moves, np.float32(np.nan), held.keyframe.depth_m)
-                told = replace(held.keyframe, instances=instances, depth_m=depth_m, unmatched=moves)
-                self._held[k] = self._prepare(told)
+                depth_m = np.where(hidden, np.float32(np.nan), held.keyframe.depth_m)
+                keyframe = replace(
+                    held.keyframe, instances=instances, depth_m=depth_m, unmatched=hidden
+                )
+                self._held[k] = self._prepare(keyframe)
 
-    def forget(self, keyframe_ids: Collection[int]) -> None:
-        """Do without keyframes from here on."""
+    def remove(self, keyframe_ids: Collection[int]) -> None:
+        """Remove held keyframes."""
         self._held = [p for p in self._held if p.keyframe.id not in keyframe_ids]
         self._wanted -= set(keyframe_ids)
 
     def flush(self) -> list[FusedKeyframe]:
-        """What still waits for neighbours that will not come; what follows begins anew."""
+        """Fuse and return the keyframes that still wait; the next one starts a new stream."""
         results = self._finished(len(self._held))
         self._held = []
         return results
 
     def _finished(self, end: int) -> list[FusedKeyframe]:
-        """Fuse those held up to ``end`` and let go of what nobody needs any more."""
+        """Fuse the held keyframes before ``end`` and drop those that no later one needs."""
         ids = [p.keyframe.id for p in self._held[: max(end, 0)]]
         results = [self._fuse(k) for k, number in enumerate(ids) if number in self._wanted]
         self._wanted -= set(ids)
@@ -192,19 +195,19 @@ class DenseMapper:
         own = self._held[k]
         window = self._held[max(k - WINDOW, 0) : k + WINDOW + 1]
         others = {p.keyframe.id: p for p in window if p is not own}
-        chosen = neighbours(
+        chosen = choose_neighbours(
             own.keyframe, [p.keyframe for p in others.values()], self.config.neighbours
         )
-        return fused(own, [others[n.id] for n in chosen], self.camera, self.config)
+        return fuse_keyframe(own, [others[n.id] for n in chosen], self.camera, self.config)
 
 
 def as_image(rgb: Image, device: str = "cpu") -> Tensor:
-    """Slightly blurred colours (3, H, W), 0 to 255, of an image (H, W, 3)."""
+    """Colours (3, H, W), 0 to 255, of an image (H, W, 3), blurred over 3x3 pixels."""
     blurred = np.ascontiguousarray(cv2.blur(rgb, (3, 3)).transpose(2, 0, 1))
     return torch.from_numpy(blurred).to(device, torch.float32)
 
 
-def fused(
+def fuse_keyframe(
     own: _Prepared, others: list[_Prepared], camera: Camera, config: DenseConfig
 ) -> FusedKeyframe:
     """Steps 4 and 5 of a keyframe with its neighbours."""
@@ -214,12 +217,14 @@ def fused(
         for other in others
     ]
     result = fuse(own.map, views, camera, own.image)
-    final = stated(regularise(result.map), result)
+    final = with_calibrated_variance(regularise(result.map), result)
     return FusedKeyframe(own.keyframe, final, result.views.cpu().numpy())
 
 
-def neighbours(own: DenseKeyframe, others: list[DenseKeyframe], count: int) -> list[DenseKeyframe]:
-    """The keyframes that share most landmarks with one, the nearer in order first of equals."""
+def choose_neighbours(
+    own: DenseKeyframe, others: list[DenseKeyframe], count: int
+) -> list[DenseKeyframe]:
+    """The keyframes that share most landmarks with ``own``; of equals the nearer in id."""
     shared = [len(np.intersect1d(own.landmark_ids, o.landmark_ids)) for o in others]
     order = sorted(range(len(others)), key=lambda k: (-shared[k], abs(others[k].id - own.id)))
     return [others[k] for k in order[:count]]

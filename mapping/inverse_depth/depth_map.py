@@ -1,19 +1,23 @@
-"""Inverse-depth maps: what is known of a keyframe's surfaces, pixel by pixel."""
+"""Inverse-depth maps: the inverse depth of a keyframe's pixels with its variance."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bmask_slam.graph.arrays import Floats, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.mapping.inverse_depth.pixelwise import gate
+from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
+from bmask_slam.mapping.inverse_depth.pixelwise import nan_where_negative, squared_gradient
 
-COMPATIBLE = 5.99
-"""Chi-square with 2 degrees of freedom at 95 %."""
+DEPTH_FILE = FileKind("fused depth", 1)
+RHO_STEP, SIGMA_STEP = 1 / 16000, 1e-6
+"""Units of the stored integers in 1/m: rho up to 4, far finer than sigma, and sigma up to 0.065."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +25,7 @@ class InverseDepthMap:
     """Independent Gaussians over inverse depth, one a pixel.
 
     Attributes:
-        rho: (H, W) float32, 1 / z in 1/m, NaN where nothing is known.
+        rho: (H, W) float32, 1 / z in 1/m, NaN where it is unknown.
         variance: (H, W) float32 in 1/m^2, NaN in the same places.
     """
 
@@ -34,14 +38,14 @@ class InverseDepthMap:
         return self.rho.abs() < torch.inf
 
     def where(self, keep: Tensor) -> InverseDepthMap:
-        """The same, with everything outside ``keep`` (H, W) unknown."""
+        """The same map, unknown outside ``keep`` (H, W)."""
         missing = torch.full_like(self.rho, torch.nan)
         return InverseDepthMap(
             torch.where(keep, self.rho, missing), torch.where(keep, self.variance, missing)
         )
 
     def without(self, hidden: Mask) -> InverseDepthMap:
-        """The same, with everything in ``hidden`` (H, W) unknown."""
+        """The same map, unknown in ``hidden`` (H, W)."""
         return self.where(torch.from_numpy(~hidden).to(self.rho.device))
 
     def depth_m(self) -> Floats:
@@ -56,12 +60,12 @@ class InverseDepthMap:
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """How a depth sensor errs.
+    """The noise model of a depth sensor.
 
     Attributes:
-        disparity_sigma_px: of the disparity bf / z; for structured light a constant.
-        lateral_sigma_px: how far from a pixel's centre its depth may have been taken.
-        min_depth_m, max_depth_m: depth outside is taken for missing.
+        disparity_sigma_px: of the disparity bf / z; constant for structured light.
+        lateral_sigma_px: distance from a pixel's centre at which its depth may have been measured.
+        min_depth_m, max_depth_m: depth outside this range counts as missing.
     """
 
     disparity_sigma_px: float = 0.08
@@ -73,35 +77,44 @@ class DepthNoise:
 def from_sensor(
     depth_m: Floats, camera: Camera, noise: DepthNoise, device: str = "cpu"
 ) -> InverseDepthMap:
-    """The measurement of a depth sensor as an inverse-depth map.
+    """The measurement (H, W) of a depth sensor as an inverse-depth map.
 
     rho = d / (f b) with d ~ N(d0, sigma_d^2) gives sigma_rho^2 = (sigma_d / (f b))^2 (paper eq. 6,
     corrected), to which the lateral error adds (sigma_lateral |grad rho|)^2.
     """
     z = torch.as_tensor(depth_m, dtype=torch.float32, device=device)
     usable = torch.minimum(z - noise.min_depth_m, noise.max_depth_m - z)
-    rho = z.reciprocal().add_(gate(usable))
+    rho = z.reciprocal().add_(nan_where_negative(usable))
     disparity = (noise.disparity_sigma_px / camera.stereo_bf_px_m) ** 2
     variance = squared_gradient(rho).mul_(noise.lateral_sigma_px**2).add_(disparity)
     return InverseDepthMap(rho, variance)
 
 
-def squared_gradient(rho: Tensor) -> Tensor:
-    """|grad rho|^2 (H, W) per pixel^2, NaN where rho is.
+def write_depth_map(path: Path, given: InverseDepthMap) -> None:
+    """Save a map, quantised; the file appears whole or not at all.
 
-    Central differences; where a neighbour is missing that direction counts as flat.
+    Raises:
+        InputError: it cannot be written.
     """
-    squared = rho * 0
-    squared[:, 1:-1] += (rho[:, 2:] - rho[:, :-2]).div_(2).nan_to_num_().square_()
-    squared[1:-1] += (rho[2:] - rho[:-2]).div_(2).nan_to_num_().square_()
-    return squared
+    arrays = {
+        "rho": _quantised(given.rho, RHO_STEP),
+        "sigma": _quantised(torch.sqrt(given.variance), SIGMA_STEP),
+    }
+    write_arrays(path, DEPTH_FILE, {}, arrays)
 
 
-def agreement(difference: Tensor, weight: Tensor, worth: float = 1.0) -> Tensor:
-    """``worth`` where difference^2 weight < 5.99, else 0; the difference is overwritten.
+def read_depth_map(path: Path) -> InverseDepthMap:
+    """Read a map. Raises InputError for a missing, foreign or broken file."""
+    arrays = read_arrays(path, DEPTH_FILE)[1]
+    known = arrays["rho"] > 0
+    rho, sigma = (
+        np.where(known, arrays[name] * np.float32(step), np.float32(np.nan))
+        for name, step in (("rho", RHO_STEP), ("sigma", SIGMA_STEP))
+    )
+    return InverseDepthMap(torch.from_numpy(rho), torch.from_numpy(sigma**2))
 
-    ``weight`` is 1 / sigma_x^2 + 1 / sigma_y^2.
-    """
-    distance = difference.square_().mul_(weight)
-    steep = 2.0**100
-    return torch.rsub(distance, COMPATIBLE * steep, alpha=steep).clamp_(0, worth)
+
+def _quantised(values: Tensor, step: float) -> NDArray[np.uint16]:
+    """Multiples of a step, at least 1, 0 where NaN."""
+    steps = torch.nan_to_num(torch.round(values / step).clamp(1, 65535))
+    return np.asarray(steps.cpu().numpy(), np.uint16)

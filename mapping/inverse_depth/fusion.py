@@ -1,4 +1,4 @@
-"""Step 4: a keyframe's map fused with what its neighbours know of the same surfaces."""
+"""Step 4: a keyframe's map is fused with its neighbours' maps of the same surfaces."""
 
 from __future__ import annotations
 
@@ -14,8 +14,13 @@ from torch.nn.functional import pad
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse
-from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap, agreement, squared_gradient
-from bmask_slam.mapping.inverse_depth.pixelwise import gate, windowed
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.inverse_depth.pixelwise import (
+    agreement,
+    nan_where_negative,
+    squared_gradient,
+    windowed,
+)
 from bmask_slam.mapping.inverse_depth.regularisation import FAR, set_order
 from bmask_slam.mapping.inverse_depth.warping import View, hypothesis, project
 
@@ -24,23 +29,23 @@ MAX_COLOUR_STEP = 15.0
 MEDIAN_CHI2 = 0.455
 SAMPLE_STEP, MIN_SAMPLE = 4, 200
 FACTOR_RANGE = (0.25, 20.0)
-"""Errors that all views share are not seen in their differences: it is never very small."""
+"""The lower bound is not small: errors that all views share do not show in their differences."""
 BLUR_PX = 0.43
 MAX_SMOOTHED = 0.9
 WRONG_SIDE = 0.03
-"""Measured on the rendered rooms' silhouettes."""
+"""Share of estimates on the rim of a silhouette that belong to the other side; measured."""
 RIM_STEP, RIM_PX = 1.05, 2
-"""So near to a surface, seeded or not, that is nearer by this factor nothing is seeded: it may be
-its rim."""
+"""No hole is seeded within so many pixels of a surface that is nearer by this factor, since the
+pixel may belong to that surface's rim."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """What Step 4 makes of a keyframe.
+    """The result of Step 4 for a keyframe.
 
     Attributes:
         map: the fused estimates.
-        views: (H, W) uint8, how many keyframes each rests on, its own among them.
+        views: (H, W) uint8, number of keyframes in each estimate, its own included.
         factor: see ``variance_factor``.
     """
 
@@ -55,27 +60,27 @@ def fuse(
     camera: Camera,
     image: Tensor | None = None,
 ) -> Fused:
-    """Fuse a map with up to six neighbours' by paper eq. (8) over compatible hypotheses.
+    """Fuse a map with those of up to six neighbours by paper eq. (8) over compatible hypotheses.
 
     Each neighbour gives one hypothesis a pixel (`mapping.inverse_depth.warping.hypothesis`) about
-    the point at
-    rho_0: the own estimate, or where there is none the nearest surface that the neighbours see
-    there. Of the own estimate and the hypotheses the largest mutually compatible set is fused,
-    rho = sum(rho_j / sigma_j^2) / sum(1 / sigma_j^2) and sigma^2 = 1 / sum(1 / sigma_j^2), since
-    these are independent views. An own estimate that nobody shares stays, unless a neighbour
-    sees through it; a surface that only one neighbour shows is not taken, nor, where there are
-    images (3, H, W), one that has another colour there.
+    the point at rho_0: the own estimate, or where there is none the nearest surface that the
+    neighbours see there. Of the own estimate and the hypotheses the largest mutually compatible set
+    is fused, rho = sum(rho_j / sigma_j^2) / sum(1 / sigma_j^2) and
+    sigma^2 = 1 / sum(1 / sigma_j^2), since these are independent views. An own estimate that is
+    compatible with no hypothesis stays, unless a neighbour sees a farther surface through it. A
+    hole is not filled by a single neighbour, nor, where there are images (3, H, W), by a surface
+    with another colour in the neighbour.
     """
     views, known = neighbours[:MAX_NEIGHBOURS], own.known
-    seeds = seeded(own, views, camera)
-    asked, empty = torch.where(known, own.rho, seeds), torch.isnan(own.rho).to(torch.float32)
-    said = [hypothesis(asked, view, camera, empty) for view in views]
-    factor = variance_factor(own, said)
+    seeds = hole_seeds(own, views, camera)
+    points, empty = torch.where(known, own.rho, seeds), torch.isnan(own.rho).to(torch.float32)
+    hypotheses = [hypothesis(points, view, camera, empty) for view in views]
+    factor = variance_factor(own, hypotheses)
     if image is not None:
-        drop_other_colours(seeds, [v for _, v in said], (image, views), camera)
-    rho = [_definite(own.rho, FAR)]
-    rho += [_definite(r + 0 * v, FAR * k) for k, (r, v) in enumerate(said, 2)]
-    weight = [_definite(1 / v, 1.0) for v in (own.variance, *(v for _, v in said))]
+        reject_other_colours(seeds, [v for _, v in hypotheses], image, views, camera)
+    rho = [_without_nan(own.rho, FAR)]
+    rho += [_without_nan(r + 0 * v, FAR * k) for k, (r, v) in enumerate(hypotheses, 2)]
+    weight = [_without_nan(1 / v, 1.0) for v in (own.variance, *(v for _, v in hypotheses))]
     members = compatible_members(rho, weight)
     seen_through = reduce(torch.minimum, rho) < own.rho
     members += (members == 0) & known & ~seen_through
@@ -85,7 +90,7 @@ def fuse(
 def _fused(
     rho: Sequence[Tensor], weight: Sequence[Tensor], members: Tensor
 ) -> tuple[InverseDepthMap, Tensor]:
-    """The members (H, W), as bit masks, of the estimates fused, and how many they are."""
+    """The members (H, W), as bit masks, of the estimates fused, and their number (H, W)."""
     total, norm, count = (torch.zeros_like(rho[0]) for _ in range(3))
     for k, (rho_k, weight_k) in enumerate(zip(rho, weight, strict=True)):
         used = (members >> k).bitwise_and_(1).to(torch.float32)
@@ -98,16 +103,17 @@ def _fused(
     return fused, count.to(torch.uint8)
 
 
-def _definite(values: Tensor, missing: float) -> Tensor:
+def _without_nan(values: Tensor, missing: float) -> Tensor:
     return torch.nan_to_num(values, nan=missing, posinf=0.0)
 
 
 def variance_factor(own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Tensor]]) -> float:
-    """By how much the variances (H, W) that views state must be multiplied to agree with them.
+    """The factor by which the views' variances (H, W) must be multiplied to fit their differences.
 
-    The squared difference of two views over sigma_0^2 + sigma_j^2 has the median 0.455 if both are
-    right. Step 3 states the least variance of correlated neighbours, which is too large, an error
-    of the relative pose makes it too small. The median of all neighbours' factors.
+    The squared difference of two views over sigma_0^2 + sigma_j^2 has the median 0.455 if both
+    variances are right. Step 3 gives the least variance of correlated neighbours, which is too
+    large; an error of the relative pose makes the variance too small. The factor is the median over
+    the neighbours.
     """
     factors, step = [], (slice(None, None, SAMPLE_STEP),) * 2
     own_rho, own_variance = own.rho[step], own.variance[step]
@@ -118,12 +124,12 @@ def variance_factor(own: InverseDepthMap, hypotheses: Sequence[tuple[Tensor, Ten
     return float(np.clip(np.median(factors), *FACTOR_RANGE)) if factors else 1.0
 
 
-def stated(final: InverseDepthMap, before: Fused) -> InverseDepthMap:
-    """A map after Step 5 with its honest variance, by what Step 4 made.
+def with_calibrated_variance(final: InverseDepthMap, before: Fused) -> InverseDepthMap:
+    """The map after Step 5 with a consistent variance, from the result of Step 4.
 
-    It is what both Steps state times ``before.factor``, less what Step 5 smoothed away: at least
-    var(after - before), as for means over all neighbours; over compatible ones it is more.
-    Steps 3 and 5 and the reading between pixels move a depth in the image by BLUR_PX, which adds
+    It is the variance of the Steps times ``before.factor``, less the part that Step 5 smoothed
+    away, which is at least var(after - before) as for means over all neighbours. Steps 3 and 5 and
+    the interpolation between pixels move a depth in the image by BLUR_PX, which adds
     (BLUR_PX |grad rho|)^2. On the rim of a silhouette a share WRONG_SIDE of the estimates belongs
     to the surface on the other side, which adds that share of the squared step.
     """
@@ -136,7 +142,7 @@ def stated(final: InverseDepthMap, before: Fused) -> InverseDepthMap:
 
 
 def _smoothed_away(final: InverseDepthMap, before: Fused) -> float:
-    """Share of the variance, by the median change of the estimates."""
+    """Share of the variance that Step 5 removed, by the median change of the estimates."""
     step = (slice(None, None, SAMPLE_STEP),) * 2
     change = (final.rho[step] - before.map.rho[step]) ** 2 / before.map.variance[step]
     change = change[torch.isfinite(change)]
@@ -146,9 +152,9 @@ def _smoothed_away(final: InverseDepthMap, before: Fused) -> float:
 
 
 def rim_steps(given: InverseDepthMap) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows and columns (N,) of estimates beside a hole, and how far others within two pixels are.
+    """Rows and columns (N,) of estimates beside a hole, and the largest step (N,) near each.
 
-    The third is the greatest |rho_j - rho| (N,) of the 5x5 pixels around.
+    The step is the largest |rho_j - rho| over the 5x5 pixels around.
     """
     around = windowed(torch.add, given.rho, 1)  # NaN beside a hole
     rows, columns = torch.nonzero(given.known & torch.isnan(around)).unbind(-1)
@@ -159,19 +165,19 @@ def rim_steps(given: InverseDepthMap) -> tuple[Tensor, Tensor, Tensor]:
     return rows, columns, steps
 
 
-def drop_other_colours(
+def reject_other_colours(
     seeds: Tensor,
     variances: Sequence[Tensor],
-    images: tuple[Tensor, Sequence[View]],
+    image: Tensor,
+    views: Sequence[View],
     camera: Camera,
 ) -> None:
     """Make the views' variances (H, W) NaN in place where a seed has another colour in the view."""
-    own, views = images
     height, width = seeds.shape
     chosen = torch.nonzero(seeds.reshape(-1) > 0)[:, 0]
     pixels = (chosen % width).to(torch.float32), (chosen // width).to(torch.float32)
     seed = seeds.reshape(-1).index_select(0, chosen)
-    colours = own.reshape(3, -1).index_select(1, chosen)
+    colours = image.reshape(3, -1).index_select(1, chosen)
     for view, variance in zip(views, variances, strict=True):
         if view.image is None:
             continue
@@ -180,10 +186,10 @@ def drop_other_colours(
         place = u.add_(v, alpha=width).nan_to_num_().to(torch.int32)
         there = view.image.reshape(3, -1).index_select(1, place)
         apart = (colours - there).abs_().amax(0)
-        variance.view(-1).index_add_(0, chosen, gate(MAX_COLOUR_STEP - apart))
+        variance.view(-1).index_add_(0, chosen, nan_where_negative(MAX_COLOUR_STEP - apart))
 
 
-def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tensor:
+def hole_seeds(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tensor:
     """Inverse depth (H, W) of the nearest surface that neighbours see where ``own`` has none."""
     height, width = own.rho.shape
     empty = pad(torch.isnan(own.rho), (1, 1, 1, 1)).reshape(-1)
@@ -204,9 +210,9 @@ def seeded(own: InverseDepthMap, views: Sequence[View], camera: Camera) -> Tenso
 def compatible_members(rho: Sequence[Tensor], weight: Sequence[Tensor]) -> Tensor:
     """Bit masks (H, W) uint8 of the largest mutually compatible sets of two or more estimates.
 
-    ``rho`` and ``weight`` hold one (H, W) for each of up to seven keyframes; where it says nothing
-    its rho is far from all others. 0 where no two are compatible; of equal sets the one with early
-    members.
+    ``rho`` and ``weight`` hold one (H, W) for each of up to seven keyframes; where one has no
+    estimate its rho is far from all others. 0 where no two are compatible; of equally large sets
+    the one with early members.
     """
     code = torch.zeros_like(rho[0])  # holds 21 bits without loss
     for k, (i, j) in enumerate(combinations(range(len(rho)), 2)):
@@ -217,7 +223,7 @@ def compatible_members(rho: Sequence[Tensor], weight: Sequence[Tensor]) -> Tenso
 
 @cache
 def _largest_sets(n: int) -> Tensor:
-    """For every set of compatible pairs, as a bit mask, the largest set of members."""
+    """The largest set of members for every set of compatible pairs, both as bit masks."""
     pairs = list(combinations(range(n), 2))
     codes = np.arange(1 << len(pairs), dtype=np.int32)
     table = np.zeros(len(codes), np.uint8)

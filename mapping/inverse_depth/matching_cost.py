@@ -1,6 +1,6 @@
-"""Step 2: how well two images agree under a hypothesis, summed over support windows.
+"""Step 2: matching costs of two images under a hypothesis, summed over support windows.
 
-Images are (3, H, W) float32, 0 to 255. A hypothesis is the other image brought to this one's
+Images are (3, H, W) float32, 0 to 255. A hypothesis is the other image warped to this one's
 pixels, NaN where it has none.
 """
 
@@ -18,8 +18,8 @@ class MatchingConfig:
     """Constants of the costs (Yoon and Kweon 2006; Hosni et al. 2013).
 
     Attributes:
-        alpha: share of the gradient's cost.
-        max_colour, max_gradient: at which the two costs are cut off.
+        alpha: weight of the gradient's cost.
+        max_colour, max_gradient: at which the two costs are truncated.
         gamma_colour, gamma_distance: of the support weights; radius: of their window in pixels.
         guided_radius, guided_epsilon: of the guided filter, the latter for colours 0 to 1.
     """
@@ -35,10 +35,10 @@ class MatchingConfig:
 
 
 def matching_cost(image: Tensor, other: Tensor, config: MatchingConfig) -> Tensor:
-    """Costs (H, W) of one hypothesis pixel by pixel.
+    """Costs (H, W) of the pixels under one hypothesis.
 
     (1 - alpha) min(mean |dI|, max_colour) + alpha min(|d grad_x I|, max_gradient); the largest
-    possible where the other image has nothing.
+    possible where the other image is NaN.
     """
     colour = (image - other).abs().mean(0).clamp(max=config.max_colour)
     slope = (_slope(image) - _slope(other)).abs().clamp(max=config.max_gradient)
@@ -54,9 +54,9 @@ def _slope(image: Tensor) -> Tensor:
 
 
 def support_weighted(cost: Tensor, image: Tensor, other: Tensor, config: MatchingConfig) -> Tensor:
-    """Mean cost (H, W) over a window, both images' adaptive support weights multiplied.
+    """Mean cost (H, W) over a window, weighted by both images' adaptive support weights.
 
-    w = exp(-(dC / gamma_c + dG / gamma_g)) with the Euclidean distances in colour and in the image.
+    w = exp(-(dC / gamma_c + dG / gamma_g)) with Euclidean distances in colour and in the image.
     """
     r, (height, width) = config.radius, cost.shape
     other = torch.nan_to_num(other)
@@ -76,7 +76,7 @@ def support_weighted(cost: Tensor, image: Tensor, other: Tensor, config: Matchin
 
 
 class GuidedFilter:
-    """The fast equal of adaptive support weights: He et al. 2010, with a grey guide."""
+    """A fast substitute for adaptive support weights: He et al. 2010, with a grey guide."""
 
     def __init__(self, image: Tensor, config: MatchingConfig) -> None:
         self._radius = config.guided_radius
@@ -93,7 +93,7 @@ class GuidedFilter:
         return self._box(slope) * self._guide + self._box(offset)
 
     def _box(self, values: Tensor) -> Tensor:
-        """Means over the window, at the image's rim over what is inside."""
+        """Means over the part of the window that is inside the image."""
         r, planes = self._radius, values.reshape(-1, 1, *values.shape[-2:])
         size = (2 * r + 1, 1)
         for kernel, rim in ((size, (r, 0)), (size[::-1], (0, r))):
@@ -102,10 +102,10 @@ class GuidedFilter:
 
 
 def winner(costs: Tensor) -> tuple[Tensor, Tensor]:
-    """Index of the least cost (H, W) of (D, H, W) with its fraction, and how clear it is.
+    """Index (H, W) of the least of costs (D, H, W), with its fraction, and its distinctness (H, W).
 
-    The fraction is that of the parabola through the least cost and its two neighbours. Clear is
-    the second best cost beyond these neighbours, over the best.
+    The fraction is that of the parabola through the least cost and its two neighbours. The
+    distinctness is the ratio of the least cost beyond these neighbours to the least of all.
     """
     best, index = costs.min(0)
     count = len(costs)

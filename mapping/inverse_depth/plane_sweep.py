@@ -1,4 +1,4 @@
-"""Step 2 between keyframes: a sweep over inverse depth, for what no sensor has measured."""
+"""Step 2 between keyframes: a plane sweep over inverse depth."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from bmask_slam.mapping.inverse_depth.warping import project
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """How a sweep is made.
+    """Constants of the plane sweep.
 
     Attributes:
-        levels: inverse depths tried, evenly over the search range.
-        shrink: the images are made smaller by it.
-        min_clearness: of the winner; below it the place is ambiguous.
-        max_cost: of the winner.
+        levels: number of inverse depths, evenly spaced over the search range.
+        shrink: factor by which the images are made smaller.
+        min_distinctness: of the best match; below it the match is ambiguous.
+        max_cost: of the best match.
         matching: constants of the costs.
     """
 
     levels: int = 48
     shrink: int = 2
-    min_clearness: float = 1.15
+    min_distinctness: float = 1.15
     max_cost: float = 2.5
     matching: MatchingConfig = field(default_factory=lambda: MatchingConfig(guided_radius=4))
 
@@ -48,12 +48,12 @@ def sweep(
     search_range: tuple[float, float],
     config: SweepConfig | None = None,
 ) -> InverseDepthMap:
-    """Inverse depth (H, W) of an image (3, H, W) by neighbours (image, T_own_neighbour).
+    """Inverse depth (H, W) of an image (3, H, W) from neighbours (image, T_own_neighbour).
 
-    At each level every neighbour is seen through the plane z = 1 / rho; of the neighbours the
-    better agrees, since the other may be occluded. The winner takes all, in the fraction of a
-    level. sigma_rho is one pixel of the small image over the baseline: 1 / |dp / d rho| in the
-    neighbour that moves most.
+    At each level every neighbour is warped by the plane z = 1 / rho; the cost is that of the
+    neighbour which agrees best, since the point may be occluded in the others. The level with the
+    least cost wins, refined to a fraction of a level. sigma_rho is the change of inverse depth that
+    moves a pixel of the small image by one, 1 / |dp / d rho|, in the neighbour that moves most.
     """
     config = config or SweepConfig()
     small = shrunk_camera(camera, config.shrink)
@@ -62,8 +62,8 @@ def sweep(
     levels = torch.linspace(*search_range, config.levels, device=image.device)
     planes = [_level(guide, others, small, float(rho), config.matching) for rho in levels]
     costs = GuidedFilter(guide, config.matching)(torch.stack(planes))
-    index, clear = winner(costs)
-    good = (clear > config.min_clearness) & (costs.amin(0) < config.max_cost)
+    index, distinctness = winner(costs)
+    good = (distinctness > config.min_distinctness) & (costs.amin(0) < config.max_cost)
     good &= (index > 0) & (index < config.levels - 1)
     step = (search_range[1] - search_range[0]) / (config.levels - 1)
     rho = torch.where(good, search_range[0] + index * step, torch.nan)
@@ -79,22 +79,22 @@ def _level(
     rho: float,
     config: MatchingConfig,
 ) -> Tensor:
-    """Costs (h, w) of one inverse depth: the least of all neighbours'."""
+    """Costs (h, w) of one inverse depth: the least over the neighbours."""
     plane = torch.full(guide.shape[-2:], rho, device=guide.device)
     costs = []
     for other, T_other_own in others:
         u, v, _ = project(plane, T_other_own, camera)
-        seen = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
+        inside = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
         grid = torch.stack(
             [u * (2 / (camera.width - 1)) - 1, v * (2 / (camera.height - 1)) - 1], dim=-1
         )[None]
         warped = grid_sample(other[None], grid, "bilinear", "border", align_corners=True)[0]
-        costs.append(matching_cost(guide, torch.where(seen, warped, torch.nan), config))
+        costs.append(matching_cost(guide, torch.where(inside, warped, torch.nan), config))
     return torch.stack(costs).amin(0)
 
 
 def _motion(rho: Tensor, T_other_own: Array, camera: Camera) -> Tensor:
-    """|dp / d rho| (h, w) of the pixel in the neighbour, by a small step."""
+    """|dp / d rho| (h, w) of the pixel in the neighbour, by a finite difference."""
     step = 1e-3
     u, v, _ = project(rho, T_other_own, camera)
     u2, v2, _ = project(rho + step, T_other_own, camera)
@@ -115,7 +115,7 @@ def _shrunk(image: Tensor, by: int) -> Tensor:
 
 
 def _enlarged(small: InverseDepthMap, shape: Sequence[int]) -> InverseDepthMap:
-    """Every pixel takes its block's estimate."""
+    """A map of a larger shape (H, W) in which every pixel has the estimate of its block."""
     rho, variance = (
         interpolate(x[None, None], size=tuple(shape), mode="nearest-exact")[0, 0]
         for x in (small.rho, small.variance)
@@ -123,10 +123,10 @@ def _enlarged(small: InverseDepthMap, shape: Sequence[int]) -> InverseDepthMap:
     return InverseDepthMap(rho, variance)
 
 
-def completed(measured: InverseDepthMap, swept: InverseDepthMap) -> InverseDepthMap:
-    """The measurement where there is one, what the sweep found elsewhere."""
+def fill_missing(measured: InverseDepthMap, matched: InverseDepthMap) -> InverseDepthMap:
+    """The measurement where there is one, the match of images elsewhere."""
     known = measured.known
     return InverseDepthMap(
-        torch.where(known, measured.rho, swept.rho),
-        torch.where(known, measured.variance, swept.variance),
+        torch.where(known, measured.rho, matched.rho),
+        torch.where(known, measured.variance, matched.variance),
     )

@@ -1,23 +1,28 @@
-"""Steps 3 and 5: outliers of a map removed and its holes filled by the eight neighbours."""
+"""Steps 3 and 5: outliers of a map are removed and holes filled from the eight neighbours."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from bmask_slam.mapping.inverse_depth.depth_map import COMPATIBLE, InverseDepthMap, agreement
-from bmask_slam.mapping.inverse_depth.pixelwise import gate, windowed
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.inverse_depth.pixelwise import (
+    COMPATIBLE,
+    agreement,
+    nan_where_negative,
+    windowed,
+)
 
 OFFSETS = tuple((dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0))
 MIN_SUPPORT = 2
 FAR = 1e6
-"""Stands for what is missing: compatible with no estimate."""
+"""Inverse depth of missing pixels: compatible with no estimate."""
 FILL_SUPPORT = 5
-"""The paper's 2 also fills the rim of silhouettes, from whichever side has more pixels."""
+"""The paper has 2, which also fills the rim of silhouettes, from the side with more pixels."""
 
 
 def regularise(given: InverseDepthMap, fill_support: int = FILL_SUPPORT) -> InverseDepthMap:
-    """A map smoothed, cleaned and completed at the rims of its holes.
+    """The map smoothed, without outliers, and with the rims of its holes filled.
 
     Neighbours x and y are compatible where (rho_x - rho_y)^2 (1/sigma_x^2 + 1/sigma_y^2) < 5.99. A
     pixel with fewer than two compatible neighbours is dropped; else it and they are fused by
@@ -31,26 +36,26 @@ def regularise(given: InverseDepthMap, fill_support: int = FILL_SUPPORT) -> Inve
     count, total = torch.zeros_like(rho), rho * weight
     norm, best = weight.clone(), weight.clone()
 
-    def take(agreeing: Tensor, offset: tuple[int, int]) -> None:
-        """Add the neighbours at an offset that agree (H, W)."""
+    def accumulate(agreeing: Tensor, offset: tuple[int, int]) -> None:
+        """Add the neighbours at an offset where they agree (H, W)."""
         share = agreeing * _shifted(weights, offset)
         count.add_(agreeing)
         norm.add_(share)
         total.addcmul_(share, _shifted(rhos, offset))
         torch.maximum(best, share, out=best)
 
-    for dy, dx in OFFSETS[:4]:  # what agrees does so in both directions
+    for dy, dx in OFFSETS[:4]:  # agreement is symmetric
         both = weight + _shifted(weights, (dy, dx))
         agreeing = agreement(rho - _shifted(rhos, (dy, dx)), both)
-        take(agreeing, (dy, dx))
-        take(_shifted(_padded(agreeing), (-dy, -dx)), (-dy, -dx))
-    rho = total.div_(norm).add_(gate(count.sub_(MIN_SUPPORT)))
+        accumulate(agreeing, (dy, dx))
+        accumulate(_shifted(_padded(agreeing), (-dy, -dx)), (-dy, -dx))
+    rho = total.div_(norm).add_(nan_where_negative(count.sub_(MIN_SUPPORT)))
     cleaned = InverseDepthMap(rho, best.reciprocal_().add_(0 * rho))
     return _filled(cleaned, rhos, weights, fill_support)
 
 
 def _padded(values: Tensor, rim: float = 0.0) -> Tensor:
-    """With a rim one pixel wide."""
+    """Values (H, W) with a rim of one pixel."""
     return torch.nn.functional.pad(values, (1, 1, 1, 1), value=rim)
 
 
@@ -64,9 +69,9 @@ def _shifted(padded: Tensor, offset: tuple[int, int]) -> Tensor:
 def _filled(
     cleaned: InverseDepthMap, rhos: Tensor, weights: Tensor, support: int
 ) -> InverseDepthMap:
-    """``cleaned``, with what was empty before filled from its neighbours there.
+    """``cleaned`` with the holes of the given map filled from their neighbours.
 
-    ``rhos`` and ``weights`` are what was given, with a rim.
+    ``rhos`` and ``weights`` are those of the given map with a rim.
     """
     known = weights[1:-1, 1:-1].sign()
     around = windowed(torch.add, known, 1).sub_(known, alpha=len(OFFSETS) + 1)
@@ -88,19 +93,19 @@ def largest_compatible_set(rho: Tensor, weight: Tensor) -> Tensor:
     """Members (N, 8) bool of the largest set of mutually compatible estimates in each row.
 
     ``rho`` (N, 8) with weights 1 / sigma^2 (N, 8), 0 where there is none. Of equally large sets
-    the first in the order of `set_order` is taken; one alone is no set.
+    the first in the order of `set_order` is taken; a single estimate is no set.
     """
     distance = (rho[:, :, None] - rho[:, None]) ** 2 * (weight[:, :, None] + weight[:, None])
     there = weight > 0
     apart = there[:, :, None] & there[:, None] & ~(distance < COMPATIBLE)
     members = there & (there.sum(-1, keepdim=True) > 1)
-    torn = torch.nonzero(apart.any((1, 2)))[:, 0]
-    members[torn] = _largest_by_trying(apart[torn], there[torn])
+    conflicting = torch.nonzero(apart.any((1, 2)))[:, 0]
+    members[conflicting] = _largest_by_trial(apart[conflicting], there[conflicting])
     return members
 
 
-def _largest_by_trying(apart: Tensor, there: Tensor) -> Tensor:
-    """The same for rows of which some are ``apart`` (N, 8, 8) among those ``there`` (N, 8)."""
+def _largest_by_trial(apart: Tensor, there: Tensor) -> Tensor:
+    """The same by trying all sets; pairs ``apart`` (N, 8, 8) are incompatible."""
     n = there.shape[-1]
     sets = [[s >> i & 1 for i in range(n)] for s in set_order(n)]
     tried = torch.tensor(sets, dtype=torch.float32, device=there.device)
@@ -112,6 +117,6 @@ def _largest_by_trying(apart: Tensor, there: Tensor) -> Tensor:
 
 
 def set_order(n: int) -> list[int]:
-    """Sets of two to n members as bit masks: larger ones first, then those of early members."""
+    """Sets of two to n members as bit masks: larger ones first, then those with early members."""
     subsets = [s for s in range(1, 1 << n) if s.bit_count() > 1]
     return sorted(subsets, key=lambda s: (-s.bit_count(), [-(s >> i & 1) for i in range(n)]))

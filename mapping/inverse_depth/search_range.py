@@ -12,12 +12,12 @@ MIN_LANDMARKS = 5
 def search_range(
     depths_m: Array, share: float = 0.98, margin: float = 0.25
 ) -> tuple[float, float] | None:
-    """Least and largest inverse depth in 1/m by the depths (N,) of a keyframe's landmarks.
+    """Least and largest inverse depth in 1/m from the depths (N,) of a keyframe's landmarks.
 
-    Algorithm 1 prints min and max, which one outlier ruins: here the middle ``share`` of the
-    INVERSE depths, widened at both ends by ``margin`` of its length, since surfaces go on beyond
-    their landmarks, and never nearer than half the nearest or farther than twice the farthest.
-    None where fewer than MIN_LANDMARKS are in front of the camera.
+    Algorithm 1 uses min and max, which one outlier spoils. Here it is the middle ``share`` of the
+    inverse depths, widened at both ends by ``margin`` of its length because surfaces extend beyond
+    their landmarks, but at most to half the least and twice the largest of them. None where fewer
+    than MIN_LANDMARKS are in front of the camera.
     """
     depths_m = np.asarray(depths_m, float)
     rho = 1 / depths_m[np.isfinite(depths_m) & (depths_m > 0)]

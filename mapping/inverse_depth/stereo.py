@@ -1,4 +1,4 @@
-"""Step 2 for rectified stereo pairs: disparities in the search range, checked from both sides."""
+"""Step 2 for rectified stereo pairs: disparities in the search range, with a left-right check."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ def match_stereo(
 ) -> InverseDepthMap:
     """Inverse depth of the left image of a rectified pair (3, H, W), u_right = u_left - d.
 
-    Costs are summed by a guided filter, or with ``exact`` by adaptive support weights; the winner
-    takes all within ``search_range`` (1/m) and a pixel around it; what wins at the rim of that is
-    no minimum and is dropped, as is what the right image's winner does not confirm within a pixel.
-    sigma_rho = sigma_d / (f b) with sigma_d = 1 px.
+    Costs are summed by a guided filter, or with ``exact`` by adaptive support weights. The least
+    cost within ``search_range`` (1/m), extended by one pixel of disparity at both ends, wins. A
+    winner at an end of the range is no minimum and is dropped, and so is one that the match of the
+    right image does not confirm within a pixel. sigma_rho = sigma_d / (f b) with sigma_d = 1 px.
     """
     bf, config = camera.stereo_bf_px_m, config or MatchingConfig()
     first = max(math.floor(search_range[0] * bf) - 1, 0)
     last = math.ceil(search_range[1] * bf) + 1
-    costs = _summed(left, right, range(first, last + 1), (config, exact))
-    mirrored = _summed(right.flip(-1), left.flip(-1), range(first, last + 1), (config, exact))
+    disparities = range(first, last + 1)
+    costs = _summed(left, right, disparities, config, exact)
+    mirrored = _summed(right.flip(-1), left.flip(-1), disparities, config, exact)
     disparity = winner(costs)[0] + first
     other = (winner(mirrored)[0] + first).flip(-1)
     inner = (disparity > max(first, 0.5)) & (disparity < last)
-    known = inner & checked(disparity, other)
+    known = inner & left_right_consistent(disparity, other)
     rho = torch.where(known, disparity / bf, torch.nan)
     return InverseDepthMap(rho, torch.where(known, bf**-2, torch.nan))
 
 
 def _summed(
-    image: Tensor, other: Tensor, disparities: range, how: tuple[MatchingConfig, bool]
+    image: Tensor, other: Tensor, disparities: range, config: MatchingConfig, exact: bool
 ) -> Tensor:
-    """Costs (D, H, W) of the other image moved right by each disparity."""
-    config, exact = how
+    """Costs (D, H, W) of the other image shifted right by each disparity."""
     moved = [pad(other, (d, 0), value=torch.nan)[..., : other.shape[-1]] for d in disparities]
     costs = [matching_cost(image, m, config) for m in moved]
     if exact:
@@ -62,8 +62,8 @@ def _summed(
     return GuidedFilter(image, config)(torch.stack(costs))
 
 
-def checked(disparity: Tensor, other: Tensor) -> Tensor:
-    """Pixels (H, W) of the left image whose match in the right image has their disparity too."""
+def left_right_consistent(disparity: Tensor, other: Tensor) -> Tensor:
+    """Pixels (H, W) of the left image whose match in the right image has the same disparity."""
     columns = torch.arange(disparity.shape[1], device=disparity.device)
     at = torch.round(columns - disparity).long()
     inside = (at >= 0) & (at < disparity.shape[1])

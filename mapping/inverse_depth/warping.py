@@ -1,4 +1,4 @@
-"""How one keyframe's inverse-depth map looks from another."""
+"""One keyframe's inverse-depth map as seen from another keyframe."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
-from bmask_slam.mapping.inverse_depth.pixelwise import gate
+from bmask_slam.mapping.inverse_depth.pixelwise import image_grid, nan_where_negative
 
 MAX_APART_PX = 1.0
-"""A neighbour's point farther from the pixel's ray is another point."""
+"""A neighbour's point that is farther from the pixel's ray is another point."""
 JUMP_SIGMAS = 3.0
-"""Four pixels are one surface where interpolation stays within so many sigmas of the nearest."""
+"""Four pixels are one surface if interpolation stays within so many sigmas of the nearest one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class View:
 
     Attributes:
         map: its inverse depth.
-        T_own_neighbour: (4, 4), its pose seen from the keyframe.
+        T_own_neighbour: (4, 4), its pose in the frame of the keyframe.
         image: (3, H, W) float32 colours 0 to 255, or None.
     """
 
@@ -39,15 +39,16 @@ class View:
 def hypothesis(
     seeds: Tensor, view: View, camera: Camera, inner: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """What a neighbour says of the points at inverse depth ``seeds`` (H, W) on each pixel's ray.
+    """A neighbour's estimate of the inverse depth of each pixel, mean (H, W) and variance (H, W).
 
-    Each point is projected into the neighbour, whose rho and sigma there are mapped back as
-    {rho + sigma, rho, rho - sigma} to p1, p2, p3: the mean p2 (H, W) and the variance
-    max(|p1 - p2|, |p3 - p2|)^2 (H, W), NaN where it says nothing. Where ``inner`` (H, W) is 1, not
-    0, only the inside of a surface counts: its last pixels reach up to half a pixel beyond its rim.
+    The point at inverse depth ``seeds`` (H, W) on the pixel's ray is projected into the neighbour,
+    whose rho and sigma there are mapped back as {rho + sigma, rho, rho - sigma} to p1, p2, p3: the
+    mean is p2 and the variance max(|p1 - p2|, |p3 - p2|)^2, NaN where the neighbour has no
+    estimate. Where ``inner`` (H, W) is 1, not 0, only pixels inside a surface count, since those at
+    its rim reach up to half a pixel beyond it.
 
     With w the ratio of seed and its inverse depth in the neighbour, (t_x, t_y, t_z) the
-    neighbour's place, e = w rho - seed and d = 1 + t_z e, mapping back gives p2 = w rho / d,
+    neighbour's position, e = w rho - seed and d = 1 + t_z e, mapping back gives p2 = w rho / d,
     |p3 - p2| = w sigma |1 - t_z seed| / (d |d - |t_z| w sigma|), which is the greater for t_z > 0
     as |p1 - p2| is for t_z < 0, and the pixel is missed by e / d (K t - t_z pixel).
     """
@@ -62,7 +63,9 @@ def hypothesis(
     lever = (b_x - t_z * columns) ** 2 + (b_y - t_z * rows) ** 2
     margin = torch.minimum(margin, torch.minimum(d, rho - sigma))
     missed = e.square_().mul_(lever)
-    usable = gate(torch.minimum(margin, d.square().mul_(MAX_APART_PX**2).sub_(missed)))
+    usable = nan_where_negative(
+        torch.minimum(margin, d.square().mul_(MAX_APART_PX**2).sub_(missed))
+    )
     least = torch.sub(d, sigma, alpha=abs(t_z)).mul_(d)
     spread = (1 - t_z * seeds).mul_(sigma).div_(least).square_()
     return rho.div_(d).add_(usable), spread.add_(usable)
@@ -71,10 +74,11 @@ def hypothesis(
 def project(
     rho: Tensor, T_other_own: Array, camera: Camera, pixels: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Where points at inverse depth ``rho`` appear in another keyframe.
+    """Project points at inverse depth ``rho`` into another keyframe.
 
-    ``pixels`` are their columns and rows, those of a whole image if not given. Returns columns and
-    rows there, infinite or NaN behind that camera, and rho over the inverse depth there, 0 behind.
+    ``pixels`` are their columns and rows; None: all pixels of an image. Returns columns and rows in
+    the other image, infinite or NaN behind that camera, and the ratio of rho to the inverse depth
+    there, 0 behind it.
     """
     if pixels is None:
         pixels = image_grid(rho)
@@ -89,21 +93,13 @@ def project(
     return x.div_(w), y.div_(w), w
 
 
-def image_grid(like: Tensor) -> tuple[Tensor, Tensor]:
-    """Columns (1, W) and rows (H, 1) of an image's pixels."""
-    height, width = like.shape
-    columns = torch.arange(width, dtype=torch.float32, device=like.device)
-    rows = torch.arange(height, dtype=torch.float32, device=like.device)
-    return columns[None], rows[:, None]
-
-
 def _sampled(
     view: InverseDepthMap, u: Tensor, v: Tensor, inner: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """rho and sigma of a map at pixels (H, W), and a margin (H, W), negative or NaN where unusable.
 
-    Inverse depth is linear in the image of a plane, so it is interpolated; where the pixels
-    around are not one surface the nearest is taken, or none where ``inner`` (H, W) is 1.
+    Inverse depth is linear in the image of a plane, so it is interpolated; where the four pixels
+    are not one surface the nearest is used, or none where ``inner`` (H, W) is 1.
     """
     height, width = view.rho.shape
     margin = torch.minimum(torch.minimum(u, width - 1 - u), torch.minimum(v, height - 1 - v))

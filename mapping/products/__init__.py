@@ -1,1 +1,1 @@
-"""TODO."""
+"""What is made of fused depth: submaps, labelled clouds, mesh, floor plan, pictures."""

@@ -1,25 +1,26 @@
 """The cloud of all submaps: one point a voxel, colours averaged, labels fused in log space.
 
-Memory is bounded by the largest block of space, not by the map: points go through files on disk.
+Points are sorted into cubes of space on disk, so that memory is bounded by one cube.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints
+from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints, Mask
 from bmask_slam.mapping.products.submaps import Submap, voxel_keys
 from bmask_slam.mapping.products.surface_labels import LabelTable
 
 BLOCK_VOXELS = 256
 CELL_VOXELS = 3
-"""Sides of a cell in which a submap that has no point in a voxel is asked for its labels."""
+"""Edge of a cell: a submap without points in a voxel gives the voxel the labels of its cell."""
 _POINT = np.dtype(
     [
         ("point", "<f4", 3),
@@ -41,7 +42,7 @@ class Cloud:
         sigmas_m: (N,) float32, standard deviation.
         labels: (N,) uint16, most probable class; 0 is the background.
         probabilities: (N,) float32 of that class.
-        views: (N,) uint16, submaps that were fused.
+        views: (N,) uint16, number of points that were fused.
     """
 
     points: Floats
@@ -55,42 +56,63 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    def select(self, rows: Mask | slice) -> Cloud:
+        """Some of the points."""
+        return Cloud(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-def spill(submaps: Iterable[tuple[Submap, Array, int]], voxel_m: float, folder: Path) -> list[Path]:
-    """Sort the points of all submaps into one file a block of space; the files, in a fixed order.
+    @staticmethod
+    def concatenate(clouds: Sequence[Cloud]) -> Cloud:
+        """The points of several clouds."""
+        return Cloud(*(np.concatenate([getattr(c, f.name) for c in clouds]) for f in fields(Cloud)))
 
-    Each submap comes with the pose of its anchor (4, 4) in the world and the number of its first
-    instance (its row 0) in a table of all submaps' instances.
+
+@dataclass(frozen=True, eq=False)
+class PlacedSubmap:
+    """A submap in the world.
+
+    Attributes:
+        submap: its points.
+        T_world_anchor: (4, 4), pose of its anchor.
+        first_instance: row of its instance 0, which stands for no instance, in the `LabelTable`.
     """
+
+    submap: Submap
+    T_world_anchor: Array
+    first_instance: int
+
+
+def sort_into_blocks(submaps: Iterable[PlacedSubmap], voxel_m: float, folder: Path) -> list[Path]:
+    """Write the points of all submaps, one file a block of space; the files in a fixed order."""
     files: dict[int, Path] = {}
-    for submap, T_world_anchor, first_instance in submaps:
+    for placed in submaps:
+        submap = placed.submap
         rows = np.empty(len(submap), _POINT)
-        rows["point"], rows["normal"] = submap.placed(T_world_anchor)
+        rows["point"], rows["normal"] = submap.placed(placed.T_world_anchor)
         rows["colour"], rows["weight"] = submap.colours, 1 / submap.variances
-        rows["instance"] = submap.instances.astype(np.int64) + first_instance
+        rows["instance"] = submap.instances.astype(np.int64) + placed.first_instance
         keys = voxel_keys(rows["point"], BLOCK_VOXELS * voxel_m)
         order = np.argsort(keys, kind="stable")
         keys, rows = keys[order], rows[order]
         starts = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]][: len(keys)])
-        for start, part in zip(starts, np.split(rows, starts[1:]), strict=False):
+        for start, end in pairwise([*starts.tolist(), len(rows)]):
             path = files.setdefault(int(keys[start]), folder / f"{keys[start]}.points")
             with path.open("ab") as file:
-                file.write(part.tobytes())
+                file.write(rows[start:end].tobytes())
     return [files[key] for key in sorted(files)]
 
 
-def merged(files: Iterable[Path], voxel_m: float, table: LabelTable) -> Iterator[Cloud]:
-    """The cloud of each block that ``spill`` wrote."""
+def merge_blocks(files: Iterable[Path], voxel_m: float, table: LabelTable) -> Iterator[Cloud]:
+    """The cloud of each block that ``sort_into_blocks`` wrote."""
     for path in files:
-        yield merge(np.fromfile(path, _POINT), voxel_m, table)
+        yield merge_points(np.fromfile(path, _POINT), voxel_m, table)
 
 
-def merge(rows: NDArray, voxel_m: float, table: LabelTable) -> Cloud:
-    """One point a voxel of rows of type _POINT.
+def merge_points(rows: NDArray, voxel_m: float, table: LabelTable) -> Cloud:
+    """One point a voxel from rows of type _POINT.
 
     Positions and normals are means weighted by 1 / sigma^2, colours plain means. The variance is
     the least of the voxel's points: their submaps were fused with each other and are no
-    independent views. Labels are what the submaps' instances say, each submap once.
+    independent views. Labels are fused from the submaps' instances, each submap once.
     """
     _, voxel, views = np.unique(
         voxel_keys(rows["point"], voxel_m), return_inverse=True, return_counts=True
@@ -126,9 +148,9 @@ def _mean(voxel: NDArray, values: NDArray, weight: Array, total: Array) -> Array
 def _fused_labels(
     voxel: NDArray, cell: NDArray, instance: NDArray, table: LabelTable
 ) -> tuple[NDArray[np.uint16], Floats]:
-    """Class (M,) and its probability (M,) of voxels, points (N,) in them being of instances (N,).
+    """Class (M,) and its probability (M,) of voxels.
 
-    ``cell`` (M,) is that of each voxel.
+    ``voxel`` (N,) and ``instance`` (N,) are those of the points, ``cell`` (M,) those of the voxels.
     """
     if table.log_likelihoods.shape[1] == 1:
         return np.zeros(len(cell), np.uint16), np.ones(len(cell), np.float32)
@@ -140,10 +162,10 @@ def _fused_labels(
 
 
 def _views(voxel: NDArray, cell: NDArray, instance: NDArray, submap_of: Ints) -> csr_matrix:
-    """(M, I) shares of instances in what each submap shows of each voxel, one in all.
+    """Weights (M, I) of instances in each voxel; those of a submap sum to one or are all zero.
 
-    A submap that has points in a voxel's cell, but none in the voxel, since its own grid lies
-    otherwise, shows there what it shows in the cell.
+    A submap's weights are the shares of its points in the voxel. Where it has points in the voxel's
+    cell but none in the voxel, since its own grid is another, they are its shares in the cell.
     """
     submap, instances = submap_of[instance], len(submap_of)
     count = int(submap_of[-1]) + 1
@@ -156,7 +178,7 @@ def _views(voxel: NDArray, cell: NDArray, instance: NDArray, submap_of: Ints) ->
 
 
 def _shares(pair: NDArray, instance: NDArray, instances: int) -> tuple[NDArray, csr_matrix]:
-    """The pairs (P,) that points (N,) have, rising, and the shares (P, I) of instances in each."""
+    """The pairs (P,) that occur among points (N,), sorted, and the shares (P, I) of instances."""
     pairs, row, points = np.unique(pair, return_inverse=True, return_counts=True)
     share = (1 / points[row]).astype(np.float32)
     return pairs, csr_matrix((share, (row, instance)), (len(pairs), instances))

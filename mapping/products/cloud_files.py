@@ -22,14 +22,17 @@ _PACKED = ("blue", "green", "red", "alpha")
 
 
 class CloudWriter:
-    """Takes blocks of a cloud and writes them as binary PLY and PCD under one name.
+    """Writes blocks of a cloud as binary PLY and PCD.
 
-    A context manager: the files take their names when the block ends well.
+    A context manager: the files appear under their names only if its block ends without an error.
+
+    Attributes:
+        count: points written so far.
     """
 
     def __init__(self, stem: Path, palette: Bytes | None = None) -> None:
-        """``stem`` is the path without suffix; with a ``palette`` (C, 3) points get their
-        label's colour.
+        """``stem`` is the path without suffix; with a ``palette`` (C, 3) points have the colours of
+        their labels.
         """
         self.stem = stem
         self.count = 0
@@ -75,7 +78,7 @@ class CloudWriter:
             shutil.copyfileobj(body, out)
 
 
-# PCD's rgb is a number of 32 bits: its bytes are PLY's blue, green, red and alpha.
+# PCD's rgb is a 32-bit number whose bytes are PLY's blue, green, red and alpha.
 _LAYOUT = np.dtype(
     [
         *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")),

@@ -1,4 +1,4 @@
-"""The map from above: what stands where, where one can walk, and what it is."""
+"""The floor plan: cells with obstacles and their labels, free floor, and the camera's path."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from bmask_slam.mapping.products.pictures import EMPTY, palette, with_legend
 
 FLOOR_COLOUR = (235, 230, 215)
 HEIGHTS_M = (0.1, 1.9)
-"""Above the floor: what stands between is in the way."""
+"""Heights above the floor between which points are obstacles."""
 UPRIGHT_COSINE = 0.95
 BIN_M = 0.04
 GUESS_DEG, CANDIDATES = 45.0, 400
 
 
 def up_direction(normals: NDArray[np.floating], first_guess: Array) -> Array:
-    """The world's upward unit vector (3,): where most normals (N, 3) lie near ``first_guess``.
+    """The world's upward unit vector (3,): the most frequent normal (N, 3) near ``first_guess``.
 
-    Floors and table tops have it, ceilings its opposite. The guess, e.g. the cameras' mean -y
-    axis, may be GUESS_DEG off. Of CANDIDATES normals the one with most others within 8 degrees
-    begins; means over cones that narrow to 4 degrees make it exact.
+    Floors and table tops have this normal, ceilings its opposite. The guess, e.g. the cameras' mean
+    -y axis, may be GUESS_DEG off. The search starts with the one of CANDIDATES normals that has
+    most others within 8 degrees, and refines it by means over cones that narrow to 4 degrees.
     """
     up = first_guess / np.linalg.norm(first_guess)
     cosine = normals @ up
@@ -44,10 +44,10 @@ def up_direction(normals: NDArray[np.floating], first_guess: Array) -> Array:
     return np.asarray(up, float)
 
 
-def levelled(points: Array, up: Array, floor_m: float) -> tuple[Array, float]:
-    """Up and the floor's height by a plane through the points (N, 3) near the floor.
+def fit_floor(points: Array, up: Array, floor_m: float) -> tuple[Array, float]:
+    """Up (3,) and the floor's height, from a plane through the points (N, 3) near the floor.
 
-    Normals are noisy: over some metres their mean is centimetres off.
+    The mean of the normals is not exact enough: over some metres it is centimetres off.
     """
     for _ in range(4):
         near = points[np.abs(points @ up - floor_m) < 1.5 * BIN_M]
@@ -61,7 +61,7 @@ def levelled(points: Array, up: Array, floor_m: float) -> tuple[Array, float]:
 
 
 def floor_height(heights_m: Array, share: float = 0.15) -> float:
-    """Height of the floor by those (N,) of upward-facing points: the lowest of the strong peaks."""
+    """Height of the floor: the lowest strong peak of the heights (N,) of upward-facing points."""
     if not len(heights_m):
         return 0.0
     low = float(np.quantile(heights_m, 0.002))
@@ -88,11 +88,11 @@ class PlanFrame:
 
 
 def plan_frame(cloud_sample: Cloud, first_guess: Array, cell_m: float) -> PlanFrame:
-    """The frame by a sample of the cloud: up by the floor, right along the longest walls."""
+    """The plan's frame from a sample of the cloud: up from the floor, right along the walls."""
     up = up_direction(cloud_sample.normals, first_guess)
     facing_up = cloud_sample.normals @ up > UPRIGHT_COSINE
-    level = cloud_sample.points[facing_up].astype(float)
-    up, floor_m = levelled(level, up, floor_height(level @ up))
+    facing = cloud_sample.points[facing_up].astype(float)
+    up, floor_m = fit_floor(facing, up, floor_height(facing @ up))
     helper = np.eye(3)[np.argmin(np.abs(up))]
     right = np.cross(helper, up)
     right /= np.linalg.norm(right)
@@ -108,7 +108,7 @@ def plan_frame(cloud_sample: Cloud, first_guess: Array, cell_m: float) -> PlanFr
 
 
 class FloorPlan:
-    """Cells that fill as blocks of the cloud arrive."""
+    """A grid of cells that counts the points of a cloud, block by block."""
 
     def __init__(self, frame: PlanFrame, classes: int) -> None:
         self.frame = frame
@@ -117,7 +117,7 @@ class FloorPlan:
         self._floor = np.zeros((0, 2), np.int64)
 
     def add(self, cloud: Cloud) -> None:
-        """Take a block in."""
+        """Add a block of the cloud."""
         placed = cloud.points.astype(float) @ self.frame.axes.T
         height_m = placed[:, 2] - self.frame.floor_m
         cells = np.floor(placed[:, :2] / self.frame.cell_m).astype(np.int64)
@@ -129,9 +129,9 @@ class FloorPlan:
         self._floor = np.concatenate([self._floor, np.unique(walked, axis=0)])
 
     def grid(self, path_world: Array) -> tuple[NDArray[np.int16], Array]:
-        """Cells (rows, the foremost last; columns right): label, -1 floor, -2 unseen.
+        """The cells (H, W), forward is up: label of an obstacle, -1 for floor, -2 for unobserved.
 
-        Also the path (N, 3) in columns and rows (N, 2), all of it inside.
+        The second result is the path (N, 3) in columns and rows (N, 2), which lies in the grid.
         """
         path = (path_world @ self.frame.axes.T)[:, :2] / self.frame.cell_m
         cells = np.concatenate([self._standing[:, :2], self._floor, np.floor(path).astype(int)])
@@ -164,7 +164,7 @@ class FloorPlan:
 
 
 def _labels(votes: Ints) -> Ints:
-    """The class of each cell (N, C): a thing before the background, with a fifth of the points."""
+    """The class (N,) of cells by votes (N, C): an object with a fifth of them beats background."""
     things = votes[:, 1:]
     if things.shape[1] == 0:
         return np.zeros(len(votes), np.int64)
@@ -173,7 +173,7 @@ def _labels(votes: Ints) -> Ints:
 
 
 def _scale_bar(image: Image, px_per_m: float, margin: int) -> None:
-    """One metre, at the lower left."""
+    """Draw a bar of one metre at the lower left."""
     x, y, length = margin, image.shape[0] - margin // 2, round(px_per_m)
     cv2.rectangle(image, (x, y - 6), (x + length, y), (0, 0, 0), -1)
     cv2.putText(

@@ -1,4 +1,4 @@
-"""Submaps: the surfaces that a keyframe sees, as points in its own frame."""
+"""Submaps: the surfaces that a keyframe observes, as points in its own frame."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Submap:
         normals: (N, 3) float32 unit vectors towards the camera, anchor frame.
         colours: (N, 3) uint8 red first.
         variances: (N,) float32 m^2 of the depth.
-        instances: (N,) uint16, number of the keyframe's instance that shows there, from 1; 0 none.
+        instances: (N,) uint16, number of the keyframe's instance at the point, from 1; 0 for none.
     """
 
     anchor: int
@@ -51,10 +51,9 @@ class Submap:
 
 
 def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) -> Submap:
-    """The submap of a fused keyframe, one point a voxel of ``voxel_m``.
+    """The submap of a fused keyframe, with at most one point in a voxel of ``voxel_m``.
 
-    Points without a normal, and those seen at less
-    than 6 degrees, are left out: they are rims.
+    Points without a normal and those observed at less than 6 degrees are dropped: they are rims.
     """
     grid = back_project(result.map, camera).reshape(-1, 3)
     normals = surface_normals(result.map, camera).reshape(-1, 3)
@@ -64,7 +63,7 @@ def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) ->
     squared_depth = result.map.rho.square().reciprocal_()
     depth_variance = (result.map.variance * squared_depth.square_()).reshape(-1)
     variances = depth_variance.index_select(0, pixels).cpu().numpy()
-    keep = nearest_a_voxel(points, variances, voxel_m)
+    keep = surest_per_voxel(points, variances, voxel_m)
     kept = pixels.cpu().numpy()[keep]
     instances = result.keyframe.instances
     if instances is None:
@@ -79,21 +78,19 @@ def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) ->
     )
 
 
-def relabelled(
-    submap: Submap, camera: Camera, instances: NDArray[np.uint16], moves: Mask
-) -> Submap:
-    """A submap with the instances (H, W) of its keyframe, without points on what ``moves`` (H, W).
+def relabel(submap: Submap, camera: Camera, instances: NDArray[np.uint16], hidden: Mask) -> Submap:
+    """The submap with other instances (H, W) of its keyframe, without ``hidden`` pixels (H, W).
 
-    Points were made of pixels' centres, which are found again by projection.
+    Its points are back-projected pixel centres, so that projection gives their pixels.
     """
     columns, rows = np.rint(camera.project(submap.points.astype(float))).astype(np.int64).T
-    keep = ~moves[rows, columns]
+    keep = ~hidden[rows, columns]
     arrays = {name: values[keep] for name, values in _arrays(submap).items()}
     return Submap(submap.anchor, **arrays | {"instances": instances[rows, columns][keep]})
 
 
-def nearest_a_voxel(points: Floats, variances: Floats, voxel_m: float) -> Ints:
-    """Indices, rising, of the surest point (N, 3) in each voxel, of equals the first."""
+def surest_per_voxel(points: Floats, variances: Floats, voxel_m: float) -> Ints:
+    """Sorted indices of the point (N, 3) with the least variance (N,) in each voxel."""
     if len(points) == 0:
         return np.zeros(0, np.int64)
     keys = voxel_keys(points, voxel_m)
@@ -107,13 +104,13 @@ def nearest_a_voxel(points: Floats, variances: Floats, voxel_m: float) -> Ints:
 
 
 def voxel_keys(points: NDArray[np.floating], voxel_m: float) -> Ints:
-    """One number (N,) for the voxel of each point (N, 3); 21 bits an axis."""
+    """Keys (N,) of the voxels of points (N, 3), with 21 bits for each axis."""
     index = np.floor(points / voxel_m).astype(np.int64) + (1 << 20)
     return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
 
 
 def write_submap(path: Path, submap: Submap) -> None:
-    """Save a submap; it appears whole or not at all. Raises InputError where it cannot."""
+    """Save a submap; it appears whole or not at all. Raises InputError if it cannot."""
     write_arrays(path, SUBMAP_FILE, {"anchor": submap.anchor}, _arrays(submap))
 
 

@@ -1,4 +1,4 @@
-"""Labels of surfaces: what masks say of a keyframe's pixels, and how views of a place are fused."""
+"""Labels of surfaces: instances at a keyframe's pixels, and the fusion of several views."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
 from bmask_slam.semantics.instances.instances import Instance
 
 OTHER_SHARE = 0.1
-"""Probability that what an instance says is not meant for a point: no view rules a class out."""
-ASTRAY = 0.01
-"""Probability that the landmarks on an instance are of something else."""
+"""Probability that an instance's classes do not hold for a point: no view excludes a class."""
+STRAY = 0.01
+"""Probability that the landmarks on an instance belong to another object."""
 MIN_LANDMARKS = 3
 
 
@@ -26,9 +26,9 @@ class KeyframeLabels:
     """The instances in a keyframe's image.
 
     Attributes:
-        numbers: (H, W) uint16, the instance that each pixel shows, from 1; 0 for none.
+        numbers: (H, W) uint16, the instance at each pixel, from 1; 0 for none.
         log_likelihoods: (I + 1, C) float32 of each class given the instance, relative to no view;
-            row 0, of no instance, is zero. Column 0 is the background.
+            row 0, for no instance, is zero. Column 0 is the background.
     """
 
     numbers: NDArray[np.uint16]
@@ -37,12 +37,12 @@ class KeyframeLabels:
 
 @dataclass(frozen=True, eq=False)
 class InstanceEvidence:
-    """What is known of the classes of a keyframe's instances.
+    """Evidence about the classes of a keyframe's instances.
 
     Attributes:
-        log_likelihoods: (I + 1, C) float32 by their masks, as in KeyframeLabels.
-        landmark_ids: (L,) landmarks seen on instances.
-        landmark_instances: (L,) uint16 which, from 1.
+        log_likelihoods: (I + 1, C) float32 from their masks, as in KeyframeLabels.
+        landmark_ids: (L,) landmarks observed on instances.
+        landmark_instances: (L,) uint16, the instance of each, from 1.
     """
 
     log_likelihoods: Floats
@@ -55,37 +55,37 @@ class InstanceEvidence:
         known: Mask,
         prior: NDArray[np.floating],
     ) -> Floats:
-        """The likelihoods (I + 1, C) with what the map believes of the landmarks on instances.
+        """The log likelihoods (I + 1, C) combined with the map's labels of the landmarks.
 
-        ``distributions`` (L, C) of the landmarks that are ``known`` (L,). Whether there is a thing
-        the mask says, and the views without one. Which thing it is both say: where an instance has
-        MIN_LANDMARKS with a class, the mean of their distributions, which rest on all keyframes, is
-        the prior of its class c > 0. The mask, since it is one of what that rests on, counts half:
-        p(c) ~ (mask(c) / prior(c))^(1/2) mean(c).
+        ``distributions`` (L, C) are those of the landmarks, of which some are ``known`` (L,). The
+        probability of an object, against background, is that of the mask. Which object it is comes
+        from both: where an instance has MIN_LANDMARKS with a class, the mean of their
+        distributions, which come from all keyframes, is the prior of its class c > 0. The mask
+        counts half, since it is part of that mean: p(c) ~ (mask(c) / prior(c))^(1/2) mean(c).
         """
         rows, classes = self.log_likelihoods.shape
         total, instances = np.zeros((rows, classes)), self.landmark_instances[known]
         np.add.at(total, instances, distributions[known])
         total[:, 0] = 0
         count = total.sum(axis=1, keepdims=True)
-        mean = (1 - ASTRAY) * total / np.maximum(count, 1) + ASTRAY / max(classes - 1, 1)
+        mean = (1 - STRAY) * total / np.maximum(count, 1) + STRAY / max(classes - 1, 1)
         mask = np.exp(self.log_likelihoods)
         which = np.sqrt(mask[:, 1:]) * mean[:, 1:]
-        thing = (mask * prior)[:, 1:].sum(axis=1, keepdims=True)
-        believed = mask.copy()
-        believed[:, 1:] = thing * which / which.sum(axis=1, keepdims=True) / prior[1:]
-        mixed = np.log((1 - OTHER_SHARE) * believed + OTHER_SHARE).astype(np.float32)
+        is_object = (mask * prior)[:, 1:].sum(axis=1, keepdims=True)
+        combined = mask.copy()
+        combined[:, 1:] = is_object * which / which.sum(axis=1, keepdims=True) / prior[1:]
+        mixed = np.log((1 - OTHER_SHARE) * combined + OTHER_SHARE).astype(np.float32)
         return np.where(count >= MIN_LANDMARKS, mixed, self.log_likelihoods)
 
 
 @dataclass(frozen=True, eq=False)
 class LabelTable:
-    """What the instances of all submaps say of classes.
+    """The log likelihoods of the instances of all submaps.
 
     Attributes:
         log_likelihoods: (I, C) float32 as in KeyframeLabels, one keyframe's rows after the other's.
-        submaps: (I,) the number of each one's submap, rising.
-        fusion: how views are fused.
+        submaps: (I,) index of each row's submap, sorted.
+        fusion: parameters of the fusion of views.
     """
 
     log_likelihoods: Floats
@@ -104,26 +104,27 @@ class LabelTable:
         return np.flatnonzero(np.diff(self.submaps, prepend=-1))
 
     def fused(self, views: csr_matrix) -> Floats:
-        """Log probabilities (N, C), but for a constant a point, of points seen in ``views`` (N, I).
+        """Log probabilities (N, C), up to a constant a point, of points with ``views`` (N, I).
 
-        As the label store fuses views of a landmark: what instances say, and that those who saw
-        none may all have missed it.
+        As the label store fuses views of a landmark: the likelihoods of the instances, and the
+        probability that all views without an instance missed the object.
         """
         none = np.zeros(len(self.submaps), np.float32)
         none[self.first] = 1
-        told = np.asarray(views @ self.log_likelihoods)
-        told += np.log(self.fusion.prior(told.shape[1])).astype(np.float32)
-        told[:, 1:] += self.fusion.log_missed(np.asarray(views @ none))[:, None].astype(np.float32)
-        return told
+        evidence = np.asarray(views @ self.log_likelihoods)
+        evidence += np.log(self.fusion.prior(evidence.shape[1])).astype(np.float32)
+        missed = self.fusion.log_missed(np.asarray(views @ none))
+        evidence[:, 1:] += missed[:, None].astype(np.float32)
+        return evidence
 
 
 def keyframe_labels(
     instances: Sequence[Instance], shape: tuple[int, int], classes: int, fusion: LabelStoreConfig
 ) -> KeyframeLabels:
-    """Number the instances of an image (H, W); where masks overlap the better score wins.
+    """Number the instances of an image (H, W); where masks overlap the better mask score wins.
 
-    The likelihood of an instance is its class distribution, trusted as far as its mask: with the
-    mask score s over the class score as weight; else it says nothing.
+    The likelihood of an instance is a mixture of its class distribution, with the mask score over
+    the class score as weight, and of no information.
     """
     numbers = np.zeros(shape, np.uint16)
     order = sorted(range(len(instances)), key=lambda k: instances[k].mask_score)
@@ -138,7 +139,7 @@ def keyframe_labels(
     return KeyframeLabels(numbers, table)
 
 
-def widened(shown: Mask, margin_px: int = 5) -> Mask:
-    """Pixels (H, W) of a mask, and those nearly beside it."""
+def dilate(mask: Mask, margin_px: int = 5) -> Mask:
+    """A mask (H, W) grown by ``margin_px`` in rows and columns."""
     size = 2 * margin_px + 1
-    return np.asarray(cv2.dilate(shown.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)

@@ -57,16 +57,16 @@ def _map(arguments: argparse.Namespace) -> int:
 
     without = arguments.without
     options = MapOptions(
-        arguments.run,
-        arguments.sequence,
-        _masks(arguments),
-        None if without is None else tuple(filter(None, without.split(","))),
-        arguments.moving,
-        arguments.voxel,
-        arguments.depth_source,
-        arguments.device,
-        arguments.mesh,
-        arguments.plan,
+        run=arguments.run,
+        sequence=arguments.sequence,
+        masks=_masks(arguments),
+        excluded=None if without is None else tuple(filter(None, without.split(","))),
+        keep_excluded=arguments.moving,
+        voxel_m=arguments.voxel,
+        source=arguments.depth_source,
+        device=arguments.device,
+        mesh=arguments.mesh,
+        plan=arguments.plan,
     )
     with console_log(), counting_bar(arguments.quiet) as progress:
         summary = map_run(options, progress)

@@ -1,17 +1,18 @@
-"""The folder RUN/dense: finished keyframes of a dense map, and what they were made with.
+"""The folder RUN/dense: finished keyframes of a dense map, and the settings they were made with.
 
 ==================  ==============================================================================
-settings.json       what the keyframes were fused with; another setting begins anew
+settings.json       how the keyframes were fused; other settings start a new map
 depth/ID            fused inverse depth and its sigma, quantised
 labels/ID           log likelihoods of the keyframe's instances, one row each, and landmarks on them
-submaps/ID          its points; written last, so that a keyframe that has one is finished
+submaps/ID          points of a keyframe; written last: a keyframe that has one is finished
 cloud.ply, .pcd     the cloud, with normals, label, probability and sigma of each point
 semantic.ply, .pcd  the same in the colours of the labels
 objects/ID-CLASS    a cloud of each object of the run
-moving/ID, .ply     what moves, if it is kept: points of each keyframe, and all of them
+moving/ID, .ply     with --moving: excluded points of each keyframe, and the cloud of all of them
 mesh.ply            the mesh
 plan.png            the map from above
 view_*.png          pictures of cloud and mesh
+legend.json         colours of the labels
 dense.json          counts and times
 ==================  ==============================================================================
 """
@@ -21,34 +22,75 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
 from bmask_slam.graph.whole_file import whole_file
-from bmask_slam.mapping.inverse_depth.depth_files import read_fused, write_fused
-from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
-from bmask_slam.mapping.products.submaps import Submap, read_submap, relabelled, write_submap
+from bmask_slam.mapping.inverse_depth.depth_map import (
+    InverseDepthMap,
+    read_depth_map,
+    write_depth_map,
+)
+from bmask_slam.mapping.products.submaps import Submap, read_submap, relabel, write_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence
 from bmask_slam.runtime.memory import give_back_memory
+from bmask_slam.semantics.labels import LabelSet
 
 logger = logging.getLogger(__name__)
 
 LABEL_FILE = FileKind("keyframe labels", 2)
 PARTS = ("depth", "labels", "moving", "submaps")
+METHOD = 3
+"""Version of the method; to be raised when the same settings give other submaps than before."""
+
+
+def folder_settings(
+    options: MapOptions, labels: LabelSet, stereo_bf_px_m: float | None = None
+) -> dict[str, Any]:
+    """The settings of a dense map as its folder stores them; of resolved options.
+
+    ``stereo_bf_px_m`` is that of the stereo pairs, None without pairs.
+    """
+    settings = {
+        "method": METHOD,
+        "run": _first_log_line(options.run),
+        "voxel_m": options.voxel_m,
+        "masks": None if options.masks is None else options.masks.described(),
+        "source": options.source,
+        "without": list(options.excluded or ()),
+        "moving": options.keep_excluded,
+        "labels": list(labels.names),
+        "noise": asdict(fusion_config(options).noise),
+    }
+    return settings if options.source == "sensor" else settings | {"stereo_bf": stereo_bf_px_m}
+
+
+def _first_log_line(run: Path) -> str:
+    """The first line of a run's log, with the time when it began.
+
+    When a run is overwritten the line changes, so that the dense map of the old run is not used.
+    """
+    path = run / "log.txt"
+    if not path.is_file():
+        return ""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return file.readline().strip()
 
 
 class DenseFolder:
-    """RUN/dense, opened for settings that are a dictionary of JSON values."""
+    """The folder RUN/dense for some settings, a dictionary of JSON values."""
 
     def __init__(self, run: Path, settings: dict[str, Any]) -> None:
-        """Make the folder, or keep what it holds of the same settings.
+        """Make the folder, or keep its keyframes if they were made with the same settings.
 
         Raises:
             InputError: it cannot be written.
@@ -66,21 +108,21 @@ class DenseFolder:
             ) from error
 
     @classmethod
-    def opened(cls, run: Path) -> DenseFolder:
-        """The dense map of a run, as it is. Raises InputError if there is none."""
+    def open(cls, run: Path) -> DenseFolder:
+        """The dense map of a run with its own settings. Raises InputError if there is none."""
         path = run / "dense" / "settings.json"
         if not path.is_file():
             raise InputError(f"{path}: no dense map here; make it with bmask-slam map {run}")
         return cls(run, json.loads(path.read_text(encoding="utf-8")))
 
     def _clear_unless(self, settings: dict[str, Any]) -> None:
-        """Remove keyframes that were made with other settings."""
+        """Remove the keyframes unless they were made with these settings."""
         path = self.path / "settings.json"
         before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
         if before == json.loads(json.dumps(settings)):
             return
         if before is not None:
-            logger.warning("%s: was made with other settings; begun anew", self.path)
+            logger.warning("%s: was made with other settings; started again", self.path)
         path.unlink(missing_ok=True)
         for name in PARTS:
             shutil.rmtree(self.path / name, ignore_errors=True)
@@ -90,8 +132,8 @@ class DenseFolder:
         return self._file("submaps", keyframe_id).is_file()
 
     def write(self, submap: Submap, fused: InverseDepthMap, evidence: InstanceEvidence) -> None:
-        """Save a finished keyframe. Raises InputError, with nothing half written, if it cannot."""
-        write_fused(self._file("depth", submap.anchor), fused)
+        """Save a finished keyframe. Raises InputError, with no half-written file, if it cannot."""
+        write_depth_map(self._file("depth", submap.anchor), fused)
         write_arrays(self._file("labels", submap.anchor), LABEL_FILE, {}, vars(evidence))
         write_submap(self._file("submaps", submap.anchor), submap)
         give_back_memory()
@@ -100,33 +142,34 @@ class DenseFolder:
         self,
         keyframe_id: int,
         camera: Camera,
-        shown: tuple[NDArray[np.uint16], Mask],
+        instances: NDArray[np.uint16],
+        excluded: Mask,
         evidence: InstanceEvidence,
     ) -> None:
-        """Give a finished keyframe its instances (H, W), without what moves in it (H, W).
+        """Replace the instances (H, W) of a finished keyframe, remove its excluded pixels (H, W).
 
         Raises:
-            InputError: it cannot be written; what was there stays.
+            InputError: it cannot be written; the old files stay.
         """
-        instances, moves = shown
-        told = relabelled(self.submap(keyframe_id), camera, instances, moves)
-        if moves.any():
-            still = self.fused(keyframe_id).without(moves)
-            write_fused(self._file("depth", keyframe_id), still)
+        submap = relabel(self.submap(keyframe_id), camera, instances, excluded)
+        if excluded.any():
+            write_depth_map(
+                self._file("depth", keyframe_id), self.fused(keyframe_id).without(excluded)
+            )
         write_arrays(self._file("labels", keyframe_id), LABEL_FILE, {}, vars(evidence))
-        write_submap(self._file("submaps", keyframe_id), told)
+        write_submap(self._file("submaps", keyframe_id), submap)
 
     def remove(self, keyframe_id: int) -> None:
-        """Without a keyframe, whatever is there of it; its submap goes first."""
+        """Remove all files of a keyframe, its submap first."""
         for kind in reversed(PARTS):
             self._file(kind, keyframe_id).unlink(missing_ok=True)
 
-    def write_moving(self, submap: Submap) -> None:
-        """Save what moves in a keyframe. Raises InputError if it cannot."""
+    def write_excluded(self, submap: Submap) -> None:
+        """Save the excluded points of a keyframe. Raises InputError if it cannot."""
         write_submap(self._file("moving", submap.anchor), submap)
 
-    def moving(self, keyframe_id: int) -> Submap | None:
-        """What moves in a keyframe, if that was kept."""
+    def excluded(self, keyframe_id: int) -> Submap | None:
+        """The excluded points of a keyframe, if they were saved."""
         path = self._file("moving", keyframe_id)
         return read_submap(path) if path.is_file() else None
 
@@ -135,7 +178,7 @@ class DenseFolder:
         return read_submap(self._file("submaps", keyframe_id))
 
     def evidence(self, keyframe_id: int) -> InstanceEvidence:
-        """What its masks say of its instances, and the landmarks on them."""
+        """The evidence of a finished keyframe about the classes of its instances."""
         arrays = read_arrays(self._file("labels", keyframe_id), LABEL_FILE)[1]
         return InstanceEvidence(
             np.asarray(arrays["log_likelihoods"], np.float32),
@@ -144,11 +187,11 @@ class DenseFolder:
         )
 
     def fused(self, keyframe_id: int) -> InverseDepthMap:
-        """The inverse depth of a finished keyframe."""
-        return read_fused(self._file("depth", keyframe_id))
+        """The fused inverse depth of a finished keyframe."""
+        return read_depth_map(self._file("depth", keyframe_id))
 
     def write_text(self, name: str, text: str) -> None:
-        """Replace a text file."""
+        """Write a text file, or replace it."""
         with whole_file(self.path / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
 

@@ -1,30 +1,49 @@
-"""One call that makes a dense map of a run, from keyframes to pictures."""
+"""A dense map of a run in one call, from keyframes to pictures, or keyframe by keyframe."""
 
 from __future__ import annotations
 
 import json
+import logging
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.dense.assembly import Progress, fuse_run, open_map
-from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.fusion import FusionCounts
-from bmask_slam.dense.options import MapOptions
+from bmask_slam.datasets.weights import find_weights
+from bmask_slam.dense.folder import DenseFolder, folder_settings
+from bmask_slam.dense.keyframe_fusion import FusionCounts, KeyframeFusion
+from bmask_slam.dense.keyframe_input import image_name, load_keyframe
+from bmask_slam.dense.options import MapOptions, resolve_options
 from bmask_slam.dense.products import FusedMap, Products, write_clouds, write_dense_mesh
+from bmask_slam.dense.saved_map import MappedRun, open_run, with_right_images
+from bmask_slam.graph.arrays import Image, Mask
+from bmask_slam.graph.errors import InputError
+from bmask_slam.labelling.semantic_mapper import SemanticMapper
+from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW
+from bmask_slam.run_folder.map_file import run_semantics
+from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
+from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
+from bmask_slam.sequences import Sequence
+from bmask_slam.tracking.results import FrameResult
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class MapSummary:
-    """How mapping ended.
+    """The result of mapping.
 
     Attributes:
         folder: RUN/dense.
         counts: of keyframes.
         products: files, points and labels.
-        products_s: time that these took.
+        products_s: time that the products took.
     """
 
     folder: Path
@@ -34,51 +53,163 @@ class MapSummary:
 
 
 def map_run(options: MapOptions, progress: Progress = lambda done, total: None) -> MapSummary:
-    """Fuse what is not finished, then write the products.
+    """Fuse the keyframes that are not finished, then write the products.
 
     Raises:
-        InputError: as for ``open_map`` and ``fuse_run``.
+        InputError: the run, its sequence or the masks cannot be used, a class is not known, no
+            keyframe can be used, or the disk is full.
     """
-    opened = open_map(options)
-    counts = fuse_run(opened, progress)
+    fusion = open_fusion(options)
+    counts = fusion.fuse_all(progress)
     started_s = time.perf_counter()
-    products = write_clouds(FusedMap.of(opened))
+    fused = FusedMap(fusion.run, fusion.segmenter.labels, fusion.folder, fusion.options)
+    products = write_clouds(fused)
     if options.mesh:
-        products.files.extend(write_dense_mesh(opened.run, opened.folder, options.voxel_m))
-    summary = MapSummary(opened.folder.path, counts, products, time.perf_counter() - started_s)
-    write_summary(opened.folder, summary)
+        products.files.extend(write_dense_mesh(fusion.run, fused))
+    summary = MapSummary(fusion.folder.path, counts, products, time.perf_counter() - started_s)
+    write_summary(fusion.folder, summary)
     return summary
+
+
+class RunFusion:
+    """Fuses the keyframes of a run, oldest first.
+
+    Attributes:
+        run: the run and its sequence.
+        segmenter: finds the instances in its images.
+        folder: RUN/dense.
+        options: resolved.
+    """
+
+    def __init__(self, run: MappedRun, segmenter: Segmenter, options: MapOptions) -> None:
+        """Raises InputError: the options do not fit the run, or the folder cannot be written."""
+        self.options = resolve_options(options, segmenter.labels)
+        self.run = with_right_images(run, options.source)
+        self.segmenter = segmenter
+        stereo_bf_px_m = None if self.run.right is None else self.run.camera.stereo_bf_px_m
+        settings = folder_settings(self.options, segmenter.labels, stereo_bf_px_m)
+        self.folder = DenseFolder(run.path, settings)
+        camera, labels = self.run.camera, segmenter.labels
+        self._fusion = KeyframeFusion(camera, labels, self.folder, self.options)
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Read a keyframe and fuse it; skip one that cannot be used, with a warning.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        try:
+            dense, snapshot = load_keyframe(self.run, keyframe, self.options.source)
+            name = image_name(self.run, keyframe)
+            instances = self.segmenter.segment(snapshot.frame.rgb, name)
+        except InputError as error:
+            logger.warning("%s; skipped", error)
+            self._fusion.counts.skipped[keyframe.id] = str(error)
+            return
+        labelled = self._fusion.label_pixels(instances, snapshot.landmark_ids, snapshot.pixels)
+        self._fusion.add(dense, snapshot.segment, labelled, self.run.poses())
+
+    def fuse_all(self, progress: Progress = lambda done, total: None) -> FusionCounts:
+        """Fuse every keyframe that is not finished and save its submap.
+
+        Raises:
+            InputError: no keyframe can be used, or the disk is full.
+        """
+        keyframes, counts = self.run.keyframes, self._fusion.counts
+        needed = self._needed()
+        for k, keyframe in enumerate(keyframes):
+            if needed[k]:
+                self.add(keyframe)
+            else:
+                counts.reused += 1
+            progress(k + 1, len(keyframes))
+        self._fusion.finish()
+        if not counts.fused + counts.reused:
+            reason = next(iter(counts.skipped.values()), "it has none")
+            raise InputError(f"{self.run.path}: no keyframe can be mapped; the first: {reason}")
+        return counts
+
+    def _needed(self) -> Mask:
+        """Which keyframes (K,) must be read: the unfinished ones and those in their windows."""
+        unfinished = np.array([not self.folder.is_done(k.id) for k in self.run.keyframes], bool)
+        near = np.convolve(unfinished, np.ones(2 * WINDOW + 1))[WINDOW : WINDOW + len(unfinished)]
+        return np.asarray(near > 0.5)
+
+
+def open_fusion(options: MapOptions) -> RunFusion:
+    """The fusion of a finished run. Raises InputError as ``map_run``."""
+    run = open_run(options.run, options.sequence)
+    masks = options.masks or run_semantics(options.run).segmenter
+    segmenter = make_segmenter(masks, run.sequence.folder, find_weights)
+    return RunFusion(run, segmenter, replace(options, masks=masks))
+
+
+class CachingSegmenter:
+    """A segmenter that keeps the instances of the last image, for a second caller."""
+
+    def __init__(self, segmenter: Segmenter) -> None:
+        self.labels = segmenter.labels
+        self._segmenter = segmenter
+        self._name: str | None = None
+        self._instances: list[Instance] = []
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """The instances in an image."""
+        if name != self._name:
+            self._instances = self._segmenter.segment(image, name)
+            self._name = name
+        return self._instances
+
+
+def dense_follower(
+    world: WorldMap, semantics: SemanticMapper, sequence: Sequence, run: Path
+) -> Callable[[FrameResult], None]:
+    """A function that fuses the keyframes of a run while it goes on, to be called every frame.
+
+    It saves no state of its own: keyframes that a killed run did not fuse, and those that still
+    wait for neighbours at the end, are fused by ``map_run``.
+
+    Raises:
+        InputError: also by the function, when the disk is full.
+    """
+    segmenter = semantics.segmenter = CachingSegmenter(semantics.segmenter)
+    mapped = MappedRun(run, world, [], sequence.camera, sequence=sequence)
+    fusion = RunFusion(mapped, segmenter, MapOptions(run, masks=semantics.config.segmenter))
+
+    def follow(result: FrameResult) -> None:
+        keyframe = world.keyframes.get(-1 if result.keyframe_id is None else result.keyframe_id)
+        if keyframe is not None:
+            fusion.add(keyframe)
+
+    return follow
 
 
 def write_summary(folder: DenseFolder, summary: MapSummary) -> None:
     """Write dense.json."""
-    folder.write_text("dense.json", json.dumps(_rows(summary), indent=1) + "\n")
-
-
-def _rows(summary: MapSummary) -> dict[str, object]:
     counts, products = summary.counts, summary.products
-    return {
+    values = {
         "keyframes_fused": counts.fused,
         "keyframes_reused": counts.reused,
-        "keyframes_left_out": counts.left_out,
+        "keyframes_left_out": counts.skipped,
         "fuse_ms_median": float(np.median(counts.fuse_ms)) if counts.fuse_ms else None,
         "points": products.points,
         "label_shares": products.label_shares,
         "products_s": round(summary.products_s, 3),
     }
+    folder.write_text("dense.json", json.dumps(values, indent=1) + "\n")
 
 
 def format_summary(summary: MapSummary) -> str:
     """A few lines for the command line."""
     counts, products = summary.counts, summary.products
     lines = [f"keyframes   {counts.fused} fused, {counts.reused} were finished"]
-    if counts.left_out:
-        lines[0] += f", {len(counts.left_out)} left out"
+    if counts.skipped:
+        lines[0] += f", {len(counts.skipped)} left out"
     if counts.fuse_ms:
         lines.append(f"fusion      {np.median(counts.fuse_ms):.0f} ms a keyframe (median)")
     lines.append(f"points      {products.points}")
-    things = sorted(products.label_shares.items(), key=lambda item: -item[1])
-    if len(things) > 1:
-        lines.append("labels      " + ", ".join(f"{n} {100 * s:.1f} %" for n, s in things[:8]))
+    shares = sorted(products.label_shares.items(), key=lambda item: -item[1])
+    if len(shares) > 1:
+        lines.append("labels      " + ", ".join(f"{n} {100 * s:.1f} %" for n, s in shares[:8]))
     lines.append(f"products    {', '.join(p.name for p in products.files)}")
     return "\n".join([*lines, f"Folder      {summary.folder}"])

@@ -1,12 +1,24 @@
-"""What a dense map is made of, and how."""
+"""The options of a dense map: what it is made of, and how."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bmask_slam.mapping.inverse_depth.dense_mapper import DepthSource
+import numpy as np
+
+from bmask_slam.config.configuration import resolve
+from bmask_slam.features.brisk import FeatureConfig
+from bmask_slam.graph.errors import InputError
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, DepthSource
+from bmask_slam.mapping.inverse_depth.depth_map import DepthNoise
+from bmask_slam.semantics.beliefs.movability import read_priors
+from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+
+VOXEL_RANGE_M = (0.001, 1.0)
+MIN_MOVABILITY = 0.5
+"""Classes that are likelier to move than this are excluded by default."""
 
 
 @dataclass(frozen=True)
@@ -15,24 +27,53 @@ class MapOptions:
 
     Attributes:
         run: folder of a finished run.
-        sequence: its images, if they have moved.
-        masks: what finds the instances; None: what found them in the run.
-        without: classes that are left out of the map, since they move; None: those that are
-            likelier to move than not.
-        moving: keep what is left out in a cloud of its own.
-        voxel_m: at most one point in a cube of this edge.
+        sequence: folder of its images, if they have moved.
+        masks: the segmenter; None: the one of the run.
+        excluded: classes that are not mapped because they move; None: those whose prior
+            probability to move is above one half.
+        keep_excluded: write the points of excluded classes to a cloud of their own.
+        voxel_m: the cloud has at most one point in a cube with this edge.
         source: where depth comes from, see `mapping.inverse_depth.dense_mapper.DenseConfig`.
-        device: torch's name of where depth is fused.
+        device: torch's name of the device that computes the fusion.
         mesh, plan: whether to make them.
     """
 
     run: Path
     sequence: Path | None = None
     masks: SegmenterOptions | None = None
-    without: tuple[str, ...] | None = None
-    moving: bool = False
+    excluded: tuple[str, ...] | None = None
+    keep_excluded: bool = False
     voxel_m: float = 0.01
     source: DepthSource = "sensor"
     device: str = "cpu"
     mesh: bool = False
     plan: bool = False
+
+
+def resolve_options(options: MapOptions, labels: LabelSet) -> MapOptions:
+    """The options, checked, with ``excluded`` filled in.
+
+    Raises:
+        InputError: the voxel size is out of range, or an excluded class is not in ``labels``.
+    """
+    low, high = VOXEL_RANGE_M
+    if not low <= options.voxel_m <= high:
+        raise InputError(f"voxel {options.voxel_m} m: must be between {low:g} and {high:g}")
+    excluded = options.excluded
+    if excluded is None:
+        movability = read_priors("movability").of(labels)
+        excluded = tuple(labels.names[k] for k in np.flatnonzero(movability > MIN_MOVABILITY))
+    for name in excluded:
+        if labels.number(name) == 0:
+            known = ", ".join(labels.names[1:]) or "none, give --segmenter or --masks"
+            raise InputError(f"--without {name!r}: no such class; there are: {known}")
+    return replace(options, excluded=excluded)
+
+
+def fusion_config(options: MapOptions) -> DenseConfig:
+    """The configuration of the fusion, with the run's own noise model of its depth sensor."""
+    features = resolve(FeatureConfig, options.run / "config.yaml", section="features")
+    noise = DepthNoise(
+        disparity_sigma_px=features.disparity_sigma_px, max_depth_m=features.max_depth_m
+    )
+    return DenseConfig(noise=noise, source=options.source, device=options.device)

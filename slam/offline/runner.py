@@ -274,9 +274,11 @@ def _dense_follower(
     system: System, sequence: Sequence, folder: RunFolder
 ) -> Callable[[FrameResult], None]:
     """Fuses keyframes on the way. Imports torch, which takes a second and 200 MB."""
-    from bmask_slam.dense.following import dense_follower  # noqa: PLC0415 - only for those who need it
+    from bmask_slam.dense.map_run import dense_follower  # noqa: PLC0415 - only for those who need it
 
-    return dense_follower(system, sequence, folder.path)
+    if not isinstance(system, SlamSystem):
+        return lambda result: None
+    return dense_follower(system.mapper.world, system.semantics, sequence, folder.path)
 
 
 @contextmanager

@@ -77,7 +77,7 @@ def depth_ratio(run: Path, sequence: Sequence) -> float | None:
     exact, finished = sequence.folder / "depth_true", run / "dense" / "dense.json"
     if not exact.is_dir() or not finished.is_file():
         return None
-    dense = DenseFolder.opened(run)
+    dense = DenseFolder.open(run)
     squares = np.zeros(2)
     for index, keyframe in keyframe_frames(run):
         if dense.is_done(keyframe):

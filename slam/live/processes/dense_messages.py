@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bmask_slam.dense.keyframe_view import SeenKeyframe
+from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.semantics.instances.instances import Instance
@@ -34,19 +34,19 @@ class KeyframeToMap:
     """To the process: a keyframe as it is in the map at this moment.
 
     Attributes:
-        seen: it, with its images.
+        snapshot: the keyframe with its images.
         instances: its masks; none that were found, or that have not come.
         poses: T_world_camera (4, 4) of it and of the keyframes around, by id.
     """
 
-    seen: SeenKeyframe
+    snapshot: KeyframeSnapshot
     instances: list[Instance]
     poses: dict[int, Array]
 
     @property
     def id(self) -> int:
         """Of the keyframe."""
-        return self.seen.id
+        return self.snapshot.id
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,13 @@ from typing import Any
 
 import cv2
 
-from bmask_slam.dense.assembly import folder_settings, settled
-from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.fusion import FusionCounts, KeyframeFusion
-from bmask_slam.dense.input import dense_keyframe, read_saved_map
+from bmask_slam.dense.folder import DenseFolder, folder_settings
+from bmask_slam.dense.keyframe_fusion import FusionCounts, KeyframeFusion
+from bmask_slam.dense.keyframe_input import dense_keyframe
 from bmask_slam.dense.map_run import MapSummary, write_summary
-from bmask_slam.dense.options import MapOptions
-from bmask_slam.dense.products import FusedMap, finished, write_clouds
+from bmask_slam.dense.options import MapOptions, resolve_options
+from bmask_slam.dense.products import FusedMap, write_clouds
+from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import Ready
@@ -78,7 +78,7 @@ class DenseKeeper:
         """Begin, or go on with what another process left. Raises InputError."""
         self._order, self._send = order, send
         self._labels = LabelSet(order.labels)
-        self._options = settled(MapOptions(order.run, masks=order.masks), self._labels)
+        self._options = resolve_options(MapOptions(order.run, masks=order.masks), self._labels)
         settings = folder_settings(self._options, self._labels)
         self._folder = RetryingFolder(order.run, settings)
         self._folder.unwritten = {}
@@ -93,9 +93,9 @@ class DenseKeeper:
             case LateMasks():
                 self.relabel(message)
             case Forget():
-                self._fusion.forget(message.keyframe_ids)
+                self._fusion.remove(message.keyframe_ids)
             case FinishMap():
-                self._fusion.move(message.poses)
+                self._fusion.update_poses(message.poses)
                 self._tell(self._fusion.finish())
                 self._send(self.write_products(message))
             case _:
@@ -103,22 +103,26 @@ class DenseKeeper:
 
     def take(self, message: KeyframeToMap) -> None:
         """Take a keyframe in, and say what that finished."""
-        seen = message.seen
-        if self._folder.is_done(seen.id):  # another process had died before it said so
-            self._send(Mapped(seen.id))
+        snapshot = message.snapshot
+        if self._folder.is_done(snapshot.id):  # another process had died before it said so
+            self._send(Mapped(snapshot.id))
         try:
-            dense = dense_keyframe(seen, self._order.camera)
+            dense = dense_keyframe(snapshot, self._order.camera)
         except InputError as error:
-            self._send(NotMapped(seen.id, str(error)))
+            self._send(NotMapped(snapshot.id, str(error)))
             return
-        shown = self._fusion.read(message.instances, seen.landmark_ids, seen.pixels)
-        self._tell(self._fusion.take(dense, seen.segment, shown, message.poses))
+        instances = self._fusion.label_pixels(
+            message.instances, snapshot.landmark_ids, snapshot.pixels
+        )
+        self._tell(self._fusion.add(dense, snapshot.segment, instances, message.poses))
 
     def relabel(self, message: LateMasks) -> None:
         """Use masks that come late."""
-        shown = self._fusion.read(message.instances, message.landmark_ids, message.pixels)
+        instances = self._fusion.label_pixels(
+            message.instances, message.landmark_ids, message.pixels
+        )
         try:
-            self._fusion.relabel(message.keyframe_id, shown)
+            self._fusion.relabel(message.keyframe_id, instances)
         except InputError as error:
             logger.warning("keyframe %d keeps its old labels: %s", message.keyframe_id, error)
 
@@ -128,9 +132,9 @@ class DenseKeeper:
         try:
             run = read_saved_map(self._order.run)
             missing = [k.id for k in run.keyframes if not self._folder.is_done(k.id)]
-            if not finished(run, self._folder):
-                return MapWritten(missing=missing, failure="no keyframe has a submap")
             fused = FusedMap(run, self._labels, self._folder, self._options)
+            if not fused.keyframes():
+                return MapWritten(missing=missing, failure="no keyframe has a submap")
             products = write_clouds(fused)
             counts = self._counts(missing, message.left_out)
             products_s = time.perf_counter() - started_s
@@ -145,7 +149,7 @@ class DenseKeeper:
         """What became of the keyframes, with those that did not come here."""
         reasons = self._folder.unwritten | left_out
         counts = self._fusion.counts
-        counts.left_out = {number: reasons.get(number, "") for number in missing}
+        counts.skipped = {number: reasons.get(number, "") for number in missing}
         return counts
 
     def _tell(self, submaps: list[Submap]) -> None:

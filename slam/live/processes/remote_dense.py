@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from bmask_slam.dense.keyframe_view import seen
+from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.live.messages import Masks
 from bmask_slam.live.processes.dense_messages import (
     DenseOrder,
@@ -220,8 +220,8 @@ class RemoteDenseMapper:
             return
         around = sorted(world.keyframes.keys() & (self._promised.keys() | self.submaps))[-AROUND:]
         poses = {i: world.keyframes[i].T_world_camera for i in (*around, number)}
-        whole = seen(world, keyframe, waiting.frame)
-        self._promised[number] = KeyframeToMap(whole, waiting.instances, poses)
+        snapshot = KeyframeSnapshot.of(world, keyframe, waiting.frame)
+        self._promised[number] = KeyframeToMap(snapshot, waiting.instances, poses)
         self._send(self._promised[number])
 
     def _send(self, message: KeyframeToMap) -> None:

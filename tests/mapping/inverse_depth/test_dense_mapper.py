@@ -14,7 +14,7 @@ from bmask_slam.mapping.inverse_depth.dense_mapper import (
     DenseKeyframe,
     DenseMapper,
     FusedKeyframe,
-    neighbours,
+    choose_neighbours,
 )
 
 RGB = np.full((30, 40, 3), 100, np.uint8)
@@ -32,12 +32,12 @@ def keyframes(count: int) -> list[DenseKeyframe]:
 
 
 def all_of(mapper: DenseMapper, given: list[DenseKeyframe]) -> list[FusedKeyframe]:
-    return [r for k in given for r in mapper.push(k)] + mapper.flush()
+    return [r for k in given for r in mapper.add(k)] + mapper.flush()
 
 
 def test_a_keyframe_comes_back_once_six_more_came() -> None:
     mapper, given = DenseMapper(CAMERA), keyframes(16)
-    ids = [[r.keyframe.id for r in mapper.push(k)] for k in given]
+    ids = [[r.keyframe.id for r in mapper.add(k)] for k in given]
     assert ids == [[]] * WINDOW + [[k] for k in range(16 - WINDOW)]
     assert len(mapper._held) <= 2 * WINDOW + 1
     assert [r.keyframe.id for r in mapper.flush()] == list(range(10, 16))
@@ -47,14 +47,14 @@ def test_what_is_not_wanted_serves_its_neighbours_only() -> None:
     given = keyframes(9)
     expected = {r.keyframe.id: r for r in all_of(DenseMapper(CAMERA), given)}
     mapper = DenseMapper(CAMERA)
-    found = [r for k in given for r in mapper.push(k, k.id == 4)] + mapper.flush()
+    found = [r for k in given for r in mapper.add(k, k.id == 4)] + mapper.flush()
     assert [r.keyframe.id for r in found] == [4]
     np.testing.assert_array_equal(found[0].map.rho.numpy(), expected[4].map.rho.numpy())
 
 
 def test_the_neighbours_are_those_with_most_landmarks_in_common() -> None:
     given = keyframes(12)
-    chosen = neighbours(given[5], [k for k in given if k.id != 5], 6)
+    chosen = choose_neighbours(given[5], [k for k in given if k.id != 5], 6)
     assert [k.id for k in chosen] == [4, 6, 3, 7, 2, 8]
 
 
@@ -69,9 +69,9 @@ def test_poses_that_are_optimised_meanwhile_are_followed() -> None:
     mapper = DenseMapper(CAMERA)
     away = se3_exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, -1.0]))
     for k in given[:4]:
-        assert mapper.push(moved_by(away, k)) == []
-    mapper.move({k.id: k.T_world_camera for k in given} | {99: np.eye(4)})
-    found = [r for k in given[4:] for r in mapper.push(k)] + mapper.flush()
+        assert mapper.add(moved_by(away, k)) == []
+    mapper.update_poses({k.id: k.T_world_camera for k in given} | {99: np.eye(4)})
+    found = [r for k in given[4:] for r in mapper.add(k)] + mapper.flush()
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
         np.testing.assert_array_equal(mine.keyframe.T_world_camera, theirs.keyframe.T_world_camera)
@@ -102,9 +102,9 @@ def test_what_is_forgotten_is_as_if_it_had_not_come() -> None:
     given = keyframes(8)
     expected = all_of(DenseMapper(CAMERA), [k for k in given if k.id not in (2, 5)])
     mapper = DenseMapper(CAMERA)
-    found = [r for k in given[:6] for r in mapper.push(k)]
-    mapper.forget([2, 5])
-    found += [r for k in given[6:] for r in mapper.push(k)] + mapper.flush()
+    found = [r for k in given[:6] for r in mapper.add(k)]
+    mapper.remove([2, 5])
+    found += [r for k in given[6:] for r in mapper.add(k)] + mapper.flush()
     for mine, theirs in zip(found, expected, strict=True):
         assert mine.keyframe.id == theirs.keyframe.id
         np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
@@ -118,10 +118,10 @@ def test_labels_that_come_late_are_as_if_in_time() -> None:
     told = replace(given[3], depth_m=hidden, instances=numbers, unmatched=moves)
     expected = all_of(DenseMapper(CAMERA), [told if k.id == 3 else k for k in given])
     mapper = DenseMapper(CAMERA)
-    found = [r for k in given[:6] for r in mapper.push(k)]
+    found = [r for k in given[:6] for r in mapper.add(k)]
     mapper.relabel(3, numbers, moves)
     mapper.relabel(99, numbers, moves)
-    found += [r for k in given[6:] for r in mapper.push(k)] + mapper.flush()
+    found += [r for k in given[6:] for r in mapper.add(k)] + mapper.flush()
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
     assert found[3].keyframe.instances is numbers

@@ -22,11 +22,11 @@ from bmask_slam.mapping.inverse_depth.matching_cost import (
 )
 from bmask_slam.mapping.inverse_depth.plane_sweep import (
     SweepConfig,
-    completed,
+    fill_missing,
     shrunk_camera,
     sweep,
 )
-from bmask_slam.mapping.inverse_depth.stereo import checked, match_stereo
+from bmask_slam.mapping.inverse_depth.stereo import left_right_consistent, match_stereo
 
 RNG = np.random.default_rng(8)
 CAMERA = Camera(96, 72, fx=90.0, fy=91.0, cx=47.0, cy=36.5, stereo_bf_px_m=9.0)
@@ -140,7 +140,8 @@ def test_what_the_other_side_does_not_confirm_is_dropped() -> None:
     left, right = tensor(np.full((1, 8), 2.0)), tensor(np.full((1, 8), 2.0))
     right[0, 3] = 5.0
     np.testing.assert_array_equal(
-        checked(left, right).numpy()[0], [False, False, True, True, True, False, True, True]
+        left_right_consistent(left, right).numpy()[0],
+        [False, False, True, True, True, False, True, True],
     )
 
 
@@ -192,6 +193,6 @@ def test_a_shrunk_camera_sees_the_same_rays() -> None:
 def test_measurements_come_before_the_sweep() -> None:
     half = tensor([[1.0, np.nan]])
     swept = InverseDepthMap(tensor([[3.0, 4.0]]), tensor([[0.1, 0.2]]))
-    result = completed(InverseDepthMap(half, half / 100), swept)
+    result = fill_missing(InverseDepthMap(half, half / 100), swept)
     np.testing.assert_allclose(result.rho, [[1.0, 4.0]])
     np.testing.assert_allclose(result.variance, [[0.01, 0.2]])

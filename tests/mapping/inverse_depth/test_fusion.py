@@ -17,17 +17,18 @@ from surface_scene import (
 )
 
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
-from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap, squared_gradient
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 from bmask_slam.mapping.inverse_depth.fusion import (
     BLUR_PX,
     WRONG_SIDE,
     Fused,
     fuse,
+    hole_seeds,
     rim_steps,
-    seeded,
-    stated,
     variance_factor,
+    with_calibrated_variance,
 )
+from bmask_slam.mapping.inverse_depth.pixelwise import squared_gradient
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.inverse_depth.warping import (
     JUMP_SIGMAS,
@@ -108,7 +109,7 @@ def scene(seed: int, count: int):
 def test_it_follows_the_formulas(count: int) -> None:
     own, views = scene(count, count)
     result = fuse(own, views, CAMERA)
-    rho, variance, used = reference(own, views, seeded(own, views, CAMERA).numpy())
+    rho, variance, used = reference(own, views, hole_seeds(own, views, CAMERA).numpy())
     np.testing.assert_allclose(result.map.rho.numpy(), rho, rtol=1e-5)
     np.testing.assert_allclose(result.map.variance.numpy(), variance, rtol=1e-5)
     np.testing.assert_array_equal(result.views.numpy(), np.nan_to_num(used))
@@ -187,7 +188,7 @@ def test_the_rim_of_a_nearer_surface_is_not_filled_from_behind() -> None:
     own = rho.copy()
     own[:, :10], own[:, 10:12] = 1.0, np.nan
     views = [View(as_map(rho, 0.01), np.eye(4)) for _ in range(2)]
-    assert np.isnan(seeded(as_map(own, 0.01), views, CAMERA).numpy()[:, 10:12]).all()
+    assert np.isnan(hole_seeds(as_map(own, 0.01), views, CAMERA).numpy()[:, 10:12]).all()
 
 
 def test_the_rim_of_a_seeded_surface_is_not_seeded_from_behind() -> None:
@@ -195,7 +196,7 @@ def test_the_rim_of_a_seeded_surface_is_not_seeded_from_behind() -> None:
     near[:, 10:20], far[:, 10:20] = 1.0, np.nan
     empty = as_map(np.full((30, 40), np.nan), 0.01)
     views = [View(as_map(rho, 0.01), np.eye(4)) for rho in (near, far)]
-    found = seeded(empty, views, CAMERA).numpy()
+    found = hole_seeds(empty, views, CAMERA).numpy()
     np.testing.assert_array_equal(found[:, 10:20], 1.0)
     assert np.isnan(found[:, [8, 9, 20, 21]]).all()
     np.testing.assert_array_equal(found[:, :8], 0.5)
@@ -223,7 +224,7 @@ def test_the_stated_variance_grows_with_the_slope() -> None:
     given = as_map(rho, 0.002)
     slope = squared_gradient(given.rho).numpy()[:, 1:-1]
     np.testing.assert_allclose(slope, (0.4 / 39) ** 2, rtol=1e-3)
-    stated_variance = stated(given, unchanged(given, 0.5)).variance
+    stated_variance = with_calibrated_variance(given, unchanged(given, 0.5)).variance
     extra = (stated_variance - 0.5 * given.variance).numpy()[:, 1:-1]
     np.testing.assert_allclose(extra, BLUR_PX**2 * slope, rtol=1e-3)
 
@@ -232,7 +233,7 @@ def test_the_stated_variance_shrinks_by_what_was_smoothed_away() -> None:
     rng = np.random.default_rng(4)
     given = as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004)
     final = regularise(given)
-    said = float(stated(final, unchanged(given, 1.0)).variance.nanmedian())
+    said = float(with_calibrated_variance(final, unchanged(given, 1.0)).variance.nanmedian())
     smoothed = float((final.rho - 0.5).square().nanmedian() / 0.455)
     slope = BLUR_PX**2 * float(squared_gradient(final.rho).nanmedian())
     assert smoothed < said - slope < 0.8 * 0.004**2
@@ -252,7 +253,9 @@ def test_a_rim_may_belong_to_the_other_side() -> None:
     assert set(map(tuple, near)) == set(zip(rows.tolist(), columns.tolist(), strict=True))
     np.testing.assert_allclose(steps[(columns == 19) | (columns == 21)], 0.5)
     np.testing.assert_allclose(steps[columns < 10], 0.0)
-    added = (stated(given, unchanged(given, 1.0)).variance - given.variance).numpy()
+    added = (
+        with_calibrated_variance(given, unchanged(given, 1.0)).variance - given.variance
+    ).numpy()
     np.testing.assert_allclose(added[:, 19], WRONG_SIDE * 0.25, rtol=1e-4)
     np.testing.assert_allclose(added[:, 10], 0, atol=1e-9)
 

@@ -8,17 +8,20 @@ import torch
 from surface_scene import CAMERA
 
 from bmask_slam.mapping.inverse_depth.depth_map import (
-    COMPATIBLE,
     DepthNoise,
-    agreement,
     from_sensor,
 )
-from bmask_slam.mapping.inverse_depth.pixelwise import gate, windowed
+from bmask_slam.mapping.inverse_depth.pixelwise import (
+    COMPATIBLE,
+    agreement,
+    nan_where_negative,
+    windowed,
+)
 
 
 def test_a_gate_lets_through_what_is_not_negative() -> None:
     margin = torch.tensor([2.0, 0.0, -0.0, -1e-6, torch.nan, -torch.inf])
-    np.testing.assert_array_equal(gate(margin).numpy(), [0, 0, 0, *[np.nan] * 3])
+    np.testing.assert_array_equal(nan_where_negative(margin).numpy(), [0, 0, 0, *[np.nan] * 3])
 
 
 @pytest.mark.parametrize("radius", [1, 2])

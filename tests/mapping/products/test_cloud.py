@@ -10,7 +10,13 @@ import numpy as np
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import make_pose, se3_exp
 from bmask_slam.mapping.open3d_loader import load_open3d
-from bmask_slam.mapping.products.cloud import BLOCK_VOXELS, _fused_labels, merged, spill
+from bmask_slam.mapping.products.cloud import (
+    BLOCK_VOXELS,
+    PlacedSubmap,
+    _fused_labels,
+    merge_blocks,
+    sort_into_blocks,
+)
 from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.mapping.products.pictures import palette
 from bmask_slam.mapping.products.submaps import Submap
@@ -44,12 +50,18 @@ def table(rows: list[int], classes: int) -> LabelTable:
 
 
 def test_it_is_that_of_a_loop_over_voxels(tmp_path: Path) -> None:
-    placed = [(submap(0), se3_exp(RNG.normal(0, 0.3, 6)), 0), (submap(1), np.eye(4), 3)]
-    clouds = list(merged(spill(placed, VOXEL_M, tmp_path), VOXEL_M, table([3, 3], 4)))
+    placed = [
+        PlacedSubmap(submap(0), se3_exp(RNG.normal(0, 0.3, 6)), 0),
+        PlacedSubmap(submap(1), np.eye(4), 3),
+    ]
+    clouds = list(
+        merge_blocks(sort_into_blocks(placed, VOXEL_M, tmp_path), VOXEL_M, table([3, 3], 4))
+    )
     points = np.concatenate([c.points for c in clouds])
     expected = defaultdict(list)
-    for part, T, _ in placed:
-        at, _ = part.placed(T)
+    for given in placed:
+        part = given.submap
+        at, _ = part.placed(given.T_world_anchor)
         for k in range(len(part)):
             voxel = tuple(np.floor(at[k] / VOXEL_M).astype(int))
             expected[voxel].append((at[k], 1 / part.variances[k]))
@@ -112,15 +124,19 @@ def test_a_thing_that_some_views_missed_is_still_there_and_one_seen_once_is_not(
 
 def test_blocks_do_not_share_voxels(tmp_path: Path) -> None:
     far = make_pose(np.eye(3), np.array([BLOCK_VOXELS * VOXEL_M, 0, 0]))
-    files = spill([(submap(0, instances=1), np.eye(4), 0), (submap(1), far, 1)], VOXEL_M, tmp_path)
+    files = sort_into_blocks(
+        [PlacedSubmap(submap(0, instances=1), np.eye(4), 0), PlacedSubmap(submap(1), far, 1)],
+        VOXEL_M,
+        tmp_path,
+    )
     assert len(files) > 2
-    points = np.concatenate([c.points for c in merged(files, VOXEL_M, table([1, 3], 2))])
+    points = np.concatenate([c.points for c in merge_blocks(files, VOXEL_M, table([1, 3], 2))])
     assert len(np.unique(np.floor(points / VOXEL_M), axis=0)) == len(points)
 
 
 def test_files_hold_what_was_written(tmp_path: Path) -> None:
-    files = spill([(submap(0), np.eye(4), 0)], VOXEL_M, tmp_path)
-    (cloud, *rest) = list(merged(files, VOXEL_M, table([3], 5)))
+    files = sort_into_blocks([PlacedSubmap(submap(0), np.eye(4), 0)], VOXEL_M, tmp_path)
+    (cloud, *rest) = list(merge_blocks(files, VOXEL_M, table([3], 5)))
     with CloudWriter(tmp_path / "cloud") as writer:
         for part in (cloud, *rest):
             writer.write(part)

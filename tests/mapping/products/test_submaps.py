@@ -16,9 +16,9 @@ from bmask_slam.mapping.inverse_depth.backprojection import back_project, surfac
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, FusedKeyframe
 from bmask_slam.mapping.products.submaps import (
     make_submap,
-    nearest_a_voxel,
     read_submap,
-    relabelled,
+    relabel,
+    surest_per_voxel,
     write_submap,
 )
 
@@ -107,7 +107,7 @@ def test_the_variance_is_that_of_the_depth() -> None:
 
 def test_one_point_a_voxel_the_surest() -> None:
     points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [-0.1, 0.1, 0.1], [0.3, 0.3, 0.3]])
-    kept = nearest_a_voxel(points.astype(np.float32), np.array([3, 1, 2, 4], np.float32), 1.0)
+    kept = surest_per_voxel(points.astype(np.float32), np.array([3, 1, 2, 4], np.float32), 1.0)
     np.testing.assert_array_equal(kept, [1, 2])
 
 
@@ -119,7 +119,7 @@ def test_one_point_a_voxel_of_many() -> None:
     for k, cell in enumerate(map(tuple, np.floor(points / 0.25).astype(int).tolist())):
         if cell not in best or variances[k] < variances[best[cell]]:
             best[cell] = k
-    kept = nearest_a_voxel(points, variances, 0.25)
+    kept = surest_per_voxel(points, variances, 0.25)
     np.testing.assert_array_equal(kept, sorted(best.values()))
 
 
@@ -150,7 +150,7 @@ def test_new_instances_reach_the_pixels_that_points_were_made_of() -> None:
     numbers = np.arange(1200, dtype=np.uint16).reshape(30, 40)
     moves = np.zeros((30, 40), bool)
     moves[:, 25:] = True
-    told = relabelled(submap, CAMERA, numbers, moves)
+    told = relabel(submap, CAMERA, numbers, moves)
     expected = make_submap(
         replace(result, keyframe=replace(result.keyframe, instances=numbers)), CAMERA, 0.01
     )

@@ -9,13 +9,18 @@ import numpy as np
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.mapping.products.cloud import Cloud
-from bmask_slam.mapping.products.object_clouds import MARGIN_M, ObjectClouds, ObjectRegion, owners
+from bmask_slam.mapping.products.object_clouds import (
+    MARGIN_M,
+    ObjectClouds,
+    ObjectRegion,
+    assign_regions,
+)
 from bmask_slam.mapping.products.surface_labels import (
-    ASTRAY,
     MIN_LANDMARKS,
     OTHER_SHARE,
+    STRAY,
     InstanceEvidence,
-    widened,
+    dilate,
 )
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 
@@ -37,7 +42,7 @@ def test_landmarks_are_the_prior_of_an_instances_class() -> None:
     known = instances != 3
     found = given.with_landmarks(p, known, PRIOR)
     mean = p[:20, 1:].sum(axis=0) / p[:20, 1:].sum()
-    which = np.sqrt(masks[1, 1:] / PRIOR[1:]) * ((1 - ASTRAY) * mean + ASTRAY / 3)
+    which = np.sqrt(masks[1, 1:] / PRIOR[1:]) * ((1 - STRAY) * mean + STRAY / 3)
     believed = np.r_[masks[1, 0], (1 - masks[1, 0]) * which / which.sum()]
     expected = np.log((1 - OTHER_SHARE) * believed / PRIOR + OTHER_SHARE)
     np.testing.assert_allclose(found[1], expected, atol=1e-5)
@@ -58,10 +63,10 @@ def test_landmarks_of_a_thing_on_an_instance_do_not_overrule_its_mask() -> None:
     assert given.with_landmarks(p, all_known, PRIOR)[0].argmax() == 2
 
 
-def test_widened_reaches_as_far_as_it_says() -> None:
+def test_dilate_reaches_as_far_as_it_says() -> None:
     shown = np.zeros((20, 30), bool)
     shown[10, 12] = True
-    rows, columns = np.nonzero(widened(shown, 3))
+    rows, columns = np.nonzero(dilate(shown, 3))
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (7, 13, 9, 15)
 
 
@@ -82,7 +87,7 @@ def test_points_go_to_the_object_whose_box_holds_them(tmp_path: Path) -> None:
     points = rng.uniform(-1, 4, (3000, 3)) * [1, 0.3, 0.3]
     labels = rng.integers(0, 3, 3000)
     given = cloud(points, labels)
-    found = owners(given, regions)
+    found = assign_regions(given, regions)
     for p, label, mine in zip(given.points.astype(float), labels, found, strict=True):
         fits = []
         for k, (T, region) in enumerate(zip(poses, regions, strict=True)):

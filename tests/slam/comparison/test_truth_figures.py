@@ -123,6 +123,6 @@ def test_depth_against_the_sensor(run, office, monkeypatch):
             return self.given
 
     monkeypatch.setattr(
-        "bmask_slam.comparison.jobs.truth_figures.DenseFolder.opened", lambda run: Dense()
+        "bmask_slam.comparison.jobs.truth_figures.DenseFolder.open", lambda run: Dense()
     )
     assert depth_ratio(run, sequence) == pytest.approx(0.5, rel=1e-6)

@@ -15,7 +15,8 @@ from true_run import FRAMES, make_run
 
 from bmask_slam.cli import main
 from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.input import MappedRun, load, open_run
+from bmask_slam.dense.keyframe_input import load_keyframe
+from bmask_slam.dense.saved_map import MappedRun, open_run
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested
 from bmask_slam.graph.files.ply import read_ply
@@ -63,12 +64,12 @@ def test_it_leaves_what_it_promises(mapped: Path) -> None:
 
 def test_fused_depth_is_nearer_to_the_truth_than_the_sensors(mapped: Path, room: Path) -> None:
     run = open_run(mapped)
-    folder = DenseFolder.opened(mapped)
+    folder = DenseFolder.open(mapped)
     before, after, chi2 = [], [], []
     for keyframe in run.keyframes:
         file = room / "depth_true" / run.sequence.pairs.depth_files[keyframe.frame_index].name
         true_m = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) / run.camera.depth_scale
-        sensor_m = load(run, keyframe)[0].depth_m
+        sensor_m = load_keyframe(run, keyframe)[0].depth_m
         fused = folder.fused(keyframe.id)
         both = (true_m > 0) & np.isfinite(sensor_m) & np.isfinite(fused.depth_m())
         before.append((sensor_m - true_m)[both])
@@ -131,7 +132,7 @@ def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_
     shutil.copytree(mapped, run)
     stamps = [p.stat().st_mtime_ns for p in sorted((run / "dense" / "submaps").iterdir())]
     opened, names = open_run(run), CocoSegmenter(truth_file(open_run(run))).labels
-    folder = DenseFolder.opened(run)
+    folder = DenseFolder.open(run)
     evidence = [folder.evidence(k.id) for k in opened.keyframes]
     seen = [e.log_likelihoods[e.landmark_instances].argmax(axis=1) for e in evidence]
     old = int(np.bincount(np.concatenate(seen)).argmax())
@@ -186,7 +187,7 @@ def test_without_depth_a_keyframe_is_left_out(room: Path, tmp_path: Path) -> Non
     cv2.imwrite(str(moved / "depth" / sequence.pairs.depth_files[FRAMES[3]].name), blank)
     with pytest.raises(InputError, match="no valid depth"):
         opened = open_run(run, moved)
-        load(opened, opened.keyframes[3])
+        load_keyframe(opened, opened.keyframes[3])
 
 
 def test_a_full_disk_stops_with_what_was_written(

@@ -15,10 +15,10 @@ from true_run import make_run
 
 from bmask_slam.cli import main
 from bmask_slam.config.yaml import format_yaml, read_yaml
-from bmask_slam.dense.assembly import assembled, fuse_run
 from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.input import open_run
+from bmask_slam.dense.map_run import RunFusion
 from bmask_slam.dense.options import MapOptions
+from bmask_slam.dense.saved_map import open_run
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -88,7 +88,7 @@ def relative_errors(run: Path, pairs: Path) -> Array:
     for keyframe in open_run(run).keyframes:
         file = pairs / "depth_true" / f"{STAMPS[keyframe.frame_index]}.png"
         true_m = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) / 5000
-        found.append(DenseFolder.opened(run).fused(keyframe.id).depth_m() / true_m - 1)
+        found.append(DenseFolder.open(run).fused(keyframe.id).depth_m() / true_m - 1)
     return np.stack(found)
 
 
@@ -218,8 +218,8 @@ class PersonInTheMiddle:
 
 def test_what_moves_is_left_out_of_the_pairs_too(sequence: Path) -> None:
     opened = open_run(run_of(sequence, (0,)))
-    options = MapOptions(opened.path, without=("person",), source="stereo")
-    assert fuse_run(assembled(opened, PersonInTheMiddle(), options)).fused == 1
+    options = MapOptions(opened.path, excluded=("person",), source="stereo")
+    assert RunFusion(opened, PersonInTheMiddle(), options).fuse_all().fused == 1
     relative = relative_errors(opened.path, sequence)[0]
     assert np.isnan(relative[60:120, 90:150]).all()
     assert np.isfinite(relative[:, :80]).mean() > 0.7

@@ -12,7 +12,7 @@ from synthetic_view import CAMERA, PLANE_Z_M, render_plane
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.keyframe_view import SeenKeyframe
+from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.processes.dense_messages import (
@@ -44,11 +44,11 @@ CHAIR = instance(2, slice(80, 180), slice(80, 200))
 PERSON = instance(1, slice(250, 400), slice(400, 560))
 
 
-def seen(number: int, T: Array | None = None) -> SeenKeyframe:
+def snapshot(number: int, T: Array | None = None) -> KeyframeSnapshot:
     """Keyframes that all observe four landmarks, which are the same only in number."""
     T = POSES[number] if T is None else T
     ids, points = np.arange(4), np.tile([0.0, 0.0, PLANE_Z_M], (4, 1))
-    return SeenKeyframe(number, 0, T, FRAMES[number], ids, points, PIXELS)
+    return KeyframeSnapshot(number, 0, T, FRAMES[number], ids, points, PIXELS)
 
 
 def keeper(path: Path) -> tuple[DenseKeeper, list[Any]]:
@@ -60,7 +60,7 @@ def keeper(path: Path) -> tuple[DenseKeeper, list[Any]]:
 
 
 def to_map(number: int, instances: list[Instance], T: Array | None = None) -> KeyframeToMap:
-    whole = seen(number, T)
+    whole = snapshot(number, T)
     return KeyframeToMap(whole, instances, {number: whole.T_world_camera})
 
 
@@ -73,7 +73,7 @@ def test_a_submap_comes_after_its_neighbours_and_lies_on_the_surface(tmp_path) -
     for number in POSES:
         keep.handle(to_map(number, []))
     assert mapped(said) == [0, 1]
-    submap = DenseFolder.opened(tmp_path / "run").submap(1)
+    submap = DenseFolder.open(tmp_path / "run").submap(1)
     points_world, _ = submap.placed(POSES[1])
     assert np.abs(points_world[:, 2] - PLANE_Z_M).max() < 0.003
     preview = next(m.preview for m in said if isinstance(m, Mapped) and m.keyframe_id == 1)
@@ -90,13 +90,13 @@ def test_poses_that_move_before_fusion_are_followed(tmp_path) -> None:
     keep.handle(to_map(0, [], off))
     for number in range(1, 7):
         message = to_map(number, [])
-        keep.handle(KeyframeToMap(message.seen, [], {k: POSES[k] for k in range(number + 1)}))
-    folder = DenseFolder.opened(tmp_path / "run")
+        keep.handle(KeyframeToMap(message.snapshot, [], {k: POSES[k] for k in range(number + 1)}))
+    folder = DenseFolder.open(tmp_path / "run")
     sigma = float(np.median(np.sqrt(folder.submap(0).variances)))
     alone, _ = keeper(tmp_path / "alone")
     alone.handle(to_map(0, []))
     alone._tell(alone._fusion.finish())
-    single = DenseFolder.opened(tmp_path / "alone").submap(0)
+    single = DenseFolder.open(tmp_path / "alone").submap(0)
     assert sigma < 0.8 * float(np.median(np.sqrt(single.variances)))
 
 
@@ -107,7 +107,7 @@ def in_time(tmp_path_factory: pytest.TempPathFactory) -> DenseFolder:
     keep, _ = keeper(path)
     for number in range(7):
         keep.handle(to_map(number, [CHAIR, PERSON] if number == 0 else []))
-    return DenseFolder.opened(path)
+    return DenseFolder.open(path)
 
 
 def with_late_masks(path: Path, last: int) -> DenseFolder:
@@ -118,7 +118,7 @@ def with_late_masks(path: Path, last: int) -> DenseFolder:
         if number == last:
             keep.handle(LateMasks(0, [CHAIR, PERSON], np.arange(4), PIXELS))
     assert mapped(said) == [0]
-    return DenseFolder.opened(path)
+    return DenseFolder.open(path)
 
 
 def same_evidence(one: DenseFolder, other: DenseFolder) -> bool:
@@ -139,7 +139,7 @@ def test_a_detection_too_weak_for_an_object_cuts_nothing_out(tmp_path) -> None:
     keep, _ = keeper(tmp_path / "run")
     for number in range(7):
         keep.handle(to_map(number, [CHAIR, replace(PERSON, class_score=0.2)]))
-    folder = DenseFolder.opened(tmp_path / "run")
+    folder = DenseFolder.open(tmp_path / "run")
     assert np.isfinite(folder.fused(0).depth_m()[PERSON.mask]).mean() > 0.9
     assert set(folder.submap(0).instances.tolist()) == {0, 1}
 
@@ -166,7 +166,7 @@ def test_what_is_forgotten_is_gone_before_and_after_it_is_saved(tmp_path) -> Non
     keep.handle(Forget([0, 3]))
     keep._tell(keep._fusion.finish())
     assert mapped(said) == [0, 1, 2, 4, 5, 6]
-    folder = DenseFolder.opened(tmp_path / "run")
+    folder = DenseFolder.open(tmp_path / "run")
     assert [k for k in POSES if folder.is_done(k)] == [1, 2, 4, 5, 6]
     assert not list(folder.path.glob("*/000000"))
 

@@ -17,7 +17,7 @@ from test_live_faults import fill, running
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.input import read_saved_map
+from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import se3_exp
@@ -52,7 +52,7 @@ def wait_for(slam: LiveSlam, deaths: int) -> None:
 
 def keyframes_without(run: Path) -> dict[int, str]:
     """Keyframes of the map without a submap, and what dense.json says why; some have one."""
-    folder = DenseFolder.opened(run)
+    folder = DenseFolder.open(run)
     ids = [k.id for k in read_saved_map(run).keyframes]
     done = [k for k in range(100) if folder.is_done(k)]
     assert len(done) > 3

@@ -98,7 +98,7 @@ def test_the_newest_goes_first_and_one_at_a_time(dense) -> None:
     dense.follow(world, no, no)
     dense.follow(world, no, no)
     assert worker.keyframes() == [2]
-    assert (worker.sent[0].seen.frame.rgb == 0).all()
+    assert (worker.sent[0].snapshot.frame.rgb == 0).all()
     ask(dense, 3)
     for number in (2, 3, 1, 0):
         worker.answers = [Taken(number)]

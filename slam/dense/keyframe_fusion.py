@@ -1,0 +1,177 @@
+"""Fusion of keyframes and their masks, one after the other, into the folder of a dense map."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.keyframe_input import undistort_labels
+from bmask_slam.dense.options import MapOptions, fusion_config
+from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.camera import Camera
+from bmask_slam.mapping.inverse_depth.dense_mapper import (
+    DenseKeyframe,
+    DenseMapper,
+    FusedKeyframe,
+)
+from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
+from bmask_slam.mapping.products.submaps import Submap, make_submap
+from bmask_slam.mapping.products.surface_labels import InstanceEvidence, dilate, keyframe_labels
+from bmask_slam.run_folder.map_file import run_semantics
+from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.labels import LabelSet
+
+
+@dataclass(eq=False)
+class FusionCounts:
+    """What happened to the keyframes.
+
+    Attributes:
+        fused: number of keyframes that were fused.
+        reused: number of keyframes that were finished before.
+        skipped: keyframes that could not be used, by id, with the reason.
+        fuse_ms: time of Steps 1 to 6 for each fused keyframe, without reading and writing files.
+    """
+
+    fused: int = 0
+    reused: int = 0
+    skipped: dict[int, str] = field(default_factory=dict)
+    fuse_ms: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeInstances:
+    """The instances in a keyframe's image.
+
+    Attributes:
+        numbers: (H, W) uint16, the instance at each undistorted pixel, from 1; 0 for none.
+        excluded: (H, W) pixels of instances whose classes are excluded from the map.
+        evidence: about the classes of the instances.
+    """
+
+    numbers: NDArray[np.uint16]
+    excluded: Mask
+    evidence: InstanceEvidence
+
+
+class KeyframeFusion:
+    """Fuses keyframes and saves the submap of each when its neighbours have come.
+
+    Attributes:
+        counts: what happened to the keyframes.
+    """
+
+    def __init__(
+        self, camera: Camera, labels: LabelSet, folder: DenseFolder, options: MapOptions
+    ) -> None:
+        """``options`` are resolved."""
+        self.counts = FusionCounts()
+        self._camera, self._folder, self._options = camera, folder, options
+        self._classes = len(labels)
+        self._excluded = [labels.number(name) for name in options.excluded or ()]
+        self._semantics = run_semantics(options.run)
+        self._mapper = DenseMapper(camera, fusion_config(options))
+        self._evidence: dict[int, InstanceEvidence] = {}
+        self._segment: int | None = None
+
+    def label_pixels(
+        self, instances: Sequence[Instance], landmark_ids: Ints, pixels: Array
+    ) -> KeyframeInstances:
+        """The instances of an image, and the landmarks (L,) on them.
+
+        ``pixels`` (L, 2) are where the landmarks were detected; like the masks they are distorted.
+        Instances with a class score below the run's ``object_score`` do not count.
+        """
+        instances = [i for i in instances if i.class_score >= self._semantics.object_score]
+        shape = self._camera.height, self._camera.width
+        labels = keyframe_labels(instances, shape, self._classes, self._semantics.labels)
+        columns, lines = np.rint(pixels).astype(np.int64).T
+        on = labels.numbers[lines.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)]
+        evidence = InstanceEvidence(labels.log_likelihoods, landmark_ids[on > 0], on[on > 0])
+        numbers = undistort_labels(labels.numbers, self._camera)
+        excluded = [k for k, found in enumerate(instances, 1) if found.label in self._excluded]
+        return KeyframeInstances(numbers, np.isin(numbers, excluded), evidence)
+
+    def add(
+        self,
+        keyframe: DenseKeyframe,
+        segment: int,
+        instances: KeyframeInstances,
+        poses: Mapping[int, Array],
+    ) -> list[Submap]:
+        """Add a keyframe; the submaps that this completes are saved and returned.
+
+        Keyframes of different map segments have no frame in common and are not fused.
+        ``poses`` are the current T_world_camera (4, 4) of keyframes by id.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        completed = self.finish() if segment != self._segment else []
+        self._segment = segment
+        excluded = instances.excluded
+        wanted = not self._folder.is_done(keyframe.id)
+        self.counts.reused += not wanted
+        keyframe = replace(keyframe, instances=instances.numbers)
+        if wanted:
+            self._evidence[keyframe.id] = instances.evidence
+            if self._options.keep_excluded and excluded.any():
+                self._save_excluded(keyframe, excluded)
+        hidden = dilate(excluded)
+        depth_m = np.where(hidden, np.float32(np.nan), keyframe.depth_m)
+        keyframe = replace(keyframe, depth_m=depth_m, unmatched=hidden)
+        self._mapper.update_poses(poses)
+        started_s = time.perf_counter()
+        return completed + self._save(self._mapper.add(keyframe, wanted), started_s)
+
+    def update_poses(self, poses: Mapping[int, Array]) -> None:
+        """Replace the poses of waiting keyframes by T_world_camera (4, 4), by id."""
+        self._mapper.update_poses(poses)
+
+    def relabel(self, keyframe_id: int, instances: KeyframeInstances) -> None:
+        """Replace the instances of a keyframe whose masks came late, whether it waits or is saved.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        numbers, hidden = instances.numbers, dilate(instances.excluded)
+        evidence = instances.evidence
+        if self._folder.is_done(keyframe_id):
+            self._folder.relabel(keyframe_id, self._mapper.camera, numbers, hidden, evidence)
+        elif keyframe_id in self._evidence:
+            self._evidence[keyframe_id] = evidence
+            self._mapper.relabel(keyframe_id, numbers, hidden)
+
+    def remove(self, keyframe_ids: Collection[int]) -> None:
+        """Remove keyframes that left the map, with their submaps."""
+        self._mapper.remove(keyframe_ids)
+        for number in keyframe_ids:
+            self._evidence.pop(number, None)
+            self._folder.remove(number)
+
+    def finish(self) -> list[Submap]:
+        """Fuse and save the keyframes that still wait. Raises InputError if the disk is full."""
+        started_s = time.perf_counter()
+        return self._save(self._mapper.flush(), started_s)
+
+    def _save_excluded(self, keyframe: DenseKeyframe, excluded: Mask) -> None:
+        """Save the excluded pixels of a keyframe as the sensor measured them, not fused."""
+        depth_m = np.where(excluded, keyframe.depth_m, np.float32(np.nan))
+        measured = from_sensor(depth_m, self._mapper.camera, self._mapper.config.noise)
+        points = FusedKeyframe(keyframe, measured, excluded.astype(np.uint8))
+        self._folder.write_excluded(make_submap(points, self._camera, self._options.voxel_m))
+
+    def _save(self, finished: Sequence[FusedKeyframe], started_s: float) -> list[Submap]:
+        voxel_m, folder = self._options.voxel_m, self._folder
+        submaps = [make_submap(r, self._camera, voxel_m) for r in finished]
+        elapsed_ms = 1e3 * (time.perf_counter() - started_s)
+        for result, submap in zip(finished, submaps, strict=True):
+            folder.write(submap, result.map, self._evidence.pop(submap.anchor))
+            self.counts.fused += 1
+            self.counts.fuse_ms.append(elapsed_ms / len(finished))
+        return submaps

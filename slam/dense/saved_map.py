@@ -1,0 +1,103 @@
+"""The saved map of a run, and the sequence that it was made from: the input of dense mapping."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import part
+from bmask_slam.mapping.inverse_depth.dense_mapper import DepthSource
+from bmask_slam.run_folder.map_file import RunLabels, read_map, saved_labels
+from bmask_slam.run_folder.origin import find_sequence
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.right_images import RIGHT_LIST, RightImages, read_right_images
+from bmask_slam.world.map_state import world_of
+from bmask_slam.world.world_map import Keyframe, WorldMap
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """The map of a run folder.
+
+    Attributes:
+        path: the run folder.
+        world: the map.
+        keyframes: those of its largest segment, oldest first.
+        camera: of the images, with distortion.
+        labels: the classes of its landmarks; None if the run had no segmenter.
+    """
+
+    path: Path
+    world: WorldMap
+    keyframes: list[Keyframe]
+    camera: Camera
+    labels: RunLabels | None = None
+
+    def poses(self) -> dict[int, Array]:
+        """The current T_world_camera (4, 4) of every keyframe by its id."""
+        return {k.id: k.T_world_camera for k in self.world.keyframes.values()}
+
+    def label_distributions(self, ids: Ints, names: LabelSet) -> tuple[Array, Mask]:
+        """Distributions (N, C) over ``names`` of landmarks (N,), and which (N,) are known.
+
+        None is known where the run had other labels.
+        """
+        if self.labels is None or self.labels.names != names or not len(ids):
+            return np.zeros((len(ids), len(names))), np.zeros(len(ids), bool)
+        parents = self.world.landmarks.current(ids)
+        store = self.labels.store
+        return store.probabilities(parents), store.estimates(parents).views > 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MappedRun(SavedMap):
+    """A run folder and its sequence.
+
+    Attributes:
+        sequence: the images.
+        right: the right images, if depth comes from stereo pairs.
+    """
+
+    sequence: Sequence
+    right: RightImages | None = None
+
+
+def open_run(path: Path, sequence: Path | None = None) -> MappedRun:
+    """Open a finished run; ``sequence`` is needed if the images have moved.
+
+    Raises:
+        InputError: no map in the folder, or no sequence.
+    """
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder; give the folder of a finished run")
+    saved = read_saved_map(path)
+    folder = sequence or find_sequence(path)
+    opened = open_sequence(folder, camera=saved.camera)
+    return MappedRun(**vars(saved), sequence=opened)
+
+
+def with_right_images(run: MappedRun, source: DepthSource) -> MappedRun:
+    """The run with its right images and the bf of the pairs, if the source of depth uses them.
+
+    Raises:
+        InputError: the source is "stereo" and the right images or the baseline are not there.
+    """
+    optional = source == "both" and (run.sequence.folder / RIGHT_LIST).is_file()
+    if source != "stereo" and not optional:
+        return run
+    right = read_right_images(run.sequence, run.camera)
+    return replace(run, camera=right.camera, right=right)
+
+
+def read_saved_map(path: Path) -> SavedMap:
+    """The map of a run folder, without its images. Raises InputError if there is none."""
+    state, camera = read_map(path)
+    world = world_of(part(state, "mapper.world"))
+    keyframes = world.in_segment(world.largest_segment())
+    return SavedMap(path, world, keyframes, camera, saved_labels(part(state, "semantics"), path))
