@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails, to_jsonable_python
 
 from bmask_slam.config.yaml import format_yaml, parse_yaml, read_yaml
 from bmask_slam.graph.data_files import data_path
@@ -108,12 +107,12 @@ def from_text(cls: type[Config], text: str, source: str) -> Config:
 
 def dump(config: Any) -> str:
     """YAML text of a resolved configuration; resolving it gives an equal configuration."""
-    return format_yaml(to_jsonable_python(config))
+    return format_yaml(_plain(config))
 
 
 def differences(config: Any, other: Any) -> dict[str, Any]:
     """Plain values of ``config`` by dotted path where ``other``, of the same class, has another."""
-    values, others = (dict(_leaves(to_jsonable_python(c))) for c in (config, other))
+    values, others = (dict(_leaves(_plain(c))) for c in (config, other))
     return {path: value for path, value in values.items() if value != others[path]}
 
 
@@ -127,6 +126,12 @@ def _with_present_names(tree: Any, prefix: str = "") -> Any:
         name = key if name in tree else name
         found[name] = _with_present_names(value, f"{prefix}{name}.")
     return found
+
+
+def _plain(config: Any) -> Any:
+    """A configuration as nested mappings of what YAML can hold."""
+    cls: Any = type(config)
+    return _adapter(cls).dump_python(config, mode="json")
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -216,7 +221,7 @@ def _default(cls: Any, name: str) -> Any:
     value = None if field.default is dataclasses.MISSING else field.default
     if field.default_factory is not dataclasses.MISSING:
         value = field.default_factory()
-    return to_jsonable_python(value) or {}
+    return {} if value is None else _plain(value)
 
 
 # --- Messages ------------------------------------------------------------------------------------
@@ -244,7 +249,7 @@ def _suggestion(root: Any, prefix: str, key: str) -> str:
     return f"did you mean {close[0]}?" if close else f"there are: {', '.join(siblings)}"
 
 
-def _refusal(error: ErrorDetails, sources: Mapping[str, str], cls: type) -> str:
+def _refusal(error: Mapping[str, Any], sources: Mapping[str, str], cls: type) -> str:
     """One line for an error that pydantic found: where it was given, path, value and cure."""
     path = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in error["loc"])[1:]
     group = f"{path.partition('[')[0]}.".lstrip(".")
