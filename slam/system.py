@@ -23,8 +23,8 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_results import SystemResults, largest
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.keyframe_decision import KeyframeDecision
-from bmask_slam.tracking.results import FrameResult, TrackingStatus
-from bmask_slam.tracking.tracker import Tracked, Tracker
+from bmask_slam.tracking.results import FrameResult, Tracked, TrackingStatus
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)

@@ -28,7 +28,7 @@ from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked
 
 NEAR_PX = 6
 """Keypoints so near to a border count for neither side."""

@@ -15,7 +15,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.map_editor import MapEditor
 from bmask_slam.world.world_map import Keyframe, WorldMap
 

@@ -33,7 +33,8 @@ from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.tracking.tracker import Tracked, Tracker
+from bmask_slam.tracking.results import Tracked
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.local_map import local_landmarks

@@ -8,7 +8,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.world_map import WorldMap
 
 

@@ -38,12 +38,17 @@ RENAMED = {
     "dynamics": "moving_objects",
     "moving_objects.suspects": "static_verification",
     "feed": "factor_selection",
+    "mapping.local_keyframes": "local_map.keyframes",
+    "mapping.local_min_shared": "local_map.min_shared",
     "factor_selection.retire_batch": "marginalise_batch",
     "graph.max_recoveries": "max_repairs",
     "graph.bridge_sigma_rotation_rad": "anchor_sigma_rotation_rad",
     "graph.bridge_sigma_translation_m": "anchor_sigma_translation_m",
 }
-"""Present name of a setting by its older path, in which the groups have their present names."""
+"""Present name of a setting, within its group, by its older path.
+
+In the path the groups have their present names.
+"""
 
 
 def find_config(name: str) -> Path:
@@ -120,11 +125,13 @@ def _with_present_names(tree: Any, prefix: str = "") -> Any:
     """A document with older names of settings replaced; not where the present name is given too."""
     if not isinstance(tree, dict):
         return tree
-    found = {}
+    found: dict[str, Any] = {}
     for key, value in tree.items():
         name = RENAMED.get(f"{prefix}{key}", key)
         name = key if name in tree else name
-        found[name] = _with_present_names(value, f"{prefix}{name}.")
+        group, _, within = str(name).rpartition(".")
+        target = found.setdefault(group, {}) if group else found
+        target[within] = _with_present_names(value, f"{prefix}{name}.")
     return found
 
 

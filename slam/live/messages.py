@@ -8,7 +8,7 @@ from pathlib import Path
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints
 from bmask_slam.live.replica import WorldDelta
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.frame_history import Entries
 from bmask_slam.world.landmark_table import Patches
 

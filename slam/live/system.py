@@ -28,8 +28,7 @@ from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.tracking.results import FrameResult
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import FrameResult, Tracked
 from bmask_slam.world.frame_history import NOBODY
 from bmask_slam.world.world_map import Keyframe
 

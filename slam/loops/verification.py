@@ -11,7 +11,6 @@ from enum import Enum
 
 import numpy as np
 
-from bmask_slam.features.brisk import Features
 from bmask_slam.features.matching import (
     MatchConfig,
     Matches,
@@ -23,19 +22,14 @@ from bmask_slam.features.matching import (
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import (
-    adjoint,
     inverse,
     make_pose,
-    orthonormalised,
-    se3_exp,
     transform,
 )
-from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, jacobian, residuals
+from bmask_slam.loops.relative_pose import LoopView, Views, refine_relative_pose
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 NEAREST_M = 0.1
-MAX_NOISE_SCALE = 3.0
-MEDIAN_TO_GATE = 2.366 / CHI2_3DOF  # of chi-square
 
 
 @dataclass(frozen=True)
@@ -66,22 +60,6 @@ class LoopConfig:
     first_ratio: float = 0.85
 
 
-@dataclass(frozen=True)
-class LoopView:
-    """What a keyframe brings to a loop.
-
-    ``features`` are its N keypoints, ``landmark_ids`` (N,) their living landmarks, -1 for none,
-    ``points_camera`` (N, 3) these in its camera's frame, NaN also where the keypoint has no depth.
-    """
-
-    keyframe_id: int
-    features: Features
-    points_camera: Array
-    landmark_ids: Ints
-
-
-Views = tuple[LoopView, LoopView]
-Pairs = tuple[Ints, Ints]  # keypoint a[k] goes with b[k]
 Search = tuple[float, Camera, LoopConfig]  # radius in px
 
 
@@ -157,7 +135,7 @@ def verify_loop(
     for radius_px in config.radii_px:
         a, b, expected = _guided_pairs(views, T_a_b, (radius_px, camera, config))
         if (found := len(a)) >= config.min_inliers:
-            T_a_b, covariance, inliers, scale = _refine(views, (a, b), T_a_b, camera)
+            T_a_b, covariance, inliers, scale = refine_relative_pose(views, (a, b), T_a_b, camera)
             found = int(inliers.sum())
         if found < config.min_inliers:
             return NoLoop(NoLoopReason.FEW_INLIERS, found, config.min_inliers)
@@ -249,62 +227,3 @@ def _guided(views: Views, T_target_source: Array, search: Search) -> tuple[Ints,
     tables = (source.features.descriptors[rows], target.features.descriptors)
     found = match_pairs((query, train), tables, MatchConfig())
     return rows[found.query], found.train, len(rows)
-
-
-def _refine(
-    views: Views, pairs: Pairs, T_a_b: Array, camera: Camera
-) -> tuple[Array, Array, Mask, float]:
-    """T_a_b on pairs, its covariance, which pairs are inliers, and the noise scale.
-
-    Gauss-Newton with Cauchy's kernel on all pairs, then on inliers alone. A pair with points on
-    both sides enters each way with half the weight, since it is one piece of information.
-    """
-    scale, active = 1.0, np.ones(len(pairs[0]), bool)
-    for kernel in (16.0, 4.0, 1.0, None, None, None, None):
-        r, J, W, gate = _linearised(views, pairs, T_a_b, camera)
-        chi2 = np.einsum("wni,wnij,wnj->n", r, W, r)
-        if kernel is None or kernel == 1.0:
-            asked = np.sqrt(np.median(chi2 / gate) / MEDIAN_TO_GATE)
-            scale = float(np.clip(asked, 1.0, MAX_NOISE_SCALE))
-        active = chi2 < gate * scale**2
-        w = active if kernel is None else 1 / (1 + chi2 / (kernel * gate))
-        H = np.einsum("n,wnia,wnij,wnjb->ab", w, J, W, J)
-        g = np.einsum("n,wnia,wnij,wnj->a", w, J, W, r)
-        T_a_b = orthonormalised(T_a_b @ se3_exp(-np.linalg.solve(H + 1e-9 * np.eye(6), g)))
-    return T_a_b, np.linalg.inv(H + 1e-9 * np.eye(6)) * scale**2, active, scale
-
-
-def _linearised(views: Views, pairs: Pairs, T_a_b: Array, camera: Camera) -> tuple[Array, ...]:
-    """Residuals (2, M, 3), Jacobians (2, M, 3, 6), weights (2, M, 3, 3), gates (M,), for two ways.
-
-    Way 0 is a's points in b, way 1 b's points in a. For ``T_a_b <- T_a_b @ se3_exp(xi)`` the
-    inverse becomes ``T_b_a @ se3_exp(-Ad(T_a_b) @ xi)``. Without a point the weight is zero.
-    """
-    r_b, J_b, W_b = _way(views, pairs, T_a_b, camera)
-    r_a, J_a, W_a = _way(views[::-1], pairs[::-1], inverse(T_a_b), camera)
-    W = np.stack([W_b, W_a])
-    has_point, has_depth = W[:, :, 0, 0] > 0, W[:, :, 2, 2] > 1e-9
-    W /= has_point.sum(axis=0)[:, None, None]
-    gate = np.where(has_depth.any(axis=0), CHI2_3DOF, CHI2_2DOF)
-    return np.stack([r_b, r_a]), np.stack([J_b, -J_a @ adjoint(T_a_b)]), W, gate
-
-
-def _way(views: Views, pairs: Pairs, T_source_target: Array, camera: Camera) -> tuple[Array, ...]:
-    """Residuals, Jacobians and weights of the source's points in the target's image.
-
-    A point is taken to be as uncertain as its own keyframe's measurement of it alone.
-    """
-    source, target = views
-    own, measured = source.points_camera[pairs[0]], target.features.measurements[pairs[1]]
-    known, stereo = np.isfinite(own[:, 2]), np.isfinite(measured[:, 2])
-    own, measured = np.where(known[:, None], own, [0, 0, 1]), np.nan_to_num(measured)
-    r, points = residuals(T_source_target, own, measured, camera)
-    J = jacobian(points, camera)
-    to_pixels = -J[:, :, 3:] @ T_source_target[:3, :3].T  # d(u, v, disparity) / d(own)
-    spread = to_pixels @ np.linalg.inv(-jacobian(own, camera)[:, :, 3:])
-    own_sigmas = np.where(known[:, None], source.features.sigmas_px[pairs[0]], 1.0)
-    sigmas = target.features.sigmas_px[pairs[1]].copy()
-    sigmas[~stereo, 2] = 1e6  # without depth, no weight
-    S = (spread * own_sigmas[:, None] ** 2) @ np.swapaxes(spread, 1, 2)
-    W = np.linalg.inv(S + sigmas[:, None] ** 2 * np.eye(3))
-    return r, J, W * known[:, None, None]

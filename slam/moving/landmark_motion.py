@@ -15,7 +15,7 @@ from bmask_slam.semantics.beliefs.movability import (
     MovabilityPriors,
 )
 from bmask_slam.semantics.tracks.instance_track import Sighting
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.map_editor import MapEditor
 
 

@@ -32,8 +32,7 @@ from bmask_slam.semantics.tracks.instance_track import Sighting, Track
 from bmask_slam.semantics.tracks.instance_tracks import InstanceTracks
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.camera_tracker import CameraTracker
-from bmask_slam.tracking.results import TrackingStatus
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.world.map_editor import MapEditor
 from bmask_slam.world.world_map import Keyframe
 

@@ -13,8 +13,7 @@ from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.runtime.stage_clock import stage
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
-from bmask_slam.tracking.results import FrameResult, TrackingStatus
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import FrameResult, Tracked, TrackingStatus
 
 REFRESH_FRAMES = 5  # a sixth of a second at 30 Hz
 

@@ -8,9 +8,9 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.geometry import carried_along, inverse, orthonormalised, se3_exp, se3_log
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
-from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
-from bmask_slam.tracking.tracker import Tracked, Tracker, lost, untracked
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import Keyframe

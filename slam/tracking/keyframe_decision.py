@@ -8,8 +8,7 @@ from typing import Literal
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.tracking.camera_tracker import CameraTracker
-from bmask_slam.tracking.results import TrackingStatus
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import Keyframe
 

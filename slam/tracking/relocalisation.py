@@ -12,8 +12,8 @@ from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.features.matching import MatchConfig, consistent_rotation, match_brute_force
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import make_pose
-from bmask_slam.tracking.results import TrackingStatus
-from bmask_slam.tracking.tracker import Tracked, Tracker
+from bmask_slam.tracking.results import Tracked, TrackingStatus
+from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.world_map import Keyframe, WorldMap
 

@@ -1,13 +1,14 @@
-"""What the system returns for a frame: a value with a status, never an exception."""
+"""What tracking and the system return for a frame: values with a status, never exceptions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.features.brisk import Features
+from bmask_slam.graph.arrays import Array, Ints
 
 
 class TrackingStatus(Enum):
@@ -16,6 +17,44 @@ class TrackingStatus(Enum):
     OK = "OK"
     WEAK = "WEAK"
     LOST = "LOST"
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame that was tracked against the map.
+
+    Attributes:
+        status: LOST means that the pose must not be used.
+        T_world_camera: (4, 4).
+        features: the frame's, with the registered pixels of the matches, and pixel sigmas that
+            agree with the frame's residuals.
+        keypoints, landmark_ids: (M,) inlier matches.
+        matches: number of matches before the robust estimate.
+        visible_ids: landmarks of the local map that project into the frame.
+        information: (6, 6) of the pose.
+    """
+
+    status: TrackingStatus
+    T_world_camera: Array
+    features: Features
+    keypoints: Ints
+    landmark_ids: Ints
+    matches: int
+    visible_ids: Ints
+    information: Array
+
+
+def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked:
+    """A frame that has no pose; T_world_camera (4, 4) is where it was expected."""
+    begun = untracked(T_world_camera, features)
+    return replace(begun, status=TrackingStatus.LOST, matches=matches)
+
+
+def untracked(T_world_camera: Array, features: Features) -> Tracked:
+    """A frame that begins a map at a given pose (4, 4)."""
+    none = np.zeros(0, np.int64)
+    information = np.zeros((6, 6))
+    return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from bmask_slam.tracking.pose_optimisation import (
     PoseOptimisationConfig,
     optimise_pose,
 )
-from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.tracking.results import Tracked, TrackingStatus, lost
 from bmask_slam.tracking.rolling_shutter import (
     Motion,
     PreviousPose,
@@ -56,31 +56,6 @@ class TrackingConfig:
     match: MatchConfig = field(default_factory=MatchConfig)
     pose: PoseOptimisationConfig = field(default_factory=PoseOptimisationConfig)
     subpixel: SubpixelConfig = field(default_factory=SubpixelConfig)
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """A frame against the map.
-
-    Attributes:
-        status: LOST means that the pose must not be used.
-        T_world_camera: (4, 4).
-        features: the frame's, with the registered pixels of the matches, and pixel sigmas that
-            agree with the frame's residuals.
-        keypoints, landmark_ids: (M,) inlier matches.
-        matches: number of matches before the robust estimate.
-        visible_ids: landmarks that should be in view.
-        information: (6, 6) of the pose.
-    """
-
-    status: TrackingStatus
-    T_world_camera: Array
-    features: Features
-    keypoints: Ints
-    landmark_ids: Ints
-    matches: int
-    visible_ids: Ints
-    information: Array
 
 
 class Tracker:
@@ -293,16 +268,3 @@ class Tracker:
             self.camera,
             config,
         )
-
-
-def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked:
-    """The outcome of a frame without a pose."""
-    begun = untracked(T_world_camera, features)
-    return replace(begun, status=TrackingStatus.LOST, matches=matches)
-
-
-def untracked(T_world_camera: Array, features: Features) -> Tracked:
-    """The outcome of a frame that begins a map at a given pose."""
-    none = np.zeros(0, np.int64)
-    information = np.zeros((6, 6))
-    return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information)

@@ -45,7 +45,7 @@ from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.frame_history import NOBODY
 
 logger = logging.getLogger(__name__)

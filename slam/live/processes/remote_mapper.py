@@ -41,7 +41,7 @@ from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.frame_history import NOBODY, Entries, FrameHistory
 from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.world_map import Keyframe, WorldMap

@@ -8,8 +8,7 @@ from synthetic_view import T_NEW_OLD, add_keyframe, make_features, points_before
 from bmask_slam.back_end.segment_joining import join_segment
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
-from bmask_slam.tracking.results import TrackingStatus
-from bmask_slam.tracking.tracker import Tracked
+from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.world.world_map import WorldMap
 
 T_WORLD_FIRST = se3_exp(np.array([0.1, 0.2, -0.1, 0.3, 0.0, 0.2]))

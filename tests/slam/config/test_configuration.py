@@ -233,6 +233,8 @@ def test_an_older_file_is_read_with_the_present_names_of_its_settings(tmp_path: 
     config = resolve(SystemConfig, write(tmp_path, text))
     assert config.moving_objects.static_verification.frames == 7
     assert config.factor_selection.marginalise_batch == 9
+    grouped = resolve(SystemConfig, write(tmp_path, "mapping: {local_keyframes: 4}\n")).mapping
+    assert grouped.local_map.keyframes == 4
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from bmask_slam.live.messages import (
 from bmask_slam.live.processes.map_process import MapKeeper
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.system import SlamSystem
-from bmask_slam.tracking.tracker import untracked
+from bmask_slam.tracking.results import untracked
 from bmask_slam.world.frame_history import ENTRY, NOBODY
 
 NO_IDS = np.zeros(0, np.int64)

@@ -15,9 +15,8 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp, se3_log
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
-from bmask_slam.tracking.results import TrackingStatus
+from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
-from bmask_slam.tracking.tracker import Tracked, lost, untracked
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import WorldMap

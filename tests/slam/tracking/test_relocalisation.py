@@ -12,7 +12,8 @@ from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
-from bmask_slam.tracking.tracker import Tracked, Tracker, TrackingConfig
+from bmask_slam.tracking.results import Tracked
+from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
