@@ -1,4 +1,4 @@
-"""How good a trajectory is: one call from files to a table of named numbers."""
+"""Errors of a trajectory against a reference: from files to a table of named numbers."""
 
 from __future__ import annotations
 
@@ -47,15 +47,15 @@ class Row(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class EvaluationResult:
-    """The errors of a trajectory, and the same as rows for metrics.json.
+    """The errors of a trajectory, also as rows for metrics.json.
 
     Attributes:
-        absolute: pose by pose after alignment.
+        absolute: error of each pose after alignment.
         per_frame: relative error of consecutive associated poses; across a gap in the estimate
             such a pair spans the gap.
         per_second: relative error over one second, None where no two poses are that far apart.
         per_metre: the same over one metre of the reference's path.
-        rows: what is printed and saved.
+        rows: all errors by name.
     """
 
     absolute: AbsoluteError
@@ -76,14 +76,14 @@ def evaluate_trajectory(
     with_scale: bool = False,
     max_time_difference_s: float = MAX_TIME_DIFFERENCE_S,
 ) -> EvaluationResult:
-    """Compare an estimate with a reference whose world frame may be another.
+    """Compare an estimate with a reference, which may be in another world frame.
 
     Poses are associated by stamp; the alignment is SE(3), or Sim(3) with ``with_scale`` (for
-    monocular systems only), whose scale relative errors are taken with too. ``expected_frames``,
-    the frames that the system was given, adds the share that it tracked.
+    monocular systems only), whose scale applies to relative errors too. ``expected_frames``, the
+    number of frames that the system was given, adds the share that it tracked.
 
     Raises:
-        InputError: fewer than three poses belong together.
+        InputError: fewer than three poses are associated.
     """
     matched, truth = associate(estimate, reference, max_time_difference_s)
     if len(matched) < MIN_POSES:
@@ -116,14 +116,13 @@ def evaluate(
 ) -> EvaluationResult:
     """Evaluate a run folder or a trajectory against a trajectory or a sequence folder.
 
-    Trajectories are in the format of TUM, EuRoC or KITTI. The latter's stamps are those of the file
-    ``times``, or of the run's frames. ``with_body`` takes the reference's poses for those of
-    another body, such as markers or an IMU, finds where it sits on the camera, and compares its
-    path.
+    Trajectories are in the format of TUM, EuRoC or KITTI; stamps of the latter are read from the
+    file ``times``, or are those of the run's frames. ``with_body``: the reference is of another
+    body, such as markers or an IMU; its pose on the camera is estimated and its path compared.
 
     Raises:
-        InputError: a file that is missing or broken, trajectories that share no time, or a body on
-            a camera that does not turn or whose scale is unknown.
+        InputError: a missing or broken file, trajectories without common times, or ``with_body``
+            with a camera that does not turn or whose scale is unknown.
     """
     if with_body and with_scale:
         raise InputError("--hand-eye with --with-scale: a body's place needs metres; leave one out")
@@ -135,10 +134,7 @@ def evaluate(
     estimate, truth = (read_trajectory(path, stamps_s) for path in (file, truth_file))
     frames = None if frames_s is None else len(frames_s)
     try:
-        body: list[Row] = []
-        if with_body:
-            T_camera_body = hand_eye(*associate(estimate, truth))
-            estimate, body = body_trajectory(estimate, T_camera_body), _body_rows(T_camera_body)
+        estimate, body = _of_body(estimate, truth) if with_body else (estimate, [])
         result = evaluate_trajectory(estimate, truth, frames, with_scale)
         result.rows.extend(body)
     except InputError as error:
@@ -150,19 +146,25 @@ def evaluate(
     return result
 
 
+def _of_body(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, list[Row]]:
+    """The estimate as the trajectory of the reference's body, and rows with its pose."""
+    T_camera_body = hand_eye(*associate(estimate, truth))
+    return body_trajectory(estimate, T_camera_body), _body_rows(T_camera_body)
+
+
 def read_reference(path: Path, stamps_s: Array | None = None) -> Trajectory:
     """The trajectory in a file, or a sequence folder's ground truth.
 
-    ``stamps_s`` are those of the lines of a file in the format of KITTI.
+    ``stamps_s`` are the stamps of the lines of a file in the format of KITTI.
 
     Raises:
-        InputError: it is missing or broken.
+        InputError: the file is missing or broken.
     """
     return read_trajectory(_reference_file(path), stamps_s)
 
 
 def frame_stamps(trajectory_file: Path) -> Array | None:
-    """Stamps of all frames of the run that a trajectory.txt belongs to, None if it has no run."""
+    """Stamps of all frames of the run of a trajectory.txt; None if it belongs to no run."""
     path = trajectory_file.parent / "frames.csv"
     if trajectory_file.name != "trajectory.txt" or not path.is_file():
         return None
@@ -204,7 +206,7 @@ def _absolute_rows(error: AbsoluteError) -> list[Row]:
 def _relative_rows(step: str, error: RelativeError | None) -> list[Row]:
     """Rows for a step, "frame", "second" or "metre"; none when no pair was found.
 
-    A warning tells of the first two; a camera that moves less than a metre is nothing unusual.
+    Without pairs of the first two a warning is logged; a path below one metre is not unusual.
     """
     if error is None:
         if step != "metre":
@@ -218,7 +220,7 @@ def _relative_rows(step: str, error: RelativeError | None) -> list[Row]:
 
 
 def _body_rows(T_camera_body: Array) -> list[Row]:
-    """Where the reference's body sits on the camera."""
+    """Position and angle of the reference's body in the camera's frame."""
     names = ("body_x", "body_y", "body_z")
     rows = [_row(name, float(t), "m") for name, t in zip(names, T_camera_body[:3, 3], strict=True)]
     angle_rad = np.linalg.norm(so3_log(T_camera_body[:3, :3]))
@@ -226,10 +228,10 @@ def _body_rows(T_camera_body: Array) -> list[Row]:
 
 
 def _coverage_rows(estimate: Trajectory, reference: Trajectory, matched: Trajectory) -> list[Row]:
-    """How much was compared: of the estimate by poses, of the reference by time.
+    """Shares that were compared: of the estimate by poses, of the reference by time.
 
     A reference pose counts as covered when the estimate has a pose within its own typical step,
-    so that a reference at 100 Hz can be covered whole by an estimate at 30 Hz.
+    so that an estimate at 30 Hz can cover all of a reference at 100 Hz.
     """
     step_s = max(float(np.median(np.diff(estimate.timestamps_s))), MAX_TIME_DIFFERENCE_S)
     nearest = nearest_indices(estimate.timestamps_s, reference.timestamps_s)

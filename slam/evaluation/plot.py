@@ -1,4 +1,4 @@
-"""The picture of a run: top view against the reference, errors over time (paper figs. 10, 11)."""
+"""The plot of a run: top view against the reference, errors over time (paper figs. 10, 11)."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def plot_trajectory(
     title: str,
     with_scale: bool = False,
 ) -> None:
-    """Write the picture; its suffix names the format. It appears whole or not at all.
+    """Write the plot in the format of its suffix; the file appears whole or not at all.
 
-    Without a reference, or with fewer than three poses that belong to it, only the top view is
-    drawn, in the estimate's own world frame.
+    Without a reference, or with fewer than three associated poses, only the top view is drawn, in
+    the estimate's own world frame.
 
     Raises:
-        InputError: the folder does not exist, or the suffix is no picture format.
+        InputError: the folder does not exist, or the suffix is not in FORMATS.
     """
     path, form = Path(path), Path(path).suffix[1:].lower()
     if not path.parent.is_dir():
@@ -67,8 +67,8 @@ def draw_top_view(
 ) -> None:
     """Draw the plane of the two axes in which the camera moved most, both in one world frame.
 
-    ``matched`` are poses of estimate and reference that belong together; red lines join them, which
-    the legend calls ``joined_by``.
+    ``matched`` are associated poses of estimate and reference; red lines join them, with
+    ``joined_by`` as their entry in the legend.
     """
     plane = view_plane((estimate if reference is None else reference).positions_world)
     if reference is not None:

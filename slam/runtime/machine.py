@@ -1,4 +1,4 @@
-"""What something was computed on and with: processor, memory, versions, commit."""
+"""The machine and the software of a result: processor, memory, versions, commit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def describe_machine() -> dict[str, str]:
 
 
 def processor() -> str:
-    """The processor's name as Linux gives it, else what Python knows."""
+    """The processor's name from Linux, otherwise from Python."""
     info = Path("/proc/cpuinfo")
     text = info.read_text(encoding="utf-8") if info.is_file() else ""
     match = re.search(r"model name\s*:\s*(.+)", text)
@@ -43,7 +43,7 @@ def available_cores() -> int:
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
-    """Those of the packages that are installed."""
+    """Versions of the packages that are installed."""
     found = {}
     for package in packages:
         try:
@@ -56,7 +56,7 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
 def commit(apart: tuple[str, ...] = ()) -> tuple[str, list[str]]:
     """The short hash of the checkout and the tracked files that differ from it.
 
-    "" and nothing where there is no checkout. Paths ``apart`` may differ without being named.
+    "" and an empty list where there is no checkout. Paths ``apart`` are not compared.
     """
     head = _git("rev-parse", "--short=12", "HEAD")
     excluded = [f":(exclude){path}" for path in apart]

@@ -1,4 +1,4 @@
-"""How much memory this process has used."""
+"""Memory of this process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def peak_rss_mb() -> float:
 
 
 def give_back_memory() -> None:
-    """Return what is free to the system: glibc keeps freed images, in ever more places."""
+    """Return freed memory to the system; glibc would keep that of freed images."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)

@@ -1,4 +1,4 @@
-"""What a person sees while frames are worked on: a bar with rate, status and keyframes."""
+"""Progress bars with rate, status and keyframes, and log messages above them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FILE_INTERVAL_S = 10.0
 
 
 def make_bar(total: int | None, quiet: bool, done: int = 0) -> tqdm:
-    """A bar on stderr; a line every 10 s where that is no terminal, nothing if quiet."""
+    """A bar on stderr: a line every 10 s if that is no terminal, nothing if quiet."""
     interval_s = TERMINAL_INTERVAL_S if sys.stderr.isatty() else FILE_INTERVAL_S
     return tqdm(
         total=total,
@@ -64,7 +64,7 @@ def byte_bars(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def iteration_bar(quiet: bool) -> Iterator[Callable[[int, float], None]]:
-    """A function ``(iteration, cost)`` that shows both, on a terminal alone."""
+    """A function ``(iteration, cost)`` that shows both, only on a terminal."""
     with tqdm(unit="step", disable=quiet or not sys.stderr.isatty()) as bar:
 
         def show(iteration: int, cost: float) -> None:
@@ -75,7 +75,7 @@ def iteration_bar(quiet: bool) -> Iterator[Callable[[int, float], None]]:
 
 
 class Progress:
-    """The bar of a run, or of the rest of one whose first ``done`` frames are done."""
+    """The bar of a run, of which ``done`` frames may be done already."""
 
     def __init__(self, total: int, quiet: bool, done: int = 0) -> None:
         self._bar = make_bar(total, quiet, done)
@@ -92,7 +92,7 @@ class Progress:
         self._bar.close()
 
     def update(self, status: TrackingStatus, keyframes: int, lost: int) -> None:
-        """One more frame, with its status and what was counted so far."""
+        """Count a frame; show its status and the counters."""
         text = f"{status.value}, {keyframes} keyframes, {lost} lost"
         self._bar.set_postfix_str(text, refresh=False)
         self._bar.update()
@@ -107,7 +107,7 @@ class _BarHandler(logging.Handler):
 
 @contextmanager
 def console_log(level: int = logging.WARNING) -> Iterator[None]:
-    """Show log records from ``level`` on stderr, without tearing the bar."""
+    """Show log records from ``level`` on stderr, above the bar."""
     handler = _BarHandler(level)
     handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
     root = logging.getLogger()

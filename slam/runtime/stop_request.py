@@ -1,4 +1,4 @@
-"""Ending a run on Ctrl-C or SIGTERM between two frames, with everything saved."""
+"""Stops a run on Ctrl-C or SIGTERM between two frames, so that everything can be saved."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ logger = logging.getLogger(__name__)
 
 
 class StopRequest:
-    """While entered, the first SIGINT or SIGTERM only sets ``signal``; a second one acts as usual.
+    """In its block the first SIGINT or SIGTERM only sets ``signal``; a second one acts as usual.
 
-    Outside the main thread, where Python allows no handlers, it never sets anything.
+    Outside the main thread, where Python allows no handlers, ``signal`` is never set.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Where a sequence's camera comes from: camera.yaml, or TUM's three known cameras."""
+"""The camera of a sequence: camera.yaml, or one of TUM's three known cameras."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ OPTIONAL = {
 """Optional numbers by the name of Camera's attribute."""
 KEYS = (*REQUIRED, "distortion", *OPTIONAL)
 LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0, "rolling_shutter": 1.0}
-"""Largest magnitude, in metres and seconds: beyond, it is another unit."""
+"""Largest magnitudes in metres and seconds: a larger value is in another unit."""
 
 
 def find_camera(folder: Path, given: Path | None = None) -> tuple[Camera, str]:
-    """The camera of a sequence and where it came from.
+    """The camera of a sequence and a description of its source.
 
-    A file that is given wins over the folder's camera.yaml, and that over the folder's name.
+    The file ``given`` has precedence over the folder's camera.yaml, and that over its name.
 
     Raises:
         InputError: a broken camera.yaml, or none and a folder name that is not TUM's.
@@ -115,7 +115,7 @@ def read_camera(path: Path) -> Camera:
 def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
     """Write a camera.yaml that ``read_camera`` reads back as the same camera.
 
-    ``comment`` comes first, each line after a #. The file appears whole or not at all.
+    The file begins with ``comment``, each line after a #. It appears whole or not at all.
     """
     values: dict[str, object] = {key: getattr(camera, key) for key in REQUIRED}
     values |= {"distortion": list(camera.distortion)}
@@ -130,14 +130,14 @@ def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
 
 
 def _number(path: Path, key: str, value: object) -> float:
-    """A finite number, not a truth value and not text."""
+    """The value as a finite number; truth values and text are refused."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{path}: {key} is {value!r}; it must be a number, e.g. 525.0")
     return float(value)
 
 
 def _check_range(path: Path, numbers: dict[str, float]) -> None:
-    """Refuse sizes, focal lengths and scales that no camera has."""
+    """Refuse sizes, focal lengths and scales that are impossible."""
     for key, value in numbers.items():
         if key not in ("cx", "cy", *LIMITS) and value <= 0:
             raise InputError(f"{path}: {key} is {value:g}; it must be positive")

@@ -1,4 +1,4 @@
-"""Decoding of one colour and one depth image, with every way in which they can be broken."""
+"""Decoding of colour and depth images, with checks for all ways in which they can be broken."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
 
 SURFACE_STEP = 0.05
-"""A pixel whose depth changes by more from one depth image to the next shows another surface."""
+"""Relative change of depth from one depth image to the next beyond which the surface changed."""
 
 
 def read_rgb(path: Path, camera: Camera) -> Image:
@@ -65,9 +65,9 @@ def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
 def depth_between(near_m: Floats, other_m: Floats, share: float) -> Floats:
     """Depth (H, W) at a time between two depth images, ``share`` of the way to the other.
 
-    At a fixed pixel of a surface the INVERSE depth changes linearly (exactly so for a plane and a
-    small motion). Where the two do not see one surface, or one sees nothing, the nearer in time
-    stays.
+    At a fixed pixel on a surface the INVERSE depth changes linearly (exactly for a plane and a
+    small motion). Where the two show different surfaces, or one has no depth, the value is that of
+    the image nearer in time.
     """
     one_surface = np.abs(near_m - other_m) < SURFACE_STEP * near_m
     with np.errstate(divide="ignore"):

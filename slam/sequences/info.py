@@ -1,4 +1,4 @@
-"""What ``bmask-slam info SEQUENCE`` says about a sequence before anything is run on it."""
+"""Summary of a sequence, as ``bmask-slam info SEQUENCE`` prints it."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ DEPTH_PERCENTILES = (5, 50, 95)
 
 @dataclass(frozen=True)
 class SequenceInfo:
-    """A sequence at a glance.
+    """Summary of a sequence.
 
     Attributes:
         frames: colour/depth pairs.
         fps_hz: from the typical step between stamps.
         gaps: (stamp in seconds, length in seconds) of steps over three times the typical one.
-        camera, camera_source: intrinsics and where they came from.
-        depth_valid_share: of the pixels of a few frames spread over the sequence.
+        camera, camera_source: intrinsics and their source.
+        depth_valid_share: share of pixels with depth in a few frames spread over the sequence.
         depth_percentiles_m: 5th, 50th and 95th, NaN without depth.
         groundtruth_share: frames with a ground truth pose within 0.02 s; None without any.
         groundtruth_length_m: path length of the ground truth during the sequence.
         unpaired_rgb, unpaired_depth: listed images without a partner.
-        broken: frames known to be broken; those in the middle show only in a run.
+        broken: frames known to be broken; unreadable images are found only when they are decoded.
     """
 
     folder: Path

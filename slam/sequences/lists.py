@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from bmask_slam.graph.trajectory import associate_stamps, check_seconds
 logger = logging.getLogger(__name__)
 
 MAX_DEPTH_STEP_S = 0.1
-"""Nothing is interpolated between depth images that are farther apart."""
+"""Largest time between two depth images for interpolation between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +36,13 @@ class ImagePairs:
         timestamps_s: (N,) stamps of the colour images in seconds.
         rgb_files: the N colour images.
         depth_files: the N depth images.
-        lags_s: (N,) how much later than the colour image each depth image was taken.
-        neighbour_files: the depth images on the other side of the colour images' stamps, None
+        lags_s: (N,) capture time of each depth image minus that of its colour image.
+        neighbour_files: the next depth images on the other side of the colour images' stamps, None
             where there is none.
-        neighbour_shares: (N,) how far toward them, from 0 to 1, the colour images were taken.
-        unpaired_rgb: colour images without a depth image near enough.
-        unpaired_depth: depth images without a colour image near enough.
+        neighbour_shares: (N,) position of the colour images' stamps between the depth image (0) and
+            its neighbour (1).
+        unpaired_rgb: number of colour images without a depth image near enough in time.
+        unpaired_depth: number of depth images without a colour image near enough in time.
     """
 
     timestamps_s: Array
@@ -54,15 +56,15 @@ class ImagePairs:
 
 
 def image_name(path: Path, folder: Path) -> str:
-    """An image's name relative to a folder; the bare file name of one outside."""
+    """An image's path relative to a folder; the file name alone if it is outside."""
     inside = path.is_relative_to(folder)
     return (path.relative_to(folder) if inside else Path(path.name)).as_posix()
 
 
 def read_pairs(folder: Path, max_difference_s: float, depth_time_offset_s: float) -> ImagePairs:
-    """The image pairs of a TUM folder; rgb.txt and depth.txt come before associations.txt.
+    """The image pairs of a TUM folder; rgb.txt and depth.txt have precedence over associations.txt.
 
-    A depth image was taken at its stamp plus the offset, and is paired by that.
+    The capture time of a depth image, by which it is paired, is its stamp plus the offset.
 
     Raises:
         InputError: a missing or broken list, or no two stamps within the limit.
@@ -100,9 +102,9 @@ def read_pairs(folder: Path, max_difference_s: float, depth_time_offset_s: float
 
 
 def _neighbours(depth_s: Array, chosen: Ints, lags_s: Array) -> tuple[Ints, Array]:
-    """For each chosen depth image the one on the other side of the moment ``lags_s`` before it.
+    """For each chosen depth image its neighbour on the other side of the time ``lags_s`` before it.
 
-    Its index, -1 where it is missing or too far away, and the share of the way to it, 0 to 1.
+    Returns indices, -1 where it is missing or too far in time, and the position between the two.
     """
     other = chosen - np.sign(lags_s).astype(np.int64)
     there = (other >= 0) & (other < len(depth_s)) & (lags_s != 0)
@@ -170,9 +172,9 @@ def _stamp(text: str, where: str) -> float:
 
 
 def _image_list(path: Path, rows: list[tuple[int, float, str]]) -> ImageList:
-    """Sort (line, stamp, file) rows by stamp and refuse stamps that cannot be."""
+    """Sort (line, stamp, file) rows by stamp; refuse repeated stamps and other units."""
     rows = sorted(rows, key=lambda row: row[1])
-    for (line, stamp_s, _), (other_line, other_s, _) in zip(rows[1:], rows, strict=False):
+    for (other_line, other_s, _), (line, stamp_s, _) in pairwise(rows):
         if stamp_s == other_s:
             raise InputError(
                 f"{path}:{line}: timestamp {stamp_s:.6f} is already on line {other_line}; "

@@ -26,8 +26,8 @@ class RightImages:
 
     Attributes:
         path: the list.
-        files: by the index of the frame whose colour image is the left one.
-        camera: of both images, with the bf of the pair.
+        files: right images by the index of the frame whose colour image is the left one.
+        camera: camera of both images, with the bf of the pair.
     """
 
     path: Path
@@ -48,8 +48,8 @@ class RightImages:
 def read_right_images(sequence: Sequence, camera: Camera) -> RightImages:
     """The right images of a sequence, paired with its colour images by stamp as depth is.
 
-    The baseline is that of ``stereo_bf`` in the sequence's own camera.yaml, where it must stand:
-    the camera of a run always has one, but mostly the default of the noise model.
+    The baseline is taken from ``stereo_bf`` in the sequence's own camera.yaml, where it is
+    required: a run's camera always has a value, but usually the default of the noise model.
 
     Raises:
         InputError: no right.txt or a broken one, no stereo_bf, a camera with distortion, or no two
@@ -81,7 +81,7 @@ def read_right_images(sequence: Sequence, camera: Camera) -> RightImages:
 
 
 def _stereo_bf(path: Path) -> float:
-    """The value that a camera.yaml itself gives."""
+    """The stereo_bf that is written in a camera.yaml."""
     cure = "stereo needs its stereo_bf, fx times the pair's baseline in metres"
     if not path.is_file():
         raise InputError(f"{path}: no such file; {cure}")

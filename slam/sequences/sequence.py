@@ -33,8 +33,8 @@ class SequenceConfig:
     Attributes:
         max_time_difference_s: largest difference between the stamps of a colour/depth pair.
         max_broken_share: share of broken frames above which the sequence is refused; a single
-            one is always passed over.
-        depth_check_frames: frames in which depth is looked for when the first has none.
+            one is always skipped.
+        depth_check_frames: number of frames that are searched for depth when the first has none.
     """
 
     max_time_difference_s: float = 0.02
@@ -47,9 +47,9 @@ class Sequence:
 
     Attributes:
         name: the folder's name.
-        folder: where it lies.
+        folder: its folder.
         camera: the colour camera to which depth is registered.
-        camera_source: where the camera's numbers came from.
+        camera_source: source of the camera's parameters.
         pairs: the image files with their stamps.
         groundtruth: T_world_camera of the colour camera, or None.
     """
@@ -57,14 +57,16 @@ class Sequence:
     def __init__(
         self,
         folder: Path,
-        camera: tuple[Camera, str],
+        camera: Camera,
+        camera_source: str,
         pairs: ImagePairs,
         groundtruth: Trajectory | None,
         config: SequenceConfig,
     ) -> None:
         self.name = folder.resolve().name
         self.folder = folder
-        self.camera, self.camera_source = camera
+        self.camera = camera
+        self.camera_source = camera_source
         self.pairs = pairs
         self.groundtruth = groundtruth
         self.config = config
@@ -81,7 +83,7 @@ class Sequence:
 
     @property
     def skipped(self) -> list[tuple[int, str]]:
-        """Index and reason of every broken frame met so far."""
+        """Index and reason of every broken frame found so far."""
         return sorted(self._skipped.items())
 
     def load(self, index: int) -> Frame:
@@ -99,7 +101,7 @@ class Sequence:
         )
 
     def _depth(self, index: int) -> Floats:
-        """The depth at the colour image's stamp, if the camera says when depth is taken."""
+        """The depth, interpolated at the colour image's stamp where depth has a time offset."""
         depth_m = self._read_depth(self.pairs.depth_files[index])
         other = self.pairs.neighbour_files[index]
         if self.camera.depth_time_offset_s == 0 or other is None:
@@ -139,7 +141,7 @@ class Sequence:
         """Decode the frames ``start:stop:stride`` in a thread, up to ``prefetch`` ahead.
 
         With ``prepare`` that function is applied in the same thread, and pairs (frame, result)
-        are yielded. Broken frames are passed over with a warning and listed in ``skipped``.
+        are yielded. Broken frames are skipped with a warning and listed in ``skipped``.
 
         Raises:
             InputError: more than ``max_broken_share`` of the sequence is broken.
@@ -162,7 +164,7 @@ class Sequence:
             yield frame
 
     def skip(self, index: int, reason: str) -> None:
-        """Note a broken frame; refuse the sequence when there are too many."""
+        """Record a broken frame; refuse the sequence when there are too many."""
         if index not in self._skipped:
             logger.warning("frame %d skipped: %s", index, reason)
         self._skipped[index] = reason
@@ -176,11 +178,11 @@ class Sequence:
 def open_sequence(
     path: Path, config: SequenceConfig | None = None, camera: Path | Camera | None = None
 ) -> Sequence:
-    """Open a folder in TUM layout, in which the order of lines never matters, only stamps.
+    """Open a folder in TUM layout; lines of its lists may be in any order.
 
-    ``rgb.txt`` and ``depth.txt`` (or ``associations.txt``), optional ``groundtruth.txt`` and
-    ``camera.yaml``, in whose place another file or a camera can be given. Everything that can be
-    checked without decoding all images is checked here.
+    It holds ``rgb.txt`` and ``depth.txt`` (or ``associations.txt``) and optionally
+    ``groundtruth.txt`` and ``camera.yaml``, which ``camera``, a file or a camera, replaces.
+    All checks that need not decode every image are done here.
 
     Raises:
         InputError: naming the file, the value and the cure.
@@ -188,19 +190,21 @@ def open_sequence(
     folder, config = Path(path), config or SequenceConfig()
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder that holds rgb.txt")
-    found = (camera, "given") if isinstance(camera, Camera) else find_camera(folder, camera)
-    offset_s = found[0].depth_time_offset_s
-    pairs = read_pairs(folder, config.max_time_difference_s, offset_s)
+    if isinstance(camera, Camera):
+        found, source = camera, "given"
+    else:
+        found, source = find_camera(folder, camera)
+    pairs = read_pairs(folder, config.max_time_difference_s, found.depth_time_offset_s)
     truth_path = folder / "groundtruth.txt"
     truth = read_tum(truth_path) if truth_path.is_file() else None
-    sequence = Sequence(folder, found, pairs, truth, config)
+    sequence = Sequence(folder, found, source, pairs, truth, config)
     _check_images(sequence)
     logger.info("%s: %d frames, ground truth: %s", folder, len(sequence), truth is not None)
     return sequence
 
 
 def _check_images(sequence: Sequence) -> None:
-    """Decode the first pair, look for depth, and note every listed image that is missing."""
+    """Decode the first pair, search for depth, and record every listed image that is missing."""
     first = sequence.load(0)
     for index, files in enumerate(
         zip(sequence.pairs.rgb_files, sequence.pairs.depth_files, strict=True)
