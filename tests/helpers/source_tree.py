@@ -89,4 +89,5 @@ def _sources_of(target: str, name: str) -> Iterator[str]:
     elif target in PATHS:
         yield target
         if _is_room(target):
-            yield from (m for m, passed_on in imported_names(PATHS[target]) if passed_on == name)
+            passed_on = imported_names(PATHS[target])
+            yield from (m for m, passed in passed_on if passed == name and m in PATHS)
