@@ -100,6 +100,8 @@ def sampled(mesh: Any, count: int = 1_000_000) -> tuple[Array, Array]:
 
 def write_mesh(path: Path, mesh: Any) -> None:
     """Write a mesh as PLY. Raises InputError where Open3D cannot."""
+    colours = np.asarray(mesh.vertex_colors)
+    np.clip(colours, 0, 1, out=colours)  # Open3D would clip them with a warning on stdout
     with whole_file(path) as temporary:
         if not load_open3d().io.write_triangle_mesh(str(temporary), mesh):
             raise InputError(f"{path}: the mesh cannot be written; free some space")

@@ -1,0 +1,168 @@
+"""The public Python API: its names, what they load, and the examples of its pages."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from repository import ROOT
+
+import bmask_slam
+from bmask_slam.api import MapKeywords, RunKeywords
+from bmask_slam.dense.options import MapOptions
+from bmask_slam.offline.options import RunOptions
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+
+REFERENCE = (ROOT / "docs/python.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+MAX_IMPORT_S = 0.2
+MAX_QUICK_START_LINES = 12
+
+
+def output(code: str, folder: Path = ROOT) -> str:
+    """What a program prints in a process of its own."""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def loaded_by(code: str) -> set[str]:
+    """Names of the heavy packages that are loaded after a program."""
+    heavy = {"gtsam", "torch", "open3d", "matplotlib", "cv2", "scipy", "yaml"}
+    return set(output(f"{code}\nimport sys; print(*({heavy} & set(sys.modules)))").split())
+
+
+@pytest.mark.parametrize("name", bmask_slam.__all__)
+def test_a_public_name_is_importable_described_and_documented(name: str) -> None:
+    value = getattr(bmask_slam, name)
+    assert name in dir(bmask_slam)
+    assert name == "__version__" or inspect.getdoc(value)
+    assert f"`{name}`" in REFERENCE
+
+
+def test_type_checkers_find_each_name_where_it_is_loaded_from() -> None:
+    tree = ast.parse((ROOT / "slam/__init__.py").read_text(encoding="utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    typed = {alias.name: node.module for node in imports for alias in node.names}
+    loaded = {name: f"bmask_slam.{module}" for name, module in bmask_slam._MODULES.items()}
+    assert typed == loaded
+    assert {*typed, "__version__"} == set(bmask_slam.__all__)
+
+
+def test_another_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="module 'bmask_slam' has no attribute 'Rum'"):
+        bmask_slam.Rum  # noqa: B018
+
+
+def test_the_import_is_quick_and_loads_nothing_else() -> None:
+    code = "import time; t = time.perf_counter(); import bmask_slam; print(time.perf_counter() - t)"
+    assert min(float(output(code)) for _ in range(3)) < MAX_IMPORT_S
+    assert loaded_by("import bmask_slam, bmask_slam.graph.geometry") == set()
+
+
+def test_a_trajectory_is_read_without_heavy_packages(tmp_path: Path) -> None:
+    (tmp_path / "trajectory.txt").write_text("0.0 0 0 0 0 0 0 1\n0.1 1 2 3 0 0 0 1\n")
+    code = f"import bmask_slam; print(len(bmask_slam.Run({str(tmp_path)!r}).trajectory))"
+    assert output(code) == "2\n"
+    assert loaded_by(code.replace("print", "len and str")) <= {"cv2", "scipy"}
+
+
+@pytest.mark.parametrize(
+    ("keywords", "options", "named"),
+    [
+        (RunKeywords, RunOptions, {"sequence", "config", "config_name", "out"}),
+        (MapKeywords, MapOptions, {"run", "masks", "mesh", "plan"}),
+    ],
+)
+def test_every_option_has_a_keyword(keywords: type, options: type, named: set[str]) -> None:
+    fields = {field.name for field in dataclasses.fields(options)}
+    assert set(keywords.__annotations__) | named == fields | {"quiet"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"strid": 3}, r"run\(\): unknown key strid; did you mean stride\?"),
+        ({"stride": "3"}, r"run\(\): stride = .*3.* is not a whole number"),
+        ({"stride": 0}, "stride 0: must be a whole number of at least 1"),
+        ({"max_frames": 2.5}, r"max_frames = 2.5 is not a whole number"),
+        ({"overwrite": "yes"}, r"overwrite = .*yes.* is not true or false"),
+        ({"out": 7}, r"out = 7 is not a path"),
+        ({"segmenter": "lite"}, "'lite': not known; there are: light, .*none"),
+        ({"config": "no/such.yaml"}, r"no/such\.yaml: "),
+        ({"settings": {"tracking.min_inliers": "x"}}, r"tracking\.min_inliers = .*whole number"),
+        (
+            {"config": bmask_slam.SystemConfig(), "settings": {"covariances": True}},
+            "settings beside a SystemConfig",
+        ),
+    ],
+)
+def test_arguments_of_run_are_checked(
+    recording: Path, tmp_path: Path, options: dict, message: str
+) -> None:
+    with pytest.raises(bmask_slam.InputError, match=message):
+        bmask_slam.run(recording, **{"out": tmp_path / "out", **options})
+    assert not (tmp_path / "out").exists()
+
+
+def test_arguments_of_map_run_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(bmask_slam.InputError, match=r"map_run\(\): voxel_m = .* is not a number"):
+        bmask_slam.map_run(tmp_path, voxel_m="1 cm")
+
+
+def test_a_signal_is_raised_again_once_the_run_is_saved(recording: Path, tmp_path: Path) -> None:
+    code = (
+        "import os, signal, bmask_slam; from bmask_slam.system import SlamSystem\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "process = SlamSystem.process\n"
+        "def stop(self, frame, features=None):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return process(self, frame, features)\n"
+        "SlamSystem.process = stop\n"
+        f"paths = {str(recording)!r}, {str(tmp_path / 'out')!r}\n"
+        "try:\n    bmask_slam.run(*paths, segmenter='none')\n"
+        "except KeyboardInterrupt:\n    print('interrupted')\n"
+    )
+    assert output(code) == "interrupted\n"
+    assert bmask_slam.Run(tmp_path / "out").metrics["tracked_share"].value == 1.0
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short rendered sequence, as path/to/recording from a working directory."""
+    folder = tmp_path_factory.mktemp("user") / "path/to"
+    folder.mkdir(parents=True)
+    config = RenderConfig("office", frames=24, fps=10, width=320, height=240)
+    path = render_sequence(config, folder / "recording")
+    os.symlink(path / "groundtruth.txt", folder / "groundtruth.txt")
+    return path
+
+
+def test_the_quick_start_runs_as_it_stands(recording: Path) -> None:
+    (code,) = PYTHON.findall(README)
+    assert len(code.splitlines()) <= MAX_QUICK_START_LINES
+    lines = output(code, recording.parents[2]).splitlines()
+    assert re.fullmatch(r"24 poses, \d{3,} landmarks", lines[0])
+    value, unit = lines[-1].split()
+    assert float(value) < 0.01 and unit == "m"
+    run = bmask_slam.Run(recording.parents[2] / "runs/first")
+    assert len(lines) == 2 + len(run.objects)
+    assert (run.path / "dense/mesh.ply").is_file()
+    assert len(run.dense_cloud) > 1000
+
+
+def test_the_examples_of_the_reference_run_as_they_stand(recording: Path) -> None:
+    (code,) = PYTHON.findall(REFERENCE)
+    *frames, shapes = output(code, recording.parents[2]).splitlines()
+    assert len(frames) == 24
+    assert shapes.startswith("(24, 3) (")
