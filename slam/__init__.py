@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from bmask_slam.evaluation import evaluate
     from bmask_slam.graph.camera import Camera
     from bmask_slam.graph.errors import InputError
-    from bmask_slam.live.live_options import LiveOptions
     from bmask_slam.live.live_slam import LiveSlam
+    from bmask_slam.live.start import LiveOptions
     from bmask_slam.run_folder.reader import Run
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
     from bmask_slam.sequences import open_sequence
@@ -50,7 +50,7 @@ _MODULES = {
     "Frame": "sequences.frame",
     "FrameResult": "tracking.results",
     "InputError": "graph.errors",
-    "LiveOptions": "live.live_options",
+    "LiveOptions": "live.start",
     "LiveSlam": "live.live_slam",
     "Run": "run_folder.reader",
     "SegmenterOptions": "semantics.segmenters.segmenter_table",

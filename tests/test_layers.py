@@ -37,7 +37,8 @@ ROOMS = {
                run_folder  system_results  system  dense  calibration  refinement  viewer
                offline  live  comparison  api  commands  cli  __init__  __main__""",
     "slam/rendering": "engine  things  rooms  [...]",
-    "slam/live": "[...]  sources  processes  system  display  live_slam  play",
+    "slam/live": """[...]  sources  processes  system  start  health  display  recorder  live_slam
+                    play""",
     "slam/comparison": "experiment  jobs  statistics  report  [...]",
 }
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS = 12, 300, 40, 6
@@ -62,7 +63,6 @@ PENDING: dict[str, set[str]] = {
         "bmask_slam.comparison.experiment.plan -> bmask_slam.comparison.jobs.cells",
         "bmask_slam.comparison.experiment.plan -> bmask_slam.comparison.jobs.job",
         "bmask_slam.comparison.jobs.child -> bmask_slam.cli",
-        "bmask_slam.live.processes.start -> bmask_slam.live.system",
     },
     "small modules": {
         "graph/factors/noise.py",
@@ -73,8 +73,6 @@ PENDING: dict[str, set[str]] = {
         "slam/comparison/experiment/provenance.py",
         "slam/comparison/jobs/ray_pool.py",
         "slam/datasets/icl_nuim.py",
-        "slam/live/live_options.py",
-        "slam/live/processes/start.py",
         "slam/moving/motion_state.py",
         "slam/offline/segment_folder.py",
         "slam/refinement/optimised_map.py",
@@ -100,7 +98,6 @@ PENDING: dict[str, set[str]] = {
         "slam/calibration/__init__.py",
         "slam/features/__init__.py",
         "slam/labelling/__init__.py",
-        "slam/live/processes/__init__.py",
         "slam/loops/__init__.py",
         "slam/moving/__init__.py",
         "slam/offline/__init__.py",

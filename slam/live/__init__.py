@@ -1,1 +1,1 @@
-"""The live loop: tracking in the caller's process, the map and segmentation in their own."""
+"""The live loop: tracking in the caller's process, everything else in processes of its own."""

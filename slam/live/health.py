@@ -1,4 +1,4 @@
-"""How the live loop is doing: what a monitor asks for, as numbers by name."""
+"""The state of the live loop as numbers by name, for a monitoring program."""
 
 from __future__ import annotations
 
@@ -9,31 +9,37 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.system import LiveSystem
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 WINDOW = 120
-"""Frames over which rates and delays are taken."""
+"""Number of last frames of which rates and latencies are computed."""
 
 
 @dataclass(frozen=True)
 class Health:
-    """The state of the loop over the last frames.
+    """The state of the live loop; rates and latencies are those of the last ``WINDOW`` frames.
 
     Attributes:
-        status: of the last frame.
-        frames: tracked so far. frames_per_second: of the last frames.
-        latency_ms_median, latency_ms_p95: from handing a frame in until its result.
+        status: tracking status of the last frame.
+        frames: tracked so far.
+        frames_per_second: rate of the last frames.
+        latency_ms_median, latency_ms_p95: from handing a frame in to its result.
         keyframes, landmarks, loops_closed: in the map.
         submaps: in the dense map.
-        keyframes_waiting: for the map's process. masks_waiting: for the segmenter's.
-        submaps_waiting: for the dense map's.
-        frames_dropped: by the source, since tracking was busy.
+        keyframes_waiting: for the map's process.
+        masks_waiting: keyframes that wait for the segmenter's process.
+        submaps_waiting: keyframes that wait for the dense map's process.
+        frames_dropped: by the source, because tracking was busy.
         frames_refused: that were broken, or not later than the one before.
-        masks_dropped: keyframes that were passed over by the segmenter.
-        submaps_dropped: keyframes that were passed over by the dense map.
-        unwritten: how often a full disk kept something from being written.
-        lost_frames: without a pose. lost_episodes: how often tracking was lost.
-        map_deaths, segmenter_deaths, dense_deaths: of their processes, which were started again.
+        masks_dropped: keyframes that the segmenter skipped.
+        submaps_dropped: keyframes that the dense map skipped.
+        unwritten: how often something could not be written, because the disk was full.
+        lost_frames: without a pose.
+        lost_episodes: how often tracking was lost.
+        map_deaths, segmenter_deaths, dense_deaths: how often these processes died or hung and were
+            started again.
         source: what the source counted, by name.
     """
 
@@ -62,11 +68,11 @@ class Health:
     source: dict[str, int] = field(default_factory=dict)
 
     def as_json(self) -> str:
-        """For a file that another program polls."""
+        """The contents of health.json, which another program may poll."""
         return json.dumps(asdict(self), indent=1) + "\n"
 
     def line(self) -> str:
-        """For a person."""
+        """A summary in one line, for the console."""
         waiting = f"{self.keyframes_waiting} keyframes and {self.masks_waiting} masks waiting"
         if self.submaps or self.submaps_waiting:
             waiting += f", {self.submaps} submaps, {self.submaps_waiting} waiting"
@@ -81,16 +87,23 @@ class Health:
 
 
 class FrameMeter:
-    """Counts frames as their results come."""
+    """Counts frames and measures their latencies.
+
+    Attributes:
+        frames: tracked.
+        refused: frames that ``check_frame`` refused.
+        lost_frames, lost_episodes, status: as in ``Health``.
+        latencies_ms: of all frames.
+    """
 
     def __init__(self) -> None:
-        self.frames = self.lost_frames = self.lost_episodes = 0
+        self.frames = self.refused = self.lost_frames = self.lost_episodes = 0
         self.status = ""
         self.latencies_ms: list[float] = []
         self._ends_s: deque[float] = deque(maxlen=WINDOW)
 
     def count(self, result: FrameResult, latency_ms: float) -> None:
-        """One more frame, and how long it took."""
+        """Count a frame."""
         is_lost = result.status is TrackingStatus.LOST
         self.lost_episodes += is_lost and self.status != TrackingStatus.LOST.value
         self.lost_frames += is_lost
@@ -100,7 +113,7 @@ class FrameMeter:
         self._ends_s.append(time.monotonic())
 
     def percentiles_ms(self, last: int | None = None) -> tuple[float, float]:
-        """Median and 95th percentile of the latency, of all frames or the last ones."""
+        """Median and 95th percentile of the latencies, of all frames or only the ``last`` ones."""
         chosen = self.latencies_ms if last is None else self.latencies_ms[-last:]
         if not chosen:
             return 0.0, 0.0
@@ -109,7 +122,46 @@ class FrameMeter:
 
     @property
     def frames_per_second(self) -> float:
-        """Of the last frames."""
+        """Rate of the last ``WINDOW`` frames."""
         if len(self._ends_s) < 2:
             return 0.0
         return (len(self._ends_s) - 1) / max(self._ends_s[-1] - self._ends_s[0], 1e-9)
+
+
+def measure_health(
+    system: LiveSystem, meter: FrameMeter, source: SourceCounts, dropped: int, unwritten: int
+) -> Health:
+    """The state of the live loop.
+
+    Args:
+        source: what the source counted.
+        dropped: frames that the source dropped.
+        unwritten: frames and files of the run folder that could not be written.
+    """
+    median_ms, p95_ms = meter.percentiles_ms(WINDOW)
+    segmenter, remote, dense = system.segmenter, system.remote, system.dense
+    return Health(
+        status=meter.status,
+        frames=meter.frames,
+        frames_per_second=meter.frames_per_second,
+        latency_ms_median=median_ms,
+        latency_ms_p95=p95_ms,
+        keyframes=len(remote.world.keyframes),
+        landmarks=int(remote.world.landmarks.alive.sum()),
+        loops_closed=remote.loops_closed,
+        submaps=len(dense.submaps) if dense else 0,
+        keyframes_waiting=remote.pending,
+        masks_waiting=segmenter.waiting if segmenter else 0,
+        submaps_waiting=dense.waiting if dense else 0,
+        frames_dropped=dropped,
+        frames_refused=meter.refused,
+        masks_dropped=segmenter.dropped if segmenter else 0,
+        submaps_dropped=dense.dropped if dense else 0,
+        unwritten=unwritten + (dense.unwritten if dense else 0),
+        lost_frames=meter.lost_frames,
+        lost_episodes=meter.lost_episodes,
+        map_deaths=remote.deaths,
+        segmenter_deaths=segmenter.deaths if segmenter else 0,
+        dense_deaths=dense.deaths if dense else 0,
+        source=asdict(source),
+    )

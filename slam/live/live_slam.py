@@ -1,17 +1,17 @@
-"""SLAM for a camera that does not wait: ``with LiveSlam(camera) as slam: slam.track(...)``."""
+"""SLAM for a live camera: ``with LiveSlam(camera) as slam: slam.track(...)``."""
 
 from __future__ import annotations
 
 import logging
-import shutil
+import math
 import tempfile
 import time
-from dataclasses import asdict, dataclass, replace
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
-import numpy as np
-
+from bmask_slam import __version__
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
 from bmask_slam.features.brisk import Features
@@ -21,13 +21,12 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.display import Display
-from bmask_slam.live.health import WINDOW, FrameMeter, Health
-from bmask_slam.live.live_options import LiveOptions
+from bmask_slam.live.health import FrameMeter, Health, measure_health
 from bmask_slam.live.processes.dense_messages import MapWritten
-from bmask_slam.live.processes.start import start_system
+from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.recorder import Recorder, rescued
 from bmask_slam.live.sources.source import SourceCounts
-from bmask_slam.live.system import LiveSystem
+from bmask_slam.live.start import LiveOptions, start_system
 from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, measure, row, save
 from bmask_slam.sequences.frame import Frame, check_frame
@@ -38,19 +37,20 @@ from bmask_slam.viewer.scene import Scene
 __all__ = ["LiveOptions", "LiveSlam", "Prepared"]
 logger = logging.getLogger(__name__)
 
-MAP_S = 1.0
-"""The longest wait for the map in one go."""
-CLOUDS_S = 600.0
-"""How long the dense map may take to be finished at the end."""
+MAX_MAP_WAIT_S = 1.0
+"""Longest time that one call of ``catch_up`` waits for the map."""
+DENSE_FINISH_S = 600.0
+"""Longest time that the dense map may take to finish at the end."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A frame's features, computed ahead of tracking.
+    """A frame's features, extracted ahead of tracking.
 
     Attributes:
-        features: see there. ms: time that they took.
-        arrived_s: ``time.monotonic()`` when the frame was there.
+        features: as of ``SlamSystem.prepare``.
+        ms: time that they took.
+        arrived_s: ``time.monotonic()`` when the frame arrived, from which its latency counts.
     """
 
     features: Features
@@ -59,23 +59,24 @@ class Prepared:
 
 
 class LiveSlam:
-    """The live loop. Map with graph and loops, segmentation and dense map have processes.
+    """Tracks frames as they come; map, segmentation and dense map run in processes of their own.
 
-    A context manager: leaving it ends them and saves everything, whatever the reason.
+    A context manager: leaving it ends the processes and saves everything, also after an error.
 
     Attributes:
-        frames_dropped: by the source, which counts them here.
+        frames_dropped: by the source, which sets it.
         source_counts: of the source, for ``health``.
-        rows: what metrics.json holds, once it is closed. dense: how the dense map ended, then.
+        rows: what metrics.json holds, after ``close``.
+        dense: how the dense map ended, after ``close``; None without one.
     """
 
     def __init__(
         self, camera: Camera, config: SystemConfig | None = None, options: LiveOptions | None = None
     ) -> None:
-        """Start the processes; returns when they can work.
+        """Start the processes; returns when all of them are ready.
 
         Raises:
-            InputError: the run folder cannot be used, or the segmenter cannot start.
+            InputError: the run folder cannot be used, or a process cannot start.
         """
         self.camera = camera
         self.config = config or SystemConfig()
@@ -85,29 +86,17 @@ class LiveSlam:
         self.rows: list[Row] = []
         self.dense: MapWritten | None = None
         self._counters, self._meter = RunCounters(), FrameMeter()
-        self._refused = 0
-        self._closed = False
-        self._last_s = -np.inf
+        self._last_stamp_s = -math.inf
         self._begin_s = time.monotonic()
-        self._scene: Scene | None = None
-        self._display: Display | None = None
-        self._scratch = Path(tempfile.mkdtemp(prefix="bmask-slam-"))
-        self._recorder: Recorder | None = None
-        try:
-            if self.options.out is not None:
-                folder = RunFolder(self.options.out, self.options.overwrite).__enter__()
-                self._recorder = Recorder(folder)
-                origin = self.options.origin
-                folder.write_text("config.yaml", f"# {origin}\n{dump(self.config)}")
-                logger.info("%s: %s", origin, self.options.title)
-            if self.options.view.anywhere:
-                self._scene = Scene(self.options.title, self.options.view)
-                self._scene.camera(camera)
-                self._display = Display(self._scene)
-            self._system = self._start()
-        except BaseException:
-            self._leave()
-            raise
+        self._closed = False
+        with ExitStack() as stack:  # closed in the opposite order
+            self._recorder = self._open_recorder(stack)
+            scratch = tempfile.TemporaryDirectory(prefix="bmask-slam-", ignore_cleanup_errors=True)
+            folder = Path(stack.enter_context(scratch))
+            self._display = self._open_display(stack)
+            system = start_system(camera, self.config, self.options, folder)
+            self._system = stack.enter_context(closing(system))
+            self._resources = stack.pop_all()
 
     def __enter__(self) -> LiveSlam:
         return self
@@ -120,8 +109,26 @@ class LiveSlam:
     ) -> None:
         self.close()
 
+    def _open_recorder(self, stack: ExitStack) -> Recorder | None:
+        options = self.options
+        if options.out is None:
+            return None
+        folder = stack.enter_context(RunFolder(options.out, options.overwrite))
+        origin = f"bmask-slam {__version__}, {options.origin}"
+        folder.write_text("config.yaml", f"# {origin}\n{dump(self.config)}")
+        logger.info("%s: %s", origin, options.title)
+        return Recorder(folder)
+
+    def _open_display(self, stack: ExitStack) -> Display | None:
+        if not self.options.view.anywhere:
+            return None
+        scene = Scene(self.options.title, self.options.view)
+        stack.callback(scene.close)
+        scene.camera(self.camera)
+        return Display(scene)
+
     def prepare(self, rgb: Image, depth_m: Floats) -> Prepared:
-        """A frame's features, for ``track``; may be called ahead in another thread."""
+        """Extract a frame's features for ``track``; may be called ahead, in another thread."""
         arrived_s, started_s = time.monotonic(), time.perf_counter()
         features = self._system.prepare(Frame(0, 0.0, rgb, depth_m))
         return Prepared(features, 1e3 * (time.perf_counter() - started_s), arrived_s)
@@ -134,30 +141,30 @@ class LiveSlam:
         prepared: Prepared | None = None,
         name: str = "",
     ) -> FrameResult:
-        """Where the camera is: ``T_world_camera`` (4, 4) and a status, in bounded time.
+        """Track a frame: its pose ``T_world_camera`` (4, 4), status and covariance.
 
-        The result's ``covariance`` says how sure that is.
+        The time that it takes is bounded: it does not wait for the other processes.
 
         Args:
             timestamp_s: of the frame; later than the one before.
             rgb: (H, W, 3) uint8, red first.
             depth_m: (H, W) float z-depth in metres, NaN or 0 where missing, registered to rgb.
-            prepared: from ``prepare``, if the features were computed ahead.
+            prepared: from ``prepare``, if the features were extracted ahead.
             name: of the image, for a segmenter that looks masks up.
 
         Raises:
             InputError: a frame that ``check_frame`` refuses. It is not used; the next one may be.
         """
         arrived_s = time.monotonic() if prepared is None else prepared.arrived_s
+        given = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name)
         try:
-            given = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name)
-            frame = check_frame(given, self.camera, self._last_s)
+            frame = check_frame(given, self.camera, self._last_stamp_s)
         except InputError:
-            self._refused += 1
+            self._meter.refused += 1
             raise
         if not self._meter.frames:
             self._begin_s = time.monotonic()
-        self._last_s = timestamp_s
+        self._last_stamp_s = timestamp_s
         result = self._system.process(frame, prepared.features if prepared else None)
         if prepared is not None:
             result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
@@ -170,96 +177,53 @@ class LiveSlam:
         return result
 
     def trajectory(self) -> Trajectory:
-        """Every frame of the largest map segment so far, from the keyframes as they are."""
+        """Every frame of the largest map segment so far, from the keyframes' present poses."""
         return self._system.trajectory()
 
     def map(self) -> LandmarkCloud:
-        """The landmarks of the largest map segment as they are."""
+        """The landmarks of the largest map segment at present."""
         return self._system.landmarks()
 
-    def catch_up(self, waiting: float = np.inf) -> None:
-        """Take in what the others have found, until only so many keyframes wait for the map."""
-        self._system.wait_for_map(waiting, MAP_S)
+    def catch_up(self, waiting: float = math.inf) -> None:
+        """Apply the other processes' results; wait until at most ``waiting`` keyframes are pending.
+
+        The wait ends after ``MAX_MAP_WAIT_S`` in any case.
+        """
+        self._system.wait_for_map(waiting, MAX_MAP_WAIT_S)
 
     def processes(self) -> dict[str, int]:
         """Process ids by name."""
-        found = {"map": self._system.remote.pid}
-        if self._system.segmenter is not None:
-            found["segmenter"] = self._system.segmenter.pid
-        if self._system.dense is not None:
-            found["dense"] = self._system.dense.pid
-        return found
+        system = self._system
+        workers = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
+        return {name: worker.pid for name, worker in workers.items() if worker is not None}
 
     def health(self) -> Health:
-        """How the loop is doing."""
-        system, meter = self._system, self._meter
-        median, high = meter.percentiles_ms(WINDOW)
-        segmenter, remote, dense = system.segmenter, system.remote, system.dense
-        return Health(
-            status=meter.status,
-            frames=meter.frames,
-            frames_per_second=meter.frames_per_second,
-            latency_ms_median=median,
-            latency_ms_p95=high,
-            keyframes=len(remote.world.keyframes),
-            landmarks=int(remote.world.landmarks.alive.sum()),
-            loops_closed=remote.loops_closed,
-            submaps=len(dense.submaps) if dense else 0,
-            keyframes_waiting=remote.pending,
-            masks_waiting=segmenter.waiting if segmenter else 0,
-            submaps_waiting=dense.waiting if dense else 0,
-            frames_dropped=self.frames_dropped,
-            frames_refused=self._refused,
-            masks_dropped=segmenter.dropped if segmenter else 0,
-            submaps_dropped=dense.dropped if dense else 0,
-            unwritten=self._unwritten(),
-            lost_frames=meter.lost_frames,
-            lost_episodes=meter.lost_episodes,
-            map_deaths=remote.deaths,
-            segmenter_deaths=segmenter.deaths if segmenter else 0,
-            dense_deaths=dense.deaths if dense else 0,
-            source=asdict(self.source_counts),
-        )
+        """The state of the live loop."""
+        counts, dropped = self.source_counts, self.frames_dropped
+        unwritten = self._recorder.unwritten if self._recorder else 0
+        return measure_health(self._system, self._meter, counts, dropped, unwritten)
 
     def close(self) -> None:
-        """End the processes and save everything. Safe to call twice.
+        """End the processes and save everything; a second call does nothing.
 
         Raises:
-            InputError: the disk is full; it says where the trajectory is.
+            InputError: the disk is full; the text says where the trajectory is.
         """
         if self._closed:
             return
         self._closed = True
-        health = self.health()
-        self._counters.wall_s = max(time.monotonic() - self._begin_s, 1e-9)
-        failure: InputError | None = None
-        try:
-            self._conclude(health)
-        except OSError as error:
-            if self.options.out is None or error.errno not in DISK_ERRORS:
-                raise
-            where = rescued(self.trajectory())
-            failure = InputError(f"{self.options.out}: {error.strerror}; {where}")
-            raise failure from error
-        finally:
-            self._system.close()
-            self._leave(failure)
+        with self._resources:
+            self._counters.wall_s = max(time.monotonic() - self._begin_s, 1e-9)
+            try:
+                self._save(self.health())
+            except OSError as error:
+                if self.options.out is None or error.errno not in DISK_ERRORS:
+                    raise
+                where = rescued(self.trajectory())
+                raise InputError(f"{self.options.out}: {error.strerror}; {where}") from error
 
-    def _start(self) -> LiveSystem:
-        options = self.options
-        if options.dense and options.out is None:
-            raise InputError("a dense map needs a run folder; give one, as out")
-        run, shown = options.out if options.dense else None, self._display is not None
-        return start_system(self.camera, self.config, self._scratch, options.images, run, shown)
-
-    def _unwritten(self) -> int:
-        """How often the disk was full."""
-        dense = self._system.dense
-        recorded = self._recorder.unwritten if self._recorder else 0
-        return recorded + (dense.unwritten if dense else 0)
-
-    def _conclude(self, health: Health) -> None:
-        """Save what an offline run saves; the trajectory at least, if the map cannot be had."""
+    def _save(self, health: Health) -> None:
+        """Save what an offline run saves; only the trajectory if the map is lost."""
         if self._recorder is None:
             return
         folder = self._recorder.folder
@@ -274,20 +238,19 @@ class LiveSlam:
             logger.error("the map is lost, the trajectory is saved: %s", error)
             return
         rows = measure(self._system, self.options.reference, self._counters, 1)
-        median, high = self._meter.percentiles_ms()
-        rows += [row("latency_ms_median", median, "ms"), row("latency_ms_p95", high, "ms")]
+        median_ms, p95_ms = self._meter.percentiles_ms()
+        rows += [row("latency_ms_median", median_ms, "ms"), row("latency_ms_p95", p95_ms, "ms")]
         rows.append(row("frames_dropped", health.frames_dropped, "frames"))
         self.rows = rows
         save(self._system, folder, rows, self.options.reference, self.options.title)
         folder.complete()
-        self._conclude_dense(folder, health)
+        if self._system.dense is not None:
+            self._finish_dense(self._system.dense, folder, health)
 
-    def _conclude_dense(self, folder: RunFolder, health: Health) -> None:
-        """Let the dense map be finished, and say what is not in it."""
-        dense, world, run = self._system.dense, self._system.mapper.world, folder.path
-        if dense is None:
-            return
-        self.dense = dense.finish(world, CLOUDS_S)
+    def _finish_dense(self, dense: RemoteDenseMapper, folder: RunFolder, health: Health) -> None:
+        """Let the dense map's process finish, and log which keyframes are missing."""
+        world, run = self._system.mapper.world, folder.path
+        self.dense = dense.finish(world, DENSE_FINISH_S)
         if self._display is not None:
             self._display.submaps(dense, world, True, len(world.keyframes))
         if self.dense.failure:
@@ -298,10 +261,3 @@ class LiveSlam:
             logger.warning("bmask-slam map %s %s the %d keyframes left out", run, cure, count)
         ended = replace(health, submaps=len(dense.submaps), submaps_waiting=0)
         folder.write_text(HEALTH, ended.as_json())
-
-    def _leave(self, failure: InputError | None = None) -> None:
-        if self._scene is not None:
-            self._scene.close()
-        shutil.rmtree(self._scratch, ignore_errors=True)
-        if self._recorder is not None:
-            self._recorder.folder.__exit__(None, failure, None)

@@ -247,6 +247,14 @@ def test_a_segmenter_that_cannot_start_says_why(tmp_path) -> None:
         RemoteSegmenter(options, tmp_path)
 
 
+def test_a_run_that_cannot_start_leaves_no_run_folder(tmp_path) -> None:
+    segmenter = SegmenterOptions("precomputed", masks=tmp_path / "none.json")
+    config = replace(CONFIG, semantics=replace(CONFIG.semantics, segmenter=segmenter))
+    with pytest.raises(InputError, match=r"none\.json"):
+        LiveSlam(CAMERA, config, LiveOptions(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
 def test_one_that_begins_too_late_is_said_to_be_late(tmp_path) -> None:
     before = children()
     with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):

@@ -1,0 +1,77 @@
+"""What a live run is asked for, and the start of its processes: all of them, or none."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.processes.dense_messages import DenseOrder
+from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
+from bmask_slam.live.processes.segmentation import RemoteSegmenter
+from bmask_slam.live.system import LiveSystem
+from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.viewer.scene import ViewOptions
+
+PREVIEW_POINTS = 3000
+"""Largest number of points of a submap that a viewer gets."""
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """What a live run writes and shows, and what it is compared with.
+
+    Attributes:
+        out: run folder, as an offline run's; None: nothing is written.
+        overwrite: replace the run that ``out`` holds.
+        reference: trajectory to compare with at the end.
+        view: where a viewer shows the run, if anywhere.
+        images: folder that the frames are read from, if any: a segmenter looks masks up for it, and
+            ``bmask-slam map`` reads it.
+        title: of the plot of the trajectory.
+        dense: make a dense map as well; needs ``out``.
+    """
+
+    out: Path | None = None
+    overwrite: bool = False
+    reference: Trajectory | None = None
+    view: ViewOptions = field(default_factory=ViewOptions)
+    images: Path = Path()
+    title: str = "live"
+    dense: bool = False
+
+    @property
+    def origin(self) -> str:
+        """What config.yaml says about where the frames come from."""
+        return "live" if self.images == Path() else f"sequence {self.images}, stride 1"
+
+
+def start_system(
+    camera: Camera, config: SystemConfig, options: LiveOptions, scratch: Path
+) -> LiveSystem:
+    """The live system, all of whose processes are ready; its temporary files go to ``scratch``.
+
+    Raises:
+        InputError: a process cannot start, or a dense map has no run folder.
+    """
+    if options.dense and options.out is None:
+        raise InputError("a dense map needs a run folder; give one, as out")
+    masks: SegmenterOptions = config.semantics.segmenter
+    with ExitStack() as undo:
+        segmenter, dense, labels = None, None, NoSegmenter.labels
+        if masks.name != "none":
+            segmenter = RemoteSegmenter(masks, options.images)
+            undo.callback(segmenter.close)
+            labels = segmenter.labels
+        if options.dense and options.out is not None:
+            points = PREVIEW_POINTS if options.view.anywhere else 0
+            dense = RemoteDenseMapper(DenseOrder(options.out, camera, masks, labels.names, points))
+            undo.callback(dense.close)
+        system = LiveSystem(camera, config, scratch, segmenter, dense)
+        undo.pop_all()
+        return system
