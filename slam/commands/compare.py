@@ -75,8 +75,7 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 
 def _options(arguments: argparse.Namespace) -> CompareOptions:
-    from bmask_slam.comparison.experiment.options import CompareOptions
-    from bmask_slam.comparison.jobs.external import parse_trajectory
+    from bmask_slam.comparison.experiment.options import CompareOptions, parse_trajectory
 
     return CompareOptions(
         data=tuple(arguments.data),

@@ -14,7 +14,6 @@ from typing import Any
 from bmask_slam.comparison.experiment.experiment import Configuration, Experiment
 from bmask_slam.comparison.experiment.experiment_file import read_experiment
 from bmask_slam.comparison.experiment.options import CompareOptions, chosen
-from bmask_slam.comparison.experiment.plan import Plan, make_plan
 from bmask_slam.comparison.experiment.provenance import provenance
 from bmask_slam.comparison.experiment.result import (
     RESULTS,
@@ -30,8 +29,8 @@ from bmask_slam.comparison.jobs.cells import Key
 from bmask_slam.comparison.jobs.errors import Rules, run_figures, trajectory_errors
 from bmask_slam.comparison.jobs.external import other_methods, published_cells, trajectory_cells
 from bmask_slam.comparison.jobs.job import Job, Outcome, finished
-from bmask_slam.comparison.jobs.pool import LocalPool, Pool
-from bmask_slam.comparison.jobs.ray_pool import RayPool
+from bmask_slam.comparison.jobs.plan import Plan, make_plan
+from bmask_slam.comparison.jobs.pool import LocalPool, Pool, RayPool
 from bmask_slam.comparison.report import write_report
 from bmask_slam.graph.errors import InputError
 

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from bmask_slam.comparison.experiment.experiment import Experiment
-from bmask_slam.comparison.jobs.external import Files, with_files
+from bmask_slam.comparison.experiment.experiment import Experiment, OtherSystem
 from bmask_slam.graph.errors import InputError
 
 Value = TypeVar("Value")
+Files = dict[tuple[str, str], Path]
+"""Trajectory file by method and SEQUENCE or SEQUENCE@SEED."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,39 @@ class CompareOptions:
             raise InputError(f"--jobs {self.workers}: must be at least 1")
         if self.seeds is not None and (not self.seeds or min(self.seeds) < 0):
             raise InputError(f"--seeds {self.seeds}: give whole numbers, none negative")
+
+
+def parse_trajectory(text: str) -> tuple[tuple[str, str], Path]:
+    """``METHOD:SEQUENCE=FILE`` or ``METHOD:SEQUENCE@SEED=FILE``. Raises InputError."""
+    name, separator, file = text.partition("=")
+    method, colon, sequence = name.rpartition(":")
+    if not (separator and colon and method and sequence and file):
+        raise InputError(f"--trajectory {text}: write it as METHOD:SEQUENCE=FILE")
+    return (method, sequence), Path(file)
+
+
+def with_files(experiment: Experiment, files: Files) -> Experiment:
+    """The experiment with the given files in place of its own, and their systems if it lacks them.
+
+    Raises:
+        InputError: a file that does not exist, or a sequence or method that cannot be.
+    """
+    systems = dict(experiment.systems)
+    for (method, sequence), file in files.items():
+        there = [s.name for s in experiment.sequences]
+        if sequence.partition("@")[0] not in there:
+            raise InputError(
+                f"--trajectory {method}:{sequence}: no such sequence; there are: {', '.join(there)}"
+            )
+        taken = [*experiment.configurations, *(q.method for q in experiment.published)]
+        if method in taken:
+            raise InputError(f"--trajectory {method}:{sequence}: {method!r} is another row's name")
+        if not file.is_file():
+            raise InputError(f"{file}: no such file; give a trajectory in TUM format")
+        system = systems.get(method, OtherSystem())
+        given = {**system.trajectories, sequence: str(file.absolute())}
+        systems[method] = replace(system, trajectories=given)
+    return replace(experiment, systems=systems)
 
 
 def chosen(experiment: Experiment, options: CompareOptions) -> Experiment:

@@ -1,22 +1,43 @@
-"""Where figures come from: commit, machine, versions, command, the experiment in full."""
+"""Where figures come from, and hashes of what they depend on.
+
+Equal hashes mean that nothing has changed, so that a result can be kept.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shlex
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from bmask_slam import __version__
+from bmask_slam import __version__, graph, mapping, semantics
 from bmask_slam.comparison.experiment.experiment import OPTIONS, Configuration, Experiment
-from bmask_slam.comparison.experiment.fingerprint import code_print
-from bmask_slam.config.configuration import differences, find_config, resolve
+from bmask_slam.config.configuration import differences, dump, find_config, resolve
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.runtime.machine import commit, describe_machine, versions
 from bmask_slam.system_config import SystemConfig
 
 PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "open3d", "scipy", "torch", "faiss-cpu")
+SYSTEM = Path(__file__).parents[2]
+LAYERS = (*tuple(Path(layer.__path__[0]) for layer in (graph, semantics, mapping)), SYSTEM)
+ELSEWHERE = (
+    "comparison",
+    "viewer",
+    "live",
+    "rendering",
+    "datasets",
+)
+"""Folders of slam that no run uses."""
+LIBRARIES = ("gtsam", "numpy", "opencv-python-headless", "torch", "scipy", "faiss-cpu")
+CONTENTS = ("rgb.txt", "depth.txt", "associations.txt", "camera.yaml", "annotations.json")
 
 
 def provenance(experiment: Experiment, workers: int) -> dict[str, Any]:
@@ -28,7 +49,7 @@ def provenance(experiment: Experiment, workers: int) -> dict[str, Any]:
     return {
         "version": __version__,
         "commit": f"{head} with changes" if changed else head,
-        "code": code_print(),
+        "code": code_hash(),
         "command": shlex.join(["bmask-slam", *sys.argv[1:]]) if sys.argv[1:] else "",
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "workers": workers,
@@ -54,3 +75,61 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
+
+
+# --- Hashes --------------------------------------------------------------------------------------
+
+
+@cache
+def code_hash() -> str:
+    """Hash of the code that a run uses, the network's weights, and the libraries' versions."""
+    versions = ",".join(f"{name} {version(name)}" for name in LIBRARIES)
+    parts = [versions]
+    for folder in LAYERS:
+        used = (p for p in folder.rglob("*.py") if p.relative_to(folder).parts[0] not in ELSEWHERE)
+        parts += _contents(used, folder)
+    weights = data_path("weights")
+    return _digest([*parts, *_contents(weights.glob("*.safetensors"), weights)])
+
+
+@cache
+def rendering_hash() -> str:
+    """Hash of the code that renders."""
+    folder = SYSTEM / "rendering"
+    return _digest(_contents(folder.rglob("*.py"), folder))
+
+
+def rendered_hash(config: RenderConfig) -> str:
+    """Hash of a rendered sequence: its configuration and the code that renders."""
+    return _digest([rendering_hash(), json.dumps(asdict(config))])
+
+
+def folder_hash(folder: Path, camera: Path | None) -> str:
+    """Hash of a recorded sequence: lists and camera by content, images by name and size."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    sizes = (
+        f"{p.relative_to(folder)} {p.stat().st_size}" for p in files if p.name != "groundtruth.txt"
+    )
+    lists = _contents((p for p in files if p.name in CONTENTS), folder)
+    given = [camera.read_text(encoding="utf-8")] if camera else []
+    return _digest([*sizes, *lists, *given])
+
+
+def configuration_hash(configuration: Configuration, settings: tuple[str, ...]) -> str:
+    """Hash of the resolved configuration and the other options of a run."""
+    file = find_config(configuration.config) if configuration.config else None
+    resolved = dump(resolve(SystemConfig, file, (*configuration.set, *settings)))
+    return _digest([resolved, *(str(getattr(configuration, name)) for name in OPTIONS)])
+
+
+def _contents(files: Iterable[Path], root: Path) -> Iterator[str]:
+    for path in sorted(files):
+        yield f"{path.relative_to(root) if path.is_relative_to(root) else path.name} "
+        yield hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _digest(texts: Iterable[str]) -> str:
+    whole = hashlib.sha256()
+    for text in texts:
+        whole.update(text.encode() + b"\0")
+    return whole.hexdigest()[:16]

@@ -9,11 +9,11 @@ from pathlib import Path
 from bmask_slam.comparison.experiment.data_folders import Site
 from bmask_slam.comparison.experiment.experiment import Configuration, Experiment, SequenceSource
 from bmask_slam.comparison.experiment.experiment_file import slug
-from bmask_slam.comparison.experiment.fingerprint import (
-    code_print,
-    configuration_print,
-    drawn_print,
-    folder_print,
+from bmask_slam.comparison.experiment.provenance import (
+    code_hash,
+    configuration_hash,
+    folder_hash,
+    rendered_hash,
 )
 from bmask_slam.comparison.jobs.job import Job
 from bmask_slam.rendering.sequence import RenderConfig
@@ -47,7 +47,7 @@ class Place:
 
 def recorded_place(source: SequenceSource, site: Site) -> Place:
     """A recorded sequence, the same for every seed."""
-    contents = "" if site.folder is None else folder_print(site.folder, source.camera)
+    contents = "" if site.folder is None else folder_hash(site.folder, source.camera)
     return Place(source, None, site.folder, site.reference, site.problem, contents)
 
 
@@ -55,7 +55,7 @@ def drawn_place(source: SequenceSource, config: RenderConfig, seed: int, out: Pa
     """A rendered sequence with its job; ``config`` without the seed."""
     drawn = replace(config, seed=seed, true_depth=True)
     folder = out / SEQUENCES / f"{slug(source.name)}-{seed}"
-    contents = drawn_print(drawn)
+    contents = rendered_hash(drawn)
     beside = str(folder)
     job = Job(
         f"rendering {source.name}, seed {seed}",
@@ -113,9 +113,9 @@ def _run_job(place: Place, named: tuple[str, Configuration], seed: int, out: Pat
         record=str(folder / "cell.json"),
         log=str(folder / "log.txt"),
         depends={
-            "code": code_print(),
+            "code": code_hash(),
             "sequence": place.contents,
-            "configuration": configuration_print(configuration, (setting,)),
+            "configuration": configuration_hash(configuration, (setting,)),
         },
         sequence=str(place.folder) if judged else "",
         run=str(run),

@@ -6,49 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from bmask_slam.comparison.experiment.experiment import Experiment, OtherSystem
+from bmask_slam.comparison.experiment.experiment import Experiment
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Kind, Method
 from bmask_slam.comparison.jobs.cells import Place
 from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.lists import read_pairs
 from bmask_slam.sequences.sequence import SequenceConfig
-
-Files = dict[tuple[str, str], Path]
-"""Trajectory file by method and SEQUENCE or SEQUENCE@SEED."""
-
-
-def parse_trajectory(text: str) -> tuple[tuple[str, str], Path]:
-    """``METHOD:SEQUENCE=FILE`` or ``METHOD:SEQUENCE@SEED=FILE``. Raises InputError."""
-    name, separator, file = text.partition("=")
-    method, colon, sequence = name.rpartition(":")
-    if not (separator and colon and method and sequence and file):
-        raise InputError(f"--trajectory {text}: write it as METHOD:SEQUENCE=FILE")
-    return (method, sequence), Path(file)
-
-
-def with_files(experiment: Experiment, files: Files) -> Experiment:
-    """The experiment with the given files in place of its own, and their systems if it lacks them.
-
-    Raises:
-        InputError: a file that does not exist, or a sequence or method that cannot be.
-    """
-    systems = dict(experiment.systems)
-    for (method, sequence), file in files.items():
-        there = [s.name for s in experiment.sequences]
-        if sequence.partition("@")[0] not in there:
-            raise InputError(
-                f"--trajectory {method}:{sequence}: no such sequence; there are: {', '.join(there)}"
-            )
-        taken = [*experiment.configurations, *(q.method for q in experiment.published)]
-        if method in taken:
-            raise InputError(f"--trajectory {method}:{sequence}: {method!r} is another row's name")
-        if not file.is_file():
-            raise InputError(f"{file}: no such file; give a trajectory in TUM format")
-        system = systems.get(method, OtherSystem())
-        given = {**system.trajectories, sequence: str(file.absolute())}
-        systems[method] = replace(system, trajectories=given)
-    return replace(experiment, systems=systems)
 
 
 def trajectory_cells(

@@ -17,6 +17,8 @@ from bmask_slam.comparison.experiment.result import CellStatus
 from bmask_slam.graph.whole_file import whole_file
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+PROCESS = "bmask_slam.job_process"
+"""Module that a job's process runs; named, since it is above this one in the order of imports."""
 LAST_LINES = 30
 LINE_LIMIT = 300
 
@@ -94,7 +96,7 @@ def run_job(job: Job, threads: int = 1, started: Start = lambda process: None) -
     begin_s = time.monotonic()
     with log.open("wb") as output:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", f"{__package__}.child", json.dumps(asdict(job))],
+            [sys.executable, "-P", "-m", PROCESS, json.dumps(asdict(job))],
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,

@@ -14,14 +14,18 @@ from bmask_slam.comparison.experiment.experiment import (
     Quotation,
     SequenceSource,
 )
-from bmask_slam.comparison.experiment.options import CompareOptions
-from bmask_slam.comparison.experiment.plan import make_plan
+from bmask_slam.comparison.experiment.options import (
+    CompareOptions,
+    parse_trajectory,
+    with_files,
+)
 from bmask_slam.comparison.experiment.result import CellStatus
 from bmask_slam.comparison.jobs.bar import JobBar
 from bmask_slam.comparison.jobs.cells import drawn_place, run_jobs
 from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
-from bmask_slam.comparison.jobs.external import parse_trajectory, published_cells, with_files
+from bmask_slam.comparison.jobs.external import published_cells
 from bmask_slam.comparison.jobs.job import Job, Outcome
+from bmask_slam.comparison.jobs.plan import make_plan
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.trajectory import Trajectory, write_tum

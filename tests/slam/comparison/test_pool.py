@@ -134,7 +134,7 @@ def test_a_job_ends_when_the_process_that_started_it_is_killed(tmp_path):
 
 def test_jobs_on_a_local_ray(tmp_path):
     pytest.importorskip("ray")
-    from bmask_slam.comparison.jobs.ray_pool import RayPool
+    from bmask_slam.comparison.jobs.pool import RayPool
 
     with RayPool("local") as pool:
         assert pool.workers == 1
@@ -146,7 +146,7 @@ def test_jobs_on_a_local_ray(tmp_path):
 
 def test_an_address_without_a_cluster_is_refused():
     pytest.importorskip("ray")
-    from bmask_slam.comparison.jobs.ray_pool import RayPool
+    from bmask_slam.comparison.jobs.pool import RayPool
 
     with pytest.raises(InputError, match="nothing answers there"):
         RayPool("127.0.0.1:1")

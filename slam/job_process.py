@@ -1,7 +1,7 @@
-"""The process of a job: ends itself when the one that started it is gone.
+"""The process of a job of a comparison; it ends when the process that started it has ended.
 
-A job is told to stop by closing its standard input, which also happens when the starting process
-is killed, so that no job is left behind to write into a folder that is used again.
+Its standard input is a pipe from that process. When the pipe is closed, also because the starting
+process was killed, this one ends, so that no job is left to write into a folder that is used again.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from bmask_slam.cli import main
 from bmask_slam.comparison.jobs.job import Job, figures_file
 
 
-def watch_parent() -> None:
+def end_with_parent() -> None:
     """End this process at the end of standard input."""
 
-    def watch() -> None:
+    def wait_for_end() -> None:
         while os.read(0, 64):
             pass
         os.kill(os.getpid(), signal.SIGKILL)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=wait_for_end, daemon=True).start()
 
 
-def work(job: Job) -> int:
-    """Run a job's command, then compare with the truth; the exit status."""
-    import cv2  # noqa: PLC0415 - after the parent is watched
+def run(job: Job) -> int:
+    """Run a job's command, then measure against the truth; return the exit status."""
+    import cv2  # noqa: PLC0415 - after end_with_parent
 
     cv2.setNumThreads(int(os.environ["OMP_NUM_THREADS"]))
     figures_file(job).unlink(missing_ok=True)
@@ -44,5 +44,5 @@ def work(job: Job) -> int:
 
 
 if __name__ == "__main__":
-    watch_parent()
-    sys.exit(work(Job(**json.loads(sys.argv[1]))))
+    end_with_parent()
+    sys.exit(run(Job(**json.loads(sys.argv[1]))))
