@@ -40,8 +40,8 @@ class MapKeywords(TypedDict, total=False):
     """Further keywords of `map_run`; each but ``quiet`` is the field of `MapOptions`."""
 
     sequence: AnyPath
-    without: tuple[str, ...]
-    moving: bool
+    excluded: tuple[str, ...]
+    keep_excluded: bool
     voxel_m: float
     source: str
     device: str
@@ -171,9 +171,9 @@ def _segmenter_options(given: str | SegmenterOptions, base: SegmenterOptions) ->
 
 
 def _plain(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The keyword arguments that are not None; a path, or a `Run`, as `Path`."""
+    """The keyword arguments that are not None; a path, or a `Run`, as text."""
     return {
-        name: Path(value) if isinstance(value, os.PathLike) else value
+        name: os.fspath(value) if isinstance(value, os.PathLike) else value
         for name, value in given.items()
         if value is not None
     }

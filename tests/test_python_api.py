@@ -97,7 +97,7 @@ def test_every_option_has_a_keyword(keywords: type, options: type, named: set[st
         ({"stride": 0}, "stride 0: must be a whole number of at least 1"),
         ({"max_frames": 2.5}, r"max_frames = 2.5 is not a whole number"),
         ({"overwrite": "yes"}, r"overwrite = .*yes.* is not true or false"),
-        ({"out": 7}, r"out = 7 is not a path"),
+        ({"out": 7}, r"run\(\): out = 7 is not a"),
         ({"segmenter": "lite"}, "'lite': not known; there are: light, .*none"),
         ({"config": "no/such.yaml"}, r"no/such\.yaml: "),
         ({"settings": {"tracking.min_inliers": "x"}}, r"tracking\.min_inliers = .*whole number"),

@@ -1,0 +1,251 @@
+"""`Run`: every part of a run folder as arrays, of finished runs and of runs that were killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_run import FakeSystem, make_sequence, true_pose
+
+from bmask_slam.api import map_run, run
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.offline import runner
+from bmask_slam.offline.options import RunOptions
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
+from bmask_slam.run_folder.reader import Run
+from bmask_slam.run_folder.semantic_files import read_labels
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A short run with exact masks, covariances and a dense map."""
+    folder = tmp_path_factory.mktemp("reader")
+    config = RenderConfig("office", frames=16, fps=8, width=320, height=240)
+    sequence = render_sequence(config, folder / "office")
+    settings = {"covariances": True, "semantics.segmenter.min_score": 0.5}
+    found = run(sequence, folder / "run", segmenter="truth", settings=settings)
+    return map_run(found)
+
+
+@pytest.fixture
+def known(tmp_path: Path) -> Run:
+    """A run of a system that knows the answer; frames 6 and 13 are lost."""
+    options = RunOptions(make_sequence(tmp_path / "seq"), out=tmp_path / "run", quiet=True)
+    return Run(runner.run(options, FakeSystem).folder)
+
+
+def test_trajectory_and_keyframes_are_those_of_the_system(known: Run) -> None:
+    tracked = [k for k in range(20) if k % 7 != 6]
+    np.testing.assert_allclose(known.trajectory.timestamps_s, np.array(tracked) / 10)
+    expected = [true_pose(k) for k in tracked]
+    np.testing.assert_allclose(known.trajectory.poses_world_camera, expected, atol=1e-8)
+    assert known.trajectories == (known.trajectory,)
+    assert known.keyframes.ids.tolist() == [0, 1, 2, 3]
+    assert known.keyframes.reasons == ("new view",) * 4
+    np.testing.assert_allclose(known.keyframes.timestamps_s, [0, 0.5, 1, 1.5])
+    np.testing.assert_allclose(known.keyframes.poses_world_camera[2], true_pose(10), atol=1e-8)
+
+
+def test_frames_have_a_row_each(known: Run) -> None:
+    frames = known.frames
+    assert len(frames) == 20
+    assert [k for k, status in enumerate(frames.status) if status == "LOST"] == [6, 13]
+    assert frames.matches.tolist() == list(range(100, 120))
+    assert frames.keyframe_ids.tolist() == [k // 5 if k % 5 == 0 else -1 for k in range(20)]
+    assert frames.stage_ms["tracking"][3] == 1003.0
+    assert np.isnan(frames.stage_ms["loops"]).all()
+    assert frames.mostly_moving.dtype == bool
+
+
+def test_landmarks_without_a_segmenter_have_no_labels(known: Run) -> None:
+    landmarks = known.landmarks
+    np.testing.assert_allclose(landmarks.points_world, [[1, 2, 3], [-4.5, 5.25, 6]])
+    assert landmarks.ids.tolist() == [3, 8]
+    assert landmarks.colours.tolist() == [[255, 1, 2], [3, 4, 250]]
+    assert (landmarks.labels, landmarks.probabilities, landmarks.entropies) == (None, None, None)
+
+
+def test_metrics_origin_and_log(known: Run, tmp_path: Path) -> None:
+    assert known.metrics["tracked_share"] == (pytest.approx(0.9), "1")
+    assert known.metrics["keyframes"].unit == "keyframes"
+    assert known.sequence == tmp_path / "seq"
+    assert known.config.tracking.min_inliers > 0
+    assert any("camera from" in line for line in known.log)
+    assert known.is_finished
+
+
+def test_a_run_is_a_path(known: Run) -> None:
+    assert Path(known) == known.path
+    assert repr(known) == f"Run({str(known.path)!r})"
+    assert Run(known).path == known.path
+
+
+def test_each_part_is_read_once(known: Run) -> None:
+    trajectory = known.trajectory
+    shutil.rmtree(known.path)
+    assert known.trajectory is trajectory
+
+
+def test_labels_are_those_of_the_csv(labelled: Run) -> None:
+    table, landmarks = read_labels(labelled.path), labelled.landmarks
+    assert landmarks.labels is not None and landmarks.probabilities is not None
+    assert landmarks.labels.tolist() == list(table.labels)
+    assert {"unknown", "desk"} <= set(landmarks.labels.tolist())
+    np.testing.assert_allclose(landmarks.probabilities, table.probability, atol=1e-5)
+
+
+def test_label_distributions_belong_to_the_landmarks(labelled: Run) -> None:
+    p, landmarks = labelled.label_distributions, labelled.landmarks
+    assert p.shape == (len(landmarks), len(labelled.label_names))
+    np.testing.assert_allclose(p.sum(axis=1), 1)
+    np.testing.assert_allclose(p.max(axis=1), landmarks.probabilities, atol=1e-6)
+    assert landmarks.labels is not None
+    assert np.array(labelled.label_names)[p.argmax(axis=1)].tolist() == landmarks.labels.tolist()
+
+
+def test_objects_stand_among_their_landmarks(labelled: Run) -> None:
+    landmarks = labelled.landmarks
+    assert {"desk", "screen"} <= {o.label for o in labelled.objects}
+    for thing in labelled.objects:
+        points = landmarks.points_world[np.isin(landmarks.ids, thing.landmarks)]
+        distances_m = np.linalg.norm(points - thing.centroid_world, axis=1)
+        assert distances_m.min(initial=0) < 0.5
+
+
+def test_saved_and_computed_covariances_are_the_same(labelled: Run, tmp_path: Path) -> None:
+    saved = read_covariances(labelled.path / COVARIANCES)
+    rows = np.searchsorted(saved.keyframe_ids, labelled.keyframes.ids)
+    np.testing.assert_allclose(labelled.keyframe_covariances, saved.covariances[rows])
+    for name in ("graph", "keyframes.txt", "frames.csv", "config.yaml", "landmarks.ply"):
+        shutil.copy(labelled.path / name, tmp_path)
+    computed = Run(tmp_path).keyframe_covariances
+    np.testing.assert_allclose(computed, labelled.keyframe_covariances, rtol=1e-6, atol=1e-18)
+
+
+def test_landmark_covariances_belong_to_the_landmarks(labelled: Run) -> None:
+    covariances = labelled.landmark_covariances
+    assert covariances.shape == (len(labelled.landmarks), 3, 3)
+    known = np.isfinite(covariances).all(axis=(1, 2))
+    assert known.mean() > 0.2
+    assert (np.linalg.eigvalsh(covariances[known])[:, 0] > 0).all()
+    distance_m = np.linalg.norm(labelled.landmarks.points_world[known], axis=1)
+    sigma_m = np.sqrt(np.trace(covariances[known], axis1=1, axis2=2))
+    near = distance_m < np.median(distance_m)
+    assert np.median(sigma_m[near]) < np.median(sigma_m[~near])
+
+
+def test_dense_clouds(labelled: Run) -> None:
+    cloud, columns = labelled.dense_cloud, read_ply(labelled.path / "dense/cloud.ply")
+    np.testing.assert_array_equal(cloud.points_world[:, 2], columns["z"])
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals_world, axis=1), 1, atol=1e-3)
+    assert "desk" in set(cloud.labels.tolist())
+    assert (cloud.sigmas_m > 0).all()
+    by_id = {o.id: o for o in labelled.objects}
+    for number, part in labelled.object_clouds.items():
+        assert set(part.labels.tolist()) == {by_id[number].label}
+        assert by_id[number].box.contains(part.points_world).mean() > 0.8
+
+
+def test_the_camera_is_that_of_the_sequence(labelled: Run) -> None:
+    assert (labelled.camera.width, labelled.camera.height) == (320, 240)
+
+
+# --- What is not there, or not whole -------------------------------------------------------------
+
+
+def killed(tmp_path: Path, **options: int) -> Run:
+    """What a run leaves that ends without a word after frame 41."""
+
+    class KilledError(Exception):
+        pass
+
+    def kill(k: int) -> None:
+        if k == 41:
+            raise KilledError
+
+    sequence = make_sequence(tmp_path / "seq", 50)
+    made = RunOptions(sequence, out=tmp_path / "run", quiet=True, **options)
+    with pytest.raises(KilledError):
+        runner.run(made, partial(FakeSystem, on_frame=kill))
+    return Run(tmp_path / "run")
+
+
+def test_a_killed_run_gives_what_is_there(tmp_path: Path) -> None:
+    found = killed(tmp_path)
+    assert not found.is_finished
+    assert len(found.frames) == 41
+    assert len(found.trajectory) == 36
+    assert found.config.tracking.min_inliers > 0
+    again = rf"make it by: bmask-slam run {tmp_path}/seq --out {tmp_path}/run --overwrite"
+    for part in ("keyframes", "landmarks", "metrics", "camera", "label_distributions"):
+        with pytest.raises(InputError, match=rf"run/[\w.]+: no such file; {again}"):
+            getattr(found, part)
+
+
+def test_a_killed_run_with_a_checkpoint_can_be_finished(tmp_path: Path) -> None:
+    found = killed(tmp_path, checkpoint_every=10)
+    cure = rf"finish the run by: bmask-slam run --resume {tmp_path}/run"
+    with pytest.raises(InputError, match=rf"landmarks\.ply: no such file yet; {cure}"):
+        _ = found.landmarks
+
+
+def test_a_cut_off_last_line_of_frames_is_passed_over(known: Run) -> None:
+    path = known.path / "frames.csv"
+    os.truncate(path, path.stat().st_size - 7)
+    assert len(known.frames) == 19
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ("objects", r"objects\.json: no such file; make it by: .* --segmenter light --out"),
+        ("label_names", r"objects\.json: no such file"),
+        ("dense_cloud", r"dense/cloud\.ply: no such file; make it by: bmask-slam map"),
+        ("object_clouds", r"make it by: bmask-slam map"),
+    ],
+)
+def test_a_missing_part_names_the_command_that_makes_it(
+    known: Run, part: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        getattr(known, part)
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "text", "message"),
+    [
+        ("metrics", "metrics.json", "[{}]", r"metrics\.json: cannot be read .*; make it by: bmask"),
+        ("frames", "frames.csv", "index,timestamp\n", r"frames\.csv: no column status; run again"),
+        ("frames", "frames.csv", None, r"frames\.csv: a line with too few or too many values"),
+        ("trajectory", "trajectory.txt", "0 0 0 nan 0 0 0 1\n", r"trajectory\.txt"),
+        ("landmarks", "landmarks.ply", "ply\n", r"landmarks\.ply: not a PLY file"),
+    ],
+)
+def test_a_broken_part_is_named(
+    known: Run, part: str, name: str, text: str | None, message: str
+) -> None:
+    path = known.path / name
+    path.write_text(path.read_text().replace("OK,", "", 1) if text is None else text)
+    with pytest.raises(InputError, match=message):
+        getattr(known, part)
+
+
+def test_a_label_without_a_name_is_refused(labelled: Run, tmp_path: Path) -> None:
+    shutil.copy(labelled.path / "landmarks.ply", tmp_path)
+    (tmp_path / "objects.json").write_text(json.dumps({"labels": ["unknown"], "objects": []}))
+    with pytest.raises(InputError, match=r"landmarks\.ply: a label beyond the 1 of the run"):
+        _ = Run(tmp_path).landmarks
+
+
+def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere: no such folder; give the folder of a run"):
+        Run(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="holds no run; make one by: bmask-slam run SEQUENCE"):
+        Run(tmp_path)
