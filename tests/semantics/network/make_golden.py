@@ -1,7 +1,8 @@
 """Writes golden.npz: what torchvision computes, for test_parity.py. Not part of the tests' run.
 
     python3 -m venv ref && ref/bin/pip install torch==2.15.0 torchvision==0.29.2
-    ref/bin/python tests/semantics/make_golden.py tests/semantics/golden.npz
+    PYTHONPATH=tests/helpers ref/bin/python tests/semantics/network/make_golden.py \
+        tests/semantics/network/golden.npz
 
 Weights and inputs come from seeds (random_weights.py), so only results are stored.
 """

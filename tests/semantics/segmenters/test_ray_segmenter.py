@@ -15,6 +15,7 @@ import pytest
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.segmenters.ray_connection import connect
 from bmask_slam.semantics.segmenters.ray_segmenter import RaySegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
@@ -39,6 +40,7 @@ def options(folder: Path) -> SegmenterOptions:
 
 @pytest.fixture(scope="module")
 def segmenter(options: SegmenterOptions, folder: Path) -> Iterator[RaySegmenter]:
+    connect("local", local_cpus=2)  # for two actors; fewer workers start faster
     found = make_segmenter(options, folder)
     assert isinstance(found, RaySegmenter)
     yield found
