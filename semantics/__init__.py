@@ -1,1 +1,1 @@
-"""What things are: labels, instances and the network that finds them."""
+"""Labels, instance masks, the segmentation network, class beliefs of landmarks and objects."""

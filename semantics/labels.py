@@ -1,4 +1,4 @@
-"""Label sets: which number stands for which class."""
+"""Label sets: the class that each number stands for."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bmask_slam.graph.errors import InputError
 
 BACKGROUND = "background"
 UNKNOWN = "unknown"
-"""What label 0 means of a thing in the map: on no object that the set has a name for."""
+"""Name of label 0 for landmarks and objects: of no class of the set."""
 UNUSED = "N/A"
 """Name of a number that stands for no class."""
 
@@ -25,8 +25,8 @@ class LabelSet:
     def __len__(self) -> int:
         return len(self.names)
 
-    def of_thing(self, label: int) -> str:
-        """The name of a label of something in the map."""
+    def map_name(self, label: int) -> str:
+        """The name of a label of a landmark or object: "unknown" for label 0."""
         return self.names[label] if label else UNKNOWN
 
     def number(self, name: str) -> int:
@@ -40,10 +40,10 @@ def label_set(classes: tuple[str, ...] | list[str]) -> LabelSet:
 
 
 def read_label_set(name: str) -> LabelSet:
-    """A set from its file, one class a line, or from the bare name of one in ``data/labels``.
+    """Read a set from a file with one class a line, or by the bare name of one in ``data/labels``.
 
     Raises:
-        InputError: no such file, no class in it, or a class that stands on two lines.
+        InputError: no such file, no class in it, or a class on two lines.
     """
     path = data_path("labels", f"{name}.txt") if re.fullmatch(r"[\w-]+", name) else Path(name)
     try:
@@ -54,7 +54,7 @@ def read_label_set(name: str) -> LabelSet:
     if not classes:
         raise InputError(f"{path}: there is no class in it; give one class name a line")
     named = [c for c in classes if c != UNUSED]
-    twice = next((c for c in named if named.count(c) > 1), None)
-    if twice is not None:
-        raise InputError(f"{path}: the class {twice!r} stands on two lines; remove one")
+    repeated = next((c for c in named if named.count(c) > 1), None)
+    if repeated is not None:
+        raise InputError(f"{path}: the class {repeated!r} stands on two lines; remove one")
     return label_set(classes)

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Votes of masks about landmarks, class beliefs, probability of moving."""

@@ -1,4 +1,4 @@
-"""Whether things move: a binary Bayes filter for many things at once, by their ids."""
+"""Probability of moving: a binary Bayes filter for many landmarks at once, by their ids."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _FIRST_CAPACITY = 1024
 
 @dataclass(frozen=True)
 class MovabilityConfig:
-    """How evidence counts.
+    """The weight of evidence.
 
-    ``hit_rate`` is P(evidence says moving | moving) = P(evidence says static | static).
-    Frames in a row err together, so that one counts for ``frame_power`` of its likelihood. All
-    evidence together moves the log odds by at most ``max_evidence``: what stops moving becomes
-    static again, and the other way round.
+    ``hit_rate`` is P(evidence says moving | moving) = P(evidence says static | static). Errors of
+    consecutive frames are correlated, so that the likelihood of each is raised to the power
+    ``frame_power``. All evidence together changes the log odds by at most ``max_evidence``, so that
+    a change between moving and static is found.
     """
 
     hit_rate: float = 0.9
@@ -45,10 +45,10 @@ class MovabilityConfig:
 
 
 class MovabilityFilter:
-    """P(moving) of every id from 0 on, as log odds: those of its prior and of the evidence.
+    """P(moving) of every id >= 0, as log odds of its prior plus those of the evidence.
 
-    The two are kept apart, since a label that comes later changes the prior alone. ``unknown``
-    is the prior of what has no label.
+    The two are stored separately, since a later label changes only the prior. ``unknown`` is the
+    prior without a label.
     """
 
     def __init__(self, unknown: float, config: MovabilityConfig | None = None) -> None:
@@ -57,12 +57,12 @@ class MovabilityFilter:
         self._clear()
 
     def set_priors(self, ids: Ints, priors: Array) -> None:
-        """Things ids (N,) are of classes that move with these probabilities (N,)."""
+        """Set the priors (N,) of ids (N,), by their classes."""
         self._reserve(ids)
         self._prior[ids] = log_odds(priors)
 
     def update(self, ids: Ints, moving: Mask, power: float = 1.0) -> None:
-        """Evidence about things ids (N,), each at most once: moving or static (N,)."""
+        """Add evidence about ids (N,), each at most once: moving or static (N,)."""
         self._reserve(ids)
         step = np.float32(power * self.config.step)
         limit = np.float32(self.config.max_evidence)
@@ -70,7 +70,7 @@ class MovabilityFilter:
         self._evidence[ids] = np.clip(gained, -limit, limit)
 
     def log_odds(self, ids: Ints) -> Array:
-        """(N,) for any ids (N,)."""
+        """Log odds (N,) of moving for any ids (N,)."""
         found = np.full(len(ids), self._unknown)
         inside = ids < len(self._prior)
         found[inside] = self._prior[ids[inside]] + self._evidence[ids[inside]]
@@ -85,11 +85,11 @@ class MovabilityFilter:
         return self.log_odds(ids) > 0
 
     def known(self) -> Ints:
-        """Ids (N,) that were spoken of, rising."""
+        """Ids (N,) with a prior or evidence, ascending."""
         return np.flatnonzero((self._evidence != 0) | (self._prior != self._unknown))
 
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
-        """Evidence about from_ids (N,) is about to_ids (N,) as well; both are one thing."""
+        """Add the evidence of from_ids (N,) to that of to_ids (N,): each pair is one thing."""
         self._reserve(np.concatenate([from_ids, to_ids]))
         limit = np.float32(self.config.max_evidence)
         gained = self._evidence[from_ids]
@@ -100,13 +100,13 @@ class MovabilityFilter:
         self._evidence[to_ids] = np.clip(self._evidence[to_ids], -limit, limit)
 
     def drop(self, ids: Ints) -> None:
-        """Forget things (N,)."""
+        """Reset ids (N,) to the prior without a label."""
         ids = ids[ids < len(self._prior)]
         self._evidence[ids] = 0.0
         self._prior[ids] = self._unknown
 
     def state(self) -> Arrays:
-        """What is known, as named arrays with one row for each id that was spoken of."""
+        """The filter as named arrays with one row for each known id."""
         ids = self.known()
         size = np.array(len(self._prior))
         return {
@@ -117,7 +117,7 @@ class MovabilityFilter:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the filter of a state."""
+        """Replace the content by a state."""
         self._clear()
         self._reserve(state["size"].reshape(1) - 1)
         self._prior[state["ids"]] = state["prior"]
@@ -137,14 +137,14 @@ class MovabilityFilter:
 
 @dataclass(frozen=True)
 class MovabilityPriors:
-    """P(moving) by class name; ``unknown`` of what has no label, ``other`` of other classes."""
+    """P(moving) by class name; ``unknown`` without a label, ``other`` for all other classes."""
 
     by_name: Mapping[str, float]
     unknown: float
     other: float
 
     def of(self, labels: LabelSet) -> Array:
-        """(C,) of a label set's classes; label 0 is "unknown"."""
+        """Priors (C,) of a label set's classes; label 0 is "unknown"."""
         named = [self.by_name.get(name, self.other) for name in labels.names[1:]]
         return np.array([self.unknown, *named])
 

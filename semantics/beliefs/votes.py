@@ -1,4 +1,4 @@
-"""From a keyframe's instances to labelled landmarks: Algorithm 3 of the paper, made robust."""
+"""Votes of a keyframe's instances about landmarks: Algorithm 3 of the paper, made robust."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from bmask_slam.semantics.instances.instances import Instance, mask_box
 from bmask_slam.semantics.instances.mask_order import painting_order
 from bmask_slam.semantics.labels import LabelSet
 
-NOBODY = -1
+NO_INSTANCE = -1
 _MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
 class VoteConfig:
-    """Which pixels of a mask are believed.
+    """Which pixels of a mask count.
 
-    Nearer than ``border_px`` to another mask or to the mask's edge a pixel says nothing, since
-    segmentation errs there, unless depth tells the sides apart: where all surface within
-    ``edge_px`` that is as far as the landmark, to the share ``edge_depth``, is of instances of one
-    class. A depth belongs to the mask's surface if it is within ``depth_sigmas`` robust
-    standard deviations, and ``depth_margin_m`` at 1 m that grows with the square of the depth,
-    of the median in the mask. What is farther than ``background_border_px`` from any mask is
-    missed by all. Where neither distance nor depth decides, a pixel speaks for its owner, or as
-    missed, with ``border_weight`` of the usual weight.
+    Within ``border_px`` of another mask or of the mask's edge the owner of a pixel is uncertain,
+    unless the depth decides: where all surface within ``edge_px`` at the landmark's depth, to the
+    relative tolerance ``edge_depth``, belongs to instances of one class. A depth belongs to the
+    mask's surface if it differs from the median depth in the mask by at most ``depth_sigmas``
+    robust standard deviations plus ``depth_margin_m`` at 1 m, which grows with the square of the
+    depth. Landmarks farther than ``background_border_px`` from any mask are missed. Where neither
+    distance nor depth decides, a pixel votes for its owner, or as missed, with ``border_weight``
+    times the usual weight.
 
-    A mask that lies in another of at least twice its area, to the share ``nested``, is in front
-    of it whatever their scores, if it is of another class: a book in a bookcase.
+    A mask of which the share ``nested`` lies in another of at least twice its area and of another
+    class is in front of it, whatever the scores: a book in a bookcase.
     """
 
     border_px: int = 1
@@ -51,22 +51,23 @@ class VoteConfig:
             or self.depth_sigmas <= 0
             or min(self.depth_margin_m, self.edge_depth) < 0
         ):
-            raise ValueError("borders and what depths may differ by must not be negative")
+            raise ValueError("borders and depth tolerances must not be negative")
         if not 0 <= self.border_weight <= 1 or self.nested <= 0:
             raise ValueError("border_weight must be in [0, 1], nested above 0")
 
 
 @dataclass(frozen=True, eq=False)
 class PixelAssignment:
-    """Who owns the pixels of a keyframe.
+    """The instance of each pixel of a keyframe.
 
     Attributes:
-        instances: in the order of their mask scores, the best first.
-        owner: (H, W) int16, the instance that a pixel belongs to, -1 for none.
-        under: (H, W) int16, the one that it would belong to without its owner, -1 for none.
-        inner: (H, W) bool, not near the border between two owners, or that of a mask and none.
-        depth_m: (h, w) every s-th pixel of the depth image both ways, NaN where missing.
-        depth_range_m: (K, 2) nearest and farthest depth of each instance's surface; NaN for one
+        instances: sorted by mask score, the best first.
+        owner: (H, W) int16, the index of a pixel's instance, -1 for none.
+        under: (H, W) int16, the instance behind the owner, -1 for none.
+        inner: (H, W) bool, whether a pixel is away from borders between owners and from borders of
+            masks.
+        depth_m: (h, w) every s-th pixel of the depth image in both directions, NaN where missing.
+        depth_range_m: (K, 2) least and largest depth of each instance's surface; NaN for one
             without depth.
     """
 
@@ -78,22 +79,22 @@ class PixelAssignment:
     depth_range_m: Array
 
     def on_surface(self, owners: Ints, z_m: Array) -> Mask:
-        """Whether depths (N,) belong to the surfaces of instances (N,); unknown depths do."""
+        """Whether depths (N,) are on the surfaces of instances (N,); True for unknown depths."""
         near, far = self.depth_range_m[owners].T
         return ~((z_m < near) | (z_m > far))
 
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """What a keyframe's masks say about landmarks.
+    """Votes of a keyframe's masks about landmarks.
 
     Attributes:
-        rows: (M,) which of the landmarks.
-        instances: (M,) the instance that each is on for sure, -1 for none.
-        missed: (M,) no instance is there.
-        sure: (M,) distance or depth tells whose surface it is.
-        distributions: (M, C); zeros where missed.
-        weights: (M,) how likely the distribution, or the miss, is meant for this landmark.
+        rows: (M,) index of each vote's landmark.
+        instances: (M,) the instance that it is certainly on, -1 for none.
+        missed: (M,) whether no instance covers it.
+        sure: (M,) whether distance or depth decides on which surface it is.
+        distributions: (M, C) of classes; zeros where missed.
+        weights: (M,) probability that the distribution, or the miss, applies to this landmark.
     """
 
     rows: Ints
@@ -107,7 +108,7 @@ class Votes:
 def check_instances(
     instances: Sequence[Instance], size: tuple[int, int], labels: LabelSet, name: str
 ) -> None:
-    """Refuse instances that are not of an image of this (height, width) or of this label set.
+    """Refuse instances of another image size than (height, width) or another label set.
 
     Raises:
         InputError: a mask of another size, a label or distribution outside the set.
@@ -138,14 +139,14 @@ def assign_pixels(
     config: VoteConfig,
     in_boxes: bool = False,
 ) -> PixelAssignment:
-    """Give each pixel to the instance with the best mask score that covers it, or is in front.
+    """Assign each pixel to the frontmost instance that covers it, usually that of best mask score.
 
     ``size`` is the image's (H, W); ``depth_m`` (H / s, W / s) may be every s-th pixel of the
-    depth image in both directions. With ``in_boxes`` it is enough for being in front of another
-    to lie within the box around its mask: a bookcase's mask may leave out the books.
+    depth image in both directions. With ``in_boxes`` a mask is in front of another if it lies
+    within the box around that: a bookcase's mask may exclude the books.
     """
     ranked = tuple(sorted(instances, key=lambda i: -i.mask_score))
-    owner, under = np.full((2, *size), NOBODY, np.int16)
+    owner, under = np.full((2, *size), NO_INSTANCE, np.int16)
     for k in painting_order(ranked, config.nested, in_boxes).tolist():
         x1, y1, x2, y2 = mask_box(ranked[k].mask).astype(int)
         here = ranked[k].mask[y1:y2, x1:x2]
@@ -155,7 +156,7 @@ def assign_pixels(
     if ranked:
         disc = _disc(config.border_px)
         inner = cv2.erode(owner, disc) == cv2.dilate(owner, disc)
-        covered = (owner != NOBODY).astype(np.uint8)
+        covered = (owner != NO_INSTANCE).astype(np.uint8)
         near = cv2.dilate(covered, _disc(config.background_border_px)) > covered
         inner &= ~near
     surfaces = _surfaces(owner, inner, depth_m, len(ranked), config)
@@ -165,46 +166,47 @@ def assign_pixels(
 def vote(
     assignment: PixelAssignment, pixels: Array, z_m: Array, classes: int, config: VoteConfig
 ) -> Votes:
-    """The votes of a keyframe about the landmarks that it sees (paper, Algorithm 3).
+    """The votes of a keyframe about landmarks in its image (paper, Algorithm 3).
 
     For each landmark, at ``pixels`` (N, 2) in the image and with z-depth ``z_m`` (N,) in the
-    camera, NaN if unknown: the instance that owns its pixel, unless the landmark is not on the
-    instance's surface, votes with its class distribution, weighted by its mask score; with what
-    that leaves, the one under it. Near a border it is the instance that alone has surface at the
-    landmark's depth. Where there is no instance, it is missed.
+    camera, NaN if unknown: the instance of its pixel votes with its class distribution, weighted
+    by its mask score, and the instance behind with the remaining weight; no vote if the landmark is
+    not on the instance's surface. Near a border the instance is the only one with surface at the
+    landmark's depth. Where there is no instance, the landmark is missed.
     """
     height, width = assignment.owner.shape
     columns, rows = np.rint(pixels).astype(np.int64).reshape(-1, 2).T
     columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
     owners = assignment.owner[rows, columns].astype(np.int64)
     inner = assignment.inner[rows, columns]
-    sure, alone = inner.copy(), inner.copy()
+    sure, single = inner.copy(), inner.copy()
     edge = np.flatnonzero(~inner)
     if assignment.instances and config.edge_px and len(edge):
         found, one = _at_edges(assignment, rows[edge], columns[edge], z_m[edge], config)
-        told = found != NOBODY
-        owners[edge[told]], alone[edge], sure[edge] = found[told], one & told, told
-    covered = owners != NOBODY
+        decided = found != NO_INSTANCE
+        owners[edge[decided]], single[edge] = found[decided], one & decided
+        sure[edge] = decided
+    covered = owners != NO_INSTANCE
     votes = np.ones(len(owners), bool)
     votes[covered] = assignment.on_surface(owners[covered], z_m[covered])
     votes &= sure | (config.border_weight > 0)
     chosen = np.flatnonzero(votes)
-    speakers = owners[chosen]
-    same = speakers == assignment.owner[rows[chosen], columns[chosen]]
-    behind = np.where(same, assignment.under[rows[chosen], columns[chosen]], NOBODY)
-    distributions, weights = _mixed(assignment.instances, speakers, behind, classes)
-    missed = speakers == NOBODY
+    voters = owners[chosen]
+    same = voters == assignment.owner[rows[chosen], columns[chosen]]
+    behind = np.where(same, assignment.under[rows[chosen], columns[chosen]], NO_INSTANCE)
+    distributions, weights = _mixed(assignment.instances, voters, behind, classes)
+    missed = voters == NO_INSTANCE
     weights[missed] = 1.0
     sure = sure[chosen]
     weights[~sure] *= np.float32(config.border_weight)
-    instances = np.where(alone[chosen], speakers, NOBODY)
+    instances = np.where(single[chosen], voters, NO_INSTANCE)
     return Votes(chosen, instances, missed, sure, distributions, weights)
 
 
 def _mixed(
     instances: Sequence[Instance], first: Ints, second: Ints, classes: int
 ) -> tuple[Floats, Floats]:
-    """What instances (M,) with others (M,) behind them, or NOBODY, say: distributions, weights."""
+    """Distributions (M, C) and weights (M,) of instances (M,) with others (M,) behind them."""
     nothing = np.zeros(classes)
     table: Floats = np.array([*(i.distribution for i in instances), nothing], np.float32)
     scores: Floats = np.array([*(i.mask_score for i in instances), 0.0], np.float32)
@@ -217,10 +219,12 @@ def _mixed(
 def _at_edges(
     assignment: PixelAssignment, rows: Ints, columns: Ints, z_m: Array, config: VoteConfig
 ) -> tuple[Ints, Mask]:
-    """Whose surface landmarks (N,) at rows and columns (N,) near a border are on, by their depth.
+    """The instance, by depth, of landmarks (N,) at rows and columns (N,) near a border.
 
-    The instance (N,) with the worst score of those of one class that have surface there, NOBODY
-    where classes differ or some of the surface is nobody's; whether it is the only one (N,).
+    Returns:
+        of the instances of one class with surface at the landmark's depth, that of the lowest score
+        (N,), NO_INSTANCE where classes differ or some of the surface is of none; and whether it is
+        the only one (N,).
     """
     step = max(assignment.owner.shape[0] // max(assignment.depth_m.shape[0], 1), 1)
     limits = np.minimum(assignment.depth_m.shape, np.array(assignment.owner.shape) // step) - 1
@@ -233,11 +237,11 @@ def _at_edges(
     owners = assignment.owner[rows * step, columns * step].astype(np.int64)
     count = len(assignment.instances)
     first = np.where(there, owners, count).min(axis=1, initial=count)
-    last = np.where(there, owners, NOBODY).max(axis=1, initial=NOBODY)
+    last = np.where(there, owners, NO_INSTANCE).max(axis=1, initial=NO_INSTANCE)
     classes = np.array([i.label for i in assignment.instances])
-    of_class = np.where(owners == NOBODY, 0, classes[owners])
+    of_class = np.where(owners == NO_INSTANCE, 0, classes[owners])
     one = (~there | (of_class == classes[last][:, None])).all(axis=1) & there.any(axis=1)
-    return np.where(one, last, NOBODY), first == last
+    return np.where(one, last, NO_INSTANCE), first == last
 
 
 def _disc(radius_px: int) -> Bytes:
@@ -252,12 +256,12 @@ def _surfaces(
     count: int,
     config: VoteConfig,
 ) -> Array:
-    """Depth range (K, 2) of each instance's surface, by median and MAD of its inner pixels."""
+    """Depth range (K, 2) of each instance's surface: median and MAD of its inner pixels."""
     step = owner.shape[0] // max(depth_m.shape[0], 1)
-    seen = owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
-    usable = inner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]] & (seen != NOBODY)
-    usable &= np.isfinite(depth_m[: seen.shape[0], : seen.shape[1]])
-    owners, depths = seen[usable].astype(np.int64), depth_m[usable].astype(float)
+    coarse = owner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]]
+    usable = inner[::step, ::step][: depth_m.shape[0], : depth_m.shape[1]] & (coarse != NO_INSTANCE)
+    usable &= np.isfinite(depth_m[: coarse.shape[0], : coarse.shape[1]])
+    owners, depths = coarse[usable].astype(np.int64), depth_m[usable].astype(float)
     middle = grouped_median(depths, owners, count)
     spread = grouped_median(np.abs(depths - middle[owners]), owners, count)
     reach = config.depth_sigmas * _MAD_TO_SIGMA * spread + config.depth_margin_m * middle**2

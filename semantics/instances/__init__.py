@@ -1,1 +1,1 @@
-"""TODO."""
+"""Instances of an image: masks, COCO files, reading images, drawing."""

@@ -1,4 +1,4 @@
-"""COCO annotation files: read with a check of every object, decoded one image at a time."""
+"""COCO annotation files: every object is checked, masks are decoded one at a time."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class CocoObject:
     """One annotated object.
 
     Attributes:
-        label: its class in the file's label set.
-        runs: its mask as compressed run lengths.
+        label: class in the file's label set.
+        runs: the mask as compressed run lengths.
         box: x1, y1, x2, y2 in pixels.
-        crowd: it stands for a group of objects.
-        score, class_score: of a result file; 1 in one of annotations.
-        distribution: of a result file, if it has any.
+        crowd: whether it stands for a group of objects.
+        score, class_score: of a result file; 1 in an annotation file.
+        distribution: over classes, in a result file that has it.
     """
 
     label: int
@@ -42,7 +42,7 @@ class CocoObject:
     distribution: tuple[float, ...] | None = None
 
     def mask(self) -> Mask:
-        """(H, W) bool."""
+        """The mask (H, W) bool."""
         return np.asarray(coco_mask.decode(self.runs), bool)
 
 
@@ -62,9 +62,9 @@ class CocoFile:
     """The images of a file, in its order.
 
     Attributes:
-        labels: the categories by rising id as labels 1, 2, ...
+        labels: the categories, sorted by id, as labels 1, 2, ...
         category_ids: the file's id of each label, with 0 for the background.
-        problems: what was left out, and why.
+        problems: one line for each object, or part of one, that is not used, with the reason.
     """
 
     labels: LabelSet
@@ -74,10 +74,10 @@ class CocoFile:
 
 
 def read_coco(path: Path) -> CocoFile:
-    """Read a file; broken objects are left out and named in a warning, the rest is used.
+    """Read a file; invalid objects are skipped with a warning.
 
     Raises:
-        InputError: no JSON, no COCO, or not one usable image.
+        InputError: not JSON, not in COCO's format, or without images.
     """
     content = _read_json(path)
     try:
@@ -137,7 +137,7 @@ def _integer(annotation: Any, key: str, known: dict[int, Any]) -> int:
 def _read_object(
     annotation: dict[str, Any], image: tuple[str, int, int], label: int, problems: list[str]
 ) -> CocoObject:
-    """One object; ValueError says what is wrong with it."""
+    """One object. Raises ValueError with the reason if it is invalid."""
     _, height, width = image
     segmentation = annotation.get("segmentation")
     if isinstance(segmentation, dict):

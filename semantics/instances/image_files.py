@@ -1,4 +1,4 @@
-"""Decoding of image files, with every way in which they can be broken."""
+"""Decoding of image files, with a clear error for each way in which they can be broken."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def read_colour(path: Path) -> Image:
 
 
 def decode_image(path: Path, flags: int) -> NDArray:
-    """The decoded image; a truncated file is refused, where OpenCV would fill it up with grey."""
+    """The decoded image. A truncated file is refused; OpenCV would fill the rest with grey."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -41,7 +41,7 @@ def decode_image(path: Path, flags: int) -> NDArray:
 
 
 def decode_bytes(data: bytes, flags: int, where: str) -> NDArray:
-    """An image from the bytes of its file; ``where`` they are from, for errors."""
+    """An image from the bytes of its file; ``where`` names their origin in errors."""
     if not data:
         raise InputError(f"{where}: the image is empty (0 bytes); restore it or leave it out")
     tail = data[-_TAIL_BYTES:]

@@ -1,4 +1,4 @@
-"""What a segmentation says about an image: one ``Instance`` an object."""
+"""The result of segmenting an image: one ``Instance`` an object."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from bmask_slam.graph.arrays import Bytes, Floats, Mask
 
 @dataclass(frozen=True, eq=False)
 class PackedMask:
-    """A mask of ``shape`` (H, W) with a bit a pixel: ``bits`` (H * W / 8,), rounded up."""
+    """A mask of ``shape`` (H, W) with one bit a pixel: ``bits`` (ceil(H W / 8),)."""
 
     bits: Bytes
     shape: tuple[int, ...]
 
     @classmethod
     def of(cls, mask: Mask) -> PackedMask:
-        """A mask (H, W)."""
+        """Pack a mask (H, W)."""
         return cls(np.packbits(mask), mask.shape)
 
     def unpacked(self) -> Mask:
@@ -35,11 +35,11 @@ class Instance:
     Attributes:
         mask: (H, W) bool, its visible pixels.
         box: (4,) x1, y1, x2, y2 in pixels, the edges of a box around it.
-        label: its class in the segmenter's label set, never 0.
+        label: class in the segmenter's label set, never 0.
         distribution: (C,) probability of each class, background first; sums to 1.
         class_score: probability of the label.
-        mask_score: class score times predicted IoU of the mask (Huang et al. 2019): how far the
-            mask can be trusted. Equal to the class score where nobody predicted an IoU.
+        mask_score: class score times predicted IoU of the mask (Huang et al. 2019), a confidence
+            of the mask; equal to the class score without a predicted IoU.
     """
 
     mask: Mask
@@ -50,7 +50,7 @@ class Instance:
     mask_score: float
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """To other processes and machines with a bit a pixel."""
+        """Pickle with one bit a pixel, for other processes and machines."""
         rest = (self.box, self.label, self.distribution, self.class_score, self.mask_score)
         return _with_mask, (PackedMask.of(self.mask), rest)
 
@@ -60,7 +60,7 @@ def _with_mask(packed: PackedMask, rest: tuple) -> Instance:
 
 
 def mask_box(mask: Mask) -> Floats:
-    """The box (4,) around the pixels of a mask (H, W), all 0 if there are none."""
+    """The box (4,) around the pixels of a mask (H, W); zeros for an empty mask."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return np.zeros(4, np.float32)
@@ -68,10 +68,7 @@ def mask_box(mask: Mask) -> Floats:
 
 
 def certain(label: int, classes: int, score: float = 1.0) -> Floats:
-    """The distribution (classes,) of a label with a score and no word about the others.
-
-    What is left goes to the background: "something else".
-    """
+    """The distribution (classes,) of a label with a score; the rest goes to the background."""
     distribution = np.zeros(classes, np.float32)
     distribution[0] = 1.0 - score
     distribution[label] = score
@@ -79,7 +76,7 @@ def certain(label: int, classes: int, score: float = 1.0) -> Floats:
 
 
 def as_annotation(instance: Instance) -> dict[str, Any]:
-    """COCO's form of an instance, without its ids; the mask as compressed run lengths."""
+    """An instance in COCO's format, without ids; the mask as compressed run lengths."""
     from pycocotools import mask as coco_mask  # noqa: PLC0415  # only where masks are coded
 
     coded = coco_mask.encode(np.asfortranarray(instance.mask.astype(np.uint8)))

@@ -1,4 +1,4 @@
-"""Which instances are in front of which, by their masks alone."""
+"""The order of overlapping instances in depth, from their masks alone."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from bmask_slam.graph.arrays import Floats, Ints
 from bmask_slam.semantics.instances.instances import Instance, mask_box
 
 _COARSE = 4
-"""Every so many pixels each way of masks are compared."""
+"""Masks are compared on every fourth pixel in both directions."""
 
 
 def painting_order(ranked: Sequence[Instance], nested: float, in_boxes: bool) -> Ints:
-    """Numbers of instances, those at the back first: by how many each lies in, then by score.
+    """Indices of instances from back to front: by how many others each lies in, then by score.
 
-    ``ranked`` by score, the best first. One lies in another of at least twice its area and of
-    another class if the share ``nested`` of it is on the other's mask, or, with ``in_boxes``, in
-    the box around that.
+    ``ranked`` is sorted by score, the best first. An instance lies in another one of at least twice
+    its area and of another class if the share ``nested`` of it is on the other's mask or, with
+    ``in_boxes``, in the box around that mask.
     """
     if not ranked:
         return np.zeros(0, np.int64)
@@ -33,7 +33,7 @@ def painting_order(ranked: Sequence[Instance], nested: float, in_boxes: bool) ->
 
 
 def _filled(mask: Floats) -> Floats:
-    """The box around a mask (H, W), as one."""
+    """A mask (H, W) of the box around a mask (H, W)."""
     x1, y1, x2, y2 = mask_box(mask > 0).astype(int)
     box = np.zeros_like(mask)
     box[y1:y2, x1:x2] = 1

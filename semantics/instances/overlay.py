@@ -16,10 +16,7 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def draw(image: Image, instances: Sequence[Instance], labels: LabelSet) -> Bytes:
-    """The image (H, W, 3) with masks in the colours of their classes, outlines, names and scores.
-
-    The number is the mask score.
-    """
+    """The image (H, W, 3) with masks in class colours, outlines, class names and mask scores."""
     canvas = image.astype(np.float32)
     for instance in reversed(instances):  # the best on top
         colour = class_colour(instance.label)
@@ -39,7 +36,7 @@ def draw(image: Image, instances: Sequence[Instance], labels: LabelSet) -> Bytes
 
 
 def class_colour(label: int) -> Floats:
-    """A bright colour (3,), red first, that is always the same for a label."""
+    """A bright colour (3,), red first, that depends on the label alone."""
     hue = (label * 0.61803398875) % 1.0  # golden ratio: neighbours differ
     hsv = np.array([[[hue * 180, 200, 255]]], np.uint8)
     return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0], np.float32)

@@ -1,1 +1,1 @@
-"""Mask R-CNN with the MaskIoU head, in plain torch: every stage a file."""
+"""The Mask (Scoring) R-CNN in PyTorch: configuration, RPN, heads, RoIAlign, suppression."""

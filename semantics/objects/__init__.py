@@ -1,1 +1,1 @@
-"""TODO."""
+"""Objects of the map: detections with depth, association, revision, boxes, gravity."""

@@ -1,4 +1,4 @@
-"""Which detection is which object: one gated assignment a keyframe."""
+"""Association of detections to objects: one gated linear assignment a keyframe."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ _IMPOSSIBLE = 1e6
 class AssociationConfig:
     """When a detection may be an object.
 
-    Points of both are the same surface within ``radius_m`` and three sigmas of a depth at 1 m,
-    ``depth_sigma_m``, which grows with its square. ``min_overlap`` is the share of either that
-    the other must cover. The cost of a pair is the share that is not covered, plus
-    ``class_weight`` times the distance of the class distributions, plus ``time_weight`` as the
-    object was not seen for long, against ``forget_s``; it must not be above ``max_cost``.
+    Points belong to the same surface if they are within ``radius_m`` plus three sigmas of the
+    depth, ``depth_sigma_m`` at 1 m, which grows with the square of the depth. One of the two must
+    cover the share ``min_overlap`` of the other. The cost of a pair is the share that is not
+    covered, plus ``class_weight`` times one minus the affinity of the class distributions, plus
+    ``time_weight`` (1 - exp(-t / ``forget_s``)) where t is the time since the object's last
+    sighting; it must not be above ``max_cost``.
     """
 
     radius_m: float = 0.03
@@ -33,19 +34,19 @@ class AssociationConfig:
     max_cost: float = 1.0
 
     def reach_m(self, z_m: Array) -> Array:
-        """How far apart points of one surface may be, at depths (...)."""
+        """Largest distance of points of one surface, at depths (...)."""
         return self.radius_m + 3 * self.depth_sigma_m * z_m**2
 
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """How far D detections and O objects are the same surface.
+    """Overlap of the surfaces of D detections and O objects.
 
     Attributes:
-        of_detection: (D, O) share of the detection's points that lie on the object, each point
-            on the object that is nearest to it.
-        of_object: (D, O) share of the object's points in view that the detection covers.
-        in_view: (O,) how many points of the object are in view.
+        of_detection: (D, O) share of the detection's points that lie on the object; each point
+            counts for the object that is nearest to it.
+        of_object: (D, O) share of the object's visible points that the detection covers.
+        in_view: (O,) number of visible points of the object.
     """
 
     of_detection: Array
@@ -55,11 +56,11 @@ class Overlap:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a keyframe's D detections and O objects know of their classes and times.
+    """Classes and times of a keyframe's D detections and O objects.
 
     Attributes:
-        detected: (D, C) and ``known``: (O, C), class distributions.
-        unseen_s: (O,) since the object was seen last.
+        detected: (D, C) class distributions of the detections; ``known``: (O, C) of the objects.
+        unseen_s: (O,) time since the object's last sighting.
     """
 
     detected: Array
@@ -68,7 +69,7 @@ class Evidence:
 
 
 def shares(first: Ints, second: Ints, sizes: Ints, shape: tuple[int, int]) -> Array:
-    """(A, B) how many pairs (first, second) there are, as shares of sizes (A,)."""
+    """Counts (A, B) of the pairs (first, second), as shares of sizes (A,)."""
     counts = np.zeros(shape)
     np.add.at(counts, (first, second), 1.0)
     return counts / np.maximum(sizes, 1)[:, None]
@@ -79,7 +80,7 @@ def points_on_objects(
 ) -> Ints:
     """The object (P,) that is nearest to each point (P, 3), -1 for none.
 
-    ``object_points`` (N, 3) are of objects ``owners`` (N,); all points in the camera's frame.
+    ``object_points`` (N, 3) belong to objects ``owners`` (N,); all points in the camera's frame.
     """
     found = np.full(len(points), -1)
     if not len(object_points) or not len(points):
@@ -99,7 +100,7 @@ def class_affinity(detected: Array, known: Array) -> Array:
 
 
 def assign(overlap: Overlap, evidence: Evidence, config: AssociationConfig) -> Ints:
-    """The object of each detection (D,), -1 for a new one; no object has two detections."""
+    """The object of each detection (D,), -1 for a new one; at most one detection an object."""
     found = np.full(overlap.of_detection.shape[0], -1)
     if not overlap.of_detection.size:
         return found

@@ -1,4 +1,4 @@
-"""Oriented boxes in space: around points, as corners, and how far two of them overlap."""
+"""Gravity-aligned boxes in space: fitted to points, their corners, their overlap."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bmask_slam.graph.arrays import Array, Mask
 MIN_SIZE_M = 0.01
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 EDGES = np.array([(a, b) for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1])
-"""(12, 2) which corners are joined."""
+"""(12, 2) pairs of corners that an edge joins."""
 _GRID = (np.stack(np.meshgrid(*3 * [np.arange(16)], indexing="ij"), -1).reshape(-1, 3) + 0.5) / 16
 
 
@@ -31,13 +31,13 @@ class OrientedBox:
 
     @property
     def corners_world(self) -> Array:
-        """(8, 3); which are joined by an edge says EDGES."""
+        """The corners (8, 3); EDGES says which pairs an edge joins."""
         corners = 0.5 * _SIGNS * self.size_m
         return corners @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3]
 
     @property
     def volume_m3(self) -> float:
-        """Its volume."""
+        """The volume."""
         return float(np.prod(self.size_m))
 
     def contains(self, points_world: Array) -> Mask:
@@ -46,8 +46,8 @@ class OrientedBox:
         return np.asarray((np.abs(points) <= 0.5 * self.size_m).all(axis=1))
 
 
-def upright_axes(up_world: Array) -> Array:
-    """A rotation (3, 3) R_world_upright whose third axis is a unit vector (3,)."""
+def gravity_axes(up_world: Array) -> Array:
+    """The rotation R_world_gravity (3, 3) whose third axis is the unit vector (3,)."""
     first = np.eye(3)[np.abs(up_world).argmin()]
     first = first - (first @ up_world) * up_world
     first = first / np.linalg.norm(first)
@@ -55,11 +55,11 @@ def upright_axes(up_world: Array) -> Array:
 
 
 def supported(points: Array, neighbours: int, reach_m: float) -> Mask:
-    """Which of the points (N, 3) of one thing have so many others near them.
+    """Which of the points (N, 3) of one object have that many neighbours close by.
 
-    Near is within ``reach_m`` and, where points are sparse, three times the median distance of the
-    farthest of a point's ``neighbours``. All, where nobody has. A lone point is an error of depth
-    or of a mask; a quantile would also take away faces that are seen at a glancing angle.
+    Close is within ``reach_m`` or, where points are sparse, within three times the median distance
+    to the farthest of a point's ``neighbours``. If no point qualifies, all do. An isolated point is
+    an error of depth or of a mask; a quantile would also remove faces at a glancing angle.
     """
     if neighbours < 1 or len(points) <= neighbours:
         return np.ones(len(points), bool)
@@ -69,9 +69,9 @@ def supported(points: Array, neighbours: int, reach_m: float) -> Mask:
 
 
 def box_around(points_world: Array, up_world: Array) -> OrientedBox:
-    """The upright box of least ground area around points (N, 3), N >= 1."""
-    R_world_upright = upright_axes(up_world)
-    points = points_world @ R_world_upright
+    """The gravity-aligned box of least ground area around points (N, 3), N >= 1."""
+    R_world_gravity = gravity_axes(up_world)
+    points = points_world @ R_world_gravity
     low, high = points[:, 2].min(), points[:, 2].max()
     angle_deg = cv2.minAreaRect(points[:, :2].astype(np.float32))[2]
     angle = np.deg2rad(angle_deg)
@@ -80,16 +80,17 @@ def box_around(points_world: Array, up_world: Array) -> OrientedBox:
     middle = turn @ (0.5 * (flat.min(axis=0) + flat.max(axis=0)))
     size_m = np.array([*np.ptp(flat, axis=0), high - low])
     T = np.eye(4)
-    T[:3, :3] = R_world_upright @ np.block([[turn, np.zeros((2, 1))], [0, 0, 1]])
-    T[:3, 3] = R_world_upright @ [*middle, 0.5 * (low + high)]
+    T[:3, :3] = R_world_gravity @ np.block([[turn, np.zeros((2, 1))], [0, 0, 1]])
+    T[:3, 3] = R_world_gravity @ [*middle, 0.5 * (low + high)]
     return OrientedBox(T, np.maximum(size_m, MIN_SIZE_M))
 
 
 def without_noise(points_world: Array, noise_world: Array, up_world: Array, share: float) -> Array:
-    """The points (N, 3), those moved in that noise may have carried out of the thing's box.
+    """The points (N, 3), clipped to their box after its sides were moved in by the noise.
 
-    ``noise_world`` (N, 3) is what a sigma of its depth moves each by. Each side of the box moves in
-    by the median of this in its direction, but not beyond that share of the points.
+    ``noise_world`` (N, 3) is the displacement of each point by one sigma of its depth. Each side
+    moves in by the median displacement in its direction, but leaves at most ``share`` of the points
+    outside.
     """
     T_world_box = box_around(points_world, up_world).T_world_box
     axes = T_world_box[:3, :3]

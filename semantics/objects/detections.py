@@ -1,4 +1,4 @@
-"""A keyframe's instances as pieces of surface in space."""
+"""Surface points of a keyframe's instances."""
 
 from __future__ import annotations
 
@@ -9,26 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
-from bmask_slam.semantics.beliefs.votes import NOBODY, PixelAssignment
+from bmask_slam.semantics.beliefs.votes import NO_INSTANCE, PixelAssignment
 
 _COARSE = 4
-"""Of masks every so many pixels each way are counted."""
+"""Overlaps of masks are counted on every fourth pixel in both directions."""
 
 
 @dataclass(frozen=True)
 class DetectionConfig:
     """Which pixels of an instance become points, and how many.
 
-    ``border_px``: nearer to a mask's border depth belongs to this side or the other; not where
-    both sides' masks have scores of ``exact_score`` or more. An instance
-    with fewer than ``min_points`` is passed over, of more than ``max_points`` some are taken. So is
-    one of which better ones of its class own more than ``double``: it is another outline of them,
-    as one around two desks that stand side by side, and what it is left with is no thing.
+    Pixels within ``border_px`` of a mask's border are not used, since their depth may belong to
+    either side, unless both masks have scores of at least ``exact_score``. An instance with fewer
+    than ``min_points`` is ignored; of more than ``max_points``, some are chosen. An instance is
+    also ignored if better ones of its class own more than the share ``double`` of it: it is a
+    second outline of them, such as one around two desks side by side.
 
-    The inverse depth of a point is a mean over pixels of its instance in a window of
-    ``smooth_px`` to each side, of those whose depth is within three sigmas: at 1 m
-    ``depth_sigma_m``, growing with the square of the depth. Noise along the rays would else make
-    thin things thick.
+    The inverse depth of a point is a mean over the pixels of its instance in a window of
+    ``smooth_px`` to each side whose depth is within three sigmas (``depth_sigma_m`` at 1 m, growing
+    with the square of the depth). Otherwise noise along the rays would make thin objects thick.
     """
 
     border_px: int = 1
@@ -45,10 +44,11 @@ class Detections:
     """Instances (D,) with depth.
 
     Attributes:
-        instances: (D,) their numbers among the claims.
+        instances: (D,) their indices in the pixel assignment.
         points_camera: (P, 3) metres.
-        owners: (P,) the detection that each point is of, rising.
-        number: (K + 1,) the detection of each instance, -1 for none; the last for "no instance".
+        owners: (P,) the detection of each point, ascending.
+        number: (K + 1,) the detection of each instance, -1 for none; the last row stands for
+            pixels without an instance.
     """
 
     instances: Ints
@@ -65,13 +65,13 @@ def detect(
 ) -> Detections:
     """The surface points of each instance.
 
-    ``depth_m`` (h, w) is every s-th pixel of the image both ways, ``rays`` (h, w, 3) are the
-    points at depth 1 m that those pixels see.
+    ``depth_m`` (h, w) is every s-th pixel of the image in both directions, ``rays`` (h, w, 3) the
+    camera-frame points of these pixels at a depth of 1 m.
     """
     step = assignment.owner.shape[0] // depth_m.shape[0]
     height, width = depth_m.shape
     owner = _without_border(assignment, config)[::step, ::step][:height, :width]
-    rows, columns = np.nonzero((owner != NOBODY) & np.isfinite(depth_m))
+    rows, columns = np.nonzero((owner != NO_INSTANCE) & np.isfinite(depth_m))
     owners, z_m = owner[rows, columns].astype(np.int64), depth_m[rows, columns].astype(float)
     good = assignment.on_surface(owners, z_m)
     order = np.argsort(owners[good], kind="stable")
@@ -83,13 +83,13 @@ def detect(
     instances = np.flatnonzero(sizes >= config.min_points)
     number = np.full(len(assignment.instances) + 1, -1)
     number[instances] = np.arange(len(instances))
-    z_m = _smoothed((owner, depth_m), rows, columns, config.smooth_px // step, config)
+    z_m = _smoothed(owner, depth_m, rows, columns, config.smooth_px // step, config)
     points = rays[rows, columns] * z_m[:, None]
     return Detections(instances, points, number[owners], number)
 
 
 def _doubles(assignment: PixelAssignment, share: float) -> list[int]:
-    """Instances of whose masks others of their class own more than a share."""
+    """Instances of which others of their class own more than a share."""
     labels = np.array([*(i.label for i in assignment.instances), 0])
     owned = labels[assignment.owner[::_COARSE, ::_COARSE]]
     found = []
@@ -102,14 +102,14 @@ def _doubles(assignment: PixelAssignment, share: float) -> list[int]:
 
 
 def _smoothed(
-    images: tuple[NDArray[np.int16], Floats],
+    owner: NDArray[np.int16],
+    depth_m: Floats,
     rows: Ints,
     columns: Ints,
     reach: int,
     config: DetectionConfig,
 ) -> Array:
-    """Depths (P,) of pixels of the images (h, w) of owners and depth, means over windows."""
-    owner, depth_m = images
+    """Depths (P,) at pixels of ``depth_m`` (h, w): means over windows within one owner (h, w)."""
     shifts = np.arange(-reach, reach + 1)
     v = np.clip(rows[:, None, None] + shifts[:, None], 0, depth_m.shape[0] - 1)
     u = np.clip(columns[:, None, None] + shifts, 0, depth_m.shape[1] - 1)
@@ -124,19 +124,19 @@ def _smoothed(
 
 
 def _without_border(assignment: PixelAssignment, config: DetectionConfig) -> NDArray[np.int16]:
-    """Owners of pixels (H, W), nobody where another is near and either may be wrong."""
+    """Owners of pixels (H, W); none near a border where either mask may be inexact."""
     owner, reach = assignment.owner, config.border_px
     vague = np.array([*(i.mask_score < config.exact_score for i in assignment.instances), False])
     if reach == 0 or not vague.any():
         return owner
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    alone = cv2.erode(owner, square) == cv2.dilate(owner, square)
+    interior = cv2.erode(owner, square) == cv2.dilate(owner, square)
     near_vague = cv2.dilate(vague[owner].astype(np.uint8), square) > 0
-    return np.where(alone | ~near_vague, owner, np.int16(NOBODY))
+    return np.where(interior | ~near_vague, owner, np.int16(NO_INSTANCE))
 
 
 def _evenly(groups: Ints, sizes: Ints, most: int) -> Mask:
-    """Of each group (sorted, of these sizes) at most so many members, spread over it."""
+    """Choose at most so many members of each group (sorted, of these sizes), evenly spread."""
     place = np.arange(len(groups)) - (np.cumsum(sizes) - sizes)[groups]
     share = np.minimum(1.0, most / np.maximum(sizes, 1))[groups]
     return np.floor((place + 1) * share) > np.floor(place * share)

@@ -1,4 +1,4 @@
-"""Which way is up, from what keyframes see and how they are held."""
+"""The direction of gravity, from surface normals and the attitude of keyframes."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Arrays, Floats
 
 _SAMPLES = 64
-_MAX_STEP = 0.05  # of the depth
+_MAX_STEP = 0.05  # relative to the depth
 _UP_CAMERA = np.array([0.0, -1.0, 0.0])
 
 
 class GravityEstimator:
-    """Surface normals of each keyframe, in its frame, so that they turn with the graph."""
+    """Estimates the up direction from normals, stored in the frames of their keyframes."""
 
     def __init__(self) -> None:
         self._normals: dict[int, Floats] = {}
 
     def add(self, keyframe_id: int, depth_m: Floats, rays: Array) -> None:
-        """Sample the normals of a depth image (h, w); ``rays`` (h, w, 3) have z = 1."""
+        """Add normals sampled from a depth image (h, w); ``rays`` (h, w, 3) have z = 1."""
         self._normals[keyframe_id] = sample_normals(depth_m, rays)
 
     def up_world(self, poses: dict[int, Array]) -> Array:
-        """A unit vector (3,); the keyframes T_world_keyframe by id say how cameras are held."""
+        """The up direction, a unit vector (3,), given T_world_keyframe by keyframe id."""
         known = [k for k in self._normals if k in poses]
         if not known:
             return _UP_CAMERA
@@ -31,11 +31,11 @@ class GravityEstimator:
         return up_direction(np.concatenate(normals).astype(float), ups)
 
     def keep(self, keyframe_ids: set[int]) -> None:
-        """Forget keyframes that are not among these."""
+        """Drop all other keyframes."""
         self._normals = {k: n for k, n in self._normals.items() if k in keyframe_ids}
 
     def state(self) -> Arrays:
-        """The samples as named arrays."""
+        """The normals as named arrays."""
         rows = list(self._normals.values())
         return {
             "keyframes": np.array(list(self._normals), np.int64),
@@ -43,14 +43,15 @@ class GravityEstimator:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the samples of a state."""
+        """Replace the content by a state."""
         self._normals = dict(zip(state["keyframes"].tolist(), state["normals"], strict=True))
 
 
 def sample_normals(depth_m: Floats, rays: Array) -> Floats:
     """Unit normals (64, 3) toward the camera, spread over the smooth parts of a depth image.
 
-    Zero where there are fewer. Differences over a few pixels, since depth is noisy.
+    All zeros if there are fewer than 64. They are cross products of differences over four pixels,
+    since depth is noisy.
     """
     points = rays[::2, ::2] * depth_m[::2, ::2, None]
     step = 2
@@ -68,11 +69,11 @@ def sample_normals(depth_m: Floats, rays: Array) -> Floats:
 
 
 def up_direction(normals_world: Array, camera_ups_world: Array, cone_deg: float = 40.0) -> Array:
-    """Which way is up: a unit vector (3,).
+    """The up direction in the world, a unit vector (3,).
 
-    Cameras are held upright on the whole, so it is near the mean of their up axes (K, 3); floors
-    and tables, whose normals are among ``normals_world`` (N, 3), say it exactly. A mean of the
-    normals in a cone around the last answer, the cone narrowing to 5 degrees.
+    It starts at the mean of the cameras' up axes (K, 3), which are roughly vertical, and is refined
+    by floors and tables, whose normals are among ``normals_world`` (N, 3): the median of the
+    normals in a cone around the last estimate, while the cone narrows to 5 degrees.
     """
     up = camera_ups_world.sum(axis=0)
     up = up / max(np.linalg.norm(up), 1e-12)

@@ -1,4 +1,4 @@
-"""The objects of a map: what detections in many keyframes have in common."""
+"""The objects of a map, fused from detections in many keyframes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
-from bmask_slam.semantics.beliefs.votes import NOBODY, PixelAssignment
+from bmask_slam.semantics.beliefs.votes import NO_INSTANCE, PixelAssignment
 from bmask_slam.semantics.objects.association import (
     AssociationConfig,
     Evidence,
@@ -23,7 +23,7 @@ from bmask_slam.semantics.objects.association import (
 )
 from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around, supported, without_noise
 from bmask_slam.semantics.objects.detections import DetectionConfig, Detections, detect
-from bmask_slam.semantics.objects.points import ObjectPoints
+from bmask_slam.semantics.objects.points import ObjectPoints, Sightings
 from bmask_slam.semantics.objects.revision import MergeEvidence, RevisionConfig, merges, splits
 
 
@@ -31,9 +31,10 @@ from bmask_slam.semantics.objects.revision import MergeEvidence, RevisionConfig,
 class ObjectConfig:
     """How objects are made of detections.
 
-    An object of fewer than ``min_keyframes`` is not told of; one keeps ``max_points`` points. In
-    its box are those that have ``neighbours`` others within ``support_m``; each side is moved in
-    by a sigma of the depth, but not beyond the share ``trim`` of the points.
+    Objects observed by fewer than ``min_keyframes`` are not reported; each keeps at most
+    ``max_points`` points. Its box is fitted to the points with ``neighbours`` others within
+    ``support_m``; each side is moved in by one sigma of the depth, but leaves at most the share
+    ``trim`` of the points outside.
     """
 
     enabled: bool = True
@@ -49,14 +50,14 @@ class ObjectConfig:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeView:
-    """A keyframe whose masks have come.
+    """A keyframe with its masks.
 
     Attributes:
-        keyframe_id, timestamp_s, T_world_camera: its own.
-        depth_m: (h, w) every s-th pixel of its depth image both ways.
-        rays: (h, w, 3) what these pixels see at a depth of 1 m.
-        claims: who owns its pixels.
-        poses: T_world_keyframe of the keyframes of its map segment, by id, itself among them.
+        keyframe_id, timestamp_s, T_world_camera: of the keyframe.
+        depth_m: (h, w) every s-th pixel of its depth image in both directions.
+        rays: (h, w, 3) camera-frame points of these pixels at a depth of 1 m.
+        assignment: the instance of each pixel.
+        poses: T_world_keyframe of all keyframes of its map segment, by id.
     """
 
     keyframe_id: int
@@ -69,14 +70,14 @@ class KeyframeView:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """What a keyframe met.
+class _Association:
+    """The objects in view of a keyframe and its detections' assignment to them.
 
     Attributes:
-        ids: (O,) the objects in its image; known: (O, C) their class distributions before.
-        overlap: of its detections with them; assigned: (D,) the object's number or -1.
+        ids: (O,) the objects in the image; known: (O, C) their class distributions before.
+        overlap: of the detections with them; assigned: (D,) index of the object, or -1.
         rows, owners, points_camera: (N,), (N,), (N, 3) all points of its map segment: their rows
-            in the table, objects, and place in its frame.
+            in the table, their objects, and their positions in the camera frame.
     """
 
     ids: Ints
@@ -93,11 +94,11 @@ class MapObject:
     """One object.
 
     Attributes:
-        id: its number, never used twice.
-        label: its likeliest class; distribution: (C,) over all.
-        centroid_world: (3,) m, mean of its points but lone ones. box: around them.
-        keyframe_ids: that saw it. landmark_ids: on it.
-        first_seen_s, last_seen_s: stamps.
+        id: unique, never reused.
+        label: the likeliest class; distribution: (C,) over all classes.
+        centroid_world: (3,) m, mean of its points without outliers. box: around them.
+        keyframe_ids: keyframes that observed it. landmark_ids: landmarks on it.
+        first_seen_s, last_seen_s: timestamps of the first and last of these keyframes.
     """
 
     id: int
@@ -112,9 +113,7 @@ class MapObject:
 
 
 class ObjectMap:
-    """Objects by id. Their points lie in the frames of the keyframes that saw them, and so move
-    with the graph.
-    """
+    """Objects by id; their points are in keyframes' frames, so that they move with the graph."""
 
     def __init__(
         self, camera: Camera, classes: int, config: ObjectConfig, labels: LabelStoreConfig
@@ -127,29 +126,29 @@ class ObjectMap:
         self._splitting = MergeEvidence(config.revision)
 
     def add(self, view: KeyframeView) -> Ints:
-        """Take a keyframe's instances in; returns the object (K,) of each, -1 for none."""
+        """Fuse a keyframe's instances; returns the object (K,) of each, -1 for none."""
         found = detect(view.assignment, view.depth_m, view.rays, self.config.detections)
         instances = [view.assignment.instances[k] for k in found.instances.tolist()]
         rows = [i.distribution for i in instances]
         detected = np.array(rows, np.float32).reshape(-1, self.labels.classes)
-        seen = self._associate(view, found, detected.astype(float))
-        fresh = seen.assigned < 0
-        objects = np.append(seen.ids, -1)[seen.assigned]
+        matched = self._associate(view, found, detected.astype(float))
+        fresh = matched.assigned < 0
+        objects = np.append(matched.ids, -1)[matched.assigned]
         objects[fresh] = self.points.new_ids(int(fresh.sum()))
-        objects = self._revise(seen, found, objects)
+        objects = self._revise(matched, found, objects)
         scores = np.array([i.mask_score for i in instances], np.float32)
         self.labels.update(objects, detected, scores)
-        key = view.keyframe_id, view.timestamp_s
-        self.points.add(key, objects, found.points_camera, objects[found.owners])
+        sightings = Sightings(view.keyframe_id, view.timestamp_s, objects)
+        self.points.add(sightings, found.points_camera, objects[found.owners])
         self.points.thin(self.config.max_points)
         return np.append(objects, -1)[found.number[:-1]]
 
     def place_landmarks(self, landmark_ids: Ints, object_ids: Ints) -> None:
-        """Landmarks (N,) lie on objects (N,)."""
+        """Record that landmarks (N,) lie on objects (N,)."""
         self.points.place_landmarks(landmark_ids, object_ids)
 
     def objects(self, poses: dict[int, Array], up_world: Array) -> list[MapObject]:
-        """The objects as they are now, by id, of those keyframes whose poses are given."""
+        """The current objects by id, from the keyframes whose poses are given."""
         owners, points = self.points.in_world(poses)
         noise = self.config.association.depth_sigma_m * self.points.rays_in_world(poses)
         found = []
@@ -163,14 +162,23 @@ class ObjectMap:
             mine = mine[near]
             inner = without_noise(mine, noise[owners == i][near], up_world, self.config.trim)
             box = box_around(inner, up_world)
-            label, landmarks = int(distribution.argmax()), self.points.landmarks_of(i)
-            seen_s = float(stamps_s.min()), float(stamps_s.max())
-            shape, by_whom = (mine.mean(axis=0), box), (keyframe_ids, landmarks)
-            found.append(MapObject(i, label, distribution, *shape, *by_whom, *seen_s))
+            found.append(
+                MapObject(
+                    id=i,
+                    label=int(distribution.argmax()),
+                    distribution=distribution,
+                    centroid_world=mine.mean(axis=0),
+                    box=box,
+                    keyframe_ids=keyframe_ids,
+                    landmark_ids=self.points.landmarks_of(i),
+                    first_seen_s=float(stamps_s.min()),
+                    last_seen_s=float(stamps_s.max()),
+                )
+            )
         return found
 
     def state(self) -> Arrays:
-        """All objects as named arrays."""
+        """The object map as named arrays."""
         return {
             "merging": self._merging.state().ravel(),
             "splitting": self._splitting.state().ravel(),
@@ -178,14 +186,14 @@ class ObjectMap:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the objects of a state."""
+        """Replace the content by a state."""
         self._merging.restore(state["merging"].reshape(-1, 3))
         self._splitting.restore(state["splitting"].reshape(-1, 3))
         self.labels.restore(part(state, "labels"))
         self.points.restore(part(state, "points"))
 
-    def _associate(self, view: KeyframeView, found: Detections, detected: Array) -> _Seen:
-        """The objects that may be in a view, and which detection is which."""
+    def _associate(self, view: KeyframeView, found: Detections, detected: Array) -> _Association:
+        """Assign the detections of a view to the objects in its image."""
         config = self.config.association
         all_owners, points_world = self.points.in_world(view.poses)
         all_points = transform(inverse(view.T_world_camera), points_world)
@@ -206,10 +214,10 @@ class ObjectMap:
         evidence = Evidence(detected, self.labels.probabilities(ids), unseen_s)
         assigned = assign(overlap, evidence, config)
         rows = self.points.rows(view.poses)
-        return _Seen(ids, evidence.known, overlap, assigned, rows, all_owners, all_points)
+        return _Association(ids, evidence.known, overlap, assigned, rows, all_owners, all_points)
 
     def _inside(self, points: Array) -> tuple[Ints, Ints]:
-        """Which points (N, 3) of the camera frame are in the image, and their pixels (M, 2)."""
+        """Indices (M,) of camera-frame points (N, 3) in the image, and their pixels (M, 2)."""
         rows = np.flatnonzero(points[:, 2] > 0.05)
         if not len(rows):
             return rows, np.zeros((0, 2), np.int64)
@@ -229,48 +237,50 @@ class ObjectMap:
         reach_m = self.config.association.reach_m(points[:, 2])
         visible = np.abs(points[:, 2] - depth_m) <= reach_m
         owners = view.assignment.owner[pixels[:, 1], pixels[:, 0]].astype(np.int64)
-        detections = found.number[np.where(visible, owners, NOBODY)]
+        detections = found.number[np.where(visible, owners, NO_INSTANCE)]
         return detections, visible
 
-    def _revise(self, seen: _Seen, found: Detections, objects: Ints) -> Ints:
-        """Merge and split what a keyframe tips; returns the objects (D,) of its detections then."""
-        ids, revision = seen.ids, self.config.revision
-        for o, step in splits(seen.overlap, revision):
+    def _revise(self, matched: _Association, found: Detections, objects: Ints) -> Ints:
+        """Merge and split objects with enough evidence; the objects (D,) of the detections then."""
+        ids, revision = matched.ids, self.config.revision
+        for o, step in splits(matched.overlap, revision):
             key = int(ids[o]), int(ids[o])
-            self._splitting.speak(key, step)
+            self._splitting.add(key, step)
             if self._splitting.decided(key):
-                self._split(key[0], o, seen, found, objects)
-        gone: set[int] = set()
-        for a, b, step in merges(seen.overlap, seen.assigned, seen.known, revision):
+                self._split(key[0], o, matched, found, objects)
+        merged: set[int] = set()
+        for a, b, step in merges(matched.overlap, matched.assigned, matched.known, revision):
             kept, other = int(ids[a]), int(ids[b])
-            self._merging.speak((kept, other), step)
-            if self._merging.decided((kept, other)) and not gone & {kept, other}:
+            self._merging.add((kept, other), step)
+            if self._merging.decided((kept, other)) and not merged & {kept, other}:
                 self.merge(kept, other)
-                gone.add(other)
+                merged.add(other)
                 objects = np.where(objects == other, kept, objects)
         return objects
 
-    def merge(self, kept: int, gone: int) -> None:
-        """Two objects are one."""
-        self.points.merge(kept, gone)
-        self.labels.move(np.array([gone]), np.array([kept]))
-        for balance in (self._merging, self._splitting):
-            balance.forget(gone)
+    def merge(self, kept: int, removed: int) -> None:
+        """Merge an object into another."""
+        self.points.merge(kept, removed)
+        self.labels.move(np.array([removed]), np.array([kept]))
+        for evidence in (self._merging, self._splitting):
+            evidence.drop(removed)
 
-    def _split(self, split: int, o: int, seen: _Seen, found: Detections, objects: Ints) -> None:
-        """Detections that share an object take the points that are nearest to them along."""
+    def _split(
+        self, split: int, o: int, matched: _Association, found: Detections, objects: Ints
+    ) -> None:
+        """Reassign the points of an object to the nearest of the detections that share it."""
         revision = self.config.revision
-        rows = np.flatnonzero(seen.owners == split)
-        distance_m, nearest = KDTree(found.points_camera).query(seen.points_camera[rows])
+        rows = np.flatnonzero(matched.owners == split)
+        distance_m, nearest = KDTree(found.points_camera).query(matched.points_camera[rows])
         of_detection = np.where(distance_m <= revision.reach_m, found.owners[nearest], -1)
-        for d in np.flatnonzero(seen.overlap.of_object[:, o] >= revision.part).tolist():
+        for d in np.flatnonzero(matched.overlap.of_object[:, o] >= revision.part).tolist():
             if objects[d] != split:
-                self.points.give(seen.rows[rows[of_detection == d]], int(objects[d]))
-        self._splitting.forget(split)
+                self.points.reassign(matched.rows[rows[of_detection == d]], int(objects[d]))
+        self._splitting.drop(split)
 
 
 def pixel_rays(camera: Camera, step: int) -> Array:
-    """(h, w, 3) what every step-th pixel both ways of an image, as recorded, sees at 1 m."""
+    """Camera-frame points (h, w, 3) at a depth of 1 m of every step-th recorded pixel."""
     columns, rows = np.meshgrid(np.arange(0, camera.width, step), np.arange(0, camera.height, step))
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(float)
     return camera.backproject(camera.undistort(pixels), np.ones(len(pixels))).reshape(

@@ -1,6 +1,8 @@
-"""What objects are made of, as tables: points in keyframes' frames, sightings, landmarks."""
+"""Tables of what belongs to objects: points in keyframes' frames, sightings, landmarks."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,12 +10,21 @@ from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.geometry import transform
 
 
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """The objects (D,) that a keyframe with a timestamp observed."""
+
+    keyframe_id: int
+    timestamp_s: float
+    objects: Ints
+
+
 class ObjectPoints:
-    """Rows of points, sightings and landmarks, each with the object it is of."""
+    """Tables of points, sightings and landmarks, each row with its object."""
 
     def __init__(self) -> None:
         self._next_id = 0
-        self._points: Floats = np.zeros((0, 3), np.float32)  # in the anchor's frame
+        self._points: Floats = np.zeros((0, 3), np.float32)  # in the anchor keyframe's frame
         self._anchors: Ints = np.zeros(0, np.int64)
         self._owners: Ints = np.zeros(0, np.int64)
         self._sightings: Ints = np.zeros((0, 2), np.int64)  # object, keyframe
@@ -21,23 +32,23 @@ class ObjectPoints:
         self._landmarks: Ints = np.zeros((0, 2), np.int64)  # landmark, object
 
     def new_ids(self, count: int) -> Ints:
-        """Ids (count,) that were never used."""
+        """Ids (count,) that were not used before."""
         ids = np.arange(self._next_id, self._next_id + count)
         self._next_id += count
         return ids
 
-    def add(self, seen: tuple[int, float], objects: Ints, points: Array, owners: Ints) -> None:
-        """A keyframe, by id and stamp, saw objects (D,) and points (P, 3) in its frame on them."""
-        keyframe_id, stamp_s = seen
-        pairs = np.stack([objects, np.full(len(objects), keyframe_id)], axis=1)
+    def add(self, sightings: Sightings, points: Array, owners: Ints) -> None:
+        """Add sightings, and points (P, 3) of objects (P,) in the frame of their keyframe."""
+        count = len(sightings.objects)
+        pairs = np.stack([sightings.objects, np.full(count, sightings.keyframe_id)], axis=1)
         self._sightings = np.concatenate([self._sightings, pairs])
-        self._seen_s = np.append(self._seen_s, np.full(len(objects), stamp_s))
+        self._seen_s = np.append(self._seen_s, np.full(count, sightings.timestamp_s))
         self._points = np.concatenate([self._points, points.astype(np.float32)])
-        self._anchors = np.append(self._anchors, np.full(len(points), keyframe_id))
+        self._anchors = np.append(self._anchors, np.full(len(points), sightings.keyframe_id))
         self._owners = np.append(self._owners, owners)
 
     def in_world(self, poses: dict[int, Array]) -> tuple[Ints, Array]:
-        """Owners (N,) and world points (N, 3) of the rows whose keyframe has a pose."""
+        """Objects (N,) and world points (N, 3) of the rows whose keyframe has a pose."""
         rows = self.rows(poses)
         anchors, where = np.unique(self._anchors[rows], return_inverse=True)
         T_world_anchor = np.array([poses[k] for k in anchors.tolist()]).reshape(-1, 4, 4)
@@ -46,7 +57,7 @@ class ObjectPoints:
         return self._owners[rows], moved
 
     def rays_in_world(self, poses: dict[int, Array]) -> Array:
-        """(N, 3) of the same rows: what an error of z^2 in its depth z moves a point by."""
+        """Displacement (N, 3) of the same rows by an error of z^2 m in the depth z."""
         rows = self.rows(poses)
         anchors, where = np.unique(self._anchors[rows], return_inverse=True)
         R_world_anchor = np.array([poses[k][:3, :3] for k in anchors.tolist()]).reshape(-1, 3, 3)
@@ -58,29 +69,29 @@ class ObjectPoints:
         """The rows of points whose keyframe has a pose."""
         return np.flatnonzero(np.isin(self._anchors, list(poses)))
 
-    def give(self, rows: Ints, object_id: int) -> None:
-        """Rows of points become another object's, and the sightings from their keyframes too."""
+    def reassign(self, rows: Ints, object_id: int) -> None:
+        """Give rows of points, and the sightings from their keyframes, to another object."""
         before = np.unique(self._owners[rows])
-        theirs = np.isin(self._sightings[:, 0], before)
-        theirs &= np.isin(self._sightings[:, 1], self._anchors[rows])
-        theirs &= ~np.isin(self._sightings[:, 1], self.sightings(object_id)[0])
-        copied = self._sightings[theirs].copy()
+        chosen = np.isin(self._sightings[:, 0], before)
+        chosen &= np.isin(self._sightings[:, 1], self._anchors[rows])
+        chosen &= ~np.isin(self._sightings[:, 1], self.sightings(object_id)[0])
+        copied = self._sightings[chosen].copy()
         copied[:, 0] = object_id
         self._owners[rows] = object_id
         self._sightings = np.concatenate([self._sightings, copied])
-        self._seen_s = np.append(self._seen_s, self._seen_s[theirs])
+        self._seen_s = np.append(self._seen_s, self._seen_s[chosen])
 
-    def merge(self, kept: int, gone: int) -> None:
-        """All that was one object's becomes another's."""
-        self._owners[self._owners == gone] = kept
-        self._landmarks[self._landmarks[:, 1] == gone, 1] = kept
-        both = np.where(self._sightings == [gone, -1], [kept, -1], self._sightings)
+    def merge(self, kept: int, removed: int) -> None:
+        """Give all rows of an object to another."""
+        self._owners[self._owners == removed] = kept
+        self._landmarks[self._landmarks[:, 1] == removed, 1] = kept
+        both = np.where(self._sightings == [removed, -1], [kept, -1], self._sightings)
         _, first = np.unique(both, axis=0, return_index=True)
         first = np.sort(first)
         self._sightings, self._seen_s = both[first], self._seen_s[first]
 
     def thin(self, most: int) -> None:
-        """Keep at most so many points an object, spread over the time in which they came."""
+        """Keep at most so many points an object, spread evenly over the order of their arrival."""
         sizes = np.bincount(self._owners, minlength=self._next_id)
         if sizes.max(initial=0) <= most:
             return
@@ -98,26 +109,26 @@ class ObjectPoints:
         """The keyframes whose frames hold points."""
         return list(np.unique(self._anchors).tolist())
 
-    def hand_over(self, keyframe_id: int, parent_id: int, T_parent_keyframe: Array) -> None:
-        """A keyframe leaves the map: its points are in the frame of another from now on."""
+    def reanchor(self, keyframe_id: int, parent_id: int, T_parent_keyframe: Array) -> None:
+        """Move the points of a removed keyframe into the frame of its parent."""
         rows = self._anchors == keyframe_id
         self._points[rows] = transform(T_parent_keyframe, self._points[rows].astype(float))
         self._anchors[rows] = parent_id
 
     def sightings(self, object_id: int) -> tuple[Ints, Array]:
-        """Keyframes (K,), rising, that saw an object, and their stamps (K,)."""
+        """Keyframes (K,), ascending, that observed an object, and their timestamps (K,)."""
         rows = np.flatnonzero(self._sightings[:, 0] == object_id)
         rows = rows[np.argsort(self._sightings[rows, 1], kind="stable")]
         return self._sightings[rows, 1], self._seen_s[rows]
 
     def last_seen_s(self, object_ids: Ints) -> Array:
-        """When objects (N,) were seen last; -inf for one that never was."""
+        """Last timestamp (N,) of objects (N,); -inf for one without a sighting."""
         found = np.full(self._next_id + 1, -np.inf)
         np.maximum.at(found, self._sightings[:, 0], self._seen_s)
         return found[object_ids]
 
     def place_landmarks(self, landmark_ids: Ints, object_ids: Ints) -> None:
-        """Landmarks (N,) lie on objects (N,), wherever they were before."""
+        """Assign landmarks (N,) to objects (N,), in place of earlier assignments."""
         kept = self._landmarks[~np.isin(self._landmarks[:, 0], landmark_ids)]
         placed = np.stack([landmark_ids, object_ids], axis=1)
         both = np.concatenate([kept, placed])
@@ -128,11 +139,11 @@ class ObjectPoints:
         return self._landmarks[self._landmarks[:, 1] == object_id, 0]
 
     def landmarks(self) -> Ints:
-        """All landmarks (N,) on objects, rising."""
+        """All landmarks (N,) on objects, ascending."""
         return self._landmarks[:, 0]
 
     def rename_landmarks(self, old_ids: Ints, new_ids: Ints) -> None:
-        """Landmarks (N,) were fused into others (N,), or are gone: -1."""
+        """Replace landmarks (N,) by those that they were fused into (N,); -1: removed."""
         table = dict(zip(old_ids.tolist(), new_ids.tolist(), strict=True))
         ids = np.array([table.get(i, i) for i in self._landmarks[:, 0].tolist()], np.int64)
         _, first = np.unique(ids, return_index=True)
@@ -140,7 +151,7 @@ class ObjectPoints:
         self._landmarks = np.stack([ids[first], self._landmarks[first, 1]], axis=1)
 
     def state(self) -> Arrays:
-        """All tables as named arrays."""
+        """The tables as named arrays."""
         return {
             "next_id": np.array(self._next_id),
             "points": self._points,
@@ -152,7 +163,7 @@ class ObjectPoints:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the tables of a state."""
+        """Replace the content by a state."""
         self._next_id = int(state["next_id"])
         self._points, self._anchors = state["points"], state["anchors"]
         self._owners, self._sightings = state["owners"], state["sightings"]

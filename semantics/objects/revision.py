@@ -1,4 +1,4 @@
-"""Second thoughts: evidence that two objects are one, or that one is two."""
+"""Evidence that two objects are one, or that one object is two."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from bmask_slam.semantics.objects.association import Overlap, class_affinity
 class RevisionConfig:
     """When objects are merged or split.
 
-    A keyframe speaks for one object where one detection covers ``covered`` of both, of classes
-    that are alike by ``min_affinity`` (Bhattacharyya), and for two where each has a detection of
-    its own. It speaks for a split where two detections cover ``part`` or more of one object each;
-    then what is nearest to the one that is not the object's, within ``reach_m``, leaves. It is
-    done when the keyframes for it are ``needed`` more than those against; neither side gets more
-    than ``most`` ahead, so that a belief can be overcome.
+    A keyframe is evidence for a merge where one detection covers the share ``covered`` of both
+    objects and their class distributions have an affinity (Bhattacharyya) of ``min_affinity``;
+    against it, where each object has a detection of its own. It is evidence for a split where two
+    detections cover the share ``part`` or more of one object each; a split gives the points nearest
+    to the other detection, within ``reach_m``, to a new object. A revision is made when the
+    keyframes for it outnumber those against it by ``needed``; the difference is limited to
+    ``most`` against, so that it can be reversed.
     """
 
     covered: float = 0.5
@@ -31,32 +32,32 @@ class RevisionConfig:
 
 
 class MergeEvidence:
-    """Keyframes for a revision less those against, by key."""
+    """Number of keyframes for a revision less those against it, by pair of object ids."""
 
     def __init__(self, config: RevisionConfig) -> None:
         self.config = config
         self._counts: dict[tuple[int, int], int] = {}
 
-    def speak(self, key: tuple[int, int], step: int) -> None:
-        """One more keyframe for (1) or against (-1)."""
+    def add(self, key: tuple[int, int], step: int) -> None:
+        """Count a keyframe for (+1) or against (-1) a revision."""
         value = self._counts.get(key, 0) + step
         self._counts[key] = max(-self.config.most, min(self.config.needed, value))
 
     def decided(self, key: tuple[int, int]) -> bool:
-        """Whether the revision is to be made."""
+        """Whether there is enough evidence for the revision."""
         return self._counts.get(key, 0) >= self.config.needed
 
-    def forget(self, number: int) -> None:
-        """Drop every key with an object in it."""
-        self._counts = {key: v for key, v in self._counts.items() if number not in key}
+    def drop(self, object_id: int) -> None:
+        """Drop every pair that holds an object."""
+        self._counts = {key: v for key, v in self._counts.items() if object_id not in key}
 
     def state(self) -> Ints:
-        """Rows (N, 3) of key and count, by key."""
+        """Rows (N, 3) of pair and count, sorted by pair."""
         rows = [(a, b, n) for (a, b), n in sorted(self._counts.items())]
         return np.array(rows, np.int64).reshape(-1, 3)
 
     def restore(self, rows: Ints) -> None:
-        """Become the balance of a state."""
+        """Replace the content by a state."""
         self._counts = {(a, b): n for a, b, n in rows.tolist()}
 
 
@@ -81,7 +82,7 @@ def merges(
 
 
 def splits(overlap: Overlap, config: RevisionConfig) -> list[tuple[int, int]]:
-    """Objects and +1 (two detections share it) or -1 (one has it all)."""
+    """Objects with +1 (two detections share it) or -1 (one detection covers all of it)."""
     shared = (overlap.of_object >= config.part).sum(axis=0) >= 2
     whole = (overlap.of_object >= 1 - config.part / 2).any(axis=0)
     return [(o, 1) for o in np.flatnonzero(shared).tolist()] + [

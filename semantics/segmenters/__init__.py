@@ -1,1 +1,1 @@
-"""TODO."""
+"""Segmenters: networks, cached masks, label images, remote ones; evaluation."""

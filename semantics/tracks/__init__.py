@@ -1,1 +1,1 @@
-"""TODO."""
+"""Kalman-filter tracks of movable instances between keyframes."""

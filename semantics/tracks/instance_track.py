@@ -1,4 +1,4 @@
-"""A movable thing in one keyframe, and over time."""
+"""A movable instance in one keyframe, and its track over time."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from bmask_slam.graph.arrays import Array, Floats
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A movable thing in a keyframe.
+    """A movable instance in a keyframe.
 
     Attributes:
         centroid_world: (3,) m.
         half_size: (3,) m, along the image's columns, its rows and the depth.
         distribution: (C,) over classes.
-        prior: log odds that it moves, by its class; of what stood still for long that of no class.
-        evidence: what this keyframe's geometry adds to them.
-        still: it stood still for so long that its class does not count.
+        prior: log odds of moving by its class; those without a class if ``still``.
+        evidence: log odds that the geometry of this keyframe adds.
+        still: it stood still for so long that its class no longer counts.
     """
 
     centroid_world: Array
@@ -29,23 +29,23 @@ class Sighting:
 
     @property
     def log_odds(self) -> float:
-        """That it moves, by this keyframe alone."""
+        """Log odds of moving, from this keyframe alone."""
         return self.prior + self.evidence
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A thing that was seen, as of the last time.
+    """A movable instance as of its last sighting.
 
     Attributes:
-        id: its number.
-        time_s: when it was last seen.
+        id: unique number.
+        time_s: time of the last sighting.
         mean: (6,) centroid m and velocity m/s in the world; covariance: (6, 6).
-        half_size, distribution, prior: see Sighting, fused over sightings.
-        evidence: of all sightings together, limited.
-        sightings: how many.
-        missed: how many keyframes in a row showed its place, but not it.
-        stood: it was watched and found to stand, so that its class does not count.
+        half_size, distribution, prior: as of a Sighting, fused over sightings.
+        evidence: log odds added by all sightings, limited.
+        sightings: number of sightings.
+        missed: consecutive keyframes that showed its position without a sighting.
+        stood: it was verified to stand still, so that its class no longer counts.
     """
 
     id: int

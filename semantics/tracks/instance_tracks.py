@@ -1,4 +1,4 @@
-"""Where movable things are between the keyframes that showed them: a Kalman filter each."""
+"""Positions of movable instances between keyframes: one Kalman filter each."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _NEVER = 1e9
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """The motion that is expected, and when a track ends.
+    """The motion model, the association, and when a track ends.
 
-    ``acceleration_m_s2``: standard deviation of the white acceleration. ``speed_m_s``: that of
-    an unknown speed. ``centroid_sigma_m``: that of a measured centroid, of which part may be
-    hidden. ``gate_chi2`` (3 degrees of freedom) is where a detection no longer belongs to a track;
-    one with a quite different class costs ``class_cost`` more. Of two things whose classes have
-    ``same_class`` in common, one in the middle of the other's box is a part of it. A track ends
-    ``patience_s`` after it was last seen, which is longer than keyframes are mostly apart. Boxes
-    are widened by ``box_sigmas`` of the prediction, but by no more than ``box_slack_m``, and by
-    ``box_margin_m``. Classes that move with less than ``min_prior`` have no tracks. All evidence
-    moves a track's log odds by at most ``max_evidence``; ``max_missed`` keyframes in a row that
-    show its place, but not it, end it.
+    ``acceleration_m_s2``, ``speed_m_s`` and ``centroid_sigma_m`` are the standard deviations of the
+    white acceleration, of an unknown speed, and of a measured centroid, which may be partly hidden.
+    A sighting joins a track only below a cost of ``gate_chi2`` (3 degrees of freedom); a completely
+    different class adds ``class_cost``. Of two sightings with a class affinity of ``same_class``,
+    one with its centroid in the other's box is a part of it. A track ends ``patience_s`` after its
+    last sighting, longer than the usual time between keyframes. Boxes are widened by ``box_sigmas``
+    of the predicted position, at most ``box_slack_m``, plus ``box_margin_m``. Classes with a prior
+    below ``min_prior`` have no tracks. All evidence changes a track's log odds by at most
+    ``max_evidence``; it ends after ``max_missed`` consecutive keyframes that show its position
+    without a sighting of it.
     """
 
     acceleration_m_s2: float = 1.0
@@ -57,21 +57,21 @@ class TrackConfig:
 
 
 class InstanceTracks:
-    """All tracks, by one gated assignment a keyframe."""
+    """All tracks, updated by one gated linear assignment a keyframe."""
 
     def __init__(self, config: TrackConfig | None = None) -> None:
         self.config = config or TrackConfig()
         self.tracks: list[Track] = []
         self._next_id = 0
 
-    def see(
+    def update(
         self, time_s: float, sightings: Sequence[Sighting], R_world_camera: Array | None = None
     ) -> list[int]:
-        """The movable things of a keyframe; returns the id of the track of each.
+        """Add the movable instances of a keyframe; returns the id of the track of each.
 
-        A part that was seen besides its whole is on the whole's track. Masks that come after those
-        of a later keyframe, and tracks that have ended, are of no use. ``R_world_camera`` (3, 3)
-        turns the boxes' axes into the world's, by default they are the same.
+        A part joins the track of its whole if both have a sighting. Sightings older than the newest
+        of any track are ignored: the result is empty. ``R_world_camera`` (3, 3) rotates the boxes'
+        axes into the world's; by default they are the same.
         """
         self.expire(time_s)
         if any(track.time_s > time_s for track in self.tracks):
@@ -84,27 +84,27 @@ class InstanceTracks:
         ids = np.zeros(len(sightings), np.int64)
         for k, row in zip(distinct, chosen, strict=True):
             if row < 0:
-                self.tracks.append(self._begun(sightings[k], time_s))
+                self.tracks.append(self._new_track(sightings[k], time_s))
             else:
-                self.tracks[row] = self._joined(ahead[row], sightings[k], time_s)
+                self.tracks[row] = self._updated(ahead[row], sightings[k], time_s)
             ids[k] = self.tracks[row].id
         self._end_doubles(time_s, R)
         found: list[int] = ids[whole].tolist()
         return found
 
     def miss(self, time_s: float, shown: Sequence[Track]) -> None:
-        """A keyframe showed the places of these tracks; those not seen in it were missed.
+        """Count a miss for those of the tracks in a keyframe's view without a sighting in it.
 
-        Masks that come after those of a later keyframe are of no use here either.
+        Ignored, as in ``update``, if any track has a newer sighting.
         """
         if any(track.time_s > time_s for track in self.tracks):
             return
-        unseen = {track.id for track in shown if track.time_s < time_s}
-        tracks = [replace(t, missed=t.missed + (t.id in unseen)) for t in self.tracks]
+        missed = {track.id for track in shown if track.time_s < time_s}
+        tracks = [replace(t, missed=t.missed + (t.id in missed)) for t in self.tracks]
         self.tracks = [t for t in tracks if t.missed < self.config.max_missed]
 
     def reinstate(self, track_id: int, prior: float) -> None:
-        """A thing was found to stand: its class does not count, its log odds begin at a prior."""
+        """Mark a track as standing: its class no longer counts, its log odds start at ``prior``."""
         self.tracks = [
             replace(t, prior=min(t.prior, prior), evidence=min(t.evidence, 0.0), stood=True)
             if t.id == track_id
@@ -113,12 +113,12 @@ class InstanceTracks:
         ]
 
     def expire(self, time_s: float) -> None:
-        """End the tracks that were not seen for long."""
+        """End the tracks without a sighting for ``patience_s``."""
         limit = time_s - self.config.patience_s
         self.tracks = [track for track in self.tracks if track.time_s >= limit]
 
     def predicted(self, track: Track, time_s: float) -> Track:
-        """A track at another time, by constant velocity; its ``time_s`` stays that of sight."""
+        """A track at another time, by constant velocity; ``time_s`` stays that of its sighting."""
         dt = time_s - track.time_s
         F = np.eye(6)
         F[:3, 3:] = dt * np.eye(3)
@@ -128,15 +128,15 @@ class InstanceTracks:
         return replace(track, mean=mean, covariance=covariance)
 
     def reach_m(self, track: Track) -> Array:
-        """Half size (3,) m of a predicted track's box, widened by what is not known."""
+        """Half size (3,) m of a predicted track's box, widened by its uncertainty."""
         sigma_m = np.sqrt(max(np.trace(track.covariance[:3, :3]) / 3, 0.0))
         return track.half_size + self._slack_m(sigma_m)
 
     def moving_boxes(self, time_s: float) -> tuple[Array, Array]:
         """Centres in the world and half sizes (T, 3) m of the moving tracks' boxes at a time.
 
-        Those of ``predicted`` and ``reach_m``, of all at once: the trace of a constant-velocity
-        prediction's covariance of position is that of P_pp + 2 dt P_pv + dt^2 P_vv + dt^4 / 4 a^2.
+        The results of ``predicted`` and ``reach_m`` for all at once: the covariance of the
+        predicted position has the trace of P_pp + 2 dt P_pv + dt^2 P_vv + dt^4 / 4 a^2.
         """
         moving = [track for track in self.tracks if track.moving]
         if not moving:
@@ -152,11 +152,11 @@ class InstanceTracks:
         return means[:, :3] + dt[:, None] * means[:, 3:], sizes + slack_m[:, None]
 
     def clear(self) -> None:
-        """End all tracks: another recording."""
+        """End all tracks, for another recording."""
         self.tracks = []
 
     def state(self) -> Arrays:
-        """All tracks as named arrays."""
+        """The tracks as named arrays."""
         tracks = self.tracks
         return {
             "next_id": np.array(self._next_id),
@@ -174,7 +174,7 @@ class InstanceTracks:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the tracks of a state."""
+        """Replace the tracks by those of a state."""
         n = len(state["ids"])
         self._next_id = int(state["next_id"])
         distributions = state["distributions"].reshape(n, -1) if n else np.zeros((0, 1))
@@ -197,14 +197,16 @@ class InstanceTracks:
         ]
 
     def _wholes(self, sightings: Sequence[Sighting], R_world_box: Array) -> Ints:
-        """(N,) the largest sighting that each is a part of, itself if there is none."""
+        """Index (N,) of the largest sighting that each is a part of, or of itself."""
         if not sightings:
             return np.zeros(0, np.int64)
         centres = np.array([s.centroid_world for s in sightings])
         sizes = np.array([s.half_size for s in sightings])
-        alike = [[_alike(a.distribution, b.distribution) for b in sightings] for a in sightings]
+        affinity = [
+            [_affinity(a.distribution, b.distribution) for b in sightings] for a in sightings
+        ]
         within = _within(centres, centres, sizes, R_world_box)
-        within &= np.array(alike) >= self.config.same_class
+        within &= np.array(affinity) >= self.config.same_class
         np.fill_diagonal(within, True)
         volume = sizes.prod(axis=1)
         whole = np.where(within, volume, -1.0).argmax(axis=1)
@@ -213,21 +215,21 @@ class InstanceTracks:
         return whole
 
     def _end_doubles(self, time_s: float, R_world_box: Array) -> None:
-        """End the tracks that were not seen where one of the same class was."""
+        """End tracks without a sighting at the position of a sighting of the same class."""
         now = [track for track in self.tracks if track.time_s == time_s]
         others = [track for track in self.tracks if track.time_s != time_s]
         if not now or not others:
             return
         centres = np.array([self.predicted(track, time_s).mean[:3] for track in others])
-        seen, sizes = np.array([t.mean[:3] for t in now]), np.array([t.half_size for t in now])
-        alike = [[_alike(a.distribution, b.distribution) for b in now] for a in others]
-        double = _within(centres, seen, sizes, R_world_box)
-        double &= np.array(alike) >= self.config.same_class
+        means, sizes = np.array([t.mean[:3] for t in now]), np.array([t.half_size for t in now])
+        affinity = [[_affinity(a.distribution, b.distribution) for b in now] for a in others]
+        double = _within(centres, means, sizes, R_world_box)
+        double &= np.array(affinity) >= self.config.same_class
         ended = {others[k].id for k in np.flatnonzero(double.any(axis=1)).tolist()}
         self.tracks = [track for track in self.tracks if track.id not in ended]
 
     def _slack_m(self, sigma_m: Array) -> Array:
-        """By how much boxes are widened whose centres are not known better."""
+        """Margin of boxes whose centres have this standard deviation."""
         known = self.config.box_sigmas * sigma_m
         return np.minimum(known, self.config.box_slack_m) + self.config.box_margin_m
 
@@ -242,15 +244,15 @@ class InstanceTracks:
             away = np.array([s.centroid_world for s in sightings]) - track.mean[:3]
             S = track.covariance[:3, :3] + noise
             chi2 = np.einsum("ij,ij->i", away, np.linalg.solve(S, away.T).T)
-            alike = np.array([_alike(s.distribution, track.distribution) for s in sightings])
-            total = chi2 + self.config.class_cost * (1 - alike)
+            affinity = np.array([_affinity(s.distribution, track.distribution) for s in sightings])
+            total = chi2 + self.config.class_cost * (1 - affinity)
             cost[:, k] = np.where(total < self.config.gate_chi2, total, _NEVER)
         for row, column in zip(*linear_sum_assignment(cost), strict=True):
             if cost[row, column] < _NEVER:
                 chosen[row] = int(column)
         return chosen
 
-    def _begun(self, sighting: Sighting, time_s: float) -> Track:
+    def _new_track(self, sighting: Sighting, time_s: float) -> Track:
         self._next_id += 1
         variances = [self.config.centroid_sigma_m**2] * 3 + [self.config.speed_m_s**2] * 3
         return Track(
@@ -265,7 +267,7 @@ class InstanceTracks:
             sightings=1,
         )
 
-    def _joined(self, ahead: Track, sighting: Sighting, time_s: float) -> Track:
+    def _updated(self, ahead: Track, sighting: Sighting, time_s: float) -> Track:
         limit = self.config.max_evidence
         noise = self.config.centroid_sigma_m**2 * np.eye(3)
         mean, covariance = update(
@@ -291,6 +293,6 @@ def _within(points: Array, centres: Array, sizes: Array, R_world_box: Array) -> 
     return np.asarray((away <= sizes).all(axis=2))
 
 
-def _alike(a: Floats, b: Floats) -> float:
-    """How much two distributions (C,) have in common, 0 to 1."""
+def _affinity(a: Floats, b: Floats) -> float:
+    """Bhattacharyya coefficient of two distributions (C,), 0 to 1."""
     return float(np.sqrt(a * b).sum()) if a.shape == b.shape else 0.0

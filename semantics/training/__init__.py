@@ -1,1 +1,1 @@
-"""Training of the network: data, losses, the loop."""
+"""Training of the network: data, targets, losses, the loop, transfer to other labels."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Weight files: reading, recognising, checking and writing."""

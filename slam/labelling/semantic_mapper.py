@@ -181,7 +181,7 @@ class SemanticMapper:
             self.objects.points.rename_landmarks(gone, np.where(alive, parents, -1))
         for keyframe_id in self.objects.points.anchors():
             if keyframe_id not in keyframes:
-                self.objects.points.hand_over(keyframe_id, *self._map.history.parent(keyframe_id))
+                self.objects.points.reanchor(keyframe_id, *self._map.history.parent(keyframe_id))
         self._gravity.keep(keyframes.keys() | self._waiting.keys())
 
     def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
@@ -274,7 +274,7 @@ class SemanticMapper:
         objects = self.objects.add(view)
         if keyframe_id != observed.anchor.id:
             parent = observed.anchor.id, observed.T_anchor_camera
-            self.objects.points.hand_over(keyframe_id, *parent)
+            self.objects.points.reanchor(keyframe_id, *parent)
         return np.append(objects, -1)
 
 

@@ -262,7 +262,7 @@ class MovingObjectFilter:
             return moving, tracks
         least = log_odds(self.config.tracks.min_prior)
         movable = {k: s for k, s in enumerate(sightings) if s is not None and s.log_odds > least}
-        ids = self.tracks.see(now_s, list(movable.values()), masks.T_world_camera[:3, :3])
+        ids = self.tracks.update(now_s, list(movable.values()), masks.T_world_camera[:3, :3])
         ahead = [self.tracks.predicted(track, now_s) for track in self.tracks.tracks]
         by_id = {track.id: track for track in ahead}
         for k, track_id in zip(movable, ids, strict=True):

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.semantics.instances.overlay import class_colour
-from bmask_slam.semantics.objects.boxes3d import EDGES, upright_axes
+from bmask_slam.semantics.objects.boxes3d import EDGES, gravity_axes
 
 UNKNOWN_COLOUR = "#c9c9c4"
 _MIN_NAMED_M = 0.25
@@ -26,7 +26,7 @@ def draw_objects(
     Only larger objects bear their number; the legend counts those of each class.
     """
     assert cloud.labels is not None
-    R_upright_world = upright_axes(found.up_world).T
+    R_upright_world = gravity_axes(found.up_world).T
     figure = Figure(figsize=(11, 9), dpi=120, layout="constrained")
     axes = figure.add_subplot()
     labels, points = cloud.labels.estimates.labels, cloud.points_world @ R_upright_world.T
@@ -40,13 +40,13 @@ def draw_objects(
         colour = 0.7 * class_colour(o.label) / 255
         axes.add_collection(LineCollection(list(corners[EDGES]), colors=[colour], linewidths=0.8))
         if o.box.size_m.max() > _MIN_NAMED_M:
-            text = f"{found.names.of_thing(o.label)} {o.id}"
+            text = f"{found.names.map_name(o.label)} {o.id}"
             axes.annotate(text, corners.mean(axis=0), fontsize=6, ha="center", color=0.6 * colour)
     path_points = trajectory.positions_world @ R_upright_world.T
     axes.plot(*path_points[:, :2].T, color="black", lw=0.9, label="camera")
     counts = Counter(o.label for o in found.objects)
     for label in sorted(counts, key=lambda k: (-counts[k], k)):
-        name = f"{found.names.of_thing(label)} ({counts[label]})"
+        name = f"{found.names.map_name(label)} ({counts[label]})"
         axes.plot([], [], "s", ms=5, color=0.8 * class_colour(label) / 255, label=name)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("m")

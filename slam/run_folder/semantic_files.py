@@ -66,7 +66,7 @@ def write_labels(path: Path, cloud: LandmarkCloud) -> None:
     names, found = cloud.labels.names, cloud.labels.estimates
     rows = zip(
         cloud.ids.tolist(),
-        [names.of_thing(label) for label in found.labels.tolist()],
+        [names.map_name(label) for label in found.labels.tolist()],
         [f"{p:.5f}" for p in found.probability.tolist()],
         [f"{h:.5f}" for h in found.entropy.tolist()],
         found.views.tolist(),
@@ -125,7 +125,7 @@ class SavedObject:
 def write_objects(path: Path, found: MapObjects) -> None:
     """Write objects as JSON: metres, in the run's world frame."""
     content = {
-        "labels": [found.names.of_thing(k) for k in range(len(found.names))],
+        "labels": [found.names.map_name(k) for k in range(len(found.names))],
         "up_world": _rounded(found.up_world),
         "objects": [_as_json(o, found) for o in found.objects],
     }
@@ -136,10 +136,10 @@ def _as_json(o: MapObject, found: MapObjects) -> dict[str, Any]:
     likely = [k for k in np.argsort(-o.distribution).tolist()[:5] if o.distribution[k] >= 0.001]
     return {
         "id": o.id,
-        "label": found.names.of_thing(o.label),
+        "label": found.names.map_name(o.label),
         "probability": round(float(o.distribution[o.label]), 5),
         "distribution": {
-            found.names.of_thing(k): round(float(o.distribution[k]), 5) for k in likely
+            found.names.map_name(k): round(float(o.distribution[k]), 5) for k in likely
         },
         "centroid_world_m": _rounded(o.centroid_world),
         "box": {

@@ -94,7 +94,7 @@ def system() -> SlamSystem:
         system.mapper.world.keyframes[first], kept_depth(FRAMES[3].depth_m)
     )
     sighting = Sighting(np.array([0.1, 0, 2]), np.full(3, 0.2), certain(1, 3), 1.0)
-    system.moving_objects.tracks.see(FRAMES[19].timestamp_s, [sighting])
+    system.moving_objects.tracks.update(FRAMES[19].timestamp_s, [sighting])
     removed = [
         Removed(
             k, np.arange(k, 4 + 2 * k), some_patches(4 + k), PackedMask.of(FRAMES[k].depth_m > 2)

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Convolutional bodies: ResNet and MobileNetV2, with their batch norm."""

@@ -13,8 +13,8 @@ from bmask_slam.semantics.objects.boxes3d import (
     OrientedBox,
     box_around,
     box_iou,
+    gravity_axes,
     supported,
-    upright_axes,
     without_noise,
 )
 from bmask_slam.semantics.objects.gravity import GravityEstimator, sample_normals, up_direction
@@ -121,10 +121,10 @@ def test_edges_join_corners_along_the_axes() -> None:
     assert sorted(np.round(lengths, 9)) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
 
 
-def test_upright_axes_are_a_rotation_with_up_last() -> None:
+def test_gravity_axes_are_a_rotation_with_up_last() -> None:
     for up in np.random.default_rng(4).normal(size=(5, 3)):
         unit = up / np.linalg.norm(up)
-        R = upright_axes(unit)
+        R = gravity_axes(unit)
         assert np.allclose(R @ R.T, np.eye(3))
         assert np.linalg.det(R) == pytest.approx(1.0)
         assert np.allclose(R[:, 2], unit)
@@ -133,7 +133,7 @@ def test_upright_axes_are_a_rotation_with_up_last() -> None:
 def test_up_is_found_although_all_cameras_look_down() -> None:
     rng = np.random.default_rng(5)
     up = se3_exp(np.array([0.3, 0.2, -0.1, 0, 0, 0]))[:3, :3] @ UP
-    R = upright_axes(up)
+    R = gravity_axes(up)
     walls = np.array([R @ [np.cos(a), np.sin(a), 0] for a in rng.uniform(0, 6.3, 400)])
     floor = up + 0.03 * rng.normal(size=(200, 3))
     floor /= np.linalg.norm(floor, axis=1, keepdims=True)

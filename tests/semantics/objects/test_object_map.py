@@ -148,7 +148,7 @@ def test_points_of_a_culled_keyframe_stay_where_they_are() -> None:
         scene.show(x, CHAIRS)
     before = [o.centroid_world for o in scene.objects()]
     T_parent_culled = np.linalg.inv(scene.poses[2]) @ scene.poses.pop(3)
-    scene.map.points.hand_over(3, 2, T_parent_culled)
+    scene.map.points.reanchor(3, 2, T_parent_culled)
     after = scene.objects()
     assert np.allclose(before, [o.centroid_world for o in after], atol=1e-6)
     assert 3 in after[0].keyframe_ids  # it did see them

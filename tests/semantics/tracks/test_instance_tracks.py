@@ -22,7 +22,7 @@ def seen(x: float, y: float = 0.0, z: float = 3.0, what: Floats = PERSON) -> Sig
 def test_a_walker_is_predicted_between_keyframes() -> None:
     tracks = InstanceTracks()
     for k in range(8):
-        tracks.see(0.4 * k, [seen(0.8 * 0.4 * k, z=3 - 0.5 * 0.4 * k)])
+        tracks.update(0.4 * k, [seen(0.8 * 0.4 * k, z=3 - 0.5 * 0.4 * k)])
     (track,) = tracks.tracks
     ahead = tracks.predicted(track, 2.8 + 0.3)
     np.testing.assert_allclose(ahead.mean[3:], [0.8, 0, -0.5], atol=0.05)
@@ -34,8 +34,8 @@ def test_a_walker_is_predicted_between_keyframes() -> None:
 def test_the_filter_agrees_with_the_textbook() -> None:
     config = TrackConfig(acceleration_m_s2=1.5, speed_m_s=0.9, centroid_sigma_m=0.1)
     tracks, dt, z = InstanceTracks(config), 0.5, np.array([0.3, -0.1, 3.2])
-    tracks.see(0.0, [seen(0.0)])
-    tracks.see(dt, [Sighting(z, SIZE, PERSON, 2.0)])
+    tracks.update(0.0, [seen(0.0)])
+    tracks.update(dt, [Sighting(z, SIZE, PERSON, 2.0)])
     eye, zero = np.eye(3), np.zeros((3, 3))
     F = np.block([[eye, dt * eye], [zero, eye]])
     G = np.vstack([dt**2 / 2 * eye, dt * eye])
@@ -50,7 +50,7 @@ def test_two_that_cross_keep_their_tracks_in_any_order() -> None:
     tracks = InstanceTracks()
     for k in range(11):
         both = [seen(-2 + 0.4 * k), seen(2 - 0.4 * k, z=3.3)]
-        ids = tracks.see(0.5 * k, both[:: 1 if k % 2 else -1])
+        ids = tracks.update(0.5 * k, both[:: 1 if k % 2 else -1])
         assert sorted(ids) == [0, 1]
     ends = {round(float(t.mean[0]), 1) for t in tracks.tracks}
     assert ends == {2.0, -2.0}
@@ -58,24 +58,24 @@ def test_two_that_cross_keep_their_tracks_in_any_order() -> None:
 
 def test_a_chair_is_not_the_person_who_stood_there() -> None:
     tracks = InstanceTracks(TrackConfig(class_cost=20.0))
-    first = tracks.see(0.0, [seen(0.0)])
-    assert tracks.see(0.3, [seen(0.0, what=CHAIR)]) != first
+    first = tracks.update(0.0, [seen(0.0)])
+    assert tracks.update(0.3, [seen(0.0, what=CHAIR)]) != first
     assert len(tracks.tracks) == 2
 
 
 def test_far_away_is_another_and_the_unseen_end() -> None:
     tracks = InstanceTracks(TrackConfig(patience_s=1.0))
-    assert tracks.see(0.0, [seen(0.0)]) == [0]
-    assert tracks.see(0.3, [seen(3.0)]) == [1]
-    tracks.see(1.2, [])
+    assert tracks.update(0.0, [seen(0.0)]) == [0]
+    assert tracks.update(0.3, [seen(3.0)]) == [1]
+    tracks.update(1.2, [])
     assert [t.id for t in tracks.tracks] == [1]
 
 
 def test_masks_out_of_order_change_nothing() -> None:
     tracks = InstanceTracks()
-    tracks.see(1.0, [seen(0.0)])
+    tracks.update(1.0, [seen(0.0)])
     before = tracks.state()
-    assert tracks.see(0.5, [seen(1.0)]) == []
+    assert tracks.update(0.5, [seen(1.0)]) == []
     tracks.miss(0.5, tracks.tracks)
     assert all(np.array_equal(a, before[name]) for name, a in tracks.state().items())
 
@@ -83,7 +83,7 @@ def test_masks_out_of_order_change_nothing() -> None:
 def moving_after(evidence: list[float], prior: float) -> bool:
     tracks = InstanceTracks()
     for k, told in enumerate(evidence):
-        tracks.see(0.3 * k, [replace(seen(0.0), prior=prior, evidence=told)])
+        tracks.update(0.3 * k, [replace(seen(0.0), prior=prior, evidence=told)])
     return tracks.tracks[0].moving
 
 
@@ -98,10 +98,10 @@ def test_what_views_say_adds_up_until_it_outweighs_the_class() -> None:
 
 def test_a_track_that_keyframes_miss_where_they_look_ends() -> None:
     tracks = InstanceTracks(TrackConfig(max_missed=2))
-    tracks.see(0.0, [seen(0.0), seen(3.0)])
+    tracks.update(0.0, [seen(0.0), seen(3.0)])
     missed = tracks.tracks[0]
     tracks.miss(0.2, [missed])
-    tracks.see(0.3, [seen(0.0)])
+    tracks.update(0.3, [seen(0.0)])
     tracks.miss(0.4, [missed])
     assert [t.missed for t in tracks.tracks] == [1, 0]
     tracks.miss(0.4, [missed])
@@ -110,25 +110,25 @@ def test_a_track_that_keyframes_miss_where_they_look_ends() -> None:
 
 def test_what_a_keyframe_shows_it_does_not_miss() -> None:
     tracks = InstanceTracks(TrackConfig(max_missed=1))
-    tracks.see(0.2, [seen(0.0)])
+    tracks.update(0.2, [seen(0.0)])
     tracks.miss(0.2, tracks.tracks)
     assert [t.missed for t in tracks.tracks] == [0]
 
 
 def test_state_and_back() -> None:
     tracks, other = InstanceTracks(), InstanceTracks()
-    tracks.see(0.0, [seen(0.0), seen(2.0, what=CHAIR)])
-    tracks.see(0.4, [seen(0.2)])
+    tracks.update(0.0, [seen(0.0), seen(2.0, what=CHAIR)])
+    tracks.update(0.4, [seen(0.2)])
     other.restore(tracks.state())
     assert all(np.array_equal(a, other.state()[name]) for name, a in tracks.state().items())
-    assert other.see(0.6, [seen(0.3), seen(5.0)]) == tracks.see(0.6, [seen(0.3), seen(5.0)])
+    assert other.update(0.6, [seen(0.3), seen(5.0)]) == tracks.update(0.6, [seen(0.3), seen(5.0)])
 
 
 def test_all_boxes_at_once_are_those_of_each_track() -> None:
     tracks = InstanceTracks()
     for k in range(4):
-        tracks.see(0.3 * k, [seen(0.2 * k), seen(2.0 + 0.1 * k, z=2.0)])
-    tracks.see(1.1, [seen(0.75), Sighting(np.array([-2.0, 0, 2]), SIZE, CHAIR, -1.0)])
+        tracks.update(0.3 * k, [seen(0.2 * k), seen(2.0 + 0.1 * k, z=2.0)])
+    tracks.update(1.1, [seen(0.75), Sighting(np.array([-2.0, 0, 2]), SIZE, CHAIR, -1.0)])
     centres, sizes = tracks.moving_boxes(1.3)
     ahead = [tracks.predicted(t, 1.3) for t in tracks.tracks if t.moving]
     assert len(ahead) == 2 < len(tracks.tracks)
@@ -143,10 +143,10 @@ def part(x: float, y: float, z: float) -> Sighting:
 
 def test_a_part_seen_besides_its_whole_is_no_second_person() -> None:
     tracks = InstanceTracks()
-    assert tracks.see(0.0, [part(0.1, -0.6, 3.1), seen(0.0), seen(0.0, what=CHAIR)]) == [0, 0, 1]
+    assert tracks.update(0.0, [part(0.1, -0.6, 3.1), seen(0.0), seen(0.0, what=CHAIR)]) == [0, 0, 1]
     (person, _) = tracks.tracks
     np.testing.assert_array_equal(person.half_size, SIZE)
-    first, second = tracks.see(0.3, [seen(0.05), part(0.1, -0.6, 3.3)])
+    first, second = tracks.update(0.3, [seen(0.05), part(0.1, -0.6, 3.3)])
     assert first == 0 != second
 
 
@@ -156,25 +156,26 @@ def test_boxes_have_the_axes_of_the_camera_that_saw_them() -> None:
     behind = R_world_camera @ np.array([0.0, 0.0, 0.22])
     for away, ids in ((beside, [0, 0]), (behind, [0, 1])):
         both = [seen(0.0), part(*(np.array([0, 0, 3.0]) + away))]
-        assert InstanceTracks().see(0.0, both, R_world_camera) == ids
+        assert InstanceTracks().update(0.0, both, R_world_camera) == ids
 
 
 def test_an_unseen_track_where_its_like_was_seen_ends() -> None:
     tracks = InstanceTracks()
-    assert tracks.see(0.0, [seen(0.0), seen(0.3), seen(0.1, what=CHAIR), seen(1.0)]) == [0, 1, 2, 3]
-    (kept,) = tracks.see(0.2, [seen(0.12)])
+    four = [seen(0.0), seen(0.3), seen(0.1, what=CHAIR), seen(1.0)]
+    assert tracks.update(0.0, four) == [0, 1, 2, 3]
+    (kept,) = tracks.update(0.2, [seen(0.12)])
     assert [t.id for t in tracks.tracks] == [kept, 2, 3]
 
 
 def test_a_class_does_not_count_any_more_for_a_thing_that_was_found_to_stand() -> None:
     tracks = InstanceTracks()
-    (mine, other) = tracks.see(0.0, [seen(0.0), seen(2.0)])
+    (mine, other) = tracks.update(0.0, [seen(0.0), seen(2.0)])
     tracks.reinstate(mine, -1.4)
-    tracks.see(0.3, [seen(0.0), seen(2.0)])
+    tracks.update(0.3, [seen(0.0), seen(2.0)])
     by_id = {track.id: track for track in tracks.tracks}
     assert [by_id[k].stood for k in (mine, other)] == [True, False]
     assert [by_id[k].moving for k in (mine, other)] == [False, True]
     for k in range(2):  # but what views say does
         moves = Sighting(np.array([0.1 * k, 0, 3]), SIZE, PERSON, 2.0, evidence=2.2)
-        tracks.see(0.6 + 0.3 * k, [moves, seen(2.0)])
+        tracks.update(0.6 + 0.3 * k, [moves, seen(2.0)])
     assert {track.id: track.moving for track in tracks.tracks}[mine]

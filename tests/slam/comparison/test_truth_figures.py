@@ -49,7 +49,7 @@ def run(office, tmp_path):
     file = office / "instances" / sequence.pairs.rgb_files[0].name
     instances = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[rows, columns]
     labels = [
-        NAMES.of_thing(k) for k in true_classes(office, NAMES)[instances.astype(int)].tolist()
+        NAMES.map_name(k) for k in true_classes(office, NAMES)[instances.astype(int)].tolist()
     ]
     labels = ["umbrella" if k % WRONG == 0 else name for k, name in enumerate(labels)]
     columns = dict(zip("xyz", points.T.astype(np.float32), strict=True))

@@ -237,7 +237,7 @@ def test_what_is_seen_to_stand_still_is_used_in_a_walkers_box_too(frames: list[F
     system = run(frames[:8])
     wall = np.array([0.5, 0.0, 2.0])
     someone = Sighting(wall, np.full(3, 0.5), certain(1, len(NAMES), 0.95), 3.0)
-    system.moving_objects.tracks.see(frames[7].timestamp_s, [someone])
+    system.moving_objects.tracks.update(frames[7].timestamp_s, [someone])
     features = system.prepare(frames[8])
     left_out = {
         geometry: replaced(system, geometry).moving_objects.filter(frames[8], features).moving.sum()
