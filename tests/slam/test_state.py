@@ -190,7 +190,7 @@ def test_every_array_of_the_state_matters(system: SlamSystem) -> None:
             other = restored({**state, name: spoiled})
         except (InputError, ValueError, IndexError, KeyError):
             continue
-        assert list(differences(system, other)), name
+        assert next(differences(system, other), None) is not None, name
 
 
 def test_both_go_on_the_same() -> None:
