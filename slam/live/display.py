@@ -34,7 +34,7 @@ class Display:
     def frame(self, result: FrameResult, rgb: Image, system: LiveSystem) -> bool:
         """Show a frame, and of the submaps what is due; whether the map has changed."""
         self._frames += 1
-        self._scene.frame(result, rgb if self._frames % IMAGE_EVERY == 1 else None)
+        self._scene.log_frame(result, rgb if self._frames % IMAGE_EVERY == 1 else None)
         has_changed = self._changes != system.remote.changes
         self._changes = system.remote.changes
         if system.dense is not None:
@@ -44,11 +44,11 @@ class Display:
     def map(self, system: LiveSystem, health: Health) -> None:
         """Show landmarks, keyframes and queues."""
         cloud, path = system.landmarks(), system.keyframe_trajectory().positions_world
-        self._scene.points("world/landmarks", cloud.points_world, cloud.colours, 0.008)
+        self._scene.log_points("world/landmarks", cloud.points_world, cloud.colours, 0.008)
         colours = np.full((len(path), 3), 200, np.uint8)
-        self._scene.points("world/keyframes", path, colours, 0.02)
+        self._scene.log_points("world/keyframes", path, colours, 0.02)
         numbers = {k: v for k, v in asdict(health).items() if isinstance(v, int | float)}
-        self._scene.numbers("health", numbers)
+        self._scene.log_numbers("health", numbers)
 
     def submaps(
         self, dense: RemoteDenseMapper, world: WorldMap, has_changed: bool, at_once: int
@@ -70,7 +70,7 @@ class Display:
         due = [n for n in dense.previews if n in world.keyframes]
         for number in [n for n in due if world.keyframes[n].segment == segment][:at_once]:
             preview = dense.previews.pop(number)
-            self._scene.submap(number, preview.points, preview.colours)
+            self._scene.log_submap(number, preview.points, preview.colours)
             self._place(number, world)
 
     def _moved(self, world: WorldMap) -> list[int]:

@@ -120,11 +120,11 @@ class LiveSlam:
         return Recorder(folder)
 
     def _open_display(self, stack: ExitStack) -> Display | None:
-        if not self.options.view.anywhere:
+        if not self.options.view.enabled:
             return None
         scene = Scene(self.options.title, self.options.view)
         stack.callback(scene.close)
-        scene.camera(self.camera)
+        scene.log_camera(self.camera)
         return Display(scene)
 
     def prepare(self, rgb: Image, depth_m: Floats) -> Prepared:

@@ -30,7 +30,7 @@ class LiveOptions:
         out: run folder, as an offline run's; None: nothing is written.
         overwrite: replace the run that ``out`` holds.
         reference: trajectory to compare with at the end.
-        view: where a viewer shows the run, if anywhere.
+        view: where a viewer shows the run, if at all.
         images: folder that the frames are read from, if any: a segmenter looks masks up for it, and
             ``bmask-slam map`` reads it.
         title: of the plot of the trajectory.
@@ -69,7 +69,7 @@ def start_system(
             undo.callback(segmenter.close)
             labels = segmenter.labels
         if options.dense and options.out is not None:
-            points = PREVIEW_POINTS if options.view.anywhere else 0
+            points = PREVIEW_POINTS if options.view.enabled else 0
             dense = RemoteDenseMapper(DenseOrder(options.out, camera, masks, labels.names, points))
             undo.callback(dense.close)
         system = LiveSystem(camera, config, scratch, segmenter, dense)

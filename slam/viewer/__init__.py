@@ -1,1 +1,1 @@
-"""What a run looks like in Rerun: recorded to a file, served to a browser, or shown."""
+"""The viewer: a live or a finished run in Rerun, in a recording, a browser or a window."""

@@ -1,13 +1,13 @@
-"""A map and a camera in Rerun; entity paths follow the frame tree, world first.
+"""A map and a camera in Rerun; entity paths follow the tree of frames, world first.
 
 ====================  ==============================================================================
 world/camera          the camera's pose; below it ``image``
 world/trajectory      the path so far
-world/keyframes       their positions; ``world/loops`` lines between the ends of closed loops
-world/landmarks       points, coloured by their labels where they have one, else as they look
+world/keyframes       their positions; ``world/loops``: lines between the ends of closed loops
+world/landmarks       points in the colours of their labels, else in their own
 world/objects         boxes with labels
 world/dense           the dense cloud of a finished run
-world/submaps/ID      of a live run: some points of each submap, in the frame of its keyframe
+world/submaps/ID      in a live run: some points of each submap, in the frame of its keyframe
 plots/...             status, inliers, milliseconds of each stage, queues
 ====================  ==============================================================================
 """
@@ -37,15 +37,15 @@ STATUS = {TrackingStatus.OK: 2, TrackingStatus.WEAK: 1, TrackingStatus.LOST: 0}
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Where it goes: a file, a viewer in the browser on a port (0: none), a viewer's own window."""
+    """Where the scene is shown: a recording, a browser on a port (0: none), or Rerun's window."""
 
     record: Path | None = None
     serve: int = 0
     window: bool = False
 
     @property
-    def anywhere(self) -> bool:
-        """Whether it goes anywhere."""
+    def enabled(self) -> bool:
+        """Whether it is shown at all."""
         return self.record is not None or self.serve > 0 or self.window
 
 
@@ -59,10 +59,10 @@ class Box:
 
 
 class Scene:
-    """Sends what is given to Rerun, at once and without touching it."""
+    """Sends a map and frames to Rerun; the arrays given are not changed."""
 
     def __init__(self, name: str, options: ViewOptions) -> None:
-        """Raises InputError where Rerun is not installed, or the file cannot be written."""
+        """Raises InputError: Rerun is not installed, or the recording's folder is not there."""
         self._rr = _import_rerun()
         self._stream = self._rr.RecordingStream(f"bmask-slam {name}")
         if options.record is not None:
@@ -79,8 +79,8 @@ class Scene:
         self._path: list[Array] = []
         self._log("world", self._rr.ViewCoordinates.RDF, static=True)
 
-    def camera(self, camera: Camera) -> None:
-        """The camera's field of view."""
+    def log_camera(self, camera: Camera) -> None:
+        """Show the camera's field of view."""
         size = [camera.width // IMAGE_STEP, camera.height // IMAGE_STEP]
         K = camera.K / IMAGE_STEP
         self._log(
@@ -89,8 +89,8 @@ class Scene:
             static=True,
         )
 
-    def frame(self, result: FrameResult, rgb: Image | None = None) -> None:
-        """A frame's pose, its image (H, W, 3) red first, status and times."""
+    def log_frame(self, result: FrameResult, rgb: Image | None = None) -> None:
+        """Show a frame's pose, its image (H, W, 3) red first, status and times."""
         rr = self._rr
         self._stream.set_time(TIMELINE, duration=result.timestamp_s)
         T = result.T_world_camera
@@ -98,47 +98,47 @@ class Scene:
             self._log("world/camera", self._pose(T))
             self._path.append(T[:3, 3])
             if len(self._path) % 10 == 0:
-                self.line("world/trajectory", np.array(self._path), (80, 170, 255))
+                self.log_line("world/trajectory", np.array(self._path), (80, 170, 255))
         if rgb is not None:
             small = np.ascontiguousarray(rgb[::IMAGE_STEP, ::IMAGE_STEP, ::-1])
             quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
             contents = cv2.imencode(".jpg", small, quality)[1].tobytes()
             picture = rr.EncodedImage(contents=contents, media_type="image/jpeg")
             self._log("world/camera/image", picture)
-        self.numbers("status", {"status": STATUS[result.status]})
+        self.log_numbers("status", {"status": STATUS[result.status]})
         counted = {"matches": result.matches, "inliers": result.inliers, "moving": result.ignored}
-        self.numbers("features", counted)
-        self.numbers("ms", result.stage_ms)
+        self.log_numbers("features", counted)
+        self.log_numbers("ms", result.stage_ms)
 
-    def points(
+    def log_points(
         self, path: str, points: NDArray[np.floating], colours: Bytes, radius_m: float
     ) -> None:
-        """Points (N, 3) with colours (N, 3)."""
+        """Show points (N, 3) with colours (N, 3)."""
         self._log(path, self._rr.Points3D(points, colors=colours, radii=radius_m))
 
-    def submap(self, number: int, points: Floats, colours: Bytes) -> None:
-        """Points (N, 3) with colours (N, 3) in the frame of a keyframe, see ``move_submap``."""
-        self.points(f"world/submaps/{number}", points, colours, 0.006)
+    def log_submap(self, number: int, points: Floats, colours: Bytes) -> None:
+        """Show points (N, 3) with colours (N, 3), in the frame given by ``move_submap``."""
+        self.log_points(f"world/submaps/{number}", points, colours, 0.006)
 
     def move_submap(self, number: int, T_world_anchor: Array) -> None:
-        """Put a submap where its keyframe is, T (4, 4)."""
+        """Set the pose (4, 4) of a submap's keyframe."""
         self._log(f"world/submaps/{number}", self._pose(T_world_anchor))
 
     def remove_submap(self, number: int) -> None:
-        """Show it no more."""
+        """Remove a submap from the scene."""
         self._log(f"world/submaps/{number}", self._rr.Clear(recursive=True))
 
-    def line(self, path: str, points: Array, colour: Sequence[int]) -> None:
-        """A line through points (N, 3)."""
+    def log_line(self, path: str, points: Array, colour: Sequence[int]) -> None:
+        """Show a line through points (N, 3)."""
         if len(points) > 1:
             self._log(path, self._rr.LineStrips3D([points], colors=[colour]))
 
-    def pairs(self, path: str, ends: Array, colour: Sequence[int]) -> None:
-        """Lines from ends[:, 0] to ends[:, 1], (N, 2, 3)."""
+    def log_segments(self, path: str, ends: Array, colour: Sequence[int]) -> None:
+        """Show N straight lines with these ends (N, 2, 3)."""
         self._log(path, self._rr.LineStrips3D(ends, colors=[colour]))
 
-    def boxes(self, boxes: Sequence[Box]) -> None:
-        """The map's objects."""
+    def log_boxes(self, boxes: Sequence[Box]) -> None:
+        """Show the map's objects."""
         rr = self._rr
         self._log(
             "world/objects",
@@ -151,17 +151,17 @@ class Scene:
             ),
         )
 
-    def numbers(self, group: str, values: Mapping[str, float]) -> None:
-        """A moment of time series, by name."""
+    def log_numbers(self, group: str, values: Mapping[str, float]) -> None:
+        """Add a value to each time series, by name."""
         for name, value in values.items():
             self._log(f"plots/{group}/{name}", self._rr.Scalars([float(value)]))
 
-    def at(self, timestamp_s: float) -> None:
-        """What follows is of this time."""
+    def set_time(self, timestamp_s: float) -> None:
+        """Set the time of everything that is logged from now on."""
         self._stream.set_time(TIMELINE, duration=timestamp_s)
 
     def close(self) -> None:
-        """Write what waits."""
+        """Write buffered data and end the recording."""
         self._stream.flush()
         self._stream.disconnect()
 

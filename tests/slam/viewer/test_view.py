@@ -1,4 +1,4 @@
-"""What reaches Rerun, read back from the recording."""
+"""What Rerun receives, read back from the recording."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_without_rerun_it_says_what_to_install(monkeypatch, tmp_path) -> None:
         Scene("a", ViewOptions(record=tmp_path / "a.rrd"))
 
 
-def test_a_recording_in_no_folder_is_refused(tmp_path) -> None:
+def test_a_recording_in_a_missing_folder_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         Scene("a", ViewOptions(record=tmp_path / "none" / "a.rrd"))
 
@@ -90,10 +90,10 @@ def test_submaps_stand_where_their_keyframes_are_and_move_with_them(tmp_path) ->
     }
     points = np.arange(12, dtype=np.float32).reshape(4, 3)
     previews = {k: Preview(points, np.full((4, 3), 9, np.uint8)) for k in range(3)}
-    dense = SimpleNamespace(previews=previews)  # all that it is asked for
+    dense = SimpleNamespace(previews=previews)
     display.submaps(dense, world, True, 1)
     display.submaps(dense, world, False, 1)
-    assert list(previews) == [2]  # of another map segment
+    assert list(previews) == [2]  # its keyframe is in another map segment
     world.keyframes[0].T_world_camera = POSES[9]
     world.keyframes[1].T_world_camera = POSES[1] @ se3_exp(np.full(6, 1e-5))
     display.submaps(dense, world, True, 5)
