@@ -1,13 +1,12 @@
-"""The live loop in a few lines: python examples/live.py path/to/recording
+"""Live SLAM from Python: python examples/live.py path/to/recording
 
-A recording stands in for a camera here; anything that gives colour and depth will do.
+The recording stands in for a camera: ``track`` takes colour and depth images from any source.
 """
 
 import sys
 from pathlib import Path
 
-from bmask_slam.live.live_slam import LiveOptions, LiveSlam
-from bmask_slam.sequences import open_sequence
+from bmask_slam import LiveOptions, LiveSlam, open_sequence
 
 sequence = open_sequence(Path(sys.argv[1]))
 with LiveSlam(sequence.camera, options=LiveOptions(out=Path("runs/live"), overwrite=True)) as slam:

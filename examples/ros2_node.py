@@ -1,10 +1,11 @@
-"""The live loop as a ROS 2 node, which publishes T_world_camera as geometry_msgs/PoseStamped:
+"""Live SLAM as a ROS 2 node that publishes T_world_camera as geometry_msgs/PoseStamped:
 
 python examples/ros2_node.py --ros-args -r rgb:=/camera/color/image_raw \
     -r depth:=/camera/aligned_depth_to_color/image_raw -r camera_info:=/camera/color/camera_info
 
-Depth must be registered to colour, and images not rectified. The world is the optical frame of the
-first keyframe (z forward), not ROS's map with z up. Ctrl-C ends it and saves all in runs/ros2.
+Depth must be registered to colour, and the images must not be rectified. The world frame is the
+optical frame of the first keyframe (z forward), not ROS's map frame (z up). Ctrl-C ends the node
+and saves the run in runs/ros2.
 """
 
 from __future__ import annotations
@@ -13,23 +14,22 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from bmask_slam.graph.errors import InputError
+from bmask_slam import InputError, LiveOptions, LiveSlam
 from bmask_slam.graph.geometry import quaternion_from_rotation
-from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.sources import ros_images as ros
 from bmask_slam.run_folder.folder import free_run_path
 from bmask_slam.sequences.images import depth_in_metres
 
 
 class Bridge:
-    """Messages in, poses out; ``slam`` is there from the first messages on."""
+    """Passes messages to ``slam``, which the first ones start, and publishes the poses."""
 
     def __init__(self, new_pose: Callable[[], Any], publish: Callable[[Any], None]) -> None:
         self.slam: LiveSlam | None = None
         self._new_pose, self._publish = new_pose, publish
 
     def track(self, rgb: Any, depth: Any, info: Any) -> None:
-        """A colour and a depth image and their camera, of one time; broken ones are passed over."""
+        """Track a colour and a depth image of one time; broken messages are skipped."""
         try:
             if self.slam is None:
                 scale = ros.DEPTH_SCALES[ros.depth_encoding(depth, "depth")]

@@ -1,4 +1,4 @@
-"""Frames into a live system, at a rate that a map on a busy machine can follow."""
+"""Feeds frames to a live system at a rate that the map's process on a busy machine can follow."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from bmask_slam.live.live_slam import LiveSlam
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import TrackingStatus
 
-PATIENCE_S = 2
+MAX_WAIT_S = 2
 
 
-def factor_selection(slam: LiveSlam, frames: list[Frame], waiting: int = 1) -> list[TrackingStatus]:
-    """Track frames, each after the map has taken all keyframes but so many; their statuses."""
+def track_frames(slam: LiveSlam, frames: list[Frame], waiting: int = 1) -> list[TrackingStatus]:
+    """Track frames, each when at most ``waiting`` keyframes wait for the map; their statuses."""
     statuses = []
     for frame in frames:
         tracked = slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, name="a.png")
         statuses.append(tracked.status)
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + MAX_WAIT_S
         while slam.health().keyframes_waiting > waiting and time.monotonic() < deadline_s:
             time.sleep(0.01)
             slam.catch_up()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from feeding import factor_selection
+from feeding import track_frames
 from synthetic_view import CAMERA, render_plane
 from test_live_faults import fill, running
 
@@ -75,9 +75,9 @@ def off_the_plane_m(run: Path) -> float:
 def test_a_killed_process_comes_back_and_no_keyframe_is_left_out(tmp_path) -> None:
     run = tmp_path / "run"
     with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
-        factor_selection(slam, FRAMES[:10], 0)
+        track_frames(slam, FRAMES[:10], 0)
         os.kill(slam.processes()["dense"], signal.SIGKILL)
-        assert set(factor_selection(slam, FRAMES[10:], 0)) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[10:], 0)) == {TrackingStatus.OK}
         wait_for(slam, deaths=1)
         pids = list(slam.processes().values())
     assert set(keyframes_without(run).values()) <= {LATE}  # busy machines restart it slowly
@@ -94,9 +94,9 @@ def test_one_that_hangs_is_started_again(tmp_path, monkeypatch) -> None:
     run = tmp_path / "run"
     with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
         first = slam.processes()["dense"]
-        factor_selection(slam, FRAMES[:8], 0)
+        track_frames(slam, FRAMES[:8], 0)
         os.kill(first, signal.SIGSTOP)
-        assert set(factor_selection(slam, FRAMES[8:], 0)) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[8:], 0)) == {TrackingStatus.OK}
         wait_for(slam, deaths=1)
         assert slam.processes()["dense"] != first
         pids = [first, *slam.processes().values()]
@@ -110,9 +110,9 @@ def test_on_a_full_disk_tracking_goes_on_and_the_end_says_what_is_missing(
 ) -> None:
     run = small_disk / "run"
     with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
-        factor_selection(slam, FRAMES[:4], 0)
+        track_frames(slam, FRAMES[:4], 0)
         ballast = fill(small_disk)
-        assert set(factor_selection(slam, FRAMES[4:], 0)) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[4:], 0)) == {TrackingStatus.OK}
         deadline_s = time.monotonic() + 60
         while not slam._system.dense.unwritten and time.monotonic() < deadline_s:
             time.sleep(0.02)

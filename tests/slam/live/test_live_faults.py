@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from feeding import factor_selection
+from feeding import track_frames
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
@@ -62,14 +62,14 @@ def fill(disk: Path) -> Path:
 
 def test_tracking_goes_on_while_the_disk_is_full(small_disk, caplog) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(small_disk / "run")) as slam:
-        factor_selection(slam, FRAMES[:4])
+        track_frames(slam, FRAMES[:4])
         ballast = fill(small_disk)
         time.sleep(HEALTH_S)
-        assert set(factor_selection(slam, FRAMES[4:16])) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[4:16])) == {TrackingStatus.OK}
         assert slam.health().unwritten > 0
         assert "DISK FULL" in slam.health().line()
         ballast.unlink()
-        assert set(factor_selection(slam, FRAMES[16:])) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[16:])) == {TrackingStatus.OK}
         assert sum("tracking goes on" in r.message for r in caplog.records) == 1
         rows = (small_disk / "run" / "frames.csv").read_text().splitlines()
         assert len(rows) == 1 + len(FRAMES)
@@ -117,7 +117,7 @@ def test_an_unplugged_camera_ends_the_run_with_everything_saved(tmp_path) -> Non
 
 def test_five_seconds_without_a_frame_do_no_harm() -> None:
     with LiveSlam(CAMERA, CONFIG) as slam:
-        factor_selection(slam, FRAMES[:10])
+        track_frames(slam, FRAMES[:10])
         time.sleep(5.0)
         for k, frame in enumerate(FRAMES[10:14]):
             stamp_s = FRAMES[9].timestamp_s + 5.0 + 0.03 * k
@@ -139,9 +139,9 @@ def test_a_killed_segmenter_costs_masks_alone(tmp_path) -> None:
     semantics = {"semantics": CONFIG.semantics.__class__(segmenter=label_image(tmp_path))}
     config = CONFIG.__class__(**{**vars(CONFIG), **semantics})
     with LiveSlam(CAMERA, config, LiveOptions(tmp_path / "run")) as slam:
-        factor_selection(slam, FRAMES[:6])
+        track_frames(slam, FRAMES[:6])
         os.kill(slam.processes()["segmenter"], signal.SIGKILL)
-        assert set(factor_selection(slam, FRAMES[6:])) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[6:])) == {TrackingStatus.OK}
         deadline_s = time.monotonic() + 60
         while slam.health().masks_waiting and time.monotonic() < deadline_s:
             time.sleep(0.05)
@@ -187,10 +187,10 @@ def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(rerun.RecordingStream, "spawn", spawn)
     options = LiveOptions(tmp_path / "run", view=ViewOptions(window=True))
     with LiveSlam(CAMERA, CONFIG, options) as slam:
-        factor_selection(slam, FRAMES[:8])
+        track_frames(slam, FRAMES[:8])
         viewers[0].kill()
         viewers[0].wait()
-        assert set(factor_selection(slam, FRAMES[8:])) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[8:])) == {TrackingStatus.OK}
         started_s = time.monotonic()
     assert time.monotonic() - started_s < 30
     assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == len(FRAMES)

@@ -14,7 +14,7 @@ from pathlib import Path
 import faiss
 import numpy as np
 import pytest
-from feeding import factor_selection
+from feeding import track_frames
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
@@ -67,7 +67,7 @@ def offline() -> SlamSystem:
 def test_live_is_as_good_as_offline_and_leaves_the_same_files(tmp_path, offline) -> None:
     before = children()
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
-        assert set(factor_selection(slam, FRAMES)) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES)) == {TrackingStatus.OK}
         assert len(children() - before) == 1
         cloud, health = slam.map(), slam.health()
         assert len(slam.trajectory()) == len(FRAMES)
@@ -92,9 +92,9 @@ def test_live_is_as_good_as_offline_and_leaves_the_same_files(tmp_path, offline)
 
 def test_a_killed_map_comes_back_and_no_frame_is_lost(tmp_path) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
-        factor_selection(slam, FRAMES[:12])
+        track_frames(slam, FRAMES[:12])
         os.kill(slam.processes()["map"], signal.SIGKILL)
-        assert set(factor_selection(slam, FRAMES[12:])) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[12:])) == {TrackingStatus.OK}
         health = slam.health()
     assert health.map_deaths == 1
     trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
@@ -105,7 +105,7 @@ def test_a_killed_map_comes_back_and_no_frame_is_lost(tmp_path) -> None:
 
 def test_a_map_that_dies_again_and_again_costs_the_map_but_not_the_trajectory(tmp_path) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
-        factor_selection(slam, FRAMES[:8])
+        track_frames(slam, FRAMES[:8])
         for _ in range(3):
             os.kill(slam.processes()["map"], signal.SIGKILL)
             deaths, deadline_s = slam.health().map_deaths, time.monotonic() + 10
@@ -140,9 +140,9 @@ def wait_for_the_map(slam: LiveSlam) -> None:
 
 def test_a_keyframe_that_kills_the_map_is_passed_over(tmp_path, monkeypatch) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
-        factor_selection(slam, FRAMES[:6])
+        track_frames(slam, FRAMES[:6])
         poisoned = poison_next_keyframe(slam, monkeypatch)
-        assert set(factor_selection(slam, FRAMES[6:])) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[6:])) == {TrackingStatus.OK}
         wait_for_the_map(slam)
         assert slam.health().map_deaths == 2
         assert poisoned[0] not in slam._system.remote.world.keyframes
@@ -154,11 +154,11 @@ def test_a_keyframe_that_kills_the_map_is_passed_over(tmp_path, monkeypatch) -> 
 def test_a_first_keyframe_that_kills_the_map_costs_its_frame(tmp_path, monkeypatch) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         poison_next_keyframe(slam, monkeypatch)
-        factor_selection(slam, FRAMES[:1])
+        track_frames(slam, FRAMES[:1])
         wait_for_the_map(slam)
         assert slam.health().map_deaths == 2
         assert len(slam.trajectory()) == 0
-        assert set(factor_selection(slam, FRAMES[1:])) == {TrackingStatus.OK}
+        assert set(track_frames(slam, FRAMES[1:])) == {TrackingStatus.OK}
     trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
     assert len(trajectory) == len(FRAMES) - 1
     assert error_m(trajectory.poses_world_camera, first=1) < 0.02
@@ -192,11 +192,11 @@ def test_black_frames_are_lost_and_tracking_comes_back() -> None:
     black = np.zeros_like(FRAMES[0].rgb)
     nothing = np.full_like(FRAMES[0].depth_m, np.nan)
     with LiveSlam(CAMERA, CONFIG) as slam:
-        factor_selection(slam, FRAMES[:10])
+        track_frames(slam, FRAMES[:10])
         for k in range(3):
             result = slam.track(FRAMES[9].timestamp_s + 0.01 * (k + 1), black, nothing)
             assert result.status is TrackingStatus.LOST
-        assert factor_selection(slam, FRAMES[11:13])[-1] is TrackingStatus.OK
+        assert track_frames(slam, FRAMES[11:13])[-1] is TrackingStatus.OK
         health = slam.health()
     assert (health.lost_frames, health.lost_episodes) == (3, 1)
 
