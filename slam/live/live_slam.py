@@ -29,7 +29,7 @@ from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.live.start import LiveOptions, start_system
 from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, measure, row, save
-from bmask_slam.sequences.frame import Frame, check_frame
+from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.viewer.scene import Scene
@@ -86,7 +86,6 @@ class LiveSlam:
         self.rows: list[Row] = []
         self.dense: MapWritten | None = None
         self._counters, self._meter = RunCounters(), FrameMeter()
-        self._last_stamp_s = -math.inf
         self._begin_s = time.monotonic()
         self._closed = False
         with ExitStack() as stack:  # closed in the opposite order
@@ -156,16 +155,14 @@ class LiveSlam:
             InputError: a frame that ``check_frame`` refuses. It is not used; the next one may be.
         """
         arrived_s = time.monotonic() if prepared is None else prepared.arrived_s
-        given = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name)
+        if not self._meter.frames:
+            self._begin_s = arrived_s
+        frame = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name)
         try:
-            frame = check_frame(given, self.camera, self._last_stamp_s)
+            result = self._system.process(frame, prepared.features if prepared else None)
         except InputError:
             self._meter.refused += 1
             raise
-        if not self._meter.frames:
-            self._begin_s = time.monotonic()
-        self._last_stamp_s = timestamp_s
-        result = self._system.process(frame, prepared.features if prepared else None)
         if prepared is not None:
             result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
         self._counters.count(result)
