@@ -1,15 +1,14 @@
 """Taking things out of the map and the graph together: what a mask covers, landmarks, a loop.
 
-News about a keyframe may come seconds after it. By then its landmarks may have been fused into
-others, culled, or retired from the graph, the keyframe may have been culled, its segment joined
-to another, a loop closed. So everything is looked up by the ids as they are now. The graph is
-asked first, since it may refuse; the map follows.
+Masks of a keyframe may come seconds after it. By then its landmarks may have been fused into
+others, culled, or marginalised out of the graph, the keyframe may have been culled, its segment
+joined to another, a loop closed. So everything is looked up by the ids as they are now. The graph
+is changed first; the map follows.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from enum import Enum, IntEnum
 
 import numpy as np
 
@@ -19,33 +18,11 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import (
     GraphEstimate,
     GraphUpdate,
-    Refusals,
     RelativePoseName,
-    RemovalPolicy,
 )
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.world.masked_keypoints import keypoints_under
 from bmask_slam.world.world_map import Keyframe, WorldMap
-
-
-class MaskScope(Enum):
-    """What leaves where a mask covers a keyframe's keypoints."""
-
-    VIEW = "view"
-    """The keyframe's own observations: something stood before the landmarks there."""
-    LANDMARKS = "landmarks"
-    """The landmarks, with all observations: they are on the thing itself."""
-
-
-class KeptReason(IntEnum):
-    """Why a landmark that was asked for did not leave."""
-
-    NOT_IN_MAP = 1
-    """It never was, or was culled or pruned before."""
-    KEYFRAME_CULLED = 2
-    """Its observation left with the keyframe; nothing is left of it to take out."""
-    REFUSED = 3
-    """The whole request was refused."""
 
 
 def _no_ids() -> Ints:
@@ -54,80 +31,83 @@ def _no_ids() -> Ints:
 
 @dataclass(frozen=True)
 class PruneReport:
-    """What became of a request.
+    """What left the map and the graph, and what the graph did about the rest.
 
     Attributes:
         landmark_ids: (N,) sorted, out of the map and the graph with all their observations.
         observations: (N, 2) keyframe id, landmark id of those that left alone.
         loops: names of the relative poses that left.
-        kept_ids, kept_reasons: (M,) landmarks that stay, and why (KeptReason).
         refused: why nothing was done; "" if it was.
-        refused_variables: what the graph would have been left with, if that is the reason.
         dropped_landmarks: (N,) out of the graph as well, left underconstrained there; they are
             still in the map and may enter again.
-        bridged_keyframes: (N,) left with too little, and held loosely where they are.
+        anchored_keyframes: (N,) left underconstrained, and anchored loosely where they are.
     """
 
     landmark_ids: Ints = field(default_factory=_no_ids)
     observations: Ints = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     loops: tuple[RelativePoseName, ...] = ()
-    kept_ids: Ints = field(default_factory=_no_ids)
-    kept_reasons: Ints = field(default_factory=_no_ids)
     refused: str = ""
-    refused_variables: Refusals = field(default_factory=Refusals)
     dropped_landmarks: Ints = field(default_factory=_no_ids)
     anchored_keyframes: Ints = field(default_factory=_no_ids)
+
+    def __str__(self) -> str:
+        """One line for the log."""
+        if self.refused:
+            return f"nothing removed: {self.refused}"
+        counts = {
+            "landmarks": len(self.landmark_ids),
+            "observations": len(self.observations),
+            "loops": len(self.loops),
+        }
+        removed = ", ".join(f"{n} {what}" for what, n in counts.items() if n) or "nothing"
+        line = f"{removed} removed"
+        if len(self.dropped_landmarks):
+            line += f"; {len(self.dropped_landmarks)} landmarks underconstrained in the graph"
+        if len(self.anchored_keyframes):
+            line += f"; keyframes anchored: {self.anchored_keyframes.tolist()}"
+        return line
 
 
 @dataclass(frozen=True)
 class MapPruner:
-    """Takes things out of one map and its graph, and leaves both consistent.
+    """Takes observations out of one map and its graph, and leaves both consistent.
 
-    ``policy`` says whether the graph refuses what would leave something underconstrained.
-    Masks lose ``border_px`` all round, since segmentation errs there; negative widens them.
+    Masks are narrowed by ``border_px`` all round, since segmentation errs there; a negative number
+    widens them.
     """
 
     world: WorldMap
     smoother: Smoother
     camera: Camera
-    policy: RemovalPolicy = RemovalPolicy.DROP
     border_px: int = 2
 
-    def prune_mask(
-        self, keyframe_id: int, mask: Mask, scope: MaskScope = MaskScope.VIEW
-    ) -> PruneReport:
+    def prune_mask(self, keyframe_id: int, mask: Mask) -> PruneReport:
         """Take out what a keyframe observes under a mask (H, W) of its image, as recorded.
 
-        The keypoints observe nothing from now on and make no landmark; under
-        MaskScope.LANDMARKS all keypoints do so that observe the same landmarks.
+        The keypoints observe nothing from now on and make no landmark. Of a culled keyframe no
+        observation is left that could be taken out.
         """
         expected = (self.camera.height, self.camera.width)
         if mask.shape != expected or mask.dtype != bool:
             given = f"{mask.dtype} of shape {mask.shape}"
             return PruneReport(refused=f"the mask is {given}, the image needs bool {expected}")
+        if keyframe_id in self.world.culled:
+            return PruneReport()
         keyframe = self.world.keyframes.get(keyframe_id)
-        if keyframe is not None:
-            keypoints = keypoints_under(mask, keyframe.features.image_pixels, self.border_px)
-            return self._prune_view(keyframe, keypoints, scope)
-        culled = self.world.culled.get(keyframe_id)
-        if culled is None:
+        if keyframe is None:
             return PruneReport(refused=f"keyframe {keyframe_id} is not in the map")
-        keypoints = keypoints_under(mask, culled.image_pixels, self.border_px)
-        ids = culled.landmark_ids[keypoints]
-        if scope is MaskScope.LANDMARKS:
-            return self.prune_landmarks(ids[ids >= 0])
-        left = self.world.landmarks.living(self.world.landmarks.current(ids[ids >= 0]))
-        return _with_kept(PruneReport(), left, KeptReason.KEYFRAME_CULLED)
+        keypoints = keypoints_under(mask, keyframe.features.image_pixels, self.border_px)
+        return self._prune_observations(keyframe, keypoints)
 
     def prune_landmarks(self, ids: Ints) -> PruneReport:
-        """Take landmarks (N,) out entirely; of fused ones, what they were fused into."""
+        """Take landmarks (N,) out entirely; of fused ones, what they were fused into.
+
+        Those that are not in the map, or not any more, are passed over.
+        """
         landmarks = self.world.landmarks
-        known = (ids >= 0) & (ids < len(landmarks))
-        unknown, ids = ids[~known], np.unique(landmarks.current(ids[known]))
-        alive = landmarks.alive[ids]
-        report = self._carry_out(ids[alive], np.zeros((0, 2), np.int64))
-        absent = np.union1d(unknown, ids[~alive])
-        return _with_kept(report, absent, KeptReason.NOT_IN_MAP)
+        known = ids[(ids >= 0) & (ids < len(landmarks))]
+        current = np.unique(landmarks.current(known))
+        return self._remove(current[landmarks.alive[current]], np.zeros((0, 2), np.int64))
 
     def prune_loop(self, keyframe_a: int, keyframe_b: int) -> PruneReport:
         """Take a loop out: its relative poses, and every landmark that it fused falls in two.
@@ -152,13 +132,11 @@ class MapPruner:
         update = GraphUpdate(
             remove_observations=np.concatenate([np.zeros((0, 2), np.int64), *pairs]),
             remove_relative_poses=names,
-            removal_policy=self.policy,
         )
-        report, estimate = self._ask(update)
-        if estimate is None:
-            return report
+        estimate = self.smoother.update(update)
         self.world.split(fused, new_side, self.camera)
         read_back(self.world, estimate)
+        report = _report(update, estimate)
         return replace(report, loops=estimate.removal.relative_poses)
 
     def _side(self, end: int, ends: list[int]) -> list[Keyframe]:
@@ -191,55 +169,32 @@ class MapPruner:
         ids = [self.world.observed(keyframe)[1] for keyframe in keyframes]
         return np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))
 
-    def _prune_view(self, keyframe: Keyframe, keypoints: Ints, scope: MaskScope) -> PruneReport:
+    def _prune_observations(self, keyframe: Keyframe, keypoints: Ints) -> PruneReport:
+        """Take out what keypoints (N,) observe; landmarks that nothing else observes go too."""
         ids = keyframe.landmark_ids[keypoints]
         alive = (ids >= 0) & self.world.landmarks.alive[ids]
-        leaves = alive & (self.world.landmarks.observations[ids] <= 1)  # nobody else sees it
-        if scope is MaskScope.LANDMARKS:
-            leaves = alive
-        single = ids[alive & ~leaves]
-        pairs = np.stack([np.full(len(single), keyframe.id), single], axis=1)
-        report = self._carry_out(np.unique(ids[leaves]), pairs)
-        if not report.refused:
-            self.world.mask(keyframe, keypoints)
-        return _with_kept(report, ids[(ids >= 0) & ~alive], KeptReason.NOT_IN_MAP)
+        alone = alive & (self.world.landmarks.observations[ids] <= 1)
+        shared = ids[alive & ~alone]
+        pairs = np.stack([np.full(len(shared), keyframe.id), shared], axis=1)
+        report = self._remove(np.unique(ids[alone]), pairs)
+        self.world.mask(keyframe, keypoints)
+        return report
 
-    def _carry_out(self, ids: Ints, pairs: Ints) -> PruneReport:
+    def _remove(self, ids: Ints, pairs: Ints) -> PruneReport:
         """Take landmarks out of graph and map, single observations (N, 2) out of the graph."""
         if not len(ids) and not len(pairs):
             return PruneReport()
-        update = GraphUpdate(
-            remove_landmarks=ids, remove_observations=pairs, removal_policy=self.policy
-        )
-        report, estimate = self._ask(update)
-        if estimate is None:
-            return report
+        update = GraphUpdate(remove_landmarks=ids, remove_observations=pairs)
+        estimate = self.smoother.update(update)
         self.world.mask_landmarks(ids)
         read_back(self.world, estimate)
-        return report
-
-    def _ask(self, update: GraphUpdate) -> tuple[PruneReport, GraphEstimate | None]:
-        """Let the graph do it; without an estimate if it refused, then the map must not change."""
-        estimate = self.smoother.update(update)
-        refused = estimate.removal.refused
-        ids, pairs = update.remove_landmarks, update.remove_observations
-        if len(refused):
-            text = f"{len(refused)} landmarks and keyframes would be left underconstrained"
-            report = PruneReport(refused=text, refused_variables=refused)
-            kept = np.union1d(ids, pairs[:, 1])
-            return _with_kept(report, kept, KeptReason.REFUSED), None
-        return PruneReport(
-            landmark_ids=ids,
-            observations=pairs,
-            dropped_landmarks=estimate.dropped_landmarks,
-            anchored_keyframes=estimate.anchored_keyframes,
-        ), estimate
+        return _report(update, estimate)
 
 
-def _with_kept(report: PruneReport, ids: Ints, reason: KeptReason) -> PruneReport:
-    """The report with more landmarks that stay."""
-    return replace(
-        report,
-        kept_ids=np.concatenate([report.kept_ids, ids]),
-        kept_reasons=np.concatenate([report.kept_reasons, np.full(len(ids), reason)]),
+def _report(update: GraphUpdate, estimate: GraphEstimate) -> PruneReport:
+    return PruneReport(
+        landmark_ids=update.remove_landmarks,
+        observations=update.remove_observations,
+        dropped_landmarks=estimate.dropped_landmarks,
+        anchored_keyframes=estimate.anchored_keyframes,
     )

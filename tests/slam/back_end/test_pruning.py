@@ -18,10 +18,10 @@ from synthetic_view import (
 )
 
 from bmask_slam.back_end.factor_selection import FactorSelectionConfig, FactorSelector, read_back
-from bmask_slam.back_end.pruning import KeptReason, MapPruner, MaskScope
+from bmask_slam.back_end.pruning import MapPruner
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose, RemovalPolicy
+from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.system import SlamSystem
@@ -32,7 +32,6 @@ from bmask_slam.world.masked_keypoints import keypoints_under
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 COUNT = 60
-VIEW, LANDMARKS = MaskScope.VIEW, MaskScope.LANDMARKS
 
 
 class Session:
@@ -72,8 +71,8 @@ class Session:
             known[keypoints] = ids
         return known
 
-    def pruner(self, policy: RemovalPolicy = RemovalPolicy.DROP) -> MapPruner:
-        return MapPruner(self.world, self.smoother, CAMERA, policy, border_px=-3)
+    def pruner(self) -> MapPruner:
+        return MapPruner(self.world, self.smoother, CAMERA, border_px=-3)
 
     def fuse(self) -> None:
         """Landmarks of one point that were made anew become the oldest of it."""
@@ -167,7 +166,7 @@ def test_a_view_leaves_and_its_landmarks_stay() -> None:
     assert set(chosen) <= set(covered_ids.tolist())
     assert before - in_graph(session.smoother) == {(3, i) for i in covered_ids.tolist()}
     assert session.world.landmarks.alive.all()
-    assert len(report.landmark_ids) == len(report.kept_ids) == 0
+    assert len(report.landmark_ids) == 0
     assert newest.masked.sum() == len(covered_ids)
     assert_consistent(session.world, session.smoother)
     older = session.world.keyframes[2]  # the landmarks look as there again
@@ -179,17 +178,16 @@ def test_a_view_leaves_and_its_landmarks_stay() -> None:
 
 def test_landmarks_leave_with_all_their_views() -> None:
     session = Session(4)
-    report = session.pruner().prune_mask(1, mask_of(session, 1, np.array([5, 17])), LANDMARKS)
-    gone = report.landmark_ids
-    assert {5, 17} <= set(gone.tolist())
+    asked = np.array([5, 17])
+    gone = session.pruner().prune_landmarks(np.array([17, 5, -1, 10**6])).landmark_ids
+    assert gone.tolist() == asked.tolist()
     assert not session.world.landmarks.alive[gone].any()
     assert all(k.masked[gone].all() for k in session.world.keyframes.values())
     assert not {i for _, i in in_graph(session.smoother)} & set(gone.tolist())
     assert_consistent(session.world, session.smoother)
     again = session.pruner().prune_landmarks(gone)
-    assert (again.kept_reasons == KeptReason.NOT_IN_MAP).all()
-    assert again.kept_ids.tolist() == gone.tolist()
     assert len(again.landmark_ids) == 0
+    assert str(again) == "nothing removed"
 
 
 def test_a_landmark_that_nobody_else_sees_leaves_with_its_view() -> None:
@@ -213,29 +211,23 @@ def test_a_late_mask_follows_what_was_fused_and_culled() -> None:
     session.factor_selection.forget_landmarks(first.landmark_ids[[12]])
     culled = first.landmark_ids[12]
     session.add_keyframe(np.arange(20, COUNT))
-    report = session.pruner().prune_mask(first.id, mask, LANDMARKS)
-    assert {3, 8} <= set(report.landmark_ids.tolist())
-    assert report.kept_ids.tolist() == [culled]
-    assert report.kept_reasons.tolist() == [KeptReason.NOT_IN_MAP]
+    report = session.pruner().prune_mask(first.id, mask)
+    assert {(first.id, 3), (first.id, 8)} <= set(map(tuple, report.observations.tolist()))
+    assert culled not in {*report.landmark_ids.tolist(), *report.observations[:, 1].tolist()}
     assert_consistent(session.world, session.smoother)
-    by_old_name = session.pruner().prune_landmarks(old)
-    assert by_old_name.kept_ids.tolist() == [3, 8]  # the fused ones' names still lead there
+    by_old_id = session.pruner().prune_landmarks(old)
+    assert by_old_id.landmark_ids.tolist() == [3, 8]  # what they were fused into
 
 
-def test_a_late_mask_of_a_culled_keyframe_reaches_its_landmarks() -> None:
+def test_a_late_mask_of_a_culled_keyframe_finds_nothing_to_remove() -> None:
     session = Session(5)
     session.cull_keyframe(1, parent_id=2)
-    session.factor_selection.forget_landmarks(
-        session.world.replace_landmarks(np.array([7]), np.array([6]))
-    )
     session.add_keyframe(np.arange(10, COUNT))
-    mask = mask_of(session, 1, np.array([7, 9]))
-    kept = session.pruner().prune_mask(1, mask)
-    assert {6, 9} <= set(kept.kept_ids.tolist())
-    assert (kept.kept_reasons == KeptReason.KEYFRAME_CULLED).all()
-    report = session.pruner().prune_mask(1, mask, LANDMARKS)
-    assert {6, 9} <= set(report.landmark_ids.tolist())
-    assert_consistent(session.world, session.smoother)
+    before = in_graph(session.smoother)
+    report = session.pruner().prune_mask(1, mask_of(session, 1, np.array([7, 9])))
+    assert not report.refused
+    assert len(report.landmark_ids) == len(report.observations) == 0
+    assert in_graph(session.smoother) == before
 
 
 def test_a_mask_that_comes_twice_does_nothing_the_second_time() -> None:
@@ -267,18 +259,13 @@ def test_a_mask_that_fits_nothing_is_refused_with_the_reason(
     assert in_graph(session.smoother) == before
 
 
-def test_a_refusing_graph_leaves_the_map_as_it_was() -> None:
+def test_a_keyframe_that_loses_all_is_anchored_where_it_is() -> None:
     session = Session(4)
     mask = np.ones((CAMERA.height, CAMERA.width), bool)
-    report = session.pruner(RemovalPolicy.REFUSE).prune_mask(2, mask)
-    assert "underconstrained" in report.refused
-    assert report.refused_variables.keyframe_ids.tolist() == [2]
-    assert (report.kept_reasons == KeptReason.REFUSED).all()
-    assert len(report.kept_ids) == COUNT
-    assert not session.world.keyframes[2].masked.any()
-    assert_consistent(session.world, session.smoother)
-    done = session.pruner().prune_mask(2, mask)
-    assert done.anchored_keyframes.tolist() == [2]
+    report = session.pruner().prune_mask(2, mask)
+    assert report.anchored_keyframes.tolist() == [2]
+    assert str(report) == f"{COUNT} observations removed; keyframes anchored: [2]"
+    assert session.world.keyframes[2].masked.all()
     assert_consistent(session.world, session.smoother)
 
 
@@ -309,8 +296,11 @@ def test_map_and_graph_agree_whatever_comes_first(
             keyframe_id = int(rng.choice([*world.keyframes, *world.culled]))
             mask = mask_of(session, keyframe_id, rng.permutation(COUNT)[:6])
             session.add_keyframe(np.arange(COUNT))  # what is pending goes first
-            report = session.pruner().prune_mask(keyframe_id, mask, LANDMARKS if entirely else VIEW)
+            report = session.pruner().prune_mask(keyframe_id, mask)
             assert not report.refused
+            if entirely:
+                ids = np.flatnonzero(rng.random(len(world.landmarks)) < 0.05)
+                report = session.pruner().prune_landmarks(ids)
             assert not world.landmarks.alive[report.landmark_ids].any()
             assert_consistent(world, session.smoother)
     session.add_keyframe(np.arange(COUNT))
