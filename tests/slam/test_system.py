@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,12 @@ from repository import KITCHEN
 from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Image
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
@@ -29,7 +34,7 @@ def path(count: int, start_x_m: float = -0.6) -> list[Array]:
     ]
 
 
-def factor_selection(
+def process_views(
     system: SlamSystem, poses: list[Array | None], first: int = 0
 ) -> list[FrameResult]:
     """Run the system along poses; None is a black frame without depth."""
@@ -58,7 +63,7 @@ def largest_error_m(system: SlamSystem, poses: list[Array | None]) -> float:
 
 def test_pose_agrees_with_the_truth_in_frame_unit_and_sign() -> None:
     system, poses = SlamSystem(CAMERA), path(25)
-    results = factor_selection(system, poses)
+    results = process_views(system, poses)
     assert all(r.status is TrackingStatus.OK for r in results)
     system.finish()
     assert len(system.trajectory()) == 25
@@ -71,7 +76,7 @@ def test_lost_frames_get_no_pose_and_tracking_comes_back() -> None:
     system = SlamSystem(CAMERA)
     there = path(15)
     poses = [*there, *[None] * 5, *there[5:10]]
-    results = factor_selection(system, poses)
+    results = process_views(system, poses)
     assert [r.status for r in results[15:20]] == [TrackingStatus.LOST] * 5
     assert all(r.T_world_camera is None for r in results[15:20])
     assert all(r.status is not TrackingStatus.LOST for r in results[20:])
@@ -85,12 +90,12 @@ def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
     here, elsewhere = path(12, start_x_m=-1.6), path(14, start_x_m=1.4)
     back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.03)]
     poses = [*here, *[None] * 11, *elsewhere]
-    results = factor_selection(system, poses)
+    results = process_views(system, poses)
     assert results[-1].segment == 1
     apart = system.segments()
     assert [len(apart[0]), len(apart[1])] == [12, sum(r.segment == 1 for r in results)]
     poses += [*elsewhere[::-1], *back]
-    results += factor_selection(system, poses[len(results) :], first=len(results))
+    results += process_views(system, poses[len(results) :], first=len(results))
     assert results[-1].segment == 0
     joined = system.segments()
     assert list(joined) == [0]
@@ -99,7 +104,7 @@ def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
 
 
 def test_black_frames_before_the_first_keyframe_are_lost_not_fatal() -> None:
-    results = factor_selection(SlamSystem(CAMERA), [None, None, *path(3)])
+    results = process_views(SlamSystem(CAMERA), [None, None, *path(3)])
     expected = [TrackingStatus.LOST] * 2 + [TrackingStatus.OK] * 3
     assert [r.status for r in results] == expected
     assert results[2].keyframe_reason == "first frame"
@@ -107,7 +112,7 @@ def test_black_frames_before_the_first_keyframe_are_lost_not_fatal() -> None:
 
 def test_a_frame_without_depth_is_tracked_from_the_map() -> None:
     system, poses = SlamSystem(CAMERA), path(6)
-    factor_selection(system, poses[:5])
+    process_views(system, poses[:5])
     frame = render_plane(poses[5], 5)
     blind = Frame(5, frame.timestamp_s, frame.rgb, np.full((480, 640), np.nan, np.float32))
     result = system.process(blind)
@@ -130,7 +135,7 @@ def test_features_prepared_ahead_change_nothing_and_runs_repeat() -> None:
 def test_frames_of_culled_keyframes_keep_their_poses() -> None:
     every_frame = ["keyframes.max_shared=9.0", "keyframes.min_interval_frames=1"]
     system, poses = SlamSystem(CAMERA, resolve(SystemConfig, None, every_frame)), path(16)
-    results = factor_selection(system, poses)
+    results = process_views(system, poses)
     assert len(system.mapper.world.keyframes) < sum(r.keyframe_id is not None for r in results)
     assert len(system.trajectory()) == 16
     assert largest_error_m(system, poses) < 0.003
@@ -139,7 +144,7 @@ def test_frames_of_culled_keyframes_keep_their_poses() -> None:
 def test_a_place_walked_again_needs_no_more_keyframes() -> None:
     system, there = SlamSystem(CAMERA), path(108)[::6]
     poses = [*there, *there[-2::-1]]
-    made = np.array([r.keyframe_id is not None for r in factor_selection(system, poses)])
+    made = np.array([r.keyframe_id is not None for r in process_views(system, poses)])
     assert made[: len(there)].sum() == 6
     assert not made[len(there) :].any()
     assert largest_error_m(system, poses) < 0.003
@@ -163,7 +168,7 @@ def test_a_place_walked_again_needs_no_more_keyframes() -> None:
 def test_every_option_still_tracks(override: str) -> None:
     poses = path(8)
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, [override]))
-    results = factor_selection(system, poses)
+    results = process_views(system, poses)
     system.finish()
     assert all(r.status is TrackingStatus.OK for r in results)
     assert largest_error_m(system, poses) < 0.006
@@ -173,7 +178,7 @@ def test_graph_is_saved_with_every_keyframe(tmp_path: Path) -> None:
     from bmask_slam.graph.smoother.smoother import Smoother
 
     system = SlamSystem(CAMERA)
-    factor_selection(system, path(15))
+    process_views(system, path(15))
     system.files()["graph"](tmp_path / "graph")
     estimate = Smoother.load(tmp_path / "graph").estimate()
     keyframes = system.keyframe_trajectory().poses_world_camera
@@ -191,3 +196,30 @@ def test_real_kitchen_start_is_tracked() -> None:
     assert all(r.status is not TrackingStatus.LOST for r in results)
     errors = evaluate_trajectory(system.trajectory(), sequence.groundtruth)
     assert errors.value("ate_rmse") < 0.03
+
+
+def test_depth_of_zero_is_missing_depth_and_a_stamp_must_go_forward() -> None:
+    """Frames from a caller, with a segmenter whose masks cover pixels of depth 0."""
+    frames = [render_plane(pose, i) for i, pose in enumerate(path(3))]
+    results = []
+    for missing in (0.0, np.nan):
+        system = SlamSystem(CAMERA, segmenter=WholeImage())
+        for frame in frames:
+            depth_m = np.where(np.arange(640) % 7 == 0, np.float32(missing), frame.depth_m)
+            result = system.process(replace(frame, depth_m=depth_m))
+        results.append(result.T_world_camera)
+    np.testing.assert_array_equal(*results)
+    with pytest.raises(InputError, match="not later than the frame before"):
+        system.process(frames[1])
+    assert system.process(view(path(4)[3], 3)).status is TrackingStatus.OK
+
+
+class WholeImage(NoSegmenter):
+    """Calls everything one thing."""
+
+    labels = label_set(("thing",))
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        mask = np.ones(image.shape[:2], bool)
+        found = certain(1, len(self.labels), 0.9)
+        return [Instance(mask, mask_box(mask), 1, found, 0.9, 0.9)]

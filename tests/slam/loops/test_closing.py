@@ -16,6 +16,7 @@ from bmask_slam.graph.factors.graph_update import RelativePoseErrors
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, so3_exp, transform
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.tracking.results import untracked
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -291,3 +292,26 @@ def test_keyframes_at_the_ends_of_loops_are_never_culled(monkeypatch: pytest.Mon
     assert ends & near - {0, newest.id - 1, newest.id - 2}
     assert offered
     assert not ends & set(offered)
+
+
+def test_joining_a_segment_keeps_the_closed_loops_in_the_graph() -> None:
+    """A loop that were missing there would be refuted at the next closure, and taken apart."""
+    ring = Ring()
+    assert ring.run(ONCE_ROUND + 4)
+    mapper = ring.mapper
+    before = mapper.smoother.relative_pose_errors("loop")
+    newest = max(mapper.world.keyframes.values(), key=lambda k: k.id)
+    elsewhere = se3_exp(np.array([0.2, -0.1, 0.3, 1.0, 2.0, 3.0])) @ newest.T_world_camera
+    other = add_keyframe(mapper.world, elsewhere, newest.features, segment=1)
+    keypoints, ids = mapper.world.observed(newest)
+    features = newest.features
+    seen = replace(
+        untracked(newest.T_world_camera, features), keypoints=keypoints, landmark_ids=ids
+    )
+    mapper.join(1, untracked(elsewhere, features), seen)
+    assert other.segment == 0
+    after = mapper.smoother.relative_pose_errors("loop")
+    assert len(before.chi2) >= 3
+    assert after.keyframe_a.tolist() == before.keyframe_a.tolist()
+    assert after.keyframe_b.tolist() == before.keyframe_b.tolist()
+    assert refuted(mapper) == set()
