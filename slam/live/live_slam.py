@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
-from bmask_slam import __version__
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
 from bmask_slam.features.brisk import Features
@@ -113,9 +112,8 @@ class LiveSlam:
         if options.out is None:
             return None
         folder = stack.enter_context(RunFolder(options.out, options.overwrite))
-        origin = f"bmask-slam {__version__}, {options.origin}"
-        folder.write_text("config.yaml", f"# {origin}\n{dump(self.config)}")
-        logger.info("%s: %s", origin, options.title)
+        folder.write_text("config.yaml", f"# {options.origin}\n{dump(self.config)}")
+        logger.info("%s: %s", options.origin, options.title)
         return Recorder(folder)
 
     def _open_display(self, stack: ExitStack) -> Display | None:

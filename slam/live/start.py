@@ -13,6 +13,7 @@ from bmask_slam.live.processes.dense_messages import DenseOrder
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.system import LiveSystem
+from bmask_slam.run_folder.origin import Origin
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system_config import SystemConfig
@@ -46,9 +47,9 @@ class LiveOptions:
     dense: bool = False
 
     @property
-    def origin(self) -> str:
-        """What config.yaml says about where the frames come from."""
-        return "live" if self.images == Path() else f"sequence {self.images}, stride 1"
+    def origin(self) -> Origin:
+        """The sequence folder that the frames come from, if any, for config.yaml."""
+        return Origin(None if self.images == Path() else self.images)
 
 
 def start_system(

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from bmask_slam.cli import main
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.live.start import LiveOptions
 from bmask_slam.rendering.sequence import RenderConfig
 
 FRAMES = 24
@@ -99,3 +100,11 @@ def test_a_signal_ends_it_with_everything_saved(recording, tmp_path, number) -> 
     assert 8 <= tracked == frames_written(out) < FRAMES
     assert {"map", "metrics.json", "landmarks.ply"} <= {path.name for path in out.iterdir()}
     assert read_ply(out / "dense" / "cloud.ply")["x"].size > 1000
+
+
+def test_config_yaml_of_a_live_run_names_its_folder_by_the_absolute_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert f", sequence {tmp_path / 'hall'}, stride 1" in str(
+        LiveOptions(images=Path("hall")).origin
+    )
+    assert str(LiveOptions().origin).endswith(", live")
