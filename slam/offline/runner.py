@@ -5,12 +5,8 @@ from __future__ import annotations
 import logging
 import platform
 import shlex
-import signal
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -18,70 +14,43 @@ from typing import Any
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.datasets.weights import find_weights
-from bmask_slam.evaluation import Row
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.graph.trajectory_formats import read_trajectory
-from bmask_slam.offline.checkpoint import Checkpoints, read_checkpoint
+from bmask_slam.offline.checkpoint import read_checkpoint
+from bmask_slam.offline.frame_loop import ActiveRun, RunSummary, finish_run, process_frames
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder, free_run_path
 from bmask_slam.run_folder.map_file import read_map
-from bmask_slam.run_folder.metrics import RunCounters, measure, save
 from bmask_slam.run_folder.origin import Origin
-from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.sequences import Sequence, open_sequence
-from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_interface import System
-from bmask_slam.tracking.results import FrameResult
 
 __all__ = ["RunOptions", "RunSummary", "resume", "run"]
 logger = logging.getLogger(__name__)
 
-SNAPSHOT_FRAMES = 30
-SNAPSHOT_GROWTH = 1.05
 MIN_REFERENCE_POSES = 3
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """How a run ended.
-
-    Attributes:
-        folder: the run folder.
-        rows: what metrics.json holds.
-        frames: frames given to the system.
-        skipped: frames that were broken, not counted in ``frames``.
-        stopped_by: the signal that ended the run early, or None.
-        resumable: the run can be resumed from its last checkpoint, since it was stopped.
-    """
-
-    folder: Path
-    rows: list[Row]
-    frames: int
-    skipped: int
-    stopped_by: signal.Signals | None = None
-    resumable: bool = False
 
 
 MakeSystem = Callable[[Camera, SystemConfig], System]
 
 
 def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummary:
-    """Run the system over a sequence and fill the run folder.
+    """Run the system over a sequence and write the run folder.
 
-    SIGINT and SIGTERM end it after the current frame; what was tracked so far is then finished
-    and saved like a whole run.
+    SIGINT and SIGTERM end the run after the current frame; the frames processed so far are then
+    finished and saved like a whole run.
 
     Raises:
-        InputError: a broken sequence, reference or map, or a run folder that cannot be used;
-            nothing is left behind unless frames had been tracked before.
+        InputError: a broken sequence, reference or map, or a run folder that cannot be used; a
+            folder made for this run is removed unless a frame had been processed.
     """
     sequence = open_sequence(options.sequence, camera=options.camera)
     reference = find_reference(options.reference, sequence)
@@ -92,22 +61,22 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
     ):
         describe_run(folder, options, sequence)
         system = start_system(options, sequence, make_system or _with_segmenter(options, sequence))
-        counters = RunCounters()
-        track((system, counters), sequence, folder, options, stop)
-        return conclude((system, counters), (sequence, reference), folder, options, stop)
+        active = ActiveRun(options, sequence, reference, system, folder, stop)
+        process_frames(active)
+        return finish_run(active)
 
 
 def resume(
     path: Path, given: Mapping[str, Any] | None = None, make_system: MakeSystem | None = None
 ) -> RunSummary | None:
-    """Go on with a run that was killed, from its last checkpoint; None if it is finished.
+    """Resume a killed run from its last checkpoint; None if the run is finished.
 
-    ``given`` are options (attributes of RunOptions) that the user repeats: the sequence may have
-    been moved, the others must be the run's own.
+    ``given`` are options (attributes of RunOptions) that the user repeats. The sequence may have
+    been moved; all others must be those of the run.
 
     Raises:
         InputError: there is no checkpoint, it is broken or of another version, or sequence,
-            configuration or options are not those that the run was begun with.
+            configuration or options differ from those of the run.
     """
     if (path / "metrics.json").exists() and not (path / CHECKPOINT).exists():
         return None
@@ -125,12 +94,13 @@ def resume(
             logger.warning("%s: no checkpoint was reached; starting from the beginning", path)
         for index, reason in checkpoint.skipped:
             sequence.skip(index, reason)
-        track((system, counters), sequence, folder, options, stop)
-        return conclude((system, counters), (sequence, reference), folder, options, stop)
+        active = ActiveRun(options, sequence, reference, system, folder, stop, counters)
+        process_frames(active)
+        return finish_run(active)
 
 
 def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
-    """The trajectory to compare with: a file's, a sequence folder's, or the sequence's own.
+    """The reference trajectory: of a file, of a sequence folder, or of the sequence itself.
 
     Raises:
         InputError: the given file is missing or broken, or shares no time with the sequence.
@@ -149,7 +119,7 @@ def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:
 
 
 def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> None:
-    """Write the resolved configuration, and to the log what is run, by what and where."""
+    """Write config.yaml, and log the command, the versions, the camera and the frames."""
     origin = Origin(sequence.folder, options.stride)
     folder.write_text("config.yaml", f"# {origin}\n{dump(options.config)}")
     logger.info("%s: %s", origin, shlex.join(sys.argv))
@@ -160,12 +130,12 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
     pairs = sequence.pairs
     unpaired = f"{pairs.unpaired_rgb} colour and {pairs.unpaired_depth} depth images"
     logger.info("%d frames; %s without a partner", len(sequence), unpaired)
-    for index, reason in sequence.skipped:  # found while opening, before there was a log
+    for index, reason in sequence.skipped:  # found before the log was open
         logger.info("frame %d is broken: %s", index, reason)
 
 
 def _with_segmenter(options: RunOptions, sequence: Sequence) -> MakeSystem:
-    """The real system, with the segmenter of its configuration. Raises InputError."""
+    """A maker of `SlamSystem` with the segmenter of its configuration. Raises InputError."""
     chosen = options.config.semantics.segmenter
     segmenter = (
         NoSegmenter() if options.localise else make_segmenter(chosen, sequence.folder, find_weights)
@@ -174,10 +144,10 @@ def _with_segmenter(options: RunOptions, sequence: Sequence) -> MakeSystem:
 
 
 def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSystem) -> System:
-    """The system of a new run: empty, or with the map that the options name.
+    """The system of a new run: empty, or with the map of ``options.map`` or ``localise``.
 
     Raises:
-        InputError: the map cannot be read, or is to be continued with another camera.
+        InputError: the map cannot be read, or was made with another camera.
     """
     source = options.map or options.localise
     if source is None:
@@ -186,7 +156,7 @@ def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSyste
     if options.map and camera != sequence.camera:
         raise InputError(
             f"{source}: made with {camera}, but {sequence.folder} has {sequence.camera}; a map "
-            "goes on with its own camera only (--localise takes any)"
+            "can only be continued with its own camera (--localise accepts any)"
         )
     make = MapLocalisation if options.localise else make_system
     system = make(sequence.camera, options.config)
@@ -194,123 +164,3 @@ def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSyste
     system.begin_session()
     logger.info("%s: %s keyframes", source, system.statistics()["keyframes"])
     return system
-
-
-def track(
-    progress: tuple[System, RunCounters],
-    sequence: Sequence,
-    folder: RunFolder,
-    options: RunOptions,
-    stop: StopRequest,
-) -> None:
-    """Process frames until the end, ``max_frames`` or a stop request, recording each.
-
-    The system and what is counted of it go on from where they are.
-    """
-    system, counters = progress
-    end = len(sequence)
-    if options.max_frames is not None:
-        end = min(end, options.max_frames * options.stride)
-    indices = range(0, end, options.stride)
-    begin = -(-counters.next_index // options.stride)
-    frames = sequence.frames(
-        begin * options.stride, end, options.stride, prepare=_timed(system.prepare)
-    )
-    checkpoints = Checkpoints(folder, options, sequence)
-    follow = _dense_follower(system, sequence, folder) if options.dense else None
-    start_s = time.perf_counter() - counters.wall_s
-    with (
-        closing(frames),  # type: ignore[type-var]
-        Progress(len(indices), options.quiet, begin) as bar,
-        _snapshots(system, folder, counters) as snapshot,
-    ):
-        if not counters.frames:
-            checkpoints.write(system, counters)
-        for frame, (features, features_ms) in frames:
-            result = system.process(frame, features)
-            result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
-            folder.write_frame(result)
-            counters.count(result)
-            if follow is not None:
-                follow(result)
-            counters.wall_s = time.perf_counter() - start_s
-            bar.update(result.status, counters.keyframes, counters.lost)
-            snapshot()
-            if stop.signal is not None:
-                break
-            checkpoints.after_frame(system, counters)
-        else:
-            counters.next_index = end
-            checkpoints.write(system, counters)
-    logger.info("%d frames in %.1f s", counters.frames, counters.wall_s)
-
-
-def conclude(
-    progress: tuple[System, RunCounters],
-    inputs: tuple[Sequence, Trajectory | None],
-    folder: RunFolder,
-    options: RunOptions,
-    stop: StopRequest,
-) -> RunSummary:
-    """Finish the system, measure and save; a run that was not stopped is complete then."""
-    (system, counters), (sequence, reference) = progress, inputs
-    system.finish()
-    rows = measure(system, reference, counters, options.stride)
-    title = "-".join(filter(None, (sequence.name, options.config_name)))
-    save(system, folder, rows, reference, title)
-    if options.dense:
-        from bmask_slam.dense.map_run import map_run  # noqa: PLC0415
-        from bmask_slam.dense.options import MapOptions  # noqa: PLC0415 - torch, as below
-
-        map_run(MapOptions(folder.path))
-    if stop.signal is None:
-        folder.complete()
-    skipped = sum(index < counters.next_index for index, _ in sequence.skipped)
-    resumable = stop.signal is not None and options.checkpoint_every is not None
-    return RunSummary(folder.path, rows, counters.frames, skipped, stop.signal, resumable)
-
-
-def _dense_follower(
-    system: System, sequence: Sequence, folder: RunFolder
-) -> Callable[[FrameResult], None]:
-    """Fuses keyframes on the way. Imports torch, which takes a second and 200 MB."""
-    from bmask_slam.dense.map_run import dense_follower  # noqa: PLC0415 - only for those who need it
-
-    if not isinstance(system, SlamSystem):
-        return lambda result: None
-    return dense_follower(system.mapper.world, system.semantics, sequence, folder.path)
-
-
-@contextmanager
-def _snapshots(
-    system: System, folder: RunFolder, counters: RunCounters
-) -> Iterator[Callable[[], None]]:
-    """A function, called after every frame, that saves the trajectory now and then.
-
-    It grows rarer with the trajectory, so that the cost of a frame does not grow. Whatever ends
-    the block, the trajectory is saved once more if there were any frames.
-    """
-    due = counters.frames + SNAPSHOT_FRAMES
-
-    def snapshot() -> None:
-        nonlocal due
-        if counters.frames >= due:
-            folder.write_trajectory(system.trajectory())
-            due = int(counters.frames * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
-
-    try:
-        yield snapshot
-    finally:
-        if counters.frames:
-            folder.write_trajectory(system.trajectory())
-
-
-def _timed(prepare: Callable[[Frame], Any]) -> Callable[[Frame], tuple[Any, float]]:
-    """The function with the milliseconds it took."""
-
-    def timed(frame: Frame) -> tuple[Any, float]:
-        start_s = time.perf_counter()
-        features = prepare(frame)
-        return features, 1e3 * (time.perf_counter() - start_s)
-
-    return timed

@@ -1,0 +1,189 @@
+"""The frames of one run through the system, recorded on the way, and the end of the run."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from bmask_slam.evaluation import Row
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.offline.checkpoint import Checkpoints
+from bmask_slam.offline.options import RunOptions
+from bmask_slam.run_folder.folder import RunFolder
+from bmask_slam.run_folder.metrics import RunCounters, measure, save
+from bmask_slam.runtime.progress import Progress
+from bmask_slam.runtime.stop_request import StopRequest
+from bmask_slam.sequences import Sequence
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_interface import System
+from bmask_slam.tracking.results import FrameResult
+
+logger = logging.getLogger(__name__)
+
+SNAPSHOT_FRAMES = 30
+SNAPSHOT_GROWTH = 1.05
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveRun:
+    """A run that has its system and its folder.
+
+    Attributes:
+        options: what to run, and how.
+        sequence: its frames.
+        reference: trajectory to compare with, if there is one.
+        system: what processes the frames.
+        folder: where results are written.
+        stop: says when a signal asked to end the run.
+        counters: of the frames processed so far.
+    """
+
+    options: RunOptions
+    sequence: Sequence
+    reference: Trajectory | None
+    system: System
+    folder: RunFolder
+    stop: StopRequest
+    counters: RunCounters = field(default_factory=RunCounters)
+
+    @property
+    def indices(self) -> range:
+        """Indices in the sequence of all frames of the run."""
+        end, stride = len(self.sequence), self.options.stride
+        if self.options.max_frames is not None:
+            end = min(end, self.options.max_frames * stride)
+        return range(0, end, stride)
+
+    @property
+    def remaining(self) -> range:
+        """The indices that are still to be processed."""
+        done = -(-self.counters.next_index // self.options.stride)
+        return self.indices[done:]
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """How a run ended.
+
+    Attributes:
+        folder: the run folder.
+        rows: what metrics.json holds.
+        frames: frames given to the system.
+        skipped: frames that were broken, not counted in ``frames``.
+        stopped_by: the signal that ended the run early, or None.
+        resumable: the run can be resumed from its last checkpoint, since it was stopped.
+    """
+
+    folder: Path
+    rows: list[Row]
+    frames: int
+    skipped: int
+    stopped_by: signal.Signals | None = None
+    resumable: bool = False
+
+
+def process_frames(run: ActiveRun) -> None:
+    """Process the remaining frames until the last or a stop request, and record each."""
+    system, counters, remaining = run.system, run.counters, run.remaining
+    frames = run.sequence.frames(
+        remaining.start, remaining.stop, remaining.step, prepare=_timed(system.prepare)
+    )
+    checkpoints = Checkpoints(run.folder, run.options, run.sequence)
+    fuse = _dense_follower(run) if run.options.dense else None
+    start_s = time.perf_counter() - counters.wall_s
+    done = len(run.indices) - len(remaining)
+    with (
+        closing(frames),  # type: ignore[type-var]
+        Progress(len(run.indices), run.options.quiet, done) as bar,
+        _snapshots(run) as snapshot,
+    ):
+        if not counters.frames:
+            checkpoints.write(system, counters)
+        for frame, (features, features_ms) in frames:
+            result = system.process(frame, features)
+            result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
+            run.folder.write_frame(result)
+            counters.count(result)
+            if fuse is not None:
+                fuse(result)
+            counters.wall_s = time.perf_counter() - start_s
+            bar.update(result.status, counters.keyframes, counters.lost)
+            snapshot()
+            if run.stop.signal is not None:
+                break
+            checkpoints.after_frame(system, counters)
+        else:
+            counters.next_index = run.indices.stop
+            checkpoints.write(system, counters)
+    logger.info("%d frames in %.1f s", counters.frames, counters.wall_s)
+
+
+def finish_run(run: ActiveRun) -> RunSummary:
+    """Finish the system, measure and save; a run that was not stopped is complete then."""
+    counters, options, stopped_by = run.counters, run.options, run.stop.signal
+    run.system.finish()
+    rows = measure(run.system, run.reference, counters, options.stride)
+    title = "-".join(filter(None, (run.sequence.name, options.config_name)))
+    save(run.system, run.folder, rows, run.reference, title)
+    if options.dense:
+        from bmask_slam.dense.map_run import map_run  # noqa: PLC0415 - loads torch
+        from bmask_slam.dense.options import MapOptions  # noqa: PLC0415
+
+        map_run(MapOptions(run.folder.path))
+    if stopped_by is None:
+        run.folder.complete()
+    skipped = sum(index < counters.next_index for index, _ in run.sequence.skipped)
+    resumable = stopped_by is not None and options.checkpoint_every is not None
+    return RunSummary(run.folder.path, rows, counters.frames, skipped, stopped_by, resumable)
+
+
+def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:
+    """A function that fuses keyframes into the dense map while the run goes on."""
+    from bmask_slam.dense.map_run import dense_follower  # noqa: PLC0415 - loads torch
+
+    if not isinstance(run.system, SlamSystem):
+        return lambda result: None
+    return dense_follower(
+        run.system.mapper.world, run.system.semantics, run.sequence, run.folder.path
+    )
+
+
+@contextmanager
+def _snapshots(run: ActiveRun) -> Iterator[Callable[[], None]]:
+    """A function, to be called after every frame, that saves the trajectory now and then.
+
+    The interval grows with the trajectory, so that the mean cost of a frame does not. When the
+    block ends, for whatever reason, the trajectory is saved once more if there were any frames.
+    """
+    counters = run.counters
+    due = counters.frames + SNAPSHOT_FRAMES
+
+    def snapshot() -> None:
+        nonlocal due
+        if counters.frames >= due:
+            run.folder.write_trajectory(run.system.trajectory())
+            due = int(counters.frames * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
+
+    try:
+        yield snapshot
+    finally:
+        if counters.frames:
+            run.folder.write_trajectory(run.system.trajectory())
+
+
+def _timed(prepare: Callable[[Frame], Any]) -> Callable[[Frame], tuple[Any, float]]:
+    """The function with the milliseconds it took."""
+
+    def timed(frame: Frame) -> tuple[Any, float]:
+        start_s = time.perf_counter()
+        features = prepare(frame)
+        return features, 1e3 * (time.perf_counter() - start_s)
+
+    return timed
