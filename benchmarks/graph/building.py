@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, make_pose, so3_exp, transform
 
@@ -43,7 +43,7 @@ def walls() -> Array:
     return np.array(lines, float).reshape(-1, 2, 2)
 
 
-def landmarks(per_m2: float, rng: np.random.Generator) -> tuple[Array, Array]:
+def landmarks(per_m2: float, rng: np.random.Generator) -> tuple[Array, Ints]:
     """Points (N, 3) spread over all walls, up to 0.25 m before them, and their walls (N,)."""
     ends = walls()
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
@@ -87,7 +87,7 @@ def walk(rounds: int, per_round: int, rng: np.random.Generator) -> Array:
     return np.concatenate(poses)
 
 
-def visible(T_world_camera: Array, points: Array, on_wall: Array) -> tuple[Array, Array]:
+def visible(T_world_camera: Array, points: Array, on_wall: Ints) -> tuple[Ints, Array]:
     """Rows (M,) of the points that a camera sees, and their exact measurements (M, 3)."""
     p = transform(inverse(T_world_camera), points)
     near = np.flatnonzero((p[:, 2] > RANGE_M[0]) & (p[:, 2] < RANGE_M[1]))
@@ -98,7 +98,7 @@ def visible(T_world_camera: Array, points: Array, on_wall: Array) -> tuple[Array
     return rows[free], z[free]
 
 
-def _hidden(eye: Array, points: Array, on_wall: Array) -> Array:
+def _hidden(eye: Array, points: Array, on_wall: Ints) -> Mask:
     """Whether a wall other than the point's own stands between eye (2,) and points (N, 2)."""
     ends = walls()
     a, b = ends[:, 0], ends[:, 1]
@@ -113,7 +113,7 @@ def _hidden(eye: Array, points: Array, on_wall: Array) -> Array:
         side(eye, point, a) * side(eye, point, b) < 0
     )
     crosses[np.arange(len(points)), on_wall] = False
-    return crosses.any(axis=1)
+    return np.asarray(crosses.any(axis=1))
 
 
 def _way() -> Array:

@@ -92,6 +92,7 @@ def rendered(folder: Path) -> None:
     found = system.keyframe_covariances()
     elapsed_ms = 1e3 * (time.process_time() - started_s)
     keyframes, truth = system.keyframe_trajectory(), sequence.groundtruth
+    assert truth is not None
     i, j = associate_stamps(keyframes.timestamps_s, truth.timestamps_s)
     T, T_true = keyframes.poses_world_camera[i], truth.poses_world_camera[j]
     xi = se3_log(inverse(inverse(T[0]) @ T) @ inverse(T_true[0]) @ T_true)[1:]

@@ -13,7 +13,7 @@ import dataclasses
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate, Observations
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, transform
@@ -47,7 +47,7 @@ class Feeder:
         self.poses = walk(args.keyframes)
         self.points = walls(args.landmarks, self.rng)
         self.per_keyframe, self.cull = args.observations, args.cull
-        self.known: Array = np.zeros(0, np.int64)
+        self.known: Ints = np.zeros(0, np.int64)
         self.T_last_error = np.eye(4)
 
     def update(self, k: int, estimate: GraphEstimate | None) -> GraphUpdate:
@@ -94,7 +94,7 @@ class Feeder:
         noise = se3_exp(self.rng.normal(0, [0.001] * 3 + [0.003] * 3))
         return estimate.poses_world_camera[-1] @ step @ noise
 
-    def _culled(self, estimate: GraphEstimate | None) -> Array:
+    def _culled(self, estimate: GraphEstimate | None) -> Ints:
         if estimate is None or not self.cull:
             return np.zeros(0, np.int64)
         return self.rng.choice(estimate.landmark_ids, self.cull, replace=False)

@@ -18,6 +18,7 @@ import argparse
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -44,6 +45,8 @@ def plain_cost(graph: PoseGraph) -> float:
 
 def _plain_cost_from(graph: PoseGraph) -> float:
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    between: Any
+    pose: Any
     between, pose = (
         (gtsam.BetweenFactorPose2, _pose2)
         if graph.is_planar
@@ -55,7 +58,7 @@ def _plain_cost_from(graph: PoseGraph) -> float:
         graph.edges.tolist(), graph.measurements, graph.information, strict=True
     ):
         factors.add(between(i, j, pose(T), gtsam.noiseModel.Gaussian.Information(omega)))
-    prior = gtsam.PriorFactorPose2 if graph.is_planar else gtsam.PriorFactorPose3
+    prior: Any = gtsam.PriorFactorPose2 if graph.is_planar else gtsam.PriorFactorPose3
     unit = gtsam.noiseModel.Unit.Create(3 if graph.is_planar else 6)
     factors.add(prior(0, pose(graph.poses[0]), unit))
     return float(factors.error(gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()))

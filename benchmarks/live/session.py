@@ -45,7 +45,7 @@ class Tour:
 
     def __init__(self, sequence: Sequence, frames: int, hz: float, watch: Callable[[int], None]):
         self.camera = sequence.camera
-        self.groundtruth = None
+        self.groundtruth: Trajectory | None = None
         self.counts = SourceCounts()
         self.shown: list[tuple[float, int]] = []
         self._sequence, self._frames, self._hz, self._watch = sequence, frames, hz, watch

@@ -21,7 +21,7 @@ import numpy as np
 
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
 from bmask_slam.features.descriptor_index import BITS, DescriptorIndex, IndexConfig
-from bmask_slam.graph.arrays import Array, Bits, Mask
+from bmask_slam.graph.arrays import Array, Bits, Floats, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.trajectory import associate_stamps
@@ -40,7 +40,7 @@ class View:
     """A keyframe with its true pose, and every fourth pixel of its depth."""
 
     features: Features
-    depth_m: Array
+    depth_m: Floats
     T_world_camera: Array
 
 
@@ -102,7 +102,7 @@ def overlaps(made: list[View], camera: Camera) -> Array:
     return share
 
 
-def _seen(points: Array, depth_m: Array, camera: Camera) -> Mask:
+def _seen(points: Array, depth_m: Floats, camera: Camera) -> Mask:
     """Whether points (N, 3) of a camera are in its image, where the depth is theirs within 5 %."""
     z = np.maximum(points[:, 2], 0.1)
     pixels = camera.project(np.column_stack([points[:, :2], z])) / DEPTH_STEP_PX
@@ -183,8 +183,8 @@ def main() -> None:
         rows = {"places": [asdict(s) for s in scores], "times": [asdict(t) for t in times]}
         print(json.dumps(rows, indent=1))
         return
-    for row in (*scores, *times):
-        print("  ".join(f"{k} {v:.3g}" for k, v in asdict(row).items()))
+    for values in (*map(asdict, scores), *map(asdict, times)):
+        print("  ".join(f"{k} {v:.3g}" for k, v in values.items()))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -108,7 +109,7 @@ def make(folder: Path, frames: int) -> None:
         marks.append(visible_instances(instances))
     write_lists(folder, stamps, poses)
     write_camera(folder / "camera.yaml", camera)
-    scene = SimpleNamespace(categories=("person",))
+    scene: Any = SimpleNamespace(categories=("person",))
     write_json(folder / "annotations.json", coco(marks, stamps, camera, scene))
 
 

@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,7 +43,7 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 
 ROOM = "crowded_office"
-SCENES = {
+SCENES: dict[str, dict[str, Any]] = {
     "nobody": {"people": 0},
     "1 walks": {"people": 1},
     "2 walk": {"people": 2},

@@ -26,7 +26,7 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.semantics.imperfect_masks import Errors, ImperfectSegmenter
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.rendering.annotations import OBJECTS_TRUTH
 from bmask_slam.rendering.engine.sensor import depth_sigma_m
@@ -175,7 +175,7 @@ def alignment(keyframes: list[Keyframe], truths: dict[int, Truth]) -> Array:
     return T[0] @ se3_exp(se3_log(inverse(T[0]) @ T).mean(axis=0))
 
 
-def true_categories(folder: Path, system: SlamSystem) -> Array:
+def true_categories(folder: Path, system: SlamSystem) -> Ints:
     """(I + 1,) the system's label of each instance number; 0 for the background."""
     content = json.loads((folder / "annotations.json").read_text())
     names = {c["id"]: c["name"] for c in content["categories"]}
@@ -190,7 +190,7 @@ def measure_landmarks(
     system: SlamSystem,
     truths: dict[int, Truth],
     T_truth_world: Array,
-    categories: Array,
+    categories: Ints,
     counters: RunCounters,
 ) -> None:
     """What landmarks are, by the majority of the keyframes in which they are not hidden."""
@@ -237,7 +237,7 @@ def view_label(system: SlamSystem, landmark: int) -> tuple[int, float]:
 def measure_objects(
     system: SlamSystem,
     sequence: Sequence,
-    truth: tuple[dict[int, Truth], Array, Array],
+    truth: tuple[dict[int, Truth], Array, Ints],
     counters: RunCounters,
 ) -> list[str]:
     truths, T_truth_world, categories = truth

@@ -119,7 +119,7 @@ def match_errors(first: _View, second: _View, camera: Camera) -> tuple[Array, Ar
     pairs = WindowIndex(second.features.image_pixels).pairs(truth, np.full(len(truth), WINDOW_PX))
     tables = (first.features.descriptors[rows], second.features.descriptors)
     matches = match_pairs(pairs, tables, MatchConfig())
-    rows, truth, zooms = (values[matches.query] for values in (rows, truth, zooms))
+    rows, truth, zooms = rows[matches.query], truth[matches.query], zooms[matches.query]
     start = second.features.image_pixels[matches.train]
     patches = cut_patches(first.features.gray, first.features.image_pixels[rows])
     config = SubpixelConfig()
