@@ -1,25 +1,30 @@
-"""README.md and docs/ say what is so: paths exist, commands parse, tables are the benchmark's."""
+"""README.md and docs/ are right: links, paths, commands, options, functions, rooms, results."""
 
 from __future__ import annotations
 
 import argparse
+import ast
 import re
 import shlex
 from pathlib import Path
 
 import pytest
 from repository import ROOT
+from test_layers import ROOMS
 
 from bmask_slam.cli import make_parser
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 MAX_LINES = 150
+MAX_ARCHITECTURE_LINES = 200
 MAKE_TARGET = re.compile(r"\bmake ([a-z]+)\b")
 LINK = re.compile(r"\]\(([^)]+)\)")
 CODE = re.compile(r"```.*?\n(.*?)```|`([^`\n]+)`", re.DOTALL)
 REPOSITORY_PATH = re.compile(
-    r"^(?:slam|graph|semantics|mapping|data|tests|benchmarks|docs)/[\w./]*$|^[\w]+\.(?:md|toml)$"
+    r"^(?:slam|graph|semantics|mapping|data|tests|benchmarks|docs|examples)/[\w./]*$"
+    r"|^[\w]+\.(?:md|toml)$"
 )
 
 
@@ -140,3 +145,41 @@ def test_figures_of_results_stand_nowhere_else_in_the_readme():
     example = README.partition("<!-- example:")[2].partition("<!-- end of example -->")[0]
     rest = README.replace(block(README), "").replace(example, "")
     assert not re.search(r"\d+(?:\.\d+)? ?(?:mm|cm|ms|MB|fps|Hz|°)\b", rest)
+
+
+def names_in(path: Path) -> set[str]:
+    """Functions and classes of a module, methods as Class.method."""
+    names = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
+            names.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            names |= {f"{node.name}.{m.name}" for m in node.body if isinstance(m, ast.FunctionDef)}
+            fields = [m.target for m in node.body if isinstance(m, ast.AnnAssign)]
+            names |= {f"{node.name}.{f.id}" for f in fields if isinstance(f, ast.Name)}
+    return names
+
+
+def test_the_functions_that_the_architecture_names_are_in_their_files():
+    rows = re.findall(r"^\| (Where [^|]*\?) \|(.*)\|$", ARCHITECTURE, re.MULTILINE)
+    assert len(rows) == 8
+    for question, answer in rows:
+        words = re.findall(r"`([^`]+)`", answer)
+        files = [ROOT / word for word in words if "/" in word]
+        known = set().union(*(names_in(file) for file in files))
+        missing = [word for word in words if "/" not in word and word not in known]
+        assert not missing, question
+
+
+def test_the_architecture_draws_the_rooms_as_the_layer_test_has_them():
+    picture = re.findall(r"```text\n(.*?)```", ARCHITECTURE, re.DOTALL)
+    order = picture[0].replace("<-", " ").split()
+    drawn = " ".join(picture[1].split())
+    assert order == ROOMS["the layers"].split()
+    for folder, rooms in ROOMS.items():
+        if folder != "the layers":
+            assert f"{folder} {' '.join(rooms.split())}" in drawn, folder
+
+
+def test_the_architecture_is_short():
+    assert len(ARCHITECTURE.splitlines()) <= MAX_ARCHITECTURE_LINES
