@@ -1,4 +1,4 @@
-"""Type aliases of the numpy arrays that the packages hand to each other."""
+"""Type aliases of the numpy arrays that the packages exchange, and empty ones."""
 
 from __future__ import annotations
 
@@ -15,3 +15,13 @@ Image = NDArray[np.uint8]  # colour (H, W, 3) or grey (H, W)
 Bytes = NDArray[np.uint8]  # colours of points, image patches, packed bits
 Bits = NDArray[np.uint64]  # binary descriptors, 64 bits a word
 Arrays = dict[str, NDArray[Any]]  # arrays by name, as a file holds them
+
+
+def no_ids() -> Ints:
+    """No ids (0,)."""
+    return np.zeros(0, np.int64)
+
+
+def no_pairs() -> Ints:
+    """No pairs of ids (0, 2)."""
+    return np.zeros((0, 2), np.int64)

@@ -20,7 +20,8 @@ from scipy.stats import chi2
 
 from benchmarks.graph.graph_growth import CAMERA, Feeder
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.geometry import adjoint, inverse, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 from bmask_slam.graph.trajectory import associate_stamps

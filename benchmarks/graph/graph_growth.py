@@ -15,7 +15,8 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate, Observations
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 

@@ -24,12 +24,8 @@ from matplotlib.figure import Figure
 from benchmarks.graph.building import CAMERA, landmarks, visible, walk
 from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.factors.graph_update import (
-    GraphEstimate,
-    GraphUpdate,
-    Observations,
-    RelativePose,
-)
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.smoother.smoother import Smoother

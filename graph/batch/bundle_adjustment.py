@@ -24,7 +24,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.checks import OBSERVATION_PROBABILITY, wrong_observations
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
-from bmask_slam.graph.factors.gnc import first_mu, graduate
+from bmask_slam.graph.factors.gnc import first_mu, gnc_weights
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
@@ -207,7 +207,8 @@ class _Adjuster:
             return np.zeros((0, 2), np.int64)
         steps, done = self._config.max_iterations, self._done
         before = self.stages[-1].cost_after
-        weights, _ = graduate(now, limit, first_mu(now, limit), self._config.gnc_step, steps, solve)
+        mu = first_mu(now, limit)
+        weights = gnc_weights(now, limit, mu, self._config.gnc_step, steps, solve)
         wrong = [number for number, weight in zip(numbers, weights, strict=True) if weight < 0.5]
         edges = np.array([self._tables.pose_factors[n].keyframes for n in wrong], np.int64)
         self._tables.remove_pose_factors(wrong)

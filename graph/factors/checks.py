@@ -1,7 +1,7 @@
-"""Checks of new variables and factors, each taken alone, in numpy.
+"""Checks of new variables and factors, each on its own, in numpy.
 
-A factor with its landmark behind the camera has a zero Jacobian and no error, a NaN silently
-spoils every value: what GTSAM would not see is found here.
+GTSAM does not detect these: a factor whose landmark lies behind the camera has a zero Jacobian and
+no error, and one NaN spoils every value.
 """
 
 from __future__ import annotations
@@ -15,16 +15,13 @@ from scipy.stats import chi2
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables, ValueTable
-from bmask_slam.graph.factors.graph_update import (
-    GraphUpdate,
+from bmask_slam.graph.factors.graph_estimate import (
     ObservationErrors,
-    Observations,
-    PosePrior,
     RefusalReason,
     RefusedFactor,
-    RelativePose,
     RelativePoseErrors,
 )
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, se3_log
 
@@ -34,7 +31,7 @@ _ROBUST = (None, "huber", "cauchy", "dcs")
 
 @dataclass(frozen=True)
 class Candidates:
-    """New variables with usable initial values, with everything the graph already holds."""
+    """New variables with usable initial values, and the graph as it is."""
 
     new_keyframes: Ints
     new_poses: Array
@@ -90,21 +87,14 @@ def check_pose_factors(
         if reason is None:
             good.append(factor)
         else:
-            refused.append(RefusedFactor(*describe(factor), reason))
+            refused.append(RefusedFactor(factor.kind, factor.keyframe_ids, reason))
     return tuple(good), tuple(refused)
-
-
-def describe(factor: RelativePose | PosePrior) -> tuple[str, tuple[int, ...]]:
-    """The kind ("prior" or the relative pose's) and the keyframes of a factor."""
-    if isinstance(factor, PosePrior):
-        return "prior", (factor.keyframe_id,)
-    return factor.kind, (factor.keyframe_a, factor.keyframe_b)
 
 
 def _pose_factor_reason(
     factor: RelativePose | PosePrior, candidates: Candidates
 ) -> RefusalReason | None:
-    _, ids = describe(factor)
+    ids = factor.keyframe_ids
     T = factor.T_world_camera if isinstance(factor, PosePrior) else factor.T_a_b
     if not candidates.has_keyframes(np.array(ids, np.int64)).all():
         return RefusalReason.UNKNOWN_KEYFRAME
@@ -126,7 +116,7 @@ def _pose_factor_reason(
 def check_observations(
     observations: Observations, candidates: Candidates, camera: Camera, config: SmootherConfig
 ) -> Ints:
-    """A reason (0: fine) for each observation taken alone."""
+    """A reason (0: fine) for each observation on its own."""
     z, sigmas = observations.measurements, observations.sigmas_px
     stereo = np.isfinite(z[:, 2])
     used = np.stack([stereo | True, stereo | True, stereo], axis=1)
@@ -179,7 +169,7 @@ def reprojection(
 
 
 def observation_errors(tables: FactorTables, camera: Camera) -> ObservationErrors:
-    """Chi-square of every observation at the shadow's values."""
+    """Chi-square of every observation at the current values."""
     seen = tables.observations.select(tables.observations.all_rows())
     poses = tables.keyframes.get(seen.keyframe_ids)
     points = tables.landmarks.get(seen.landmark_ids)
@@ -193,7 +183,7 @@ def wrong_observations(
 ) -> Ints:
     """Keyframe and landmark ids (N, 2) of observations beyond their chi-square bound.
 
-    3 degrees of freedom with depth, 2 without; taken without the kernel.
+    3 degrees of freedom with depth, 2 without; without the robust kernel.
     """
     errors = observation_errors(tables, camera)
     wrong = ~(errors.chi2 <= chi2.ppf(probability, np.where(errors.is_stereo, 3, 2)))
@@ -227,7 +217,7 @@ def _repeated(observations: Observations, tables: FactorTables) -> Mask:
         repeated[i] = (
             pair in seen
             or tables.observations.row(*pair) is not None
-            or tables.marginalised.holds(*pair)
+            or tables.marginalised.contains(*pair)
         )
         seen.add(pair)
     return repeated

@@ -1,9 +1,8 @@
-"""The graph in numpy: every factor by id, the current values, and each factor's place in ISAM2.
+"""The graph in numpy: every factor by id, the current values, and each factor's slot in ISAM2.
 
-ISAM2 is corrupt after a failure and cannot be saved; this can always be read, saved and made
-into a new ISAM2. It holds facts only; what may enter is decided in `graph.smoother.validation`,
-what
-must leave in `graph.smoother.removal`.
+ISAM2 is corrupt after a failure and cannot be saved; these tables can always be read, saved and
+made into a new ISAM2. What may enter is decided in `graph.smoother.validation`, what must be
+removed in `graph.smoother.removal`.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, Mask, no_ids
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.marginalised_landmarks import MarginalisedLandmarks
 
@@ -29,35 +28,42 @@ class ValueTable:
     """Sorted ids with one array value each: a pose (4, 4) or a point (3,)."""
 
     def __init__(self, *shape: int) -> None:
-        self.ids: Ints = np.zeros(0, np.int64)
+        self.ids: Ints = no_ids()
         self.values: Array = np.zeros((0, *shape))
 
-    def contains(self, ids: Ints) -> np.ndarray:
-        """Mask (N,) of the ids that are here."""
+    @classmethod
+    def of(cls, ids: Ints, values: Array) -> ValueTable:
+        """A table of sorted ids (N,) and their values (N, ...)."""
+        table = cls()
+        table.ids, table.values = ids, values
+        return table
+
+    def contains(self, ids: Ints) -> Mask:
+        """Mask (N,) of the ids that are in the table."""
         if not len(self.ids):
             return np.zeros(len(ids), bool)
         at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
         return self.ids[at] == ids
 
     def get(self, ids: Ints) -> Array:
-        """Values (N, ...) of ids that must be here."""
+        """Values (N, ...) of ids that must be in the table."""
         return self.values[np.searchsorted(self.ids, ids)]
 
     def insert(self, ids: Ints, values: Array) -> None:
-        """Add ids that must not be here yet."""
+        """Add ids that must not be in the table yet."""
         merged = np.concatenate([self.ids, np.asarray(ids, np.int64)])
         order = np.argsort(merged, kind="stable")
         self.ids = merged[order]
         self.values = np.concatenate([self.values, values])[order]
 
     def remove(self, ids: Ints) -> None:
-        """Take ids out; those that are not here are passed over."""
+        """Remove ids; those that are not in the table are ignored."""
         keep = ~np.isin(self.ids, ids)
         self.ids, self.values = self.ids[keep], self.values[keep]
 
 
 class ObservationTable:
-    """Observations in growing columns; a row number stays with its observation for life.
+    """Observations in growing columns; an observation keeps its row until it is removed.
 
     ``of_keyframe[k]`` maps landmark id to row and ``of_landmark[l]`` keyframe id to row, so
     that every removal touches only its own rows. Freed rows are used again.
@@ -68,15 +74,15 @@ class ObservationTable:
         self.of_landmark: dict[int, dict[int, int]] = {}
         self._free: list[int] = []
         self._columns = Observations()
-        self._slots: Ints = np.zeros(0, np.int64)
+        self._slots: Ints = no_ids()
         self._used = 0
 
     def __len__(self) -> int:
         return self._used - len(self._free)
 
     def add(self, observations: Observations) -> Ints:
-        """Put observations in; their rows (M,)."""
-        rows = self._take_rows(len(observations))
+        """Add observations; returns their rows (M,)."""
+        rows = self._allocate(len(observations))
         self._columns.keyframe_ids[rows] = observations.keyframe_ids
         self._columns.landmark_ids[rows] = observations.landmark_ids
         self._columns.measurements[rows] = observations.measurements
@@ -94,7 +100,7 @@ class ObservationTable:
         return rows
 
     def remove(self, rows: Ints) -> None:
-        """Take rows out; each must be in use."""
+        """Remove rows; each must be in use."""
         pairs = zip(
             self._columns.keyframe_ids[rows].tolist(),
             self._columns.landmark_ids[rows].tolist(),
@@ -122,15 +128,15 @@ class ObservationTable:
         return self._columns.select(rows)
 
     def slots(self, rows: Ints) -> Ints:
-        """Places of these rows' factors in ISAM2, NO_SLOT where there is none."""
+        """Slots of these rows' factors in ISAM2, NO_SLOT where there is none."""
         return self._slots[rows]
 
     def set_slots(self, rows: Ints, slots: Ints) -> None:
-        """Remember the places of these rows' factors in ISAM2."""
+        """Set the slots of these rows' factors in ISAM2."""
         self._slots[rows] = slots
 
     def used_rows(self) -> Ints:
-        """Every row in use, in no order that means anything."""
+        """Every row in use, in arbitrary order."""
         used = np.ones(self._used, bool)
         used[self._free] = False
         return np.flatnonzero(used)
@@ -141,7 +147,7 @@ class ObservationTable:
         columns = self._columns.select(rows)
         return rows[np.lexsort((columns.landmark_ids, columns.keyframe_ids))]
 
-    def _take_rows(self, count: int) -> Ints:
+    def _allocate(self, count: int) -> Ints:
         again = [self._free.pop() for _ in range(min(count, len(self._free)))]
         fresh = range(self._used, self._used + count - len(again))
         self._used += len(fresh)
@@ -163,28 +169,26 @@ class ObservationTable:
 
 @dataclass
 class PoseFactor:
-    """A relative pose or a prior with its place in ISAM2."""
+    """A relative pose or a prior with its slot in ISAM2."""
 
     factor: RelativePose | PosePrior
     slot: int = NO_SLOT
 
     @property
     def keyframes(self) -> tuple[int, ...]:
-        """Ids of the keyframes it touches."""
-        if isinstance(self.factor, PosePrior):
-            return (self.factor.keyframe_id,)
-        return (self.factor.keyframe_a, self.factor.keyframe_b)
+        """Ids of the keyframes it involves: one for a prior, else two."""
+        return self.factor.keyframe_ids
 
     @property
     def is_prior(self) -> bool:
-        """Whether it fixes a keyframe in the world."""
+        """Whether it is a prior on a keyframe."""
         return isinstance(self.factor, PosePrior)
 
 
 class FactorTables:
     """Values, observations and pose factors (relative poses and priors, by running number).
 
-    Observations of retired landmarks are in the archive; the pose factors stand for them.
+    Observations of marginalised landmarks are in ``marginalised``; pose factors replace them.
     """
 
     def __init__(self) -> None:
@@ -201,7 +205,7 @@ class FactorTables:
         return len(self.observations) + len(self.pose_factors)
 
     def add_pose_factors(self, factors: Iterable[RelativePose | PosePrior]) -> list[int]:
-        """Put relative poses and priors in; their numbers."""
+        """Add relative poses and priors; returns their numbers."""
         numbers = []
         for factor in factors:
             number = self._next_number
@@ -213,7 +217,7 @@ class FactorTables:
         return numbers
 
     def remove_pose_factors(self, numbers: Iterable[int]) -> None:
-        """Take relative poses and priors out."""
+        """Remove relative poses and priors."""
         for number in numbers:
             for keyframe in self.pose_factors.pop(number).keyframes:
                 others = self.pose_factors_of[keyframe]
@@ -222,8 +226,13 @@ class FactorTables:
                     del self.pose_factors_of[keyframe]
 
     def numbers_of_keyframes(self, ids: Iterable[int]) -> list[int]:
-        """Numbers of the pose factors that touch these keyframes, ascending."""
+        """Numbers of the pose factors that involve these keyframes, ascending."""
         return sorted(set().union(*(self.pose_factors_of.get(k, set()) for k in ids)))
+
+    def relative_poses(self, kind: str) -> tuple[RelativePose, ...]:
+        """The relative poses of a kind, in the order in which they were added."""
+        factors = (entry.factor for _, entry in sorted(self.pose_factors.items()))
+        return tuple(f for f in factors if isinstance(f, RelativePose) and f.kind == kind)
 
 
 def _discard(index: dict[int, dict[int, int]], first: int, second: int) -> None:

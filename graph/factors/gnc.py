@@ -18,23 +18,23 @@ def truncated_weights(chi_squares: Array, limit: float, mu: float) -> Array:
 def first_mu(chi_squares: Array, limit: float) -> float:
     """The mu at which the cost is convex for residuals up to the largest (Yang et al., remark 5).
 
-    Only where one of them is beyond the limit; else no weight would differ from 1.
+    Only if one of them is beyond the limit; otherwise no weight would differ from 1.
     """
     return limit / (2 * float(chi_squares.max()) - limit)
 
 
-def graduate(
+def gnc_weights(
     chi_squares: Array,
     limit: float,
     mu: float,
     step: float,
     max_iterations: int,
     solve: Callable[[Array], Array],
-) -> tuple[Array, Array]:
-    """Weights (M,) that end at 0 or 1, and the chi-squares (M,) that go with them.
+) -> Array:
+    """Weights (M,), each 0 or 1 at convergence.
 
-    ``solve`` takes weights, moves the solution and returns the new chi-squares. mu grows by
-    ``step`` until every weight is decided.
+    ``solve`` takes weights, updates the solution and returns the new chi-squares. mu grows by
+    ``step`` until every weight is close to 0 or 1.
     """
     weights = np.ones(len(chi_squares))
     for _ in range(max_iterations):
@@ -43,4 +43,4 @@ def graduate(
         if ((weights < 1e-3) | (weights > 1 - 1e-3)).all():
             break
         mu *= step
-    return weights, chi_squares
+    return weights

@@ -1,12 +1,13 @@
-"""Arrays to GTSAM factors and values, and values back to arrays.
+"""Arrays to GTSAM factors, noise models and values, and values back to arrays.
 
 GTSAM's stereo measurement is (u_left, u_right, v); ours is (u_left, v, u_right), as in
-``Camera.project_stereo``. The change of order is made here and nowhere else.
+``Camera.project_stereo``. The order is changed here and nowhere else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -15,7 +16,6 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
-from bmask_slam.graph.factors.noise import pixel_noises, pose_noise
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import make_pose
 
@@ -104,9 +104,52 @@ def make_values(
 def read_values(values: gtsam.Values) -> tuple[Array, Array]:
     """All poses (K, 4, 4) and all points (L, 3), each in the order of ascending ids.
 
-    GTSAM's bulk read: a third of the time of one call a variable.
+    GTSAM's bulk read takes a third of the time of one call a variable.
     """
     rows = np.asarray(gtsam.utilities.extractPose3(values)).reshape(-1, 12)
     poses = make_pose(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
     points = np.ascontiguousarray(gtsam.utilities.extractPoint3(values))
     return poses, points.reshape(-1, 3)
+
+
+def pixel_noises(sigmas_px: Array, huber_k: float | None) -> list[gtsam.noiseModel.Base]:
+    """A model for each row of sigmas, shared between equal rows.
+
+    Rows are (u, v) for a monocular factor, or (u_left, v, disparity) for a stereo factor, whose
+    error is (u_left, u_right, v). The errors of disparity and keypoint are independent, so that
+    u_right = u_left - disparity has both:
+    cov(u_left, u_right) = [[s_u^2, s_u^2], [s_u^2, s_u^2 + s_d^2]].
+    ``huber_k`` is the whitened error at which Huber's kernel starts; None: no kernel.
+    """
+    if not len(sigmas_px):
+        return []
+    distinct, which = np.unique(sigmas_px, axis=0, return_inverse=True)
+    models: list[gtsam.noiseModel.Base] = [_pixel_noise(*row) for row in distinct.tolist()]
+    if huber_k is not None:
+        kernel = gtsam.noiseModel.mEstimator.Huber.Create(huber_k)
+        models = [gtsam.noiseModel.Robust.Create(kernel, model) for model in models]
+    return [models[i] for i in which.ravel().tolist()]
+
+
+def _pixel_noise(u: float, v: float, disparity: float | None = None) -> gtsam.noiseModel.Base:
+    if disparity is None:
+        return gtsam.noiseModel.Diagonal.Sigmas(np.array([u, v]))
+    covariance = np.array([[u**2, u**2, 0], [u**2, u**2 + disparity**2, 0], [0, 0, v**2]])
+    return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+
+def pose_noise(covariance: Array, robust: str | None, k: float) -> gtsam.noiseModel.Base:
+    """A full (6, 6) model of the tangent ``[rad, m]``, with or without a robust kernel.
+
+    ``robust`` is None, "huber", "cauchy" or "dcs"; ``k`` the whitened error above which the
+    kernel takes effect. DCS (dynamic covariance scaling) compares its constant with the SQUARED
+    error, so it is given k^2.
+    """
+    model = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    estimators = gtsam.noiseModel.mEstimator
+    kernels: dict[str, Any] = {
+        "huber": lambda: estimators.Huber.Create(k),
+        "cauchy": lambda: estimators.Cauchy.Create(k),
+        "dcs": lambda: estimators.DCS.Create(k * k),
+    }
+    return model if robust is None else gtsam.noiseModel.Robust.Create(kernels[robust](), model)

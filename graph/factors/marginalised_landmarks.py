@@ -1,12 +1,13 @@
-"""What retired landmarks leave behind: their observations, and what stands for them meanwhile.
+"""Marginalised landmarks: their observations, and the factors that replace them in the graph.
 
-A chunk is a set of observations that left the graph together, and the relative poses (kind
-"marginal") that stand for them. A landmark that is out has a summary: one observation in one
-keyframe that says all that is known of it while the poses are held.
+A chunk is a set of observations that were marginalised together, and the relative poses (kind
+MARGINAL) that replace them. A marginalised landmark has a summary: one observation in one keyframe
+that says all that is known of it given the poses.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -15,17 +16,21 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.factors.graph_update import Observations
 
-MARGINAL = "marginal"
+_Index = defaultdict[int, set[int]]
+
+
+def _index() -> _Index:
+    return defaultdict(set)
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Observations that left together.
+    """Observations that were marginalised together.
 
     Attributes:
         observations: as they were in the graph.
         is_summary: (M,) those that were themselves summaries of earlier chunks.
-        numbers: of the pose factors in the shadow that stand for them.
+        numbers: of the pose factors that replace them.
     """
 
     observations: Observations
@@ -44,37 +49,38 @@ class Summary:
 
 @dataclass
 class MarginalisedLandmarks:
-    """Chunks by number, and the summary of every landmark that is out or came back.
+    """Chunks by number, and the summary of every landmark that is out of the graph or came back.
 
     Attributes:
         summaries: of landmarks that are out of the graph.
         returned: of landmarks that came back with it as an observation.
-        bases: keyframes that the relative poses of others go to (`graph.marginals.sparsification`).
-        observers: keyframes of each landmark's archived observations, summaries not counted.
+        bases: keyframes that the relative poses of others refer to
+            (`graph.marginals.sparsification`).
+        observers: keyframes of each landmark's marginalised observations, without summaries.
     """
 
     chunks: dict[int, Chunk] = field(default_factory=dict)
     summaries: dict[int, Summary] = field(default_factory=dict)
     returned: dict[int, Summary] = field(default_factory=dict)
     bases: set[int] = field(default_factory=set)
-    observers: dict[int, set[int]] = field(default_factory=dict)
+    observers: _Index = field(default_factory=_index)
     next_number: int = 0
-    _of_landmark: dict[int, set[int]] = field(default_factory=dict)
-    _of_keyframe: dict[int, set[int]] = field(default_factory=dict)
+    _of_landmark: _Index = field(default_factory=_index)
+    _of_keyframe: _Index = field(default_factory=_index)
 
-    def put(self, chunk: Chunk, number: int) -> None:
-        """Take a chunk in, under ``next_number`` or the number that it had."""
+    def add(self, chunk: Chunk, number: int) -> None:
+        """Add a chunk, under ``next_number`` or the number that it had before."""
         self.next_number = max(self.next_number, number + 1)
         self.chunks[number], seen = chunk, chunk.observations
         for landmark in np.unique(seen.landmark_ids).tolist():
-            self._of_landmark.setdefault(landmark, set()).add(number)
+            self._of_landmark[landmark].add(number)
         for keyframe in np.unique(seen.keyframe_ids).tolist():
-            self._of_keyframe.setdefault(keyframe, set()).add(number)
+            self._of_keyframe[keyframe].add(number)
         for keyframe, landmark in _pairs(chunk):
-            self.observers.setdefault(landmark, set()).add(keyframe)
+            self.observers[landmark].add(keyframe)
 
-    def take(self, number: int) -> Chunk:
-        """Take a chunk out."""
+    def remove(self, number: int) -> Chunk:
+        """Remove a chunk and return it."""
         chunk = self.chunks.pop(number)
         for landmark in np.unique(chunk.observations.landmark_ids).tolist():
             self._of_landmark[landmark].discard(number)
@@ -86,22 +92,19 @@ class MarginalisedLandmarks:
 
     def chunks_with(self, keyframes: Iterable[int], landmarks: Iterable[int]) -> list[int]:
         """Numbers of the chunks with any of these, ascending."""
-        nothing: set[int] = set()
-        return sorted(
-            nothing.union(
-                *(self._of_keyframe.get(k, nothing) for k in keyframes),
-                *(self._of_landmark.get(j, nothing) for j in landmarks),
-            )
-        )
+        found: set[int] = set()
+        for index, ids in ((self._of_keyframe, keyframes), (self._of_landmark, landmarks)):
+            found.update(*(index.get(i, ()) for i in ids))
+        return sorted(found)
 
     def newest_with(self, landmark: int) -> int:
-        """Number of the last chunk that holds observations of a landmark; -1 for none."""
+        """Number of the last chunk that has observations of a landmark; -1 for none."""
         return max(self._of_landmark.get(landmark, ()), default=-1)
 
-    def holds(self, keyframe: int, landmark: int) -> bool:
-        """Whether this observation is archived; it must not enter the graph a second time.
+    def contains(self, keyframe: int, landmark: int) -> bool:
+        """Whether this observation was marginalised; it must not enter the graph a second time.
 
-        Not said of the keyframe of the landmark's summary, where that observation enters.
+        False in the keyframe of the landmark's summary, where the summary itself enters.
         """
         summary = self.summaries.get(landmark)
         if summary is not None and summary.keyframe_id == keyframe:

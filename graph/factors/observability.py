@@ -1,4 +1,4 @@
-"""What holds a variable: a landmark by its views, a keyframe by a chain of landmarks to a prior."""
+"""Which variables are constrained: landmarks by their views, keyframes by a chain to a prior."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 
 Edges = Sequence[tuple[int, ...]]
-"""Keyframes of pose factors: one id for a prior, two for a relative pose."""
+"""Keyframe ids of pose factors: one for a prior, two for a relative pose."""
 
 
 def constrained_landmarks(
@@ -24,8 +24,8 @@ def constrained_landmarks(
 ) -> Ints:
     """Sorted ids of the landmarks that these observations alone constrain.
 
-    ``poses_world_camera`` (M, 4, 4) and ``points_world`` (M, 3) belong to the observations row
-    by row, in any order. The parallax is the angle between the ray from a landmark's first
+    ``poses_world_camera`` (M, 4, 4) and ``points_world`` (M, 3) are those of each observation, in
+    any order. The parallax is the angle between the ray from a landmark's first
     keyframe and any other: at least half of the largest angle between any two.
     """
     stereo = np.isfinite(observations.measurements[:, 2])
@@ -48,17 +48,18 @@ def constrained_landmarks(
 def loose_keyframes(
     ids: Ints,
     observations: Observations,
-    values: tuple[Array, Array],
+    poses_world_camera: Array,
+    points_world: Array,
     edges: Edges,
     config: SmootherConfig,
 ) -> Ints:
-    """Those of the sorted ids (K,) that nothing ties firmly to a prior.
+    """Those of the sorted ids (K,) that are not firmly connected to a prior.
 
-    Grown from the priors: a keyframe joins by a relative pose to a firm one, or by
-    ``min_shared_observations`` landmarks that the firm ones see. A landmark counts if they
-    know its place, or if the keyframe itself measures its depth: one that is monocular in all
-    views would leave the scale open. ``values`` are the poses (M, 4, 4) and points (M, 3) of
-    the observations, row by row.
+    Grown from the priors: a keyframe is firm by a relative pose to a firm one, or by
+    ``min_shared_observations`` landmarks that firm ones observe. A landmark counts if the firm
+    ones constrain it, or if the keyframe itself measures its depth: one that is monocular in all
+    views would leave the scale open. Poses (M, 4, 4) and points (M, 3) are those of each
+    observation.
     """
     keyframe = np.searchsorted(ids, observations.keyframe_ids)
     names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
@@ -74,7 +75,10 @@ def loose_keyframes(
         known[landmark[inside & stereo]] = True
         rest = np.flatnonzero(inside & ~known[landmark])
         by_rays = constrained_landmarks(
-            observations.select(rest), values[0][rest], values[1][rest], config.min_parallax_deg
+            observations.select(rest),
+            poses_world_camera[rest],
+            points_world[rest],
+            config.min_parallax_deg,
         )
         known[np.searchsorted(names, by_rays)] = True
         counts = known[landmark] | (stereo & seen[landmark])
@@ -86,10 +90,10 @@ def loose_keyframes(
         firm = now
 
 
-def firm_parts(ids: Ints, observations: Observations, edges: Edges, minimum: int) -> Ints:
-    """The number (K,) of the part of the sorted ids that each is in, by firm links alone.
+def firm_components(ids: Ints, observations: Observations, edges: Edges, minimum: int) -> Ints:
+    """The number (K,) of the component that each of the sorted ids is in, by firm links alone.
 
-    A link is a relative pose between two of them, or ``minimum`` landmarks that both see and
+    A link is a relative pose between two of them, or ``minimum`` landmarks that both observe and
     whose depth one of them measures.
     """
     stereo = np.isfinite(observations.measurements[:, 2])
@@ -106,7 +110,7 @@ def firm_parts(ids: Ints, observations: Observations, edges: Edges, minimum: int
 
 
 def component_labels(ids: Ints, observations: Observations, edges: Edges) -> Ints:
-    """The number (K,) of the connected part that each of the sorted ids is in."""
+    """The number (K,) of the connected component that each of the sorted ids is in."""
     names, landmark = np.unique(observations.landmark_ids, return_inverse=True)
     pairs = np.array([edge for edge in edges if len(edge) == 2], np.int64).reshape(-1, 2)
     starts = np.searchsorted(ids, np.concatenate([observations.keyframe_ids, pairs[:, 0]]))
@@ -126,5 +130,5 @@ def shared_landmarks(ids: Ints, observations: Observations) -> csr_array:
 
 
 def diagonal_covariance(sigma_rotation_rad: float, sigma_translation_m: float) -> Array:
-    """A (6, 6) covariance with equal sigmas for the three rotations and the three shifts."""
+    """A (6, 6) covariance with one sigma for all rotations and one for all translations."""
     return np.diag([sigma_rotation_rad**2] * 3 + [sigma_translation_m**2] * 3)

@@ -1,4 +1,4 @@
-"""The smoother's settings, apart from the class so that the numpy-only modules can read them."""
+"""The smoother's settings, apart from its class so that they can be read without GTSAM."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ class SmootherConfig:
         relinearize_threshold: change of a variable (rad, m) above which ISAM2 linearises anew.
         relinearize_skip: ISAM2 looks for such variables every so many updates.
         extra_iterations: further ISAM2 updates without new factors after each update.
-        robust: Huber's kernel on observations; off, factors are plain Gaussian.
+        robust: Huber's kernel on observations; without, factors are plain Gaussian.
         huber_stereo, huber_mono: where the kernel starts, in standard deviations: the square
             roots of the 95 % chi-square bounds with 3 and 2 degrees of freedom.
-        robust_pose_k: the same for a relative pose that asks for a kernel (6 degrees).
+        robust_pose_k: the same for a relative pose with a kernel (6 degrees).
         gate_sigmas: an observation whose reprojection error at the initial values is larger
-            is refused. Generous: a landmark seen once has a depth sigma of z^2/bf pixels of
+            is refused. Generous: a landmark observed once has a depth sigma of z^2/bf pixels of
             disparity noise, which from 30 degrees aside is tens of pixels; Huber does the rest.
         max_disparity_ratio: a stereo observation of a new landmark whose disparity is more
             than so many times that of the initial values is refused: at 2 a Gauss-Newton step
-            throws the landmark behind the camera, z (2 - d_measured / d).
-        min_depth_m, max_range_m: z-depth at which an observed landmark may be.
+            moves the landmark behind the camera, z (2 - d_measured / d).
+        min_depth_m, max_range_m: allowed z-depth of an observed landmark.
         min_parallax_deg: angle between two viewing rays that a landmark without any stereo
             observation needs.
-        min_shared_observations: landmarks known to the graph that a keyframe without a prior
-            or relative pose must observe.
+        min_shared_observations: landmarks of the graph that a keyframe without a prior or
+            relative pose must observe.
         prior_sigma_rotation_rad, prior_sigma_translation_m: of the prior on the first pose.
-        bridge_sigma_rotation_rad, bridge_sigma_translation_m: of the loose relative pose that
-            holds a keyframe when a removal took its support.
-        marginal_keyframes: landmarks that retire in one update are split into groups that so
-            many keyframes see; each group becomes relative poses of its own.
-        base_share: a keyframe that shares a smaller part of its retired landmarks with any
+        anchor_sigma_rotation_rad, anchor_sigma_translation_m: of the weak between factor that
+            holds a keyframe which a removal left underconstrained.
+        marginal_keyframes: landmarks that are marginalised in one update are split into groups
+            observed by at most so many keyframes; each group becomes relative poses of its own.
+        base_share: a keyframe that shares a smaller part of its marginalised landmarks with any
             base becomes one (`graph.marginals.sparsification`).
-        max_recoveries: attempts to rebuild after failures before the update is given up.
+        max_repairs: attempts to rebuild after failures before the update is given up.
     """
 
     relinearize_threshold: float = 0.003

@@ -1,10 +1,10 @@
 """Marginal covariances of many variables from one factorisation of the graph.
 
-ISAM2 can be asked too, but walks its tree anew for each variable and is linearised where each
-variable last was; here everything is linearised at the current values. A robust kernel enters by
-its weight at these values, so an observation that the kernel holds for an outlier says little:
-the covariance is that of the weighted least-squares problem at the optimum. It knows only the
-noise that the factors state, no errors of calibration and no wrong matches.
+ISAM2 gives them too, but traverses its tree for each variable and is linearised at older values;
+here everything is linearised at the current ones. A robust kernel enters by its weight at these
+values, so that outliers add little information: the covariance is that of the weighted
+least-squares problem at the optimum. It contains only the noise that the factors state, no errors
+of calibration and no wrong matches.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
 
 
 @dataclass(frozen=True)
 class Marginals:
-    """Covariances of keyframes and landmarks, each for itself.
+    """Marginal covariances of keyframes and landmarks.
 
     Attributes:
         keyframe_ids: (K,) int64.
         keyframes: (K, 6, 6) of ``[rotation rad, translation m]`` on the right side: the true
-            pose is about ``T_world_camera @ se3_exp(xi)``, xi ~ N(0, covariance). The world is
-            where the prior holds it (the first keyframe of each part of the graph), so these
-            grow with the path from there.
+            pose is about ``T_world_camera @ se3_exp(xi)``, xi ~ N(0, covariance). The prior on the
+            first keyframe of each component fixes the world, so these grow with the path from
+            there.
         landmark_ids: (L,) int64.
         landmarks: (L, 3, 3) of points_world in metres.
     """
 
     keyframe_ids: Ints
     keyframes: Array
-    landmark_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    landmark_ids: Ints = field(default_factory=no_ids)
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
 

@@ -1,4 +1,4 @@
-"""Landmarks marginalised out: what their observations say about the poses alone.
+"""Elimination of landmarks: what their observations say about the poses alone.
 
 The observations are linearised at the current values with the weights of Huber's kernel there.
 With ``xi`` the poses' tangents on the right side and ``dp`` the points' shifts in the world, the
@@ -14,12 +14,13 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.factor_tables import ValueTable
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, skew
 
 _POINT_FLOOR_PER_M2 = 1e-6
-"""Information added to each point, that of a sigma of 1 km: keeps a flat one invertible."""
+"""Information added to each point, that of a sigma of 1 km, so that it is invertible."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class PoseInformation:
 
 @dataclass(frozen=True)
 class PointInformation:
-    """What the observations say of each landmark while the poses stay where they are.
+    """What the observations say of each landmark given the poses.
 
     Attributes:
         landmark_ids: (L,) sorted.
@@ -64,7 +65,7 @@ def linearise(
 ) -> tuple[Array, Array, Array]:
     """Residuals (M, 3) of u, v, disparity and their Jacobians, whitened and robustly weighted.
 
-    Poses (M, 4, 4) and points (M, 3) belong to the observations row by row. Returns r,
+    Poses (M, 4, 4) and points (M, 3) are those of each observation. Returns r,
     J_pose (M, 3, 6) and J_point (M, 3, 3); a monocular row's third line is zero.
     """
     T_camera_world = inverse(poses_world_camera)
@@ -103,21 +104,21 @@ def _huber_weights(r: Array, stereo: Array, config: SmootherConfig) -> Array:
 
 def eliminate_points(
     observations: Observations,
-    keyframes: tuple[Ints, Array],
-    landmarks: tuple[Ints, Array],
+    keyframes: ValueTable,
+    landmarks: ValueTable,
     camera: Camera,
     config: SmootherConfig,
 ) -> tuple[PoseInformation, PointInformation]:
     """The observations' information on the poses, and what is left on each landmark given them.
 
-    Together they are the whole: p(poses, points) = p(poses) p(points | poses). ``keyframes``
-    and ``landmarks`` are sorted ids with values, and hold every observed one.
+    p(poses, points) = p(poses) p(points | poses). ``keyframes`` and ``landmarks`` contain all
+    that are observed.
     """
-    (ids, poses), (landmark_ids, points) = keyframes, landmarks
-    row = np.searchsorted(ids, observations.keyframe_ids)
-    column = np.searchsorted(landmark_ids, observations.landmark_ids)
+    poses, points = keyframes.values, landmarks.values
+    row = np.searchsorted(keyframes.ids, observations.keyframe_ids)
+    column = np.searchsorted(landmarks.ids, observations.landmark_ids)
     r, J_pose, J_point = linearise(observations, poses[row], points[column], camera, config)
-    count, points_count = len(ids), len(landmark_ids)
+    count, points_count = len(poses), len(points)
     J_pose_T, J_point_T = np.swapaxes(J_pose, 1, 2), np.swapaxes(J_point, 1, 2)
     H_point = np.zeros((points_count, 3, 3))
     np.add.at(H_point, column, J_point_T @ J_point)
@@ -137,4 +138,6 @@ def eliminate_points(
     H -= (flat @ flat.T).reshape(H.shape)
     g -= (flat @ np.einsum("lji,lj->li", root, g_point).ravel()).reshape(g.shape)
     moved = points - (covariances @ g_point[:, :, None])[:, :, 0]
-    return PoseInformation(ids, poses, H, g), PointInformation(landmark_ids, covariances, moved)
+    return PoseInformation(keyframes.ids, poses, H, g), PointInformation(
+        landmarks.ids, covariances, moved
+    )

@@ -1,4 +1,4 @@
-"""Dense information on poses, replaced by a tree of relative poses: nonlinear factor recovery.
+"""Nonlinear factor recovery: dense information on poses, replaced by a tree of relative poses.
 
 Mazuran, Burgard and Tipaldi, "Nonlinear factor recovery for long-term SLAM", IJRR 2016: of all
 graphs of relative poses with a given topology, the one nearest to the dense Gaussian in
@@ -6,12 +6,12 @@ Kullback-Leibler divergence. On a tree the solution is closed: each edge's covar
 dense one's marginal of that relative pose, and the divergence grows with the sum of their log
 det, by which the tree is chosen (Chow and Liu 1968).
 
-Which trees are allowed decides what a long session costs. The best tree is a chain from
-keyframe to keyframe, and chains of many visits make a wide graph, in which errors add up over
-every link. Here a few keyframes are **bases**: between them the best tree, and every other
-keyframe hangs on one base. So the graph's core grows with the space that was seen, not with
-time, and long ways have few links. A keyframe becomes a base when it shares too few of its
-landmarks with any; one that comes back to a known place needs no new one.
+The allowed trees decide the cost of a long session. The best tree is a chain from keyframe to
+keyframe, and chains of many visits make a wide graph, in which errors add up over every link. Here
+a few keyframes are **bases**: the best tree connects them, and every other keyframe is connected to
+one base. So the graph's core grows with the space that was observed, not with time, and long paths
+have few links. A keyframe becomes a base when it shares too few of its landmarks with any; one that
+comes back to a known place needs no new one.
 """
 
 from __future__ import annotations
@@ -21,27 +21,26 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.factors.graph_update import RelativePose
-from bmask_slam.graph.geometry import inverse, se3_exp, skew
+from bmask_slam.graph.geometry import adjoint, inverse, se3_exp
 from bmask_slam.graph.marginals.point_elimination import PoseInformation
 
 _KNOWN_SIGMAS = np.array([0.05] * 3 + [0.1] * 3)
-"""How well (rad, m) the poses are known to each other without what is made sparse. Some poses
-hang on one or two of the landmarks; taken alone these would allow any pose, far from where the
-linearisation holds. So what the observations add to this is made sparse, and this is taken off
-again."""
+"""How well (rad, m) the relative poses are known without the marginalised observations. Some poses
+observe only one or two of the landmarks, which alone would allow any pose, far from where the
+linearisation holds. So this information is added before, and subtracted from the result."""
 _FAR = 3.0
-"""In those sigmas: how far from its present value a relative pose may be measured; farther, the
-linearisation means nothing, and part of the gradient is given up."""
+"""Largest distance, in those sigmas, of a measured relative pose from its current value; farther,
+the linearisation does not hold, and part of the gradient is lost."""
 _LEAST = 1.0
-"""Information (rad^-2, m^-2) that makes every covariance finite; an edge with less is left out."""
+"""Information (rad^-2, m^-2) that makes every covariance finite; an edge with less is omitted."""
 
 
 def recover(information: PoseInformation, edges: Ints, kind: str) -> list[RelativePose]:
-    """Relative poses on a tree (E, 2) of rows that stand for the dense information.
+    """Relative poses on a tree (E, 2) of rows that replace the dense information.
 
-    Their gradient at the linearisation is that of the dense cost, so that a graph at its optimum
-    stays there when these replace the observations; but no relative pose is measured farther
-    from its present value than ``_FAR`` times how well poses are known anyway.
+    Their gradient at the linearisation point is that of the dense cost, so that a graph at its
+    optimum stays there when these replace the observations; but no measurement differs from the
+    current relative pose by more than ``_FAR`` times ``_KNOWN_SIGMAS``.
     """
     count, poses = len(information.keyframe_ids), information.poses_world_camera
     anchor, covariance = _anchored(information)
@@ -70,7 +69,7 @@ def recover(information: PoseInformation, edges: Ints, kind: str) -> list[Relati
 
 
 def spanning_tree(information: PoseInformation, is_base: Mask) -> Ints:
-    """Pairs of rows (K - 1, 2): the best tree between bases, all others on their best base."""
+    """Pairs of rows (K - 1, 2): the best tree of bases, and each other pose with its best base."""
     count = len(is_base)
     _, covariance = _anchored(information)
     a, b = np.triu_indices(count, 1)
@@ -87,8 +86,8 @@ def spanning_tree(information: PoseInformation, is_base: Mask) -> Ints:
 def with_new_bases(shared: Ints, is_base: Mask, share: float) -> Mask:
     """Bases (K,) bool such that each pose shares enough of its landmarks with one.
 
-    ``shared`` (K, K) counts common landmarks. Of those left over, the one that covers most of
-    them comes next.
+    ``shared`` (K, K) counts common landmarks. Of the poses left over, the one that covers most of
+    them becomes the next base.
     """
     is_base = is_base.copy()
     enough = shared >= share * np.diag(shared)[:, None]
@@ -98,19 +97,10 @@ def with_new_bases(shared: Ints, is_base: Mask, share: float) -> Mask:
     return is_base
 
 
-def adjoint(T: Array) -> Array:
-    """Adjoints (..., 6, 6): ``T se3_exp(xi) T^-1 = se3_exp(adjoint(T) xi)``, xi [rad, m]."""
-    R, t = T[..., :3, :3], T[..., :3, 3]
-    Ad = np.zeros((*T.shape[:-2], 6, 6))
-    Ad[..., :3, :3] = Ad[..., 3:, 3:] = R
-    Ad[..., 3:, :3] = skew(t) @ R
-    return Ad
-
-
 def _anchored(information: PoseInformation) -> tuple[int, Array]:
-    """The best known pose, and the covariance (K, 6, K, 6) of all while it is held.
+    """The best known pose, and the covariance (K, 6, K, 6) of all poses with this one fixed.
 
-    Exact for everything relative, since moving all poses together costs nothing.
+    Exact for relative poses, since the cost does not depend on the world frame.
     """
     count = len(information.keyframe_ids)
     anchor = int(np.argmax(np.einsum("kiki->k", information.H)))
@@ -125,7 +115,7 @@ def _anchored(information: PoseInformation) -> tuple[int, Array]:
 
 
 def _known(count: int, anchor: int) -> Array:
-    """The same covariance without any observation."""
+    """The same covariance without the observations."""
     covariance = np.zeros((count, 6, count, 6))
     others = np.delete(np.arange(count), anchor)
     covariance[others, :, others] = np.diag(_KNOWN_SIGMAS**2)

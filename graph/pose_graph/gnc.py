@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.stats import chi2
 
 from bmask_slam.graph.arrays import Array, Mask
-from bmask_slam.graph.factors.gnc import first_mu, graduate
+from bmask_slam.graph.factors.gnc import first_mu, gnc_weights
 from bmask_slam.graph.pose_graph.loop_consistency import LoopSupport
 from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, is_connected
@@ -109,10 +109,9 @@ class _Search:
             return solver.chi_squares()[loops]
 
         mu = first_mu(chi_squares, self.limit)
-        of_loops, _ = graduate(
+        weights[loops] = gnc_weights(
             chi_squares, self.limit, mu, config.gnc_step, config.max_iterations, solve
         )
-        weights[loops] = of_loops
         return weights > 0.5
 
 

@@ -1,20 +1,26 @@
-"""What holds a keyframe that factors hold no more: a loose bridge to a neighbour, or a prior.
+"""Anchors: weak between factors and priors that hold underconstrained keyframes.
 
-A keyframe that no chain of shared landmarks ties to a prior is bridged to the neighbour that
-shared most with it; a part of the graph without any prior gets one at its current estimate. A
-bridge leaves again when other factors hold its keyframe.
+A keyframe that no chain of shared landmarks connects to a prior gets a weak between factor to the
+neighbour that shared most with it; a component of the graph without any prior gets one at its
+current estimate. A weak between factor is removed again when other factors constrain its keyframe.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, ids_array
-from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import (
+    ANCHOR,
+    GraphUpdate,
+    Observations,
+    PosePrior,
+    RelativePose,
+)
 from bmask_slam.graph.factors.observability import (
     Edges,
     component_labels,
@@ -29,10 +35,10 @@ from bmask_slam.graph.geometry import inverse
 def anchor_loose(
     loose: Ints, gone: Observations, edges: Edges, tables: FactorTables, config: SmootherConfig
 ) -> list[int]:
-    """Bridge or anchor loose keyframes until none is left; numbers of the factors added.
+    """Anchor loose keyframes until none is left; returns the numbers of the factors added.
 
-    ``gone`` and ``edges`` are what was taken just before: each keyframe is tied inside the part
-    of the graph that it was in then, to the firm keyframe that shared most with it.
+    ``gone`` and ``edges`` are what was removed just before: each keyframe is anchored inside the
+    component that it was in then, to the firm keyframe that shared most with it.
     """
     added: list[int] = []
     before = _Before.of(gone, edges, tables) if len(loose) else None
@@ -44,7 +50,7 @@ def anchor_loose(
 
 
 def loose_in(tables: FactorTables, config: SmootherConfig) -> Ints:
-    """The keyframes of the graph that nothing ties firmly to a prior."""
+    """The keyframes of the graph that are not firmly connected to a prior."""
     numbers = tables.pose_factors
     return loose_among(
         tables.keyframes.ids, tables.observations.used_rows(), numbers, tables, config
@@ -52,7 +58,7 @@ def loose_in(tables: FactorTables, config: SmootherConfig) -> Ints:
 
 
 def anchor_components(tables: FactorTables, config: SmootherConfig) -> list[int]:
-    """Give each connected part of the graph without a prior one; numbers of the new priors."""
+    """Add a prior to each connected component without one; returns their numbers."""
     ids, edges = tables.keyframes.ids, [f.keyframes for f in tables.pose_factors.values()]
     seen = tables.observations.select(tables.observations.used_rows())
     labels = component_labels(ids, seen, edges)
@@ -65,51 +71,65 @@ def anchor_components(tables: FactorTables, config: SmootherConfig) -> list[int]
 def release_anchors(
     new: Observations, tables: FactorTables, config: SmootherConfig
 ) -> tuple[Ints, list[int]]:
-    """Take out the bridges that new observations, in the shadow already, made needless.
+    """Remove the weak between factors that new observations, already added, make unnecessary.
 
-    Returns the keyframes that they held, and their places in ISAM2.
+    Returns the keyframes that they held, and their slots in ISAM2.
     """
     table = tables.observations
     rows = table.rows_of_landmarks(np.unique(new.landmark_ids).tolist())
     touched = np.unique(table.select(rows).keyframe_ids)
-    bridges = [
+    anchors = [
         number
         for number in tables.numbers_of_keyframes(touched.tolist())
-        if getattr(tables.pose_factors[number].factor, "kind", "") == "bridge"
+        if tables.pose_factors[number].factor.kind == ANCHOR
     ]
-    if not bridges:
-        return np.zeros(0, np.int64), []
-    others = set(tables.pose_factors) - set(bridges)
+    if not anchors:
+        return no_ids(), []
+    others = set(tables.pose_factors) - set(anchors)
     loose = loose_among(
         tables.keyframes.ids, tables.observations.used_rows(), others, tables, config
     )
-    held = keyframes_held_by(bridges, tables)
-    released = [n for n in bridges if tables.pose_factors[n].keyframes[-1] not in loose]
+    held = keyframes_anchored_by(anchors, tables)
+    released = [n for n in anchors if tables.pose_factors[n].keyframes[-1] not in loose]
     slots = [tables.pose_factors[number].slot for number in released]
     tables.remove_pose_factors(released)
     return np.setdiff1d(held, loose), [slot for slot in slots if slot != NO_SLOT]
 
 
+def with_first_prior(
+    update: GraphUpdate, tables: FactorTables, config: SmootherConfig
+) -> GraphUpdate:
+    """The update, with a prior on its first keyframe if the graph is empty and it brings none."""
+    if len(tables.keyframes.ids) or update.priors or not len(update.keyframe_ids):
+        return update
+    first = int(np.argmin(update.keyframe_ids))
+    keyframe, T_world_camera = int(update.keyframe_ids[first]), update.poses_world_camera[first]
+    return replace(update, priors=(_firm_prior(keyframe, T_world_camera, config),))
+
+
 def prior_here(keyframe: int, tables: FactorTables, config: SmootherConfig) -> PosePrior:
     """A prior at a keyframe's current estimate, with the sigmas of the first pose's prior."""
+    return _firm_prior(keyframe, tables.keyframes.get(np.array([keyframe]))[0], config)
+
+
+def _firm_prior(keyframe: int, T_world_camera: Array, config: SmootherConfig) -> PosePrior:
     covariance = diagonal_covariance(
         config.prior_sigma_rotation_rad, config.prior_sigma_translation_m
     )
-    T_world_camera = tables.keyframes.get(np.array([keyframe]))[0]
     return PosePrior(keyframe, T_world_camera, covariance)
 
 
-def bridge(a: int, b: int, tables: FactorTables, config: SmootherConfig) -> RelativePose:
-    """A loose relative pose between two keyframes at their current estimates."""
+def weak_between(a: int, b: int, tables: FactorTables, config: SmootherConfig) -> RelativePose:
+    """A weak between factor of two keyframes at their current estimates."""
     T_world_a, T_world_b = tables.keyframes.get(np.array([a, b]))
     covariance = diagonal_covariance(
         config.anchor_sigma_rotation_rad, config.anchor_sigma_translation_m
     )
-    return RelativePose(a, b, inverse(T_world_a) @ T_world_b, covariance, kind="bridge")
+    return RelativePose(a, b, inverse(T_world_a) @ T_world_b, covariance, kind=ANCHOR)
 
 
-def keyframes_held_by(numbers: list[int], tables: FactorTables) -> Ints:
-    """The keyframes (N,) that these bridges and priors were made for."""
+def keyframes_anchored_by(numbers: list[int], tables: FactorTables) -> Ints:
+    """The keyframes (N,) that these anchors were added for."""
     return ids_array(tables.pose_factors[number].keyframes[-1] for number in numbers)
 
 
@@ -120,16 +140,16 @@ def loose_among(
     tables: FactorTables,
     config: SmootherConfig,
 ) -> Ints:
-    """The keyframes that these rows and pose factors of the shadow would leave loose."""
+    """The keyframes that would be loose with these rows and pose factors alone."""
     seen, poses, points = rows_in_front(rows, tables, config)
     edges = [tables.pose_factors[number].keyframes for number in sorted(numbers)]
-    return loose_keyframes(ids, seen, (poses, points), edges, config)
+    return loose_keyframes(ids, seen, poses, points, edges, config)
 
 
 def rows_in_front(
     rows: Ints, tables: FactorTables, config: SmootherConfig
 ) -> tuple[Observations, Array, Array]:
-    """Those of the rows whose landmark lies before the camera, their poses and points.
+    """Those of the rows whose landmark lies in front of the camera, their poses and points.
 
     A factor with its landmark behind the camera has a zero Jacobian.
     """
@@ -143,11 +163,11 @@ def rows_in_front(
 
 @dataclass(frozen=True)
 class _Before:
-    """How the keyframes that are left hung together before a removal.
+    """How the remaining keyframes were connected before a removal.
 
     Attributes:
-        parts: (K,) connected part of each keyframe.
-        shared: (K, K) landmarks and relative poses that two of them shared.
+        parts: (K,) connected component of each keyframe.
+        shared: (K, K) number of landmarks and relative poses that two of them shared.
     """
 
     parts: Ints
@@ -155,7 +175,7 @@ class _Before:
 
     @classmethod
     def of(cls, gone: Observations, edges: Edges, tables: FactorTables) -> _Before:
-        """From the shadow as it is and what was taken from it."""
+        """From the factor tables as they are and what was removed from them."""
         table = tables.observations
         seen = table.select(table.used_rows())
         seen = Observations(
@@ -175,7 +195,7 @@ class _Before:
     def anchor_for(
         self, loose: Ints, tables: FactorTables, config: SmootherConfig
     ) -> PosePrior | RelativePose:
-        """A prior in a part without any firm keyframe; else the bridge that shared most."""
+        """A prior in a component without any firm keyframe, else a weak between factor."""
         ids = tables.keyframes.ids
         is_loose = np.isin(ids, loose)
         unfixed = is_loose & ~np.isin(self.parts, self.parts[~is_loose])
@@ -187,4 +207,4 @@ class _Before:
         apart = np.abs(ids[rows][:, None] - ids[columns])
         best = np.lexsort((apart.ravel(), -shared.ravel()))[0]
         row, column = np.unravel_index(best, shared.shape)
-        return bridge(int(ids[columns[column]]), int(ids[rows[row]]), tables, config)
+        return weak_between(int(ids[columns[column]]), int(ids[rows[row]]), tables, config)

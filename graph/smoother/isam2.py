@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
@@ -26,48 +26,50 @@ Variable = tuple[str, int]
 
 
 class SolverError(Exception):
-    """ISAM2 could not solve; it is thrown away and must be rebuilt from the shadow."""
+    """ISAM2 could not solve; it is discarded and must be rebuilt from the factor tables."""
 
     def __init__(self, message: str, variable: Variable | None) -> None:
         super().__init__(message)
         self.variable = variable
 
 
-def _no_ids() -> Ints:
-    return np.zeros(0, np.int64)
-
-
 @dataclass(frozen=True)
 class Change:
-    """What to pass to ISAM2: rows and numbers of new factors in the shadow, ids of new
-    variables, the slots of factors that left, and how many further steps may follow."""
+    """What to pass to ISAM2.
 
-    rows: Ints = field(default_factory=_no_ids)
+    Attributes:
+        rows: of new observations in the factor tables; numbers: of new pose factors.
+        keyframe_ids, landmark_ids: new variables.
+        removed_slots: of factors that were removed.
+        max_iterations: how many further steps may follow.
+    """
+
+    rows: Ints = field(default_factory=no_ids)
     numbers: list[int] = field(default_factory=list)
-    keyframe_ids: Ints = field(default_factory=_no_ids)
-    landmark_ids: Ints = field(default_factory=_no_ids)
+    keyframe_ids: Ints = field(default_factory=no_ids)
+    landmark_ids: Ints = field(default_factory=no_ids)
     removed_slots: list[int] = field(default_factory=list)
     max_iterations: int = 0
 
 
 class Solver:
-    """An ISAM2 that follows a shadow. Without one (at first, after a failure) it builds one."""
+    """An ISAM2 that is kept equal to factor tables; at first and after a failure it is rebuilt."""
 
     def __init__(self, camera: Camera, config: SmootherConfig) -> None:
         self._config = config
         self._maker = FactorMaker(camera, config)
         self._isam: gtsam.ISAM2 | None = None
         self.elapsed_s = 0.0
-        """Time spent inside GTSAM's update and read-back since this was last set to zero."""
+        """Time spent in GTSAM's update and read-back since this was last set to zero."""
 
     def reset(self) -> None:
-        """Throw ISAM2 away; the next update builds it from the shadow."""
+        """Discard ISAM2; the next update rebuilds it from the factor tables."""
         self._isam = None
 
     def update(self, tables: FactorTables, change: Change) -> None:
-        """Apply a change that the shadow already has, and read all values back into it.
+        """Apply a change that the tables already contain, and read all values back into them.
 
-        Raises SolverError; the shadow's values are then those of before.
+        Raises SolverError; the values are then those of before.
         """
         if self._isam is None:
             self.rebuild(tables)
@@ -75,7 +77,7 @@ class Solver:
         self._apply(tables, change)
 
     def rebuild(self, tables: FactorTables) -> None:
-        """A new ISAM2 of the whole shadow, linearised at its current values."""
+        """A new ISAM2 of all factors, linearised at the current values."""
         self._isam = None
         if not len(tables.keyframes.ids):
             return
@@ -89,9 +91,9 @@ class Solver:
         self._apply(tables, everything)
 
     def optimise_batch(self, tables: FactorTables, max_iterations: int) -> tuple[float, float]:
-        """Levenberg-Marquardt on everything; the cost before and after.
+        """Levenberg-Marquardt on all factors; the cost before and after.
 
-        Raises SolverError; the shadow's values are then those of before.
+        Raises SolverError; the values are then those of before.
         """
         self._isam = None
         graph, values = self._everything(tables)
@@ -116,7 +118,7 @@ class Solver:
     def marginal_covariance(self, tables: FactorTables, keyframes: Ints, landmarks: Ints) -> Array:
         """Joint covariance of keyframes (6 each, ``[rad, m]``), then landmarks (3 each, m).
 
-        From ISAM2, or from the shadow at its current values when there is none.
+        From ISAM2, or from all factors at the current values if there is none.
         """
         keys = keyframe_keys(keyframes) + landmark_keys(landmarks)
         try:
@@ -129,7 +131,7 @@ class Solver:
             raise self._failure(error) from error
 
     def marginals(self, tables: FactorTables, landmarks: Ints) -> Marginals:
-        """Covariances of every keyframe and of some landmarks at the shadow's current values."""
+        """Covariances of every keyframe and of some landmarks at the current values."""
         if not len(tables.keyframes.ids):
             return Marginals(tables.keyframes.ids, np.zeros((0, 6, 6)))
         try:
@@ -138,7 +140,7 @@ class Solver:
             raise SolverError(str(error).strip(), variable_named_in(str(error))) from error
 
     def _everything(self, tables: FactorTables) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """All factors and values, in an order that depends on the shadow's contents alone."""
+        """All factors and values, in an order that depends on the tables' contents alone."""
         numbers = sorted(tables.pose_factors)
         graph = make_graph(self._factors(tables, tables.observations.all_rows(), numbers))
         keyframes, landmarks = tables.keyframes, tables.landmarks
@@ -161,7 +163,7 @@ class Solver:
         slots, poses, points = self._run(graph, values, change)
         if len(poses) != len(tables.keyframes.ids) or len(points) != len(tables.landmarks.ids):
             self._isam = None
-            raise SolverError("ISAM2 and the shadow hold different variables", None)
+            raise SolverError("ISAM2 and the factor tables have different variables", None)
         self._check_finite(tables, poses, points)
         tables.observations.set_slots(change.rows, np.array(slots[: len(change.rows)], np.int64))
         for number, slot in zip(change.numbers, slots[len(change.rows) :], strict=True):
@@ -177,7 +179,7 @@ class Solver:
             keys = values.keys() if removed else []
             if any(self._isam.valueExists(key) for key in keys):
                 self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), removed)
-                removed = []  # an id that left comes again: it must be gone before
+                removed = []  # an id that was removed is used again: remove it first
             result = self._isam.update(graph, values, removed, poses_last(graph))
             slots = result.getNewFactorsIndices()
             for _ in range(self._config.extra_iterations):
@@ -208,11 +210,11 @@ class Solver:
 
 
 def poses_last(graph: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
-    """The order in which ISAM2 eliminates: the poses that new factors touch at the end.
+    """The elimination order constraint for ISAM2: the poses of new factors come last.
 
-    By itself it puts all that a change touches to the end, and a keyframe that leaves touches
-    hundreds of landmarks. A pose that is eliminated before them ties all that it sees to each
-    other: where a place is walked again that takes four times the time and the memory.
+    By default all variables of a change come last, and a removed keyframe concerns hundreds of
+    landmarks. A pose that is eliminated before them connects all that it observes to each other:
+    where a place is visited again that takes four times the time and the memory.
     """
     groups = gtsam.KeyGroupMap()
     for key in graph.keyVector():

@@ -1,11 +1,10 @@
-"""The archive of retired landmarks as arrays for the file of a saved graph, and back."""
+"""Marginalised landmarks as arrays for the file of a saved graph, and back."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, concatenate
 from bmask_slam.graph.factors.marginalised_landmarks import Chunk, MarginalisedLandmarks, Summary
@@ -26,11 +25,11 @@ SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "base_ids": ("base", ()),
 }
 """Name, what its rows are, and the shape of one; ``pose_factor_chunks`` is the chunk that each
-pose factor stands for, or -1."""
+pose factor replaces, or -1."""
 
 
-def marginalised_arrays(tables: FactorTables) -> dict[str, Any]:
-    """The archive's arrays; what concerns keyframes that are gone is left out."""
+def marginalised_arrays(tables: FactorTables) -> Arrays:
+    """Arrays of the marginalised landmarks, without what refers to removed keyframes."""
     marginalised, known = tables.marginalised, tables.keyframes
     chunks = sorted(marginalised.chunks.items())
     seen = concatenate([chunk.observations for _, chunk in chunks])
@@ -42,7 +41,7 @@ def marginalised_arrays(tables: FactorTables) -> dict[str, Any]:
     summaries = sorted({**marginalised.summaries, **marginalised.returned}.items())
     hosts = np.array([s.keyframe_id for _, s in summaries], np.int64)
     ids = np.array([j for j, _ in summaries], np.int64)
-    alive = known.contains(hosts)
+    present = known.contains(hosts)
     return {
         "archived_chunks": number[keep].astype(np.int64),
         "archived_keyframe_ids": seen.keyframe_ids,
@@ -50,13 +49,13 @@ def marginalised_arrays(tables: FactorTables) -> dict[str, Any]:
         "archived_measurements": seen.measurements,
         "archived_sigmas_px": seen.sigmas_px,
         "archived_is_summary": is_summary[keep],
-        "summary_landmark_ids": ids[alive],
-        "summary_keyframe_ids": hosts[alive],
+        "summary_landmark_ids": ids[present],
+        "summary_keyframe_ids": hosts[present],
         "summary_measurements": np.array([s.measurement for _, s in summaries]).reshape(-1, 3)[
-            alive
+            present
         ],
-        "summary_sigmas_px": np.array([s.sigmas_px for _, s in summaries]).reshape(-1, 3)[alive],
-        "summary_returned": np.isin(ids, sorted(marginalised.returned))[alive],
+        "summary_sigmas_px": np.array([s.sigmas_px for _, s in summaries]).reshape(-1, 3)[present],
+        "summary_returned": np.isin(ids, sorted(marginalised.returned))[present],
         "base_ids": np.array(sorted(marginalised.bases), np.int64),
         "pose_factor_chunks": np.array(
             [chunk_of.get(n, -1) for n in sorted(tables.pose_factors)], np.int64
@@ -64,8 +63,8 @@ def marginalised_arrays(tables: FactorTables) -> dict[str, Any]:
     }
 
 
-def read_marginalised(arrays: dict[str, Any]) -> MarginalisedLandmarks:
-    """The archive of arrays that were checked; the shadow's pose factors have numbers 0, 1, ..."""
+def read_marginalised(arrays: Arrays) -> MarginalisedLandmarks:
+    """The landmarks of arrays that were checked; pose factors are numbered 0, 1, ..."""
     marginalised = MarginalisedLandmarks(bases=set(arrays["base_ids"].tolist()))
     seen = Observations(
         arrays["archived_keyframe_ids"],
@@ -77,7 +76,7 @@ def read_marginalised(arrays: dict[str, Any]) -> MarginalisedLandmarks:
         rows = np.flatnonzero(arrays["archived_chunks"] == number)
         edges = np.flatnonzero(arrays["pose_factor_chunks"] == number)
         chunk = Chunk(seen.select(rows), arrays["archived_is_summary"][rows], tuple(edges.tolist()))
-        marginalised.put(chunk, number)
+        marginalised.add(chunk, number)
     columns = (
         arrays["summary_landmark_ids"].tolist(),
         arrays["summary_keyframe_ids"].tolist(),
@@ -86,6 +85,6 @@ def read_marginalised(arrays: dict[str, Any]) -> MarginalisedLandmarks:
         arrays["summary_returned"].tolist(),
     )
     for landmark, keyframe, measurement, sigmas_px, returned in zip(*columns, strict=True):
-        there = marginalised.returned if returned else marginalised.summaries
-        there[landmark] = Summary(keyframe, measurement, sigmas_px)
+        summary_of = marginalised.returned if returned else marginalised.summaries
+        summary_of[landmark] = Summary(keyframe, measurement, sigmas_px)
     return marginalised

@@ -1,8 +1,8 @@
-"""What to take out of the graph after ISAM2 failed.
+"""What to remove from the graph after ISAM2 failed.
 
 GTSAM names a variable near the place where elimination broke down, which need not be the
-cause: a new pose on one point is reported as that point. So the causes that can be seen are
-looked for first, and the named variable is dropped only when there is none.
+cause: a new pose that observes one point is reported as that point. So recognisable causes are
+searched first, and the named variable is removed only if there is none.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import reprojection
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
-from bmask_slam.graph.factors.graph_update import GraphUpdate
+from bmask_slam.graph.factors.graph_update import ANCHOR, GraphUpdate
 from bmask_slam.graph.factors.observability import constrained_landmarks
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.smoother.anchoring import (
     anchor_components,
-    bridge,
-    keyframes_held_by,
+    keyframes_anchored_by,
     loose_in,
+    weak_between,
 )
 from bmask_slam.graph.smoother.isam2 import Variable
 from bmask_slam.graph.smoother.removal import remove
@@ -30,7 +30,7 @@ from bmask_slam.graph.smoother.removal import remove
 
 @dataclass(frozen=True)
 class Repair:
-    """What a repair took out of the shadow, and whom it tied loosely."""
+    """What a repair removed from the factor tables, and which keyframes it anchored."""
 
     dropped_landmarks: Ints
     dropped_keyframes: Ints
@@ -38,7 +38,7 @@ class Repair:
 
     @property
     def changed(self) -> bool:
-        """Whether it did anything; if not, trying again would fail again."""
+        """Whether it did anything; if not, another attempt would fail too."""
         return bool(
             len(self.dropped_landmarks)
             or len(self.dropped_keyframes)
@@ -53,8 +53,8 @@ def repair(
     camera: Camera,
     config: SmootherConfig,
 ) -> Repair:
-    """Take out what makes the system singular; ``new_keyframes`` go rather than be bridged."""
-    held = keyframes_held_by(anchor_components(tables, config), tables)
+    """Remove what makes the system singular; ``new_keyframes`` are removed, not anchored."""
+    held = keyframes_anchored_by(anchor_components(tables, config), tables)
     pairs = _broken_observations(tables, camera)
     broken = remove(GraphUpdate(remove_observations=pairs), tables, config)
     landmarks = _loose_landmarks(tables, camera, config)
@@ -67,7 +67,7 @@ def repair(
     )
     update = GraphUpdate(remove_landmarks=landmarks, remove_keyframes=leaving)
     removal = remove(update, tables, config)
-    tied = _tie(np.setdiff1d(keyframes, leaving), tables, config)
+    tied = _anchor(np.setdiff1d(keyframes, leaving), tables, config)
     anchored = (held, broken.anchored_keyframes, removal.anchored_keyframes, tied)
     dropped = (landmarks, broken.dropped_landmarks, removal.dropped_landmarks)
     return Repair(
@@ -79,7 +79,7 @@ def repair(
 
 def _is_anchored(keyframe: int, tables: FactorTables) -> bool:
     factors = (tables.pose_factors[n].factor for n in tables.numbers_of_keyframes([keyframe]))
-    return any(getattr(factor, "kind", "") == "bridge" for factor in factors)
+    return any(factor.kind == ANCHOR for factor in factors)
 
 
 def _broken_observations(tables: FactorTables, camera: Camera) -> Ints:
@@ -93,7 +93,7 @@ def _broken_observations(tables: FactorTables, camera: Camera) -> Ints:
 
 
 def _loose_landmarks(tables: FactorTables, camera: Camera, config: SmootherConfig) -> Ints:
-    """Landmarks that the views in front of a camera do not constrain."""
+    """Landmarks that observations from in front of the camera do not constrain."""
     seen = tables.observations.select(tables.observations.all_rows())
     poses = tables.keyframes.get(seen.keyframe_ids)
     points = tables.landmarks.get(seen.landmark_ids)
@@ -105,8 +105,8 @@ def _loose_landmarks(tables: FactorTables, camera: Camera, config: SmootherConfi
     return np.setdiff1d(tables.landmarks.ids, held)
 
 
-def _tie(loose: Ints, tables: FactorTables, config: SmootherConfig) -> Ints:
-    """Bridge loose keyframes to firm ones, one at a time: one bridge may hold a whole part."""
+def _anchor(loose: Ints, tables: FactorTables, config: SmootherConfig) -> Ints:
+    """Anchor loose keyframes to firm ones one by one, since one may hold a whole component."""
     anchored: list[int] = []
     while len(loose):
         firm = np.setdiff1d(tables.keyframes.ids, loose)
@@ -114,7 +114,7 @@ def _tie(loose: Ints, tables: FactorTables, config: SmootherConfig) -> Ints:
             break
         k = int(loose[0])
         nearest = int(firm[np.argmin(np.abs(firm - k))])
-        tables.add_pose_factors([bridge(nearest, k, tables, config)])
+        tables.add_pose_factors([weak_between(nearest, k, tables, config)])
         anchored.append(k)
         loose = np.intersect1d(loose[1:], loose_in(tables, config))
     return ids_array(anchored)

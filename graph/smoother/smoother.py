@@ -5,42 +5,39 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Ints, no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import (
     observation_errors,
     relative_pose_errors,
     wrong_observations,
 )
-from bmask_slam.graph.factors.factor_tables import FactorTables, ValueTable, ids_array
-from bmask_slam.graph.factors.graph_update import (
+from bmask_slam.graph.factors.factor_tables import FactorTables, ValueTable
+from bmask_slam.graph.factors.graph_estimate import (
     GraphEstimate,
-    GraphUpdate,
     ObservationErrors,
-    PosePrior,
-    RelativePose,
     RelativePoseErrors,
-    RemovalPolicy,
 )
-from bmask_slam.graph.factors.observability import diagonal_covariance
+from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.marginals.covariances import Marginals
 from bmask_slam.graph.marginals.landmark_marginalisation import (
     Marginalisation,
-    forget,
     marginalise_landmarks,
-    note_retracted,
-    note_returned,
-    reinstate,
-    returning,
+    reinsert,
+    remove_marginalised,
 )
-from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors
+from bmask_slam.graph.marginals.summaries import mark_retracted, mark_returned, with_returning
+from bmask_slam.graph.smoother.anchoring import (
+    anchor_components,
+    release_anchors,
+    with_first_prior,
+)
 from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError
 from bmask_slam.graph.smoother.removal import Removal, remove
 from bmask_slam.graph.smoother.repair import repair
@@ -58,10 +55,10 @@ logger = logging.getLogger(__name__)
 
 
 class Smoother:
-    """Keyframe poses and landmarks under ISAM2, with a shadow that survives its failures.
+    """Keyframe poses and landmarks under ISAM2, with factor tables that survive its failures.
 
-    An update never raises for what it is asked to add: whatever cannot enter is refused with
-    a reason, and a failure of ISAM2 is repaired and reported in the estimate. The first
+    An update never raises for what it adds: what cannot enter is refused with a reason, and a
+    failure of ISAM2 is repaired and reported in the estimate (``GraphEstimate.notes``). The first
     keyframe gets a prior at its initial value unless the first update brings one.
     """
 
@@ -72,43 +69,44 @@ class Smoother:
         self._solver = Solver(camera, self._config)
 
     def update(self, update: GraphUpdate) -> GraphEstimate:
-        """Remove, add, optimise one step, and read everything back."""
-        started_s = time.perf_counter()
+        """Remove, add, optimise one step, and read all values back."""
+        report = UpdateReport()
         self._solver.elapsed_s = 0.0
-        model = self._tables, self._camera, self._config
-        update = self._with_first_prior(update)
-        forgotten, removal = self._remove(update)
-        note_retracted(removal.dropped_landmarks, self._tables.marginalised)
+        tables, model = self._tables, (self._tables, self._camera, self._config)
+        update = with_first_prior(update, tables, self._config)
+        # marginalised observations first: their new relative poses still hold the keyframes
+        before = remove_marginalised(update, *model)
+        removal = remove(update, tables, self._config)
+        mark_retracted(removal.dropped_landmarks, tables.marginalised)
         marginalised = marginalise_landmarks(update.marginalise_landmarks, *model)
-        validated = validate(returning(update, self._tables, self._camera), *model)
-        report = UpdateReport(validated.refused, validated.refused_factors, removal.report)
+        validated = validate(with_returning(update, tables, self._camera), *model)
+        report.refused, report.refused_factors = validated.refused, validated.refused_factors
         report.add_removal(removal)
-        entered = self._enter(validated, [forgotten, removal, marginalised], report)
+        entered = self._enter(validated, [before, removal, marginalised], report)
         change = dataclasses.replace(entered, max_iterations=update.max_iterations)
         try:
             self._solver.update(self._tables, change)
         except SolverError as failure:
             ids = validated.keyframe_ids
-            if not self._recover(failure, ids, report, self._solver.rebuild):
+            if not self._repair(failure, ids, report, self._solver.rebuild):
                 self._retract(validated, change, report)
-        return self._estimate(report, started_s)
+        return report.estimate(tables, self._solver.elapsed_s)
 
     def optimise_batch(
         self, max_iterations: int = 100, drop_outliers: bool = False
     ) -> GraphEstimate:
         """Full bundle adjustment (Levenberg-Marquardt, with the kernels) of the whole graph.
 
-        With ``drop_outliers`` observations beyond the 95 % bound of chi-square, taken without the
-        kernel, then leave the graph, and it is optimised again.
-        Retired landmarks come back with all their observations, and stay until they are
-        retired again.
-        ISAM2 is thrown away and made anew from the result if another update comes. A failure
-        is repaired as in an update; if it cannot be, the values stay and the costs are NaN.
+        With ``drop_outliers`` observations whose chi-square without the kernel is beyond the 95 %
+        bound are then removed, and the graph is optimised again.
+        Marginalised landmarks come back with all their observations, until they are marginalised
+        again.
+        ISAM2 is discarded and rebuilt from the result if another update comes. A failure is
+        repaired as in an update; if that fails, the values stay and the costs are NaN.
         """
-        started_s = time.perf_counter()
-        self._solver.elapsed_s = 0.0
-        reinstate(self._tables, self._camera, self._config)
         report, costs = UpdateReport(), [(math.nan, math.nan)]
+        self._solver.elapsed_s = 0.0
+        reinsert(self._tables, self._camera, self._config)
 
         def solve(tables: FactorTables) -> None:
             costs.append(self._solver.optimise_batch(tables, max_iterations))
@@ -117,7 +115,7 @@ class Smoother:
             try:
                 solve(self._tables)
             except SolverError as failure:
-                if not self._recover(failure, ids_array([]), report, solve):
+                if not self._repair(failure, no_ids(), report, solve):
                     logger.error("batch optimisation failed; the values stay as they were")
                     break
             if not last:
@@ -125,28 +123,24 @@ class Smoother:
                 update = GraphUpdate(remove_observations=wrong)
                 report.add_removal(remove(update, self._tables, self._config))
         before, after = costs[-1]
-        estimate = self._estimate(report, started_s)
+        estimate = report.estimate(self._tables, self._solver.elapsed_s)
         return dataclasses.replace(estimate, cost_before=before, cost_after=after)
 
     def estimate(self) -> GraphEstimate:
         """The current estimate, without optimising."""
-        return self._estimate(UpdateReport(), time.perf_counter())
+        return UpdateReport().estimate(self._tables, 0.0)
 
     def observation_errors(self) -> ObservationErrors:
-        """Chi-square of every observation at the current estimate, to find outliers by."""
+        """Chi-square of every observation at the current estimate, to find outliers."""
         return observation_errors(self._tables, self._camera)
+
+    def relative_poses(self, kind: str) -> tuple[RelativePose, ...]:
+        """The relative poses of a kind, such as "loop", in the order in which they were added."""
+        return self._tables.relative_poses(kind)
 
     def relative_pose_errors(self, kind: str) -> RelativePoseErrors:
         """Chi-square of every relative pose of a kind at the current estimate."""
         return relative_pose_errors(self.relative_poses(kind), self._tables.keyframes)
-
-    def relative_poses(self, kind: str) -> tuple[RelativePose, ...]:
-        """Every relative pose of a kind that is in the graph, oldest first."""
-        return tuple(
-            entry.factor
-            for _, entry in sorted(self._tables.pose_factors.items())
-            if isinstance(entry.factor, RelativePose) and entry.factor.kind == kind
-        )
 
     def marginal_covariance(self, keyframe_id: int) -> Array:
         """Covariance (6, 6) of a pose's ``[rotation rad, translation m]`` on its right side.
@@ -158,7 +152,7 @@ class Smoother:
 
     def joint_covariance(self, keyframe_ids: Ints, landmark_ids: Ints | None = None) -> Array:
         """Joint covariance (6K + 3L square): keyframes in the given order, then landmarks."""
-        landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
+        landmarks = no_ids() if landmark_ids is None else landmark_ids
         _check_known(self._tables.keyframes, keyframe_ids)
         _check_known(self._tables.landmarks, landmarks)
         return self._solver.marginal_covariance(self._tables, keyframe_ids, landmarks)
@@ -168,15 +162,15 @@ class Smoother:
 
         Raises KeyError for an unknown id, SolverError for a graph that cannot be solved.
         """
-        landmarks = np.zeros(0, np.int64) if landmark_ids is None else landmark_ids
+        landmarks = no_ids() if landmark_ids is None else landmark_ids
         _check_known(self._tables.landmarks, landmarks)
         return self._solver.marginals(self._tables, landmarks)
 
     def restart(self) -> None:
-        """Throw ISAM2 away; the next update makes it from the current values.
+        """Discard ISAM2; the next update rebuilds it from the current values.
 
-        A loaded smoother starts so too: an undisturbed run that restarts where it saves goes
-        on exactly like one that is loaded from the file.
+        A loaded smoother starts this way too: a run that restarts where it saves continues exactly
+        like one that is loaded from the file.
         """
         self._solver.reset()
 
@@ -185,7 +179,7 @@ class Smoother:
         return graph_arrays(self._tables)
 
     def restore(self, state: Arrays, path: Path) -> None:
-        """Become the smoother of a state that was read from a file. Raises InputError."""
+        """Restore a state that was read from a file. Raises InputError."""
         self._tables = factor_tables_of(state, path)
         self.restart()
 
@@ -195,66 +189,42 @@ class Smoother:
 
     @classmethod
     def load(cls, path: Path, config: SmootherConfig | None = None) -> Smoother:
-        """A smoother that goes on from a saved graph. Raises InputError for a bad file."""
+        """A smoother that continues from a saved graph. Raises InputError for a bad file."""
         tables, camera = read_graph(path)
         smoother = cls(camera, config)
         smoother._tables = tables
         return smoother
 
-    def _with_first_prior(self, update: GraphUpdate) -> GraphUpdate:
-        if len(self._tables.keyframes.ids) or update.priors or not len(update.keyframe_ids):
-            return update
-        covariance = diagonal_covariance(
-            self._config.prior_sigma_rotation_rad, self._config.prior_sigma_translation_m
-        )
-        first = int(np.argmin(update.keyframe_ids))
-        prior = PosePrior(
-            int(update.keyframe_ids[first]), update.poses_world_camera[first], covariance
-        )
-        return dataclasses.replace(update, priors=(prior,))
-
-    def _remove(self, update: GraphUpdate) -> tuple[Marginalisation, Removal]:
-        """Carry out the removals on the archive and on the graph, or refuse them on both.
-
-        The archive comes first, so that what stands for the rest of it holds the keyframes.
-        """
-        model = self._tables, self._camera, self._config
-        if update.removal_policy is RemovalPolicy.DROP:
-            return forget(update, *model), remove(update, self._tables, self._config)
-        removal = remove(update, self._tables, self._config)
-        refused = len(removal.report.refused) > 0
-        return (Marginalisation() if refused else forget(update, *model)), removal
-
     def _enter(
-        self, validated: Validated, left: Sequence[Removal | Marginalisation], report: UpdateReport
+        self, validated: Validated, done: Sequence[Removal | Marginalisation], report: UpdateReport
     ) -> Change:
-        """Put what was admitted into the shadow, and say what ISAM2 must be told."""
+        """Add what passed validation to the factor tables; returns what ISAM2 must be told."""
         self._tables.keyframes.insert(validated.keyframe_ids, validated.poses_world_camera)
         self._tables.landmarks.insert(validated.landmark_ids, validated.points_world)
         rows = self._tables.observations.add(validated.observations)
-        note_returned(validated.landmark_ids, self._tables.marginalised)
-        numbers = [number for done in left for number in done.pose_factors]
+        mark_returned(validated.landmark_ids, self._tables.marginalised)
+        numbers = [number for part in done for number in part.pose_factors]
         numbers += self._tables.add_pose_factors(validated.pose_factors)
         free, slots = release_anchors(validated.observations, self._tables, self._config)
-        report.anchored.difference_update(free.tolist())
+        report.anchored_keyframes.difference_update(free.tolist())
         return Change(
             rows,
             [number for number in numbers if number in self._tables.pose_factors],
             validated.keyframe_ids,
             validated.landmark_ids,
-            sorted([*slots, *(slot for done in left for slot in done.slots)]),
+            sorted([*slots, *(slot for part in done for slot in part.slots)]),
         )
 
-    def _recover(
+    def _repair(
         self,
         failure: SolverError,
         new_keyframes: Ints,
         report: UpdateReport,
         solve: Callable[[FactorTables], None],
     ) -> bool:
-        """Repair the shadow and solve anew until it works; whether it did.
+        """Repair the factor tables and solve again until it works; returns whether it did.
 
-        The first attempt drops only what is visibly loose, later ones the named variable too.
+        The first attempt removes only what is visibly loose, later ones the named variable too.
         """
         report.rebuilt = True
         for attempt in range(self._config.max_repairs):
@@ -263,7 +233,7 @@ class Smoother:
             named = failure.variable if attempt else None
             done = repair(named, new_keyframes, self._tables, self._camera, self._config)
             report.add_repair(done)
-            note_retracted(done.dropped_landmarks, self._tables.marginalised)
+            mark_retracted(done.dropped_landmarks, self._tables.marginalised)
             try:
                 solve(self._tables)
                 return True
@@ -274,7 +244,7 @@ class Smoother:
         return False
 
     def _retract(self, validated: Validated, change: Change, report: UpdateReport) -> None:
-        """Take the whole update out again, refused as SOLVER_FAILED."""
+        """Remove the whole update again, refused as SOLVER_FAILED."""
         seen = validated.observations
         pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
         undo = GraphUpdate(
@@ -283,7 +253,7 @@ class Smoother:
             remove_observations=pairs,
         )
         report.add_removal(remove(undo, self._tables, self._config))
-        note_retracted(validated.landmark_ids, self._tables.marginalised)
+        mark_retracted(validated.landmark_ids, self._tables.marginalised)
         present = [n for n in change.numbers if n in self._tables.pose_factors]
         self._tables.remove_pose_factors(present)
         anchor_components(self._tables, self._config)
@@ -292,25 +262,6 @@ class Smoother:
             self._solver.rebuild(self._tables)
         except SolverError as failure:
             logger.error("ISAM2 cannot solve the graph (%s); values stay as they were", failure)
-
-    def _estimate(self, report: UpdateReport, started_s: float) -> GraphEstimate:
-        return GraphEstimate(
-            self._tables.keyframes.ids,
-            self._tables.keyframes.values,
-            self._tables.landmarks.ids,
-            self._tables.landmarks.values,
-            report.refused,
-            report.refused_factors,
-            report.removal,
-            dropped_landmarks=ids_array(report.landmarks),
-            dropped_keyframes=ids_array(report.keyframes),
-            anchored_keyframes=ids_array(report.anchored),
-            rebuilt=report.rebuilt,
-            failed_variable=report.failed_variable,
-            update_ms=1e3 * (time.perf_counter() - started_s),
-            solver_ms=1e3 * self._solver.elapsed_s,
-            factors=len(self._tables),
-        )
 
 
 def _check_known(table: ValueTable, ids: Ints) -> None:

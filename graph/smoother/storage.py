@@ -1,8 +1,7 @@
-"""A saved graph: every factor, value and id as named arrays, in one file
-(graph/files/array_file.py).
+"""A saved graph: every factor, value and id as named arrays, in one file (`graph.files`).
 
-ISAM2 itself cannot be saved; from this it is made anew, independent of GTSAM's version. A saved
-map holds the same arrays as a part (slam/run_folder/map_file.py).
+ISAM2 itself cannot be saved; it is rebuilt from these, independent of GTSAM's version. A saved map
+contains the same arrays as a part.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Arrays
+from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
@@ -41,11 +40,10 @@ _SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "pose_factor_robust": ("pose factor", ()),
     **SHAPES,
 }
-_PRIOR = "prior"
 
 
 def write_graph(path: Path, tables: FactorTables, camera: Camera) -> None:
-    """Save a shadow and its camera in one file, atomically. Raises InputError if it cannot."""
+    """Save a graph and its camera in one file, atomically. Raises InputError if it cannot."""
     write_arrays(path, GRAPH_FILE, {"camera": dataclasses.asdict(camera)}, graph_arrays(tables))
 
 
@@ -56,7 +54,7 @@ def read_graph(path: Path) -> tuple[FactorTables, Camera]:
 
 
 def graph_arrays(tables: FactorTables) -> Arrays:
-    """Everything a shadow knows, but for the places of its factors in ISAM2."""
+    """All of the factor tables but for the slots of the factors in ISAM2."""
     seen = tables.observations.select(tables.observations.all_rows())
     factors = [tables.pose_factors[number].factor for number in sorted(tables.pose_factors)]
     return {
@@ -68,31 +66,25 @@ def graph_arrays(tables: FactorTables) -> Arrays:
         "observation_landmark_ids": seen.landmark_ids,
         "measurements": seen.measurements,
         "sigmas_px": seen.sigmas_px,
-        "pose_factor_keyframes": np.array([_ends(factor) for factor in factors], np.int64).reshape(
-            -1, 2
-        ),
+        "pose_factor_keyframes": np.array(
+            [(factor.keyframe_ids[0], factor.keyframe_ids[-1]) for factor in factors], np.int64
+        ).reshape(-1, 2),
         "pose_factor_T": np.array([_measured(f) for f in factors], float).reshape(-1, 4, 4),
         "pose_factor_covariances": np.array(
             [factor.covariance for factor in factors], float
         ).reshape(-1, 6, 6),
-        "pose_factor_kinds": np.array([getattr(f, "kind", _PRIOR) for f in factors], np.str_),
+        "pose_factor_kinds": np.array([factor.kind for factor in factors], np.str_),
         "pose_factor_robust": np.array([getattr(f, "robust", "") or "" for f in factors], np.str_),
         **marginalised_arrays(tables),
     }
 
 
-def _ends(factor: RelativePose | PosePrior) -> tuple[int, int]:
-    if isinstance(factor, PosePrior):
-        return factor.keyframe_id, factor.keyframe_id
-    return factor.keyframe_a, factor.keyframe_b
-
-
-def _measured(factor: RelativePose | PosePrior) -> np.ndarray:
+def _measured(factor: RelativePose | PosePrior) -> Array:
     return factor.T_world_camera if isinstance(factor, PosePrior) else factor.T_a_b
 
 
 def _check(arrays: Arrays, path: Path) -> None:
-    """Every array there, of its shape, sorted ids, no factor on a variable that is missing."""
+    """Check that all arrays are there, their shapes, sorted ids, and ids that factors refer to."""
     counts: dict[str, int] = {}
     for name, (what, shape) in _SHAPES.items():
         array = arrays.get(name)
@@ -121,10 +113,10 @@ def _check(arrays: Arrays, path: Path) -> None:
 
 
 def factor_tables_of(arrays: Arrays, path: Path) -> FactorTables:
-    """The shadow of ``graph_arrays``, read from a file.
+    """The factor tables of ``graph_arrays`` that were read from a file.
 
     Raises:
-        InputError: they do not fit together.
+        InputError: the arrays do not fit together.
     """
     _check(arrays, path)
     tables = FactorTables()
@@ -147,7 +139,7 @@ def factor_tables_of(arrays: Arrays, path: Path) -> FactorTables:
     )
     for (a, b), T, covariance, kind, robust in zip(*columns, strict=True):
         factor: RelativePose | PosePrior = PosePrior(a, T, covariance)
-        if kind != _PRIOR:
+        if kind != PosePrior.kind:
             factor = RelativePose(a, b, T, covariance, robust or None, kind)
         tables.add_pose_factors([factor])
     tables.marginalised = read_marginalised(arrays)

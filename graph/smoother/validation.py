@@ -1,9 +1,8 @@
-"""What may enter the graph: every check that keeps ISAM2 from an indeterminate system.
+"""What may enter the graph: the checks that keep ISAM2 from an indeterminate system.
 
-A landmark with one monocular view or a new pose on a few points makes the whole system
-singular. `graph.factors.checks` checks each thing alone; here what passed is checked together,
-before
-GTSAM sees anything, and what is refused is reported with a reason.
+A landmark with one monocular view, or a new pose that observes few points, makes the whole system
+singular. `graph.factors.checks` checks each thing on its own; here all that passed is checked
+together, before GTSAM gets it, and what is refused is reported with a reason.
 """
 
 from __future__ import annotations
@@ -19,26 +18,22 @@ from bmask_slam.graph.factors.checks import (
     check_observations,
     check_pose_factors,
     check_variables,
-    describe,
 )
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
-from bmask_slam.graph.factors.graph_update import (
+from bmask_slam.graph.factors.graph_estimate import (
     NO_LANDMARK,
-    GraphUpdate,
-    Observations,
-    PosePrior,
     RefusalReason,
     Refusals,
     RefusedFactor,
-    RelativePose,
 )
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.observability import constrained_landmarks
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 
 
 @dataclass(frozen=True)
 class Validated:
-    """The part of an update that may enter, and what may not."""
+    """The part of an update that may enter, and what is refused."""
 
     keyframe_ids: Ints
     poses_world_camera: Array
@@ -53,7 +48,7 @@ class Validated:
 def validate(
     update: GraphUpdate, tables: FactorTables, camera: Camera, config: SmootherConfig
 ) -> Validated:
-    """Sort an update into what may enter and what is refused; removals are already done."""
+    """Divide an update into what may enter and what is refused; after its removals."""
     keyframe_rows, keyframe_reasons = check_variables(
         update.keyframe_ids, update.poses_world_camera, tables.keyframes.ids
     )
@@ -69,9 +64,11 @@ def validate(
     )
     pose_factors, refused_factors = check_pose_factors(update, candidates)
     reasons = check_observations(update.observations, candidates, camera, config)
-    keyframes, landmarks = _settle(update.observations, reasons, pose_factors, candidates, config)
+    keyframes, landmarks = _constrained(
+        update.observations, reasons, pose_factors, candidates, config
+    )
     kept, lost = _split_by_keyframes(pose_factors, keyframes, candidates)
-    fell = candidates.new_keyframes[~np.isin(candidates.new_keyframes, keyframes)]
+    loose = candidates.new_keyframes[~np.isin(candidates.new_keyframes, keyframes)]
     in_keyframes = np.isin(candidates.new_keyframes, keyframes)
     in_landmarks = np.isin(candidates.new_landmarks, landmarks)
     return Validated(
@@ -81,22 +78,22 @@ def validate(
         candidates.new_points[in_landmarks],
         update.observations.select(reasons == 0),
         kept,
-        _refusals(update, reasons, keyframe_reasons, fell),
+        _refusals(update, reasons, keyframe_reasons, loose),
         (*refused_factors, *lost),
     )
 
 
-def _settle(
+def _constrained(
     observations: Observations,
     reasons: Ints,
     pose_factors: tuple[RelativePose | PosePrior, ...],
     candidates: Candidates,
     config: SmootherConfig,
 ) -> tuple[Ints, Ints]:
-    """Ids of the new keyframes and landmarks that are constrained; marks the others' rows.
+    """Ids of the new keyframes and landmarks that are constrained; sets the others' reasons.
 
-    A landmark that falls takes support from a keyframe and the other way round, so this is
-    repeated until nothing changes; each round removes something, so it ends.
+    A refused landmark leaves keyframes with fewer observations and the other way round, so this is
+    repeated until nothing changes.
     """
     keyframes, landmarks = candidates.new_keyframes, candidates.new_landmarks
     while True:
@@ -109,7 +106,7 @@ def _settle(
             config.min_parallax_deg,
         )
         landmarks_now = landmarks[np.isin(landmarks, fine)]
-        keyframes_now = _anchored(accepted, pose_factors, keyframes, candidates, config)
+        keyframes_now = _connected(accepted, pose_factors, keyframes, candidates, config)
         bad_landmark = np.isin(accepted.landmark_ids, np.setdiff1d(landmarks, landmarks_now))
         bad_keyframe = np.isin(accepted.keyframe_ids, np.setdiff1d(keyframes, keyframes_now))
         reasons[rows[bad_keyframe]] = RefusalReason.KEYFRAME_UNDERCONSTRAINED
@@ -119,17 +116,17 @@ def _settle(
         keyframes, landmarks = keyframes_now, landmarks_now
 
 
-def _anchored(
+def _connected(
     accepted: Observations,
     pose_factors: tuple[RelativePose | PosePrior, ...],
     keyframes: Ints,
     candidates: Candidates,
     config: SmootherConfig,
 ) -> Ints:
-    """The new keyframes that hang together with the graph or with a prior.
+    """The new keyframes that are connected to the graph or to a prior.
 
-    Grown from the graph's keyframes: a keyframe joins by a prior, by a relative pose to one
-    that is in, or by enough observations of landmarks that the graph or one that is in sees.
+    Grown from the graph's keyframes: a keyframe joins by a prior, by a relative pose to a member,
+    or by enough observations of landmarks of the graph or of members.
     """
     inside = set(candidates.tables.keyframes.ids.tolist())
     waiting = keyframes.tolist()
@@ -141,7 +138,7 @@ def _anchored(
             k
             for k in waiting
             if np.count_nonzero(shared == k) >= config.min_shared_observations
-            or _held(k, pose_factors, inside)
+            or _joins(k, pose_factors, inside)
         ]
         if not joined:
             return keyframes[np.isin(keyframes, ids_array(inside))]
@@ -149,14 +146,11 @@ def _anchored(
         waiting = [k for k in waiting if k not in inside]
 
 
-def _held(
+def _joins(
     keyframe: int, pose_factors: tuple[RelativePose | PosePrior, ...], inside: set[int]
 ) -> bool:
-    for factor in pose_factors:
-        _, ids = describe(factor)
-        if keyframe in ids and all(i in inside for i in ids if i != keyframe):
-            return True
-    return False
+    ends = (factor.keyframe_ids for factor in pose_factors)
+    return any(keyframe in ids and inside.issuperset(set(ids) - {keyframe}) for ids in ends)
 
 
 def _split_by_keyframes(
@@ -165,19 +159,19 @@ def _split_by_keyframes(
     candidates: Candidates,
 ) -> tuple[tuple[RelativePose | PosePrior, ...], list[RefusedFactor]]:
     inside = {*keyframes.tolist(), *candidates.tables.keyframes.ids.tolist()}
-    kept = tuple(f for f in pose_factors if inside.issuperset(describe(f)[1]))
+    kept = tuple(f for f in pose_factors if inside.issuperset(f.keyframe_ids))
     lost = [
-        RefusedFactor(*describe(f), RefusalReason.KEYFRAME_UNDERCONSTRAINED)
+        RefusedFactor(f.kind, f.keyframe_ids, RefusalReason.KEYFRAME_UNDERCONSTRAINED)
         for f in pose_factors
-        if not inside.issuperset(describe(f)[1])
+        if not inside.issuperset(f.keyframe_ids)
     ]
     return kept, lost
 
 
-def _refusals(update: GraphUpdate, reasons: Ints, keyframe_reasons: Ints, fell: Ints) -> Refusals:
+def _refusals(update: GraphUpdate, reasons: Ints, keyframe_reasons: Ints, loose: Ints) -> Refusals:
     rows = np.flatnonzero(reasons)
     bad = np.flatnonzero(keyframe_reasons)
-    keyframes = np.concatenate([update.keyframe_ids[bad], fell])
+    keyframes = np.concatenate([update.keyframe_ids[bad], loose])
     return Refusals(
         np.concatenate([update.observations.keyframe_ids[rows], keyframes]),
         np.concatenate(
@@ -187,7 +181,7 @@ def _refusals(update: GraphUpdate, reasons: Ints, keyframe_reasons: Ints, fell: 
             [
                 reasons[rows],
                 keyframe_reasons[bad],
-                np.full(len(fell), RefusalReason.KEYFRAME_UNDERCONSTRAINED),
+                np.full(len(loose), RefusalReason.KEYFRAME_UNDERCONSTRAINED),
             ]
         ),
     )

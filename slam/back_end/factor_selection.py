@@ -8,13 +8,8 @@ import numpy as np
 
 from bmask_slam.features.brisk import Features, spread_order
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
-from bmask_slam.graph.factors.graph_update import (
-    GraphEstimate,
-    GraphUpdate,
-    Observations,
-    PosePrior,
-    concatenate,
-)
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, concatenate
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 

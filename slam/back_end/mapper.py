@@ -25,7 +25,7 @@ from bmask_slam.back_end.triangulation import triangulate_landmarks
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.graph_update import GraphEstimate
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse

@@ -15,11 +15,8 @@ import numpy as np
 from bmask_slam.back_end.factor_selection import read_back
 from bmask_slam.graph.arrays import Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.graph_update import (
-    GraphEstimate,
-    GraphUpdate,
-    RelativePoseName,
-)
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.graph_update import LOOP, GraphUpdate, RelativePoseName
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.world.masked_keypoints import keypoints_under
 from bmask_slam.world.world_map import Keyframe, WorldMap
@@ -128,16 +125,17 @@ class MapPruner:
             for k in new_side
             if len(ids := np.intersect1d(self.world.observed(k)[1], fused))
         ]
-        names = ((ends[0], ends[1], "loop"), (ends[1], ends[0], "loop"))
+        known = self.smoother.relative_poses(LOOP)
+        loops = tuple(loop.name for loop in known if sorted(loop.keyframe_ids) == ends)
         update = GraphUpdate(
             remove_observations=np.concatenate([np.zeros((0, 2), np.int64), *pairs]),
-            remove_relative_poses=names,
+            remove_relative_poses=loops,
         )
         estimate = self.smoother.update(update)
         self.world.split(fused, new_side, self.camera)
         read_back(self.world, estimate)
         report = _report(update, estimate)
-        return replace(report, loops=estimate.removal.relative_poses)
+        return replace(report, loops=loops)
 
     def _side(self, end: int, ends: list[int]) -> list[Keyframe]:
         """Keyframes covisible with one end of a loop and nearer to it than to the other."""

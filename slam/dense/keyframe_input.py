@@ -154,5 +154,5 @@ def undistort_labels(numbers: NDArray[np.uint16], camera: Camera) -> NDArray[np.
 def _undistortion_maps(camera: Camera) -> tuple[Floats, Floats]:
     """Columns and rows (H, W) in the distorted image of each pixel of the undistorted one."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    columns, rows = np.moveaxis(camera.distort(pixels), -1, 0)
+    columns, rows = np.moveaxis(camera.distort(pixels.astype(float)), -1, 0)
     return columns.astype(np.float32), rows.astype(np.float32)

@@ -17,7 +17,8 @@ from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import mahalanobis
-from bmask_slam.graph.factors.graph_update import RelativePose, RelativePoseErrors
+from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
+from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.pose_graph.loop_consistency import cycle_chi2

@@ -21,7 +21,7 @@ from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.array_file import FileKind, part, read_arrays, write_arrays
 from bmask_slam.graph.files.ply import read_ply
-from bmask_slam.graph.marginals.landmark_marginalisation import reinstate
+from bmask_slam.graph.marginals.landmark_marginalisation import reinsert
 from bmask_slam.graph.smoother.storage import read_camera, read_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
@@ -93,7 +93,7 @@ def read_run(path: Path) -> SavedRun:
     tables, camera = read_graph(path / "graph")
     config = path / "config.yaml"
     graph_config = resolve(SmootherConfig, config if config.is_file() else None, section="graph")
-    reinstate(tables, camera, graph_config)
+    reinsert(tables, camera, graph_config)
     names = ["trajectory.txt", *sorted(p.name for p in path.glob("trajectory_segment_*.txt"))]
     run = SavedRun(
         path,

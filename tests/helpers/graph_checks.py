@@ -5,12 +5,8 @@ from __future__ import annotations
 import numpy as np
 from synthetic_room import CAMERA, Room
 
-from bmask_slam.graph.factors.graph_update import (
-    GraphEstimate,
-    GraphUpdate,
-    PosePrior,
-    RelativePose,
-)
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.graph_update import GraphUpdate, PosePrior, RelativePose
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother

@@ -9,15 +9,11 @@ from graph_checks import assert_isam_matches_tables
 from synthetic_room import CAMERA, Room, make_room
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.graph_update import (
-    GraphEstimate,
-    GraphUpdate,
-    Observations,
-    RefusalReason,
-)
-from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.graph.factors.factor_tables import ValueTable
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate, RefusalReason
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations
+from bmask_slam.graph.geometry import adjoint, inverse, se3_exp, se3_log
 from bmask_slam.graph.marginals.point_elimination import eliminate_points, linearise
-from bmask_slam.graph.marginals.sparsification import adjoint
 from bmask_slam.graph.smoother.smoother import Smoother, SmootherConfig
 
 ROOM = make_room(keyframes=10, points=150, noise_px=0.5, seed=3)
@@ -66,7 +62,8 @@ def test_the_schur_complement_is_that_of_the_whole_normal_matrix() -> None:
     ids, kinds = np.unique(seen.landmark_ids), np.arange(10)
     config = SmootherConfig()
     poses, points = ROOM.initial_poses, ROOM.initial_points[ids]
-    information, left = eliminate_points(seen, (kinds, poses), (ids, points), CAMERA, config)
+    keyframes, landmarks = ValueTable.of(kinds, poses), ValueTable.of(ids, points)
+    information, left = eliminate_points(seen, keyframes, landmarks, CAMERA, config)
     column = np.searchsorted(ids, seen.landmark_ids)
     r, J_pose, J_point = linearise(seen, poses[seen.keyframe_ids], points[column], CAMERA, config)
     J = np.zeros((len(seen), 3, 60 + 3 * len(ids)))

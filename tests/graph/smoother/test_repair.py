@@ -11,13 +11,8 @@ import bmask_slam.graph.smoother.smoother
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import (
-    GraphEstimate,
-    GraphUpdate,
-    Observations,
-    RefusalReason,
-    Refusals,
-)
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate, RefusalReason, Refusals
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.isam2 import SolverError
 from bmask_slam.graph.smoother.repair import Repair

@@ -9,14 +9,8 @@ from scipy.stats import chi2
 from synthetic_room import CAMERA, Room, make_room
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.graph_update import (
-    GraphEstimate,
-    GraphUpdate,
-    Observations,
-    PosePrior,
-    RefusalReason,
-    RelativePose,
-)
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate, RefusalReason
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.isam2 import poses_last

@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 from synthetic_room import CAMERA, make_room
 
-from bmask_slam.graph.factors.graph_update import (
-    NO_LANDMARK,
-    GraphUpdate,
-    Observations,
-    PosePrior,
-    RefusalReason,
-    RelativePose,
-)
+from bmask_slam.graph.factors.graph_estimate import NO_LANDMARK, RefusalReason
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.observability import constrained_landmarks
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.graph.smoother.smoother import Smoother

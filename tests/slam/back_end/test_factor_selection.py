@@ -21,7 +21,8 @@ from bmask_slam.back_end.factor_selection import (
     stereo_measurements,
 )
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.graph_update import GraphEstimate, GraphUpdate
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.world.world_map import WorldMap

@@ -12,7 +12,7 @@ import bmask_slam.back_end.mapper
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.back_end.mapper import BackEndConfig, Mapper
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.factors.graph_update import RelativePoseErrors
+from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, so3_exp, transform
 from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
 from bmask_slam.loops.verification import LoopConstraint
