@@ -1,1 +1,1 @@
-"""TODO."""
+"""Batch optimisation: bundle adjustment without wrong loops and wrong observations."""

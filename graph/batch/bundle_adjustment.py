@@ -25,12 +25,10 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.checks import OBSERVATION_PROBABILITY, wrong_observations
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.gnc import first_mu, gnc_weights
-from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
+from bmask_slam.graph.factors.graph_update import LOOP, GraphUpdate, RelativePose
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.smoother.removal import remove
-
-LOOP = "loop"
 
 
 @dataclass(frozen=True)

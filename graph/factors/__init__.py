@@ -1,1 +1,1 @@
-"""TODO."""
+"""The graph as arrays: observations, relative poses, priors, their checks, and GTSAM factors."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Files: named arrays with a header, and point clouds as PLY."""

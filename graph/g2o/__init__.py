@@ -1,1 +1,1 @@
-"""TODO."""
+"""The g2o text format of pose graphs and of graphs with landmarks."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Marginal covariances, and relative poses that replace marginalised landmarks."""

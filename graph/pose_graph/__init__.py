@@ -1,1 +1,1 @@
-"""TODO."""
+"""Pose graphs offline: Levenberg-Marquardt, dogleg, and robust optimisation by GNC."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The incremental smoother (ISAM2): validation, removal, anchoring, repair, saved graphs."""

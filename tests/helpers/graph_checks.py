@@ -1,4 +1,4 @@
-"""Checks of a smoother against its own shadow and against a graph made from scratch."""
+"""Checks of a smoother against its own factor tables and against a graph made from scratch."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def from_scratch(smoother: Smoother, room: Room) -> GraphEstimate:
 
 
 def assert_isam_matches_tables(smoother: Smoother) -> None:
-    """Every slot holds just the factor that the shadow believes to be there."""
+    """Every slot holds exactly the factor that the tables say."""
     tables, isam = smoother._tables, smoother._solver._isam
     graph = isam.getFactorsUnsafe()
     rows = tables.observations.all_rows()

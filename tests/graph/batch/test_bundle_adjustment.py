@@ -151,11 +151,11 @@ def test_loops_that_agree_all_stay() -> None:
 def test_results_move_with_the_world() -> None:
     T_new_old = make_pose(se3_exp(np.array([0.4, -1, 2, 0, 0, 0]))[:3, :3], np.array([3.0, -5, 2]))
     rooms = [room := make_room(noise_px=1.0, mono_share=0.2), room.moved(T_new_old)]
-    shadows = [factor_tables_of(room) for room in rooms]
-    here, there = (adjust(tables, CAMERA) for tables in shadows)
+    graphs = [factor_tables_of(room) for room in rooms]
+    here, there = (adjust(tables, CAMERA) for tables in graphs)
     np.testing.assert_array_equal(here.wrong_observations, there.wrong_observations)
-    moved = T_new_old @ shadows[0].keyframes.values
-    np.testing.assert_allclose(shadows[1].keyframes.values, moved, atol=1e-5)
+    moved = T_new_old @ graphs[0].keyframes.values
+    np.testing.assert_allclose(graphs[1].keyframes.values, moved, atol=1e-5)
     assert there.final_cost == pytest.approx(here.final_cost, rel=1e-6)
 
 

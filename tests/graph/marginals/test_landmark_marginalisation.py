@@ -98,8 +98,8 @@ def test_two_keyframes_lose_nothing() -> None:
     )
 
 
-def test_what_retires_leaves_the_estimate_and_its_covariance() -> None:
-    """The poses stay where they were, and how sure they are of each other stays nearly."""
+def test_marginalisation_keeps_the_estimate_and_its_covariance() -> None:
+    """The poses do not move, and their relative covariances hardly change."""
     full, sparse = filled(), filled()
     before = full.optimise_batch()
     full.update(GraphUpdate())
@@ -115,8 +115,8 @@ def test_what_retires_leaves_the_estimate_and_its_covariance() -> None:
         assert (ratio < 1.6).all()
 
 
-def test_a_graph_of_relative_poses_alone_is_honest() -> None:
-    """Everything retires in groups: the error is what the covariance says (NEES)."""
+def test_a_graph_of_relative_poses_alone_is_consistent() -> None:
+    """All landmarks are marginalised in groups: errors agree with the covariance (NEES)."""
     nees = []
     for seed in range(8):
         room = make_room(keyframes=10, points=80, noise_px=0.7, seed=seed)
@@ -131,7 +131,7 @@ def test_a_graph_of_relative_poses_alone_is_honest() -> None:
 
 
 def test_a_landmark_comes_back_with_its_summary() -> None:
-    """Its place is where it was; its old observations are not taken a second time."""
+    """Its position is unchanged; its old observations are refused a second time."""
     smoother = filled(until=6)
     before = smoother.optimise_batch()
     ids = before.landmark_ids[:40]
@@ -160,7 +160,7 @@ def test_a_landmark_comes_back_with_its_summary() -> None:
 
 
 def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
-    """Retired, come back, retired again: every observation is there once in the end."""
+    """Marginalised, back, marginalised again: every observation is there once in the end."""
     smoother, full = Smoother(CAMERA), Smoother(CAMERA)
     estimate = None
     for k, update in enumerate(ROOM.updates()):
@@ -182,7 +182,7 @@ def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
         assert_isam_matches_tables(smoother)
     assert len(estimate.landmark_ids) < 150
     assert set(smoother._tables.marginalised.returned) & set(estimate.landmark_ids.tolist())
-    kept = _pairs(full) - _pairs(smoother) - _archived(smoother)
+    kept = _pairs(full) - _pairs(smoother) - _marginalised(smoother)
     assert all(j % 5 == k % 5 for k, j in kept)
     sparse, expected = smoother.optimise_batch(), full.optimise_batch()
     assert smoother._tables.marginalised.chunks == {}
@@ -191,7 +191,7 @@ def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
 
 
 def test_a_removed_observation_leaves_its_group() -> None:
-    """An outlier among what retired is taken out afterwards: as if it had never been there."""
+    """A marginalised outlier is removed afterwards: the result is that without it."""
     room = make_room(keyframes=2, points=80, noise_px=0.3)
     seen = room.observations
     bad = int(np.flatnonzero(seen.keyframe_ids == 1)[5])
@@ -209,13 +209,13 @@ def test_a_removed_observation_leaves_its_group() -> None:
     after = spoiled.update(GraphUpdate(remove_observations=pair))
     assert_isam_matches_tables(spoiled)
     expected = clean.update(GraphUpdate())
-    assert (1, int(pair[0, 1])) not in _archived(spoiled)
+    assert (1, int(pair[0, 1])) not in _marginalised(spoiled)
     off = np.abs(pose_differences(before, expected)).max()
     assert np.abs(pose_differences(after, expected)).max() < 0.3 * off
 
 
 @pytest.mark.parametrize("what", ["landmark", "keyframe"])
-def test_what_is_removed_leaves_the_archive_too(what: str) -> None:
+def test_removals_apply_to_marginalised_observations_too(what: str) -> None:
     smoother = filled()
     estimate = smoother.optimise_batch()
     marginalise_landmarks(smoother, estimate.landmark_ids[:100])
@@ -227,7 +227,7 @@ def test_what_is_removed_leaves_the_archive_too(what: str) -> None:
     )
     assert_isam_matches_tables(smoother)
     column = 1 if what == "landmark" else 0
-    assert not {pair[column] for pair in _archived(smoother)} & set(gone.tolist())
+    assert not {pair[column] for pair in _marginalised(smoother)} & set(gone.tolist())
     assert len(after.anchored_keyframes) == 0
     assert not after.rebuilt
     full = smoother.optimise_batch()
@@ -235,8 +235,8 @@ def test_what_is_removed_leaves_the_archive_too(what: str) -> None:
     assert full.landmark_ids.tolist() == left.tolist()
 
 
-def test_a_saved_graph_keeps_its_archive(tmp_path: Path) -> None:
-    """Save, load, and go on: as if the smoother had restarted there."""
+def test_a_saved_graph_keeps_its_marginalised_landmarks(tmp_path: Path) -> None:
+    """Save, load and continue: as if the smoother had restarted there."""
     smoother = filled(until=7)
     ids = smoother.optimise_batch().landmark_ids
     marginalise_landmarks(smoother, ids[::2])
@@ -244,7 +244,7 @@ def test_a_saved_graph_keeps_its_archive(tmp_path: Path) -> None:
     smoother.restart()
     smoother.save(tmp_path / "graph")
     loaded = Smoother.load(tmp_path / "graph")
-    assert _archived(loaded) == _archived(smoother)
+    assert _marginalised(loaded) == _marginalised(smoother)
     for k in (7, 8, 9):
         update = ROOM.update_of(k)
         back = np.setdiff1d(update.observations.landmark_ids, smoother.estimate().landmark_ids)
@@ -266,7 +266,7 @@ def _pairs(smoother: Smoother) -> set[tuple[int, int]]:
     return set(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))
 
 
-def _archived(smoother: Smoother) -> set[tuple[int, int]]:
+def _marginalised(smoother: Smoother) -> set[tuple[int, int]]:
     return {
         (int(k), int(j))
         for chunk in smoother._tables.marginalised.chunks.values()

@@ -84,7 +84,7 @@ def test_an_id_is_used_again(in_one_update: bool) -> None:
 
 
 def test_many_random_removals_and_returns() -> None:
-    """Slots are used again and again and always hold what the shadow says."""
+    """Slots are used again and again and always hold what the factor tables say."""
     rng = np.random.default_rng(5)
     smoother = filled(ROOM)
     seen = ROOM.observations

@@ -119,7 +119,7 @@ def test_pose_covariance_is_consistent(noise_px: float, disparity_noise_px: floa
     assert low < sum(nees) < high
 
 
-def test_covariance_of_isam_and_of_the_shadow_agree() -> None:
+def test_covariances_of_isam_and_of_all_factors_agree() -> None:
     room = make_room(keyframes=5, points=60, noise_px=0.5)
     smoother, _ = run(room, SmootherConfig(robust=False, extra_iterations=3))
     ids, landmarks = np.array([4, 2]), np.array([7])
@@ -204,3 +204,37 @@ def test_only_poses_are_eliminated_last() -> None:
     groups = poses_last(graph)
     assert groups.size() == 2
     assert groups.at(x1) == groups.at(x2) == 1
+
+
+def test_relative_poses_of_a_kind_are_listed_with_their_covariances() -> None:
+    """A new smoother that gets them has the same loops."""
+    room = make_room(noise_px=0.3)
+    smoother, _ = run(room)
+    T_world_a, T_world_b = room.poses_world_camera[[0, 3]]
+    loop = RelativePose(0, 3, inverse(T_world_a) @ T_world_b, 1e-4 * np.eye(6), "dcs", "loop")
+    smoother.update(GraphUpdate(relative_poses=(loop,)))
+    assert smoother.relative_poses("odometry") == ()
+    (listed,) = smoother.relative_poses("loop")
+    assert listed is loop
+    other, _ = run(room)
+    other.update(GraphUpdate(relative_poses=(listed,)))
+    assert other.relative_pose_errors("loop").keyframe_b.tolist() == [3]
+
+
+def test_notes_say_what_was_refused_and_why() -> None:
+    room, smoother = make_room(noise_px=0.3), Smoother(CAMERA)
+    first, second = room.update_of(0), room.update_of(1)
+    assert smoother.update(first).notes() == []
+    seen = second.observations
+    measurements = seen.measurements.copy()
+    measurements[:2, 0] = np.inf
+    loop = RelativePose(0, 77, np.eye(4), np.eye(6), kind="loop")
+    estimate = smoother.update(
+        dataclasses.replace(
+            second,
+            observations=dataclasses.replace(seen, measurements=measurements),
+            relative_poses=(loop,),
+        )
+    )
+    assert "2 observations refused: not finite" in estimate.notes()
+    assert "1 loop factors refused: unknown keyframe" in estimate.notes()
