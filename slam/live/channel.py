@@ -1,8 +1,8 @@
-"""Both directions of a socket between two processes, each with a thread of its own.
+"""Messages between two processes over a socket, with one thread for each direction.
 
-Messages are pickled; large arrays in them go through shared memory. Neither side ever waits for the
-other: what is sent waits in a queue, what has come waits in another. The end of the other process,
-however it came, ends the channel.
+Messages are pickled; large arrays in them go through shared memory. Neither side waits for the
+other: there is a queue of messages to send and one of received messages. The channel ends when the
+other process does, for whatever reason.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from typing import Any
 from bmask_slam.live.shared_memory import Ring
 
 LARGE = 1 << 15
-"""Bytes from which an array goes through shared memory."""
+"""Bytes from which on an array goes through shared memory."""
 _END = object()
 
 
 class Channel:
-    """One end. Log records that arrive are handled at once, everything else waits to be asked for.
+    """One end of the connection; received log records are handled at once, not queued.
 
     Attributes:
-        open: False once the other side has gone or this one was closed.
+        open: False once the other side has ended or this one was closed.
     """
 
     def __init__(self, connection: Connection, rings: tuple[Ring, Ring]) -> None:
-        """Over a connection, and the memory that it writes to and reads from."""
+        """Use a connection, and the rings to write to and to read from."""
         self.open = True
         self._connection = connection
         self._outgoing, self._incoming = rings
@@ -46,11 +46,11 @@ class Channel:
         self._reader.start()
 
     def send(self, message: Any) -> None:
-        """Send in order, later; nothing happens once the channel has ended."""
+        """Queue a message to be sent in order; does nothing once the channel has ended."""
         self._outbox.put(message)
 
     def receive(self, timeout_s: float = 0.0) -> list[Any]:
-        """Every message that has come, waiting for the first for at most ``timeout_s``."""
+        """All messages received so far; waits for the first for at most ``timeout_s``."""
         found: list[Any] = []
         deadline_s = time.monotonic() + timeout_s
         with suppress(queue.Empty):
@@ -64,17 +64,17 @@ class Channel:
         return found
 
     def messages(self) -> Iterator[Any]:
-        """Each message as it comes, until the other side ends."""
+        """Each message as it arrives, until the other side ends."""
         while (message := self._inbox.get()) is not _END:
             yield message
 
     def finish(self, timeout_s: float = 5.0) -> None:
-        """Send what waits, then tell the other side that nothing more will come."""
+        """Send the queued messages, then end this direction."""
         self._outbox.put(_END)
         self._sender.join(timeout_s)
 
-    def read_to_the_end(self, timeout_s: float = 1.0) -> None:
-        """Take in what the other side, which has gone, had sent."""
+    def drain(self, timeout_s: float = 1.0) -> None:
+        """Receive what the other side sent before it ended."""
         self._reader.join(timeout_s)
 
     def close(self) -> None:
@@ -86,8 +86,8 @@ class Channel:
     def _send_all(self) -> None:
         while (message := self._outbox.get()) is not _END:
             try:
-                self._connection.send(self._packed(message))
-            except OSError:  # the other side has gone
+                self._connection.send(self._pack(message))
+            except OSError:  # the other side has ended
                 self.open = False
                 return
         self._shutdown(socket.SHUT_WR)
@@ -95,7 +95,7 @@ class Channel:
     def _read_all(self) -> None:
         try:
             while True:
-                message = self._unpacked(*self._connection.recv())
+                message = self._unpack(*self._connection.recv())
                 if isinstance(message, logging.LogRecord):
                     logging.getLogger(message.name).handle(message)
                 else:
@@ -104,8 +104,8 @@ class Channel:
             self.open = False
             self._inbox.put(_END)
 
-    def _packed(self, message: Any) -> tuple[bytes, list[bytes | tuple[int, int]]]:
-        """The pickled message, and its large buffers: where in the memory, or themselves."""
+    def _pack(self, message: Any) -> tuple[bytes, list[bytes | tuple[int, int]]]:
+        """The pickled message and its large buffers: (position, size) in the ring, or bytes."""
         buffers: list[memoryview] = []
 
         def keep_small(buffer: pickle.PickleBuffer) -> bool:
@@ -116,12 +116,12 @@ class Channel:
             return False
 
         data = pickle.dumps(message, protocol=5, buffer_callback=keep_small)
-        places = ((self._outgoing.put(raw), raw) for raw in buffers)
+        places = ((self._outgoing.write(raw), raw) for raw in buffers)
         return data, [bytes(raw) if at is None else (at, raw.nbytes) for at, raw in places]
 
-    def _unpacked(self, data: bytes, places: list[bytes | tuple[int, int]]) -> Any:
+    def _unpack(self, data: bytes, places: list[bytes | tuple[int, int]]) -> Any:
         buffers = [
-            bytearray(place) if isinstance(place, bytes) else self._incoming.take(*place)
+            bytearray(place) if isinstance(place, bytes) else self._incoming.read(*place)
             for place in places
         ]
         return pickle.loads(data, buffers=buffers)
@@ -132,7 +132,7 @@ class Channel:
 
 
 class ForwardedLog(logging.Handler):
-    """Sends log records through a channel, to the process that has the files."""
+    """Sends log records through a channel, to the process that writes log files."""
 
     def __init__(self, channel: Channel) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What a viewer is told of the live loop, a little at each frame."""
+"""Sends the state of the live loop to a viewer, a little at each frame."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from bmask_slam.viewer.scene import Scene
 from bmask_slam.world.world_map import WorldMap
 
 IMAGE_EVERY = 3
-"""Frames from one image to the next."""
+"""Interval in frames of images that are shown."""
 MOVED_AT_ONCE = 10
-"""Submaps that are moved at a frame, at most: what waits is moved at the next ones."""
+"""Largest number of submaps that are moved at a frame; the others follow at the next frames."""
 MOVED_M, TURNED = 0.002, 0.001
-"""What is nearer to its place, in metres and by its rotation matrix, is left there."""
+"""Smallest shift in metres, and change of the rotation matrix, for which a submap is moved."""
 
 
 class Display:
-    """Tells a scene what is found; closing it is up to who made it."""
+    """Updates a scene, which its maker closes."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._frames = self._changes = 0
         self._placed: dict[int, Array] = {}
-        self._away: list[int] = []
+        self._to_move: list[int] = []
 
     def frame(self, result: FrameResult, rgb: Image, system: LiveSystem) -> bool:
-        """Show a frame, and of the submaps what is due; whether the map has changed."""
+        """Show a frame, and some changes of the submaps; returns whether the map has changed."""
         self._frames += 1
         self._scene.log_frame(result, rgb if self._frames % IMAGE_EVERY == 1 else None)
         has_changed = self._changes != system.remote.changes
@@ -53,19 +53,19 @@ class Display:
     def submaps(
         self, dense: RemoteDenseMapper, world: WorldMap, has_changed: bool, at_once: int
     ) -> None:
-        """Show submaps that are finished, and move those whose keyframes have moved.
+        """Show at most ``at_once`` finished submaps, and move as many whose keyframes have moved.
 
-        One whose keyframe is in another map segment than the largest waits until they are joined.
+        A submap whose keyframe is not in the largest map segment waits until the two are joined.
         """
         if has_changed:
             for gone in self._placed.keys() - world.keyframes.keys():
                 del self._placed[gone]
                 self._scene.remove_submap(gone)
-            self._away = self._moved(world)
-        for number in self._away[:at_once]:
+            self._to_move = self._moved(world)
+        for number in self._to_move[:at_once]:
             if number in self._placed and number in world.keyframes:
                 self._place(number, world)
-        del self._away[:at_once]
+        del self._to_move[:at_once]
         segment = world.largest_segment() if dense.previews else 0
         due = [n for n in dense.previews if n in world.keyframes]
         for number in [n for n in due if world.keyframes[n].segment == segment][:at_once]:
@@ -74,7 +74,7 @@ class Display:
             self._place(number, world)
 
     def _moved(self, world: WorldMap) -> list[int]:
-        """Submaps that are not where their keyframes are, the farthest first."""
+        """Submaps whose keyframes have moved since they were placed, the largest motion first."""
         ids = list(self._placed)
         if not ids:
             return []

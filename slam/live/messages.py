@@ -1,4 +1,4 @@
-"""What the processes of the live loop say to each other: plain values that pickle."""
+"""Messages between the processes of the live loop: plain values that pickle."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from bmask_slam.world.landmark_table import Patches
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
-    """Landmarks (N,) with the number of frames that should have seen, and did see, each."""
+class VisibilityCounts:
+    """Number of frames in whose view landmarks (N,) were, and in which they were found."""
 
     ids: Ints
     visible: Ints
@@ -29,13 +29,13 @@ class NewKeyframe:
     Attributes:
         id: of the keyframe.
         frame_index, timestamp_s: of the frame.
-        tracked: how it was tracked; with the image, from which patches are cut.
+        tracked: result of its tracking, with the image, from which patches are cut.
         segment: the map segment.
-        reference: a keyframe and its pose as tracking knew it, which says where
-            ``tracked.T_world_camera`` is; None where the frame begins a segment.
+        reference: id of a keyframe and the T_world_camera that tracking knew of it, relative to
+            which ``tracked.T_world_camera`` holds; None if the frame begins a segment.
         local_ids: (N,) landmarks that it was tracked against.
-        sightings: of the frames since the last keyframe.
-        history: the frames since then.
+        visibility: counts of the frames since the last keyframe.
+        history: the frames since the last keyframe.
         depth_m: (h, w) every second pixel of its z-depth, for its masks.
     """
 
@@ -46,20 +46,22 @@ class NewKeyframe:
     segment: int
     reference: tuple[int, Array] | None
     local_ids: Ints
-    sightings: Sightings
+    visibility: VisibilityCounts
     history: Entries
     depth_m: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class LostKeyframe:
-    """To the map, in place of a ``NewKeyframe`` that it cannot take in: its frames go to another.
+    """To the map, in place of a ``NewKeyframe`` that its process cannot handle.
 
     Attributes:
-        id: of the keyframe. heir_id: a keyframe that takes its frames. T_heir_lost: (4, 4).
-            A keyframe that began a segment has no heir (NOBODY): the segment begins anew.
+        id: of the keyframe.
+        parent_id: keyframe to which its frames are attached. A keyframe that began a segment has
+            none (NOBODY): the segment begins anew.
+        T_parent_lost: (4, 4) the pose of the keyframe relative to its parent.
         history: as of the ``NewKeyframe``.
-        landmarks: ever made, as tracking knows; no id among them means another one from now on.
+        landmarks: number of landmarks ever made that tracking knows; their ids are not used again.
     """
 
     id: int
@@ -70,15 +72,15 @@ class LostKeyframe:
 
 
 @dataclass(frozen=True)
-class Began:
-    """From the map: it has begun to carry out message ``number``."""
+class Started:
+    """From the map: it has started to handle message ``number``."""
 
     number: int
 
 
 @dataclass(frozen=True, eq=False)
 class Masks:
-    """Of a keyframe: from the segmenter, and on to the map. ``segmentation_ms``: time it took."""
+    """Masks of a keyframe, from the segmenter to the map; ``segmentation_ms``: time it took."""
 
     keyframe_id: int
     instances: list[Instance]
@@ -87,7 +89,7 @@ class Masks:
 
 @dataclass(frozen=True, eq=False)
 class ImageToSegment:
-    """To the segmenter: a keyframe's image (H, W, 3), and its name for those who look masks up."""
+    """To the segmenter: a keyframe's image (H, W, 3), and its name to look masks up by."""
 
     keyframe_id: int
     rgb: Image
@@ -96,7 +98,7 @@ class ImageToSegment:
 
 @dataclass(frozen=True)
 class NotSegmented:
-    """From the segmenter: a keyframe's image was passed over, and why."""
+    """From the segmenter: a keyframe's image was skipped, and why."""
 
     keyframe_id: int
     reason: str
@@ -104,14 +106,14 @@ class NotSegmented:
 
 @dataclass(frozen=True, eq=False)
 class PruneLandmarks:
-    """To the map: landmarks (N,) on things that move."""
+    """To the map: remove landmarks (N,) on moving objects."""
 
     ids: Ints
 
 
 @dataclass(frozen=True, eq=False)
 class PruneMask:
-    """To the map: a mask of what moves in a keyframe's image."""
+    """To the map: remove the observations under a mask of moving objects in a keyframe's image."""
 
     keyframe_id: int
     mask: PackedMask
@@ -120,9 +122,9 @@ class PruneMask:
 
 @dataclass(frozen=True, eq=False)
 class RestoreObservations:
-    """To the map: masked keypoints (N,) of a keyframe lie on what stands after all.
+    """To the map: masked keypoints (N,) of a keyframe turned out to be static; restore them.
 
-    ``patches`` (N) are those of what they observed before.
+    ``patches`` (N) are those of the landmarks that they observed before.
     """
 
     keyframe_id: int
@@ -132,14 +134,14 @@ class RestoreObservations:
 
 @dataclass(frozen=True)
 class SaveState:
-    """To the map: write all that is known to a file."""
+    """To the map: write its state to a file."""
 
     path: Path
 
 
 @dataclass(frozen=True, eq=False)
 class Finish:
-    """To the map: no more keyframes; optimise once more and write all that is known."""
+    """To the map: no more keyframes; optimise a last time and write the state to a file."""
 
     path: Path
     history: Entries
@@ -147,9 +149,9 @@ class Finish:
 
 @dataclass(frozen=True, eq=False)
 class MapChanged:
-    """From the map: a delta after ``keyframe_id``'s landmarks were made or the graph moved.
+    """From the map: changes, after a keyframe's landmarks were made or the graph was optimised.
 
-    ``done``: the keyframe's work is finished; ``update_ms`` is then the time it took.
+    ``done``: the keyframe is finished; ``update_ms`` is then the time that it took.
     """
 
     keyframe_id: int
@@ -161,7 +163,7 @@ class MapChanged:
 
 @dataclass(frozen=True)
 class StateSaved:
-    """From the map: the file holds everything up to message ``number``."""
+    """From the map: the file holds the state after message ``number``."""
 
     number: int
     path: Path
@@ -169,6 +171,6 @@ class StateSaved:
 
 @dataclass(frozen=True)
 class Ready:
-    """From a worker: it has started."""
+    """From a worker: it can work. ``labels`` are the class names of a segmenter."""
 
     labels: tuple[str, ...] = field(default=())

@@ -1,4 +1,4 @@
-"""From a source into the live loop, until it ends or is stopped."""
+"""Plays a source into the live loop until it ends or is stopped."""
 
 from __future__ import annotations
 
@@ -20,20 +20,26 @@ from bmask_slam.sequences.prefetch import prefetched
 logger = logging.getLogger(__name__)
 
 AHEAD = 2
-"""Frames whose features are computed ahead of tracking where the source waits."""
+"""Number of frames whose features are extracted ahead of tracking if the source waits."""
 KEPT = 3
-"""Frames that wait for tracking at most where it does not; one more drives out the others."""
+"""Largest number of frames that wait for tracking otherwise; one more drops all older ones."""
 WAITING = 1
-"""Keyframes that wait for the map at most where the source waits: left far behind, it is lost."""
+"""Largest number of keyframes that wait for the map if the source waits.
+
+Tracking against a map that is far behind is lost.
+"""
 
 _Pairs: TypeAlias = Iterator[tuple[Frame, Prepared]]
 
 
 @dataclass(frozen=True)
 class PlayOptions:
-    """``realtime``: a frame that tracking has no time for is dropped, else the source waits.
+    """How a source is played.
 
-    ``silence_s``: a source that gives nothing for so long is reported.
+    Attributes:
+        realtime: drop frames that tracking has no time for; else the source waits.
+        silence_s: warn when no frame comes for so long.
+        quiet: show no progress bar.
     """
 
     realtime: bool = True
@@ -42,9 +48,9 @@ class PlayOptions:
 
 
 def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals | None:
-    """Track what a source gives; returns the signal that ended it early, if one did.
+    """Track a source's frames; returns the signal that ended it early, if one did.
 
-    Frames that are refused are passed over with a warning.
+    Frames that are refused are skipped with a warning.
     """
     pairs = _with_features(slam, source)
     with StopRequest() as stop, make_bar(None, options.quiet) as bar:
@@ -53,7 +59,7 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
         )
         for frame, ahead in chosen:
             prepared = ahead
-            if not options.realtime:  # it waited in a queue, which no camera would make it do
+            if not options.realtime:  # its latency counts from now: it waited in the queue
                 slam.catch_up(WAITING)
                 prepared = replace(ahead, arrived_s=time.monotonic())
             try:
@@ -69,13 +75,13 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
 
 
 def _with_features(slam: LiveSlam, source: Source) -> _Pairs:
-    """Frames with their features, for a thread that is one frame ahead of tracking."""
+    """Frames with their features, which another thread iterates over ahead of tracking."""
     for frame in source.frames():
         yield frame, slam.prepare(frame.rgb, frame.depth_m)
 
 
 def _newest(slam: LiveSlam, pairs: _Pairs, options: PlayOptions, stop: StopRequest) -> _Pairs:
-    """What comes, dropping what there is no time for."""
+    """Frames as they come, without those that tracking has no time for."""
     newest = Newest(pairs, KEPT)
     heard_s, silent = time.monotonic(), False
     try:

@@ -1,4 +1,4 @@
-"""What a live run writes while it goes on; a full disk costs files, not the run."""
+"""Writes files while a live run goes on; a full disk does not end the run."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ logger = logging.getLogger(__name__)
 HEALTH_S = 1.0
 SNAPSHOT_S = 5.0
 SNAPSHOT_SHARE = 0.005
-"""Of the time at most goes into trajectory.txt, which takes longer as it grows."""
-SAY_S = 60.0
-"""A disk that stays full is said again after so long."""
+"""Largest share of the time that is spent on trajectory.txt, which takes longer as it grows."""
+MESSAGE_S = 60.0
+"""Interval of the message that the disk is full."""
 
 
 class Recorder:
     """Writes frames.csv, and now and then health.json and trajectory.txt, into a run folder.
 
     Attributes:
-        unwritten: how often something could not be written, for want of room.
+        unwritten: how often something could not be written because the disk was full.
     """
 
     def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
         self.unwritten = 0
-        self._said_s = -np.inf
+        self._message_s = -np.inf
         self._health_s = time.monotonic()
         self._snapshot_due_s = self._health_s + SNAPSHOT_S
 
@@ -46,15 +46,15 @@ class Recorder:
         health: Callable[[], Health],
         trajectory: Callable[[], Trajectory],
     ) -> None:
-        """Write a frame, and the other files where they are due; a full disk is said."""
+        """Write a frame, and the other files when they are due; a full disk is logged."""
         try:
             self._write(result, health, trajectory)
         except OSError as error:
             if error.errno not in DISK_ERRORS:
                 raise
             self.unwritten += 1
-            if time.monotonic() - self._said_s > SAY_S:
-                self._said_s = time.monotonic()
+            if time.monotonic() - self._message_s > MESSAGE_S:
+                self._message_s = time.monotonic()
                 logger.error(
                     "%s: %s; tracking goes on, free some space before it ends",
                     self.folder.path,
@@ -80,7 +80,7 @@ class Recorder:
 
 
 def rescued(trajectory: Trajectory) -> str:
-    """Write a trajectory where there may be room; says where, or that there was none."""
+    """Write a trajectory to the temporary folder; returns a text that says where, or why not."""
     path = Path(tempfile.gettempdir()) / f"bmask-slam-{os.getpid()}-trajectory.txt"
     try:
         write_tum(path, trajectory)

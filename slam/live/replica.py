@@ -1,8 +1,8 @@
-"""A second copy of the map in another process, kept equal by what changed.
+"""A copy of the map in another process, kept up to date by differences.
 
-The map's owner works in its own process; tracking needs the whole map between two frames. So the
-owner sends, after each change, a ``WorldDelta``: every pose and point, since the graph moves all of
-them, but descriptors, patches and observations only where they changed.
+The map's owner runs in its own process, and tracking needs the whole map for every frame. So the
+owner sends a ``WorldDelta`` after each change: every pose and point, since optimisation moves all
+of them, but descriptors, patches and observations only where they changed.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ COLUMNS = (
     *("descriptors", "directions", "extent", "angles_rad", "patches", "patch_views"),
     *("colours", "host", "last_keyframe", "observations"),
 )
-"""Of the landmark table; ``visible`` and ``found`` are counted by whoever tracks."""
+"""Columns of the landmark table that are sent; tracking counts ``visible`` and ``found``."""
 COMPARED = ("descriptors", "directions", "patch_views", "host", "observations")
-"""No other column changes unless one of these does."""
+"""Columns that are compared: the others change only together with one of these."""
 
 
 @dataclass(frozen=True, eq=False)
 class KeyframeRow:
-    """A keyframe's observations (N,), where they changed; features only if the copy lacks them."""
+    """A keyframe's observations (N,), if they changed; features only if the copy has none."""
 
     landmark_ids: Ints
     masked: Mask
@@ -42,14 +42,18 @@ class WorldDelta:
     """What changed in a map since the last delta.
 
     Attributes:
-        size: landmarks ever made. alive: (size,) flags as packed bits.
-        points_world: (A, 3) of the living landmarks, in the order of their ids.
-        ids: (R,) living landmarks that changed otherwise. columns: their rows, by name.
+        size: number of landmarks ever made.
+        alive: (size,) flags as packed bits.
+        points_world: (A, 3) of the valid landmarks, in the order of their ids.
+        ids: (R,) valid landmarks of which another column changed.
+        columns: the rows of these, by the name of the column.
         replaced_by: (size,) of all landmarks if any was fused, else None.
         next_keyframe_id: of the map.
-        keyframe_ids: (K,) all of them. poses: (K, 4, 4). segments: (K,).
+        keyframe_ids: (K,) of all keyframes.
+        poses: (K, 4, 4) T_world_camera.
+        segments: (K,) map segments.
         rows: observations of the keyframes where they changed, by id.
-        heirs: new heirs, as ``FrameHistory.hand_over`` takes them.
+        parents: new parents of culled keyframes, as the arguments of ``FrameHistory.hand_over``.
     """
 
     size: int
@@ -68,7 +72,7 @@ class WorldDelta:
 
 @dataclass
 class _Sent:
-    """What the other side has: of landmarks those that live, by ``ids``."""
+    """What the copy has; landmarks are the valid ones, whose ids are ``ids``."""
 
     ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     landmarks: Arrays = field(default_factory=dict)
@@ -79,18 +83,18 @@ class _Sent:
 
 
 class DeltaMaker:
-    """Remembers what was sent; ``known`` are keyframes whose features the other side has."""
+    """Makes deltas relative to what was sent before."""
 
     def __init__(self) -> None:
         self._sent = _Sent()
         self._features: set[int] = set()
 
     def has_features(self, keyframe_id: int) -> None:
-        """The other side made this keyframe."""
+        """Do not send the features of this keyframe: the copy has made it itself."""
         self._features.add(keyframe_id)
 
     def delta(self, world: WorldMap, history: FrameHistory) -> WorldDelta:
-        """What changed since the last call; all of the map at the first."""
+        """What changed since the last call; the whole map at the first."""
         table, keyframes = world.landmarks, list(world.keyframes.values())
         ids = self._changed_landmarks(world)
         fused = int(np.count_nonzero(table.replaced_by >= 0))
@@ -114,17 +118,17 @@ class DeltaMaker:
         )
 
     def _changed_landmarks(self, world: WorldMap) -> Ints:
-        """Living landmarks whose looks or observations are not as sent; they count as sent now."""
+        """Valid landmarks whose compared columns differ from what was sent before."""
         table, sent = world.landmarks, self._sent
         ids = np.flatnonzero(table.alive)
-        looks = {name: getattr(table, name)[ids] for name in COMPARED}
+        columns = {name: getattr(table, name)[ids] for name in COMPARED}
         _, here, there = np.intersect1d(ids, sent.ids, assume_unique=True, return_indices=True)
         same = np.ones(len(here), bool)
         for name in COMPARED if len(here) else ():
-            a, b = looks[name][here], sent.landmarks[name][there]
+            a, b = columns[name][here], sent.landmarks[name][there]
             bytes_a, bytes_b = (rows.reshape(len(here), -1).view(np.uint8) for rows in (a, b))
             same &= (bytes_a == bytes_b).all(axis=1)  # NaN is equal to itself
-        sent.ids, sent.landmarks = ids, looks
+        sent.ids, sent.landmarks = ids, columns
         return np.delete(ids, here[same])
 
     def _has_changed(self, keyframe: Keyframe) -> bool:
@@ -150,12 +154,12 @@ class DeltaMaker:
 def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> None:
     """Make a copy of the map equal to its owner's.
 
-    Keyframes that the owner has not met yet stay, and keep their place relative to the newest one
-    that both know.
+    Keyframes that the owner has not received yet stay, and keep their pose relative to the newest
+    keyframe that both have.
     """
     _apply_landmarks(delta, world)
     pending = [k for k in world.keyframes.values() if k.id >= delta.next_keyframe_id]
-    for keyframe in pending:  # an owner that began anew may have fewer landmarks
+    for keyframe in pending:  # a restarted owner may have fewer landmarks
         keyframe.landmark_ids[keyframe.landmark_ids >= delta.size] = -1
     shared = [i for i in delta.keyframe_ids.tolist() if i in world.keyframes]
     poses = dict(zip(delta.keyframe_ids.tolist(), delta.poses, strict=True))
@@ -187,7 +191,7 @@ def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
 
 
 def _keyframe(keyframe_id: int, delta: WorldDelta, world: WorldMap) -> Keyframe:
-    """The copy's keyframe with the owner's observations; made where the copy lacks it."""
+    """The copy's keyframe with the owner's observations; made if the copy has none."""
     keyframe, row = world.keyframes.get(keyframe_id), delta.rows.get(keyframe_id)
     if keyframe is None:
         assert row is not None and row.features is not None, "a delta of another map"

@@ -9,7 +9,7 @@ from pathlib import Path
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.live.processes.dense_messages import DenseOrder
+from bmask_slam.live.processes.dense_messages import DenseSetup
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.system import LiveSystem
@@ -71,7 +71,7 @@ def start_system(
             labels = segmenter.labels
         if options.dense and options.out is not None:
             points = PREVIEW_POINTS if options.view.enabled else 0
-            dense = RemoteDenseMapper(DenseOrder(options.out, camera, masks, labels.names, points))
+            dense = RemoteDenseMapper(DenseSetup(options.out, camera, masks, labels.names, points))
             undo.callback(dense.close)
         system = LiveSystem(camera, config, scratch, segmenter, dense)
         undo.pop_all()

@@ -19,11 +19,11 @@ from bmask_slam.graph.files.array_file import nested, read_arrays
 from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.messages import ImageToSegment
-from bmask_slam.live.processes.map_process import STATE_FILE, LabelledNothing
+from bmask_slam.live.processes.map_process import STATE_FILE, LabelsOnly
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
-from bmask_slam.live.processes.supervision import Patience
+from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
@@ -33,11 +33,11 @@ from bmask_slam.world.frame_history import NOBODY
 from bmask_slam.world.world_map import Keyframe
 
 FIRST_MAP_S = 5.0
-"""How long the frame that begins a map may wait for its landmarks."""
+"""Longest wait of the first frame of a map for its landmarks."""
 SWITCH_S = 0.0005
-"""How long another thread may keep Python's lock, which tracking asks for many times a frame."""
+"""Longest time that another thread keeps Python's lock, which tracking needs often in a frame."""
 MASKS_S = 10.0
-"""How long the masks of the last keyframes are waited for at the end."""
+"""Longest wait for the masks of the last keyframes at the end."""
 FINISH_S = 600.0
 
 
@@ -62,12 +62,12 @@ def settings_for_tracking() -> Iterator[None]:
 
 
 class LiveSystem(SlamSystem):
-    """Tracks in the caller's process; ``finish`` brings the map home.
+    """Tracks in the caller's process; ``finish`` fetches the map from its process.
 
     Attributes:
-        remote: the map's copy, and the process that keeps it.
-        segmenter: the process that makes masks; None without.
-        dense: the process that makes submaps; None without.
+        remote: the copy of the map, and the process that owns the map.
+        segmenter: the process that makes masks, if any.
+        dense: the process that makes submaps, if any.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class LiveSystem(SlamSystem):
             self.remote = RemoteMapper(camera, config, self._names, folder)
             undo.callback(self.remote.close)
             super().__init__(camera, config, back_end=self.remote)
-            self.remote.wait_until_ready(Patience().start_s)
+            self.remote.wait_until_ready(RestartPolicy().start_s)
             if dense is not None:
                 dense.wait_until_ready()
             self.semantics = _RemoteSemantics(self)
@@ -92,7 +92,7 @@ class LiveSystem(SlamSystem):
             self._resources = undo.pop_all()
 
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
-        """Take in what the other processes have found, then the same step as offline."""
+        """Apply the other processes' results, then do the same step as offline."""
         self.catch_up()
         result = super().process(frame, features)
         first = self.camera_tracker.reference
@@ -101,28 +101,28 @@ class LiveSystem(SlamSystem):
         if self.remote.world.in_segment(first.segment) == [first]:
             T_before = first.T_world_camera
             self.remote.wait_for(first, FIRST_MAP_S)
-            self._go_with_map(first, T_before)
+            self._follow_map(first, T_before)
         return result
 
     def catch_up(self) -> None:
-        """Bring the map's copy up to date, pass masks on, and stay where the map has moved to."""
+        """Update the copy of the map, pass masks on, and move tracking with the map."""
         reference, changes = self.camera_tracker.reference, self.remote.changes
         T_before = None if reference is None else reference.T_world_camera
         for masks in self.remote.catch_up():
             self.moving_objects.observe_masks(masks)
-        for found in self.segmenter.answers() if self.segmenter else ():
-            self.remote.tell(found)
+        for found in self.segmenter.receive_masks() if self.segmenter else ():
+            self.remote.send(found)
             if self.dense is not None:
-                self.dense.see(found, self.remote.world)
+                self.dense.add_masks(found, self.remote.world)
         if self.dense is not None:
-            self._follow(self.dense, moved=self.remote.changes != changes)
+            self._update_dense(self.dense, moved=self.remote.changes != changes)
         if reference is not None and T_before is not None and self.remote.changes != changes:
-            self._go_with_map(reference, T_before)
+            self._follow_map(reference, T_before)
 
-    def _go_with_map(self, reference: Keyframe, T_before: Array) -> None:
-        """Stay where a keyframe was that had the pose T_before (4, 4), in the map as it is.
+    def _follow_map(self, reference: Keyframe, T_before: Array) -> None:
+        """Move tracking with a keyframe whose pose was T_before (4, 4).
 
-        If the keyframe was lost with its place, the next frame begins the segment anew.
+        If the keyframe that began the segment was lost, the next frame begins the segment anew.
         """
         tracker = self.camera_tracker
         parent_id, T_parent_reference = self.remote.history.parent(reference.id)
@@ -136,18 +136,18 @@ class LiveSystem(SlamSystem):
         tracker.refer_to(parent)
         tracker.segment = parent.segment
 
-    def _follow(self, dense: RemoteDenseMapper, moved: bool) -> None:
-        """Let the dense map follow the map."""
+    def _update_dense(self, dense: RemoteDenseMapper, moved: bool) -> None:
+        """Tell the dense map which keyframes are optimised, have masks or were culled."""
         remote, segmenter = self.remote, self.segmenter
         if moved:
-            dense.forget_culled(remote.world, remote.awaits)
+            dense.remove_culled(remote.world, remote.awaits)
         lacks = segmenter.awaits if segmenter is not None else (lambda number: False)
-        dense.follow(remote.world, remote.awaits, lacks)
+        dense.update(remote.world, remote.awaits, lacks)
 
     def wait_for_map(self, waiting: float, timeout_s: float) -> None:
-        """Catch up until no more than so many keyframes wait for the map, or for so long.
+        """Catch up until at most ``waiting`` keyframes wait for the map, or until the timeout.
 
-        The dense map is waited for where it would drop a keyframe.
+        With a finite ``waiting`` it also waits while the dense map would drop a keyframe.
         """
         deadline_s = time.monotonic() + timeout_s
         self.catch_up()
@@ -160,13 +160,13 @@ class LiveSystem(SlamSystem):
         return is_full or (self.remote.pending > waiting and not self.remote.given_up)
 
     def insert(self, frame: Frame, tracked: Tracked, local_ids: Ints) -> tuple[Tracked, Keyframe]:
-        """Make a frame a keyframe; segments are joined by the map's process."""
+        """Make a frame a keyframe; the map's process joins segments."""
         self.remote.reference = self.camera_tracker.reference
         segment = self.camera_tracker.segment
         return tracked, self.remote.insert(frame, tracked, segment, local_ids)
 
     def finish(self) -> None:
-        """Let the other processes end their work; from then on this is an offline system."""
+        """Let the other processes finish; afterwards this is an offline system with the map."""
         deadline_s = time.monotonic() + MASKS_S
         while self.segmenter and self.segmenter.waiting and time.monotonic() < deadline_s:
             time.sleep(0.02)
@@ -174,38 +174,38 @@ class LiveSystem(SlamSystem):
         path = self.remote.finish(FINISH_S)
         state = read_arrays(path, STATE_FILE)[1]
         own = nested(dynamics=self.moving_objects.state())
-        whole = SlamSystem(self.camera, self.config, LabelledNothing(self._names))
+        whole = SlamSystem(self.camera, self.config, LabelsOnly(self._names))
         whole.restore({**state, **own}, path)
         self.map, self.camera_tracker = whole.map, whole.camera_tracker
         self.semantics, self.moving_objects = whole.semantics, whole.moving_objects
-        self._end()
+        self._stop_workers()
 
     def close(self) -> None:
-        """End the other processes; what they knew and did not send is lost."""
-        self._end()
+        """Kill the other processes; what they have not sent is lost."""
+        self._stop_workers()
         if self.dense is not None:
             self.dense.close()
 
-    def _end(self) -> None:
-        """End all that a finished map does without."""
+    def _stop_workers(self) -> None:
+        """Kill the map's and the segmenter's process, and restore the settings."""
         self._resources.close()
         if self.segmenter is not None:
             self.segmenter.close()
 
 
 class _RemoteSemantics(SemanticMapper):
-    """On tracking's side: asks other processes for a keyframe's masks and submap."""
+    """Requests a keyframe's masks and submap from other processes."""
 
     def __init__(self, system: LiveSystem) -> None:
         super().__init__(system.camera, system.config.semantics, system.map)
         self._system = system
 
     def observe(self, frame: Frame, keyframe: Keyframe) -> None:
-        """Ask, and do not wait."""
+        """Send the requests; does not wait for answers."""
         if self._system.segmenter is not None:
-            self._system.segmenter.ask(ImageToSegment(keyframe.id, frame.rgb, frame.name))
+            self._system.segmenter.request(ImageToSegment(keyframe.id, frame.rgb, frame.name))
         if self._system.dense is not None:
-            self._system.dense.ask(keyframe.id, frame)
+            self._system.dense.add_keyframe(keyframe.id, frame)
 
     def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
         """None: the map's process has them."""

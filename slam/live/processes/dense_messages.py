@@ -1,4 +1,4 @@
-"""What tracking's side and the dense map's process say to each other."""
+"""Messages between tracking and the dense map's process."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
 
 @dataclass(frozen=True)
-class DenseOrder:
-    """What is to be mapped.
+class DenseSetup:
+    """What the process needs to start.
 
     Attributes:
-        run: the run folder. camera: of its frames.
-        masks: where masks come from. labels: names of their classes.
-        shown: points of each submap that a viewer is to have, at most; 0: none.
+        run: the run folder.
+        camera: of the frames.
+        masks: the segmenter that makes the masks.
+        labels: names of its classes.
+        shown: largest number of points of a submap for a viewer; 0: there is no viewer.
     """
 
     run: Path
@@ -31,12 +33,12 @@ class DenseOrder:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeToMap:
-    """To the process: a keyframe as it is in the map at this moment.
+    """To the process: a keyframe with its present pose and landmarks.
 
     Attributes:
         snapshot: the keyframe with its images.
-        instances: its masks; none that were found, or that have not come.
-        poses: T_world_camera (4, 4) of it and of the keyframes around, by id.
+        instances: its masks; empty if none were found or they have not come.
+        poses: T_world_camera (4, 4) of it and of the keyframes around it, by id.
     """
 
     snapshot: KeyframeSnapshot
@@ -45,13 +47,13 @@ class KeyframeToMap:
 
     @property
     def id(self) -> int:
-        """Of the keyframe."""
+        """Id of the keyframe."""
         return self.snapshot.id
 
 
 @dataclass(frozen=True, eq=False)
 class LateMasks:
-    """To the process: masks of a keyframe that it has; landmark_ids (L,) at pixels (L, 2)."""
+    """To the process: masks of a keyframe sent before; landmark_ids (L,) are at pixels (L, 2)."""
 
     keyframe_id: int
     instances: list[Instance]
@@ -60,8 +62,8 @@ class LateMasks:
 
 
 @dataclass(frozen=True)
-class Forget:
-    """To the process: keyframes left the map."""
+class RemoveKeyframes:
+    """To the process: these keyframes are no longer in the map."""
 
     keyframe_ids: list[int]
 
@@ -80,8 +82,8 @@ class FinishMap:
 
 
 @dataclass(frozen=True)
-class Taken:
-    """From the process: it has taken a keyframe in, and can take another."""
+class Accepted:
+    """From the process: a keyframe has been handled, and another may be sent."""
 
     keyframe_id: int
 
@@ -96,7 +98,7 @@ class Preview:
 
 @dataclass(frozen=True, eq=False)
 class Mapped:
-    """From the process: a keyframe's submap is saved; ``preview`` where there is a viewer."""
+    """From the process: a keyframe's submap is saved; ``preview`` if there is a viewer."""
 
     keyframe_id: int
     preview: Preview | None = None
@@ -116,8 +118,9 @@ class MapWritten:
     """From the process: the clouds are written.
 
     Attributes:
-        points: in the cloud. missing: keyframes of the map without a submap.
-        failure: why they are not written; empty if they are.
+        points: in the cloud.
+        missing: keyframes of the map without a submap.
+        failure: why the clouds are not written; empty if they are.
     """
 
     points: int = 0

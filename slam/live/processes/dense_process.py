@@ -1,4 +1,4 @@
-"""The dense map's own process: keyframes are fused into submaps, as by ``bmask-slam map``."""
+"""The dense map's process: fuses keyframes into submaps, as ``bmask-slam map`` does."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import Ready
 from bmask_slam.live.processes.dense_messages import (
-    DenseOrder,
+    Accepted,
+    DenseSetup,
     FinishMap,
-    Forget,
     KeyframeToMap,
     LateMasks,
     Mapped,
     MapWritten,
     NotMapped,
     Preview,
-    Taken,
+    RemoveKeyframes,
 )
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 from bmask_slam.mapping.products.submaps import Submap
@@ -43,27 +43,27 @@ logger = logging.getLogger(__name__)
 NICENESS = 15
 
 
-def serve_dense(channel: Channel, order: DenseOrder) -> None:
+def serve_dense(channel: Channel, setup: DenseSetup) -> None:
     """Map keyframes until the channel ends."""
     os.nice(NICENESS)
     cv2.setNumThreads(1)
-    keeper = DenseKeeper(order, channel.send)
+    server = DenseServer(setup, channel.send)
     channel.send(Ready())
     for message in channel.messages():
-        keeper.handle(message)
+        server.handle(message)
 
 
 class RetryingFolder(DenseFolder):
-    """The folder of a dense map, which outlives a full disk.
+    """The folder of a dense map that goes on when the disk is full.
 
     Attributes:
-        unwritten: keyframes whose submaps found no room, and why.
+        unwritten: keyframes whose submaps could not be written, and why.
     """
 
     unwritten: dict[int, str]
 
     def write(self, submap: Submap, fused: InverseDepthMap, evidence: InstanceEvidence) -> None:
-        """Save a finished keyframe, or note that it cannot be."""
+        """Save a finished keyframe, or record why it cannot be saved."""
         try:
             super().write(submap, fused, evidence)
         except InputError as error:
@@ -71,53 +71,53 @@ class RetryingFolder(DenseFolder):
             self.remove(submap.anchor)
 
 
-class DenseKeeper:
-    """Carries out what tracking's side says; ``send`` takes the answers."""
+class DenseServer:
+    """Handles the messages of tracking; answers go to ``send``."""
 
-    def __init__(self, order: DenseOrder, send: Callable[[Any], None]) -> None:
-        """Begin, or go on with what another process left. Raises InputError."""
-        self._order, self._send = order, send
-        self._labels = LabelSet(order.labels)
-        self._options = resolve_options(MapOptions(order.run, masks=order.masks), self._labels)
+    def __init__(self, setup: DenseSetup, send: Callable[[Any], None]) -> None:
+        """Start a dense map, or continue one that another process left. Raises InputError."""
+        self._setup, self._send = setup, send
+        self._labels = LabelSet(setup.labels)
+        self._options = resolve_options(MapOptions(setup.run, masks=setup.masks), self._labels)
         settings = folder_settings(self._options, self._labels)
-        self._folder = RetryingFolder(order.run, settings)
+        self._folder = RetryingFolder(setup.run, settings)
         self._folder.unwritten = {}
-        self._fusion = KeyframeFusion(order.camera, self._labels, self._folder, self._options)
+        self._fusion = KeyframeFusion(setup.camera, self._labels, self._folder, self._options)
 
     def handle(self, message: Any) -> None:
-        """Carry out one message."""
+        """Handle one message."""
         match message:
             case KeyframeToMap():
-                self.take(message)
-                self._send(Taken(message.id))
+                self.add_keyframe(message)
+                self._send(Accepted(message.id))
             case LateMasks():
                 self.relabel(message)
-            case Forget():
+            case RemoveKeyframes():
                 self._fusion.remove(message.keyframe_ids)
             case FinishMap():
                 self._fusion.update_poses(message.poses)
-                self._tell(self._fusion.finish())
+                self._report(self._fusion.finish())
                 self._send(self.write_products(message))
             case _:
-                raise TypeError(f"no message for the dense map: {message!r}")
+                raise TypeError(f"not a message for the dense map: {message!r}")
 
-    def take(self, message: KeyframeToMap) -> None:
-        """Take a keyframe in, and say what that finished."""
+    def add_keyframe(self, message: KeyframeToMap) -> None:
+        """Fuse a keyframe, and report the submaps that are finished by it."""
         snapshot = message.snapshot
-        if self._folder.is_done(snapshot.id):  # another process had died before it said so
+        if self._folder.is_done(snapshot.id):  # saved by a process that died before its answer
             self._send(Mapped(snapshot.id))
         try:
-            dense = dense_keyframe(snapshot, self._order.camera)
+            dense = dense_keyframe(snapshot, self._setup.camera)
         except InputError as error:
             self._send(NotMapped(snapshot.id, str(error)))
             return
         instances = self._fusion.label_pixels(
             message.instances, snapshot.landmark_ids, snapshot.pixels
         )
-        self._tell(self._fusion.add(dense, snapshot.segment, instances, message.poses))
+        self._report(self._fusion.add(dense, snapshot.segment, instances, message.poses))
 
     def relabel(self, message: LateMasks) -> None:
-        """Use masks that come late."""
+        """Use masks that come after their keyframe."""
         instances = self._fusion.label_pixels(
             message.instances, message.landmark_ids, message.pixels
         )
@@ -130,7 +130,7 @@ class DenseKeeper:
         """Write the clouds from the run folder's final map."""
         started_s = time.perf_counter()
         try:
-            run = read_saved_map(self._order.run)
+            run = read_saved_map(self._setup.run)
             missing = [k.id for k in run.keyframes if not self._folder.is_done(k.id)]
             fused = FusedMap(run, self._labels, self._folder, self._options)
             if not fused.keyframes():
@@ -146,14 +146,14 @@ class DenseKeeper:
         return MapWritten(products.points, missing)
 
     def _counts(self, missing: list[int], left_out: dict[int, str]) -> FusionCounts:
-        """What became of the keyframes, with those that did not come here."""
+        """Counts of the keyframes, with those that were not sent to this process."""
         reasons = self._folder.unwritten | left_out
         counts = self._fusion.counts
         counts.skipped = {number: reasons.get(number, "") for number in missing}
         return counts
 
-    def _tell(self, submaps: list[Submap]) -> None:
-        """Say which submaps are saved, and show them."""
+    def _report(self, submaps: list[Submap]) -> None:
+        """Send which submaps are saved, with a preview for the viewer."""
         for submap in submaps:
             reason = self._folder.unwritten.get(submap.anchor)
             if reason is None:
@@ -162,7 +162,7 @@ class DenseKeeper:
                 self._send(NotMapped(submap.anchor, reason, disk_full=True))
 
     def _preview(self, submap: Submap) -> Preview | None:
-        if not self._order.shown:
+        if not self._setup.shown:
             return None
-        step = -(-len(submap) // self._order.shown) or 1
+        step = -(-len(submap) // self._setup.shown) or 1
         return Preview(submap.points[::step].copy(), submap.colours[::step].copy())

@@ -1,8 +1,8 @@
-"""The map's own process: graph, landmarks, loops, labels and objects, fed by keyframes.
+"""The map's process: graph, landmarks, loops, labels and objects, extended by keyframes.
 
-It holds a whole ``SlamSystem`` and does to it what an offline run does at a keyframe. Tracking is
-elsewhere and a little behind or ahead: keyframes come with poses relative to a reference keyframe
-and with landmarks that may have been fused meanwhile, and are brought up to date here.
+It has a whole ``SlamSystem`` and does with it what an offline run does at a keyframe. Tracking uses
+a copy of the map that is a little older: keyframes come with poses relative to a reference
+keyframe and with landmarks that may have been fused since, and are updated here.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from bmask_slam.graph.geometry import carried_along
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import (
-    Began,
     Finish,
     LostKeyframe,
     MapChanged,
@@ -35,8 +34,9 @@ from bmask_slam.live.messages import (
     Ready,
     RestoreObservations,
     SaveState,
-    Sightings,
+    Started,
     StateSaved,
+    VisibilityCounts,
 )
 from bmask_slam.live.replica import DeltaMaker
 from bmask_slam.runtime.memory import give_back_memory
@@ -52,11 +52,11 @@ logger = logging.getLogger(__name__)
 
 STATE_FILE = FileKind("live state", 5)
 NICENESS = 5
-"""Tracking goes first where there is a processor too few."""
+"""Tracking has priority where there are too few cores."""
 
 
-class LabelledNothing(NoSegmenter):
-    """Finds nothing itself: masks come from another process, with these labels."""
+class LabelsOnly(NoSegmenter):
+    """No segmenter, but the labels of one: masks come from another process."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self.labels = LabelSet(names)
@@ -69,9 +69,9 @@ def serve_map(
     names: tuple[str, ...],
     state: Path | None,
 ) -> None:
-    """Keep a map, from a saved state on if there is one, until the channel ends."""
+    """Handle messages until the channel ends, from a saved state on if there is one."""
     os.nice(NICENESS)
-    segmenter = LabelledNothing(names)
+    segmenter = LabelsOnly(names)
     system = SlamSystem(camera, config, segmenter)
     system.semantics = SemanticMapper(
         camera,
@@ -82,16 +82,16 @@ def serve_map(
     )
     if state is not None:
         system.restore(read_arrays(state, STATE_FILE)[1], state)
-    keeper = MapKeeper(system, channel.send)
+    server = MapServer(system, channel.send)
     channel.send(Ready())
     if state is not None:
-        keeper.tell(-1, done=False)
+        server.send_changes(-1, done=False)
     for number, message in channel.messages():
-        keeper.handle(number, message)
+        server.handle(number, message)
 
 
-class MapKeeper:
-    """Carries out what tracking and the segmenter say; ``send`` takes the answers."""
+class MapServer:
+    """Handles the messages of tracking and the segmenter; answers go to ``send``."""
 
     def __init__(self, system: SlamSystem, send: Callable[[Any], None]) -> None:
         self.system = system
@@ -99,15 +99,15 @@ class MapKeeper:
         self._deltas = DeltaMaker()
 
     def handle(self, number: int, message: Any) -> None:
-        """Carry out one message."""
-        self._send(Began(number))
+        """Handle one message."""
+        self._send(Started(number))
         match message:
             case NewKeyframe():
-                self.add(message)
+                self.add_keyframe(message)
             case LostKeyframe():
-                self.pass_over(message)
+                self.skip_keyframe(message)
             case Masks():
-                self.attach(message)
+                self.add_masks(message)
             case PruneLandmarks():
                 ids = self.system.mapper.world.landmarks.living(message.ids)
                 if len(ids):
@@ -118,7 +118,7 @@ class MapKeeper:
             case RestoreObservations():
                 back = message.keypoints, message.patches
                 self.system.map.restore_observations(message.keyframe_id, *back)
-                self.tell(-1, done=False)
+                self.send_changes(-1, done=False)
             case SaveState():
                 self.save(number, message.path)
             case Finish():
@@ -127,28 +127,28 @@ class MapKeeper:
                 write_arrays(message.path, STATE_FILE, {}, self.system.state())
                 self._send(StateSaved(number, message.path))
             case _:
-                raise TypeError(f"no message for the map: {message!r}")
+                raise TypeError(f"not a message for the map: {message!r}")
 
     def save(self, number: int, path: Path) -> None:
-        """Save the state, so that messages up to this number need not be sent again."""
+        """Save the state; messages up to this number are then not needed any more."""
         try:
             write_arrays(path, STATE_FILE, {}, self.system.state())
-        except OSError as error:  # a later one may find room
+        except OSError as error:  # a later state may be written
             logger.warning("%s: cannot be written (%s)", path, error.strerror)
         else:
             self._send(StateSaved(number, path))
         give_back_memory()  # of the state, and of what the graph has changed since
 
-    def add(self, message: NewKeyframe) -> None:
-        """Take in a keyframe as tracking made it; two deltas follow, the first at once."""
+    def add_keyframe(self, message: NewKeyframe) -> None:
+        """Add a keyframe that tracking made; changes are sent before and after optimisation."""
         started_s = time.perf_counter()
         system = self.system
-        if not self._has_place(message):
-            self.pass_over(LostKeyframe(message.id, NOBODY, np.eye(4), message.history))
+        if not self._has_reference(message):
+            self.skip_keyframe(LostKeyframe(message.id, NOBODY, np.eye(4), message.history))
             return
-        self._count(message.sightings)
+        self._count_visibility(message.visibility)
         system.mapper.history.extend(message.history)
-        tracked, segment = self._brought_up_to_date(message)
+        tracked, segment = self._updated(message)
         nothing = np.zeros((0, 0), np.float32)
         frame = Frame(
             message.frame_index, message.timestamp_s, np.zeros((0, 0, 3), np.uint8), nothing
@@ -159,51 +159,51 @@ class MapKeeper:
         assert keyframe.id == message.id, "tracking and map count keyframes differently"
         if system.semantics.enabled:
             system.semantics.await_masks(keyframe, message.depth_m)
-        self.tell(message.id, done=False)
+        self.send_changes(message.id, done=False)
         system.mapper.optimise(keyframe)
         system.mapper.close_loops(keyframe)
         if system.semantics.enabled:
             system.semantics.follow_map()
         elapsed_ms = 1e3 * (time.perf_counter() - started_s)
-        self.tell(message.id, done=True, update_ms=elapsed_ms)
+        self.send_changes(message.id, done=True, update_ms=elapsed_ms)
 
-    def pass_over(self, message: LostKeyframe) -> None:
-        """Count a keyframe that could not be taken in; another has its frames."""
+    def skip_keyframe(self, message: LostKeyframe) -> None:
+        """Skip a keyframe; its frames are attached to its parent."""
         mapper = self.system.mapper
         mapper.history.extend(message.history)
         mapper.history.hand_over(message.id, message.parent_id, message.T_parent_lost)
         mapper.world.next_keyframe_id = message.id + 1
         landmarks = mapper.world.landmarks
         landmarks.extend_to(max(message.landmarks, len(landmarks)))
-        self.tell(message.id, done=True)
+        self.send_changes(message.id, done=True)
 
-    def _has_place(self, message: NewKeyframe) -> bool:
-        """Whether what its pose refers to is in the map; not if that was lost with its place."""
+    def _has_reference(self, message: NewKeyframe) -> bool:
+        """Whether the reference of its pose is in the map; not if that began a lost segment."""
         reference, history = message.reference, self.system.mapper.history
         return reference is None or history.parent(reference[0])[0] != NOBODY
 
-    def attach(self, message: Masks) -> None:
-        """Use a keyframe's masks; those that cannot be used are passed over."""
+    def add_masks(self, message: Masks) -> None:
+        """Use a keyframe's masks; those that cannot be used are skipped."""
         try:
             self.system.semantics.attach(message.keyframe_id, message.instances)
         except InputError as error:
             logger.warning("keyframe %d has no masks: %s", message.keyframe_id, error)
 
-    def tell(self, keyframe_id: int, done: bool, update_ms: float = 0.0) -> None:
-        """Send what changed."""
+    def send_changes(self, keyframe_id: int, done: bool, update_ms: float = 0.0) -> None:
+        """Send what changed in the map."""
         mapper = self.system.mapper
         delta = self._deltas.delta(mapper.world, mapper.history)
         loops = len(mapper.loops.closed)
         self._send(MapChanged(keyframe_id, delta, done, update_ms, loops))
 
-    def _count(self, sightings: Sightings) -> None:
+    def _count_visibility(self, visibility: VisibilityCounts) -> None:
         landmarks = self.system.mapper.world.landmarks
-        ids = landmarks.current(sightings.ids)
-        np.add.at(landmarks.visible, ids, sightings.visible)
-        np.add.at(landmarks.found, ids, sightings.found)
+        ids = landmarks.current(visibility.ids)
+        np.add.at(landmarks.visible, ids, visibility.visible)
+        np.add.at(landmarks.found, ids, visibility.found)
 
-    def _brought_up_to_date(self, message: NewKeyframe) -> tuple[Tracked, int]:
-        """The tracked frame where the map is by now, and its segment."""
+    def _updated(self, message: NewKeyframe) -> tuple[Tracked, int]:
+        """The tracked frame in the map as it is now, and its segment."""
         tracked, mapper = message.tracked, self.system.mapper
         if message.reference is None:
             return tracked, message.segment

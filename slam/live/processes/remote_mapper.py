@@ -1,7 +1,7 @@
-"""Tracking's side of the map: a copy to track against, and the process that keeps the original.
+"""Tracking's side of the map: a copy to track against, and the process that owns the original.
 
-What is sent to the process is remembered until it has saved a state that contains it. If it dies,
-another one begins with that state and is told the rest again; tracking goes on meanwhile.
+Messages to the process are kept until it has saved a state that contains them. If it dies, a new
+process starts from that state and gets the later messages again; tracking goes on meanwhile.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.live.messages import (
-    Began,
     Finish,
     LostKeyframe,
     MapChanged,
@@ -31,10 +30,11 @@ from bmask_slam.live.messages import (
     Ready,
     RestoreObservations,
     SaveState,
-    Sightings,
+    Started,
     StateSaved,
+    VisibilityCounts,
 )
-from bmask_slam.live.processes.supervision import late_start
+from bmask_slam.live.processes.supervision import late_start_text
 from bmask_slam.live.processes.worker import Failure, Worker
 from bmask_slam.live.replica import apply_delta
 from bmask_slam.loops.verification import LoopConstraint
@@ -49,22 +49,22 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 logger = logging.getLogger(__name__)
 
 SAVE_EVERY = 20
-"""Keyframes from one saved state to the next."""
+"""Interval of saved states in keyframes."""
 MAX_PENDING = 3
-"""Keyframes that wait for the process; with so many no further one is accepted."""
+"""Largest number of keyframes that wait for the process; then no further one is accepted."""
 MAX_DEATHS = 3
-"""Deaths without a saved state between them, after which the map is given up."""
+"""Deaths of the process without a saved state between them after which it is not restarted."""
 
 
 class RemoteMapper:
-    """The back end of a live system: a copy of the map, and the process that keeps the original.
+    """The back end of a live system: a copy of the map, and the process that owns the original.
 
     Attributes:
-        world: the copy, with keyframes that the process has not answered yet.
+        world: the copy, with the keyframes that the process has not handled yet.
         history: of every tracked frame.
-        places: what finds keyframes that look like a frame.
+        places: index of the keyframes' descriptors, for relocalisation.
         update_ms: time that the process took for each keyframe.
-        changes: how often the copy was brought up to date.
+        changes: how often the copy was updated.
         deaths: how often the process has died.
         reference: the keyframe that tracking refers to; set before ``insert``.
     """
@@ -84,26 +84,26 @@ class RemoteMapper:
         self._state: Path | None = None
         self._journal: dict[int, Any] = {}
         self._number = 0
-        self._told_frames = 0
+        self._sent_frames = 0
         self._saved_keyframes = 0
         self._deaths_in_a_row = 0
         self._pending: set[int] = set()
         self._is_ready = False
-        self._began = self._died_at = 0
+        self._started = self._died_at = 0
         self._worker = self._start()
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Process id."""
         return self._worker.pid
 
     @property
     def pending(self) -> int:
-        """Keyframes that the process has not finished with."""
+        """Number of keyframes that the process has not finished."""
         return len(self._pending)
 
     def awaits(self, keyframe_id: int) -> bool:
-        """Whether the process has not finished with a keyframe."""
+        """Whether the process has not finished a keyframe."""
         return keyframe_id in self._pending
 
     @property
@@ -118,13 +118,13 @@ class RemoteMapper:
 
     @property
     def given_up(self) -> bool:
-        """Whether the process died too often to be started again."""
+        """Whether the process died too often to be restarted."""
         return self._deaths_in_a_row >= MAX_DEATHS
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
-        """Put a tracked frame into the copy as a keyframe, and tell the process.
+        """Add a tracked frame to the copy as a keyframe, and send it to the process.
 
-        Until the answer comes it observes what was tracked, and nothing new.
+        Until the answer comes it observes the tracked landmarks only.
         """
         reference = self.reference
         keyframe = add_keyframe(self.world, frame, tracked, segment)
@@ -132,7 +132,7 @@ class RemoteMapper:
         keyframe.landmark_ids[tracked.keypoints] = tracked.landmark_ids
         self.places.add(keyframe.id, keyframe.features.descriptors)
         self._pending.add(keyframe.id)
-        self.tell(
+        self.send(
             NewKeyframe(
                 keyframe.id,
                 frame.index,
@@ -141,59 +141,59 @@ class RemoteMapper:
                 segment,
                 None if reference is None else (reference.id, reference.T_world_camera),
                 local_ids,
-                self._sightings(),
-                self._untold_history(),
+                self._visibility_counts(),
+                self._unsent_history(),
                 kept_depth(frame.depth_m),
             )
         )
         return keyframe
 
     def optimise(self, keyframe: Keyframe) -> None:
-        """The process does it."""
+        """Nothing: the process does it."""
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
-        """The process does it."""
+        """Nothing: the process does it."""
         return []
 
     def prune_mask(self, keyframe_id: int, mask: Mask, widen_px: int) -> None:
         """As ``Mapper.prune_mask``; the map is changed when the answer comes."""
-        self.tell(PruneMask(keyframe_id, PackedMask.of(mask), widen_px))
+        self.send(PruneMask(keyframe_id, PackedMask.of(mask), widen_px))
 
     def prune_landmarks(self, landmark_ids: Ints) -> None:
         """As ``Mapper.prune_landmarks``; tracking drops them at once."""
         self.world.landmarks.alive[landmark_ids] = False
-        self.tell(PruneLandmarks(landmark_ids))
+        self.send(PruneLandmarks(landmark_ids))
 
     def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """As ``Mapper.restore_observations``; the map is changed when the answer comes."""
         if len(keypoints):
-            self.tell(RestoreObservations(keyframe_id, keypoints, patches))
+            self.send(RestoreObservations(keyframe_id, keypoints, patches))
 
-    def tell(self, message: Any) -> None:
-        """Send a message, to be sent again to another process if this one dies."""
+    def send(self, message: Any) -> None:
+        """Send a message, which is sent again to a new process if this one dies."""
         self._number += 1
         self._journal[self._number] = message
         self._worker.send((self._number, message))
 
     def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
-        """Bring the copy up to date; waits so long for an answer if there is none.
+        """Apply the process's answers to the copy; waits at most so long for the first.
 
-        Returns what came that is not about the map's own state.
+        Returns the messages that are not about the map: masks, for the moving-object filter.
         """
-        others = self._heed(self._worker.receive(timeout_s))
+        others = self._apply_answers(self._worker.receive(timeout_s))
         if not self._worker.alive and not self.given_up:
             self._worker.kill()
-            others += self._heed(self._worker.receive())
+            others += self._apply_answers(self._worker.receive())
             self._restart()
         return others
 
-    def _heed(self, messages: list[Any]) -> list[Any]:
-        """Take in the answers that are about the map; returns the others."""
+    def _apply_answers(self, messages: list[Any]) -> list[Any]:
+        """Apply the answers that are about the map; returns the others."""
         others = []
         for message in messages:
             match message:
-                case Began():
-                    self._began = message.number
+                case Started():
+                    self._started = message.number
                 case MapChanged():
                     self._apply(message)
                 case StateSaved():
@@ -208,7 +208,7 @@ class RemoteMapper:
         return others
 
     def wait_until_ready(self, timeout_s: float) -> None:
-        """Wait until the process can work. Raises InputError if it cannot start."""
+        """Wait until the process is ready. Raises InputError if it cannot start."""
         deadline_s = time.monotonic() + timeout_s
         while not self._is_ready:
             if self.given_up:
@@ -216,11 +216,11 @@ class RemoteMapper:
                 raise InputError("the map's process did not start; see the lines above")
             if time.monotonic() > deadline_s:
                 self.close()
-                raise InputError(late_start("map", timeout_s))
+                raise InputError(late_start_text("map", timeout_s))
             self.catch_up(0.1)
 
     def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:
-        """Wait until a keyframe's landmarks are there, or so long; not for one that was lost."""
+        """Wait until a keyframe has its landmarks; False after the timeout, or if it was lost."""
         deadline_s = time.monotonic() + timeout_s
         while len(self.world.observed(keyframe)[1]) == 0 and not self.given_up:
             left_s = deadline_s - time.monotonic()
@@ -230,13 +230,13 @@ class RemoteMapper:
         return True
 
     def finish(self, timeout_s: float) -> Path:
-        """Let the process optimise once more and save everything; the file's path.
+        """Let the process optimise a last time and save its state; returns the file's path.
 
         Raises:
-            InputError: it could not, within that time.
+            InputError: it did not finish within the timeout.
         """
         path = self._folder / ".live-final"
-        self.tell(Finish(path, self._untold_history()))
+        self.send(Finish(path, self._unsent_history()))
         deadline_s = time.monotonic() + timeout_s
         while self._journal and not self.given_up and time.monotonic() < deadline_s:
             self.catch_up(0.1)
@@ -246,7 +246,7 @@ class RemoteMapper:
         return path
 
     def close(self) -> None:
-        """End the process at once and remove its files."""
+        """Kill the process and remove its files."""
         self._worker.kill()
         for path in self._folder.glob(".live-*"):
             path.unlink(missing_ok=True)
@@ -257,26 +257,28 @@ class RemoteMapper:
         )
 
     def _restart(self) -> None:
-        """Another process, from the last saved state, is told what came after that."""
+        """Start a new process from the last saved state, and send the later messages again."""
         self.deaths += 1
         self._deaths_in_a_row += 1
         if self.given_up:
             logger.error(
-                "the map's process died %d times in a row; no map from here on", MAX_DEATHS
+                "the map's process died %d times in a row; it is not restarted", MAX_DEATHS
             )
             return
-        logger.warning("the map's process died; started again, %d messages", len(self._journal))
-        if self._died_at == self._began > 0:
-            self._pass_over(self._began)
-        self._died_at = self._began
+        logger.warning(
+            "the map's process died; restarted, %d messages are sent again", len(self._journal)
+        )
+        if self._died_at == self._started > 0:
+            self._skip_message(self._started)
+        self._died_at = self._started
         self._worker = self._start()
         for number, message in sorted(self._journal.items()):
             self._worker.send((number, message))
 
-    def _pass_over(self, number: int) -> None:
-        """Twice the process died of a message: do without it."""
+    def _skip_message(self, number: int) -> None:
+        """Replace a message of which two processes died."""
         message = self._journal.pop(number, None)
-        logger.error("message %d, %s, is passed over", number, type(message).__name__)
+        logger.error("message %d, %s, is skipped", number, type(message).__name__)
         match message:
             case NewKeyframe():
                 parent_id, T_parent_lost = _parent(message)
@@ -300,23 +302,23 @@ class RemoteMapper:
         self._pending -= set(message.delta.keyframe_ids.tolist()) | {message.keyframe_id}
         if message.keyframe_id + 1 - self._saved_keyframes >= SAVE_EVERY:
             self._saved_keyframes = message.keyframe_id + 1
-            self.tell(SaveState(self._folder / ".live-state"))
+            self.send(SaveState(self._folder / ".live-state"))
 
-    def _sightings(self) -> Sightings:
+    def _visibility_counts(self) -> VisibilityCounts:
         landmarks = self.world.landmarks
         ids = np.flatnonzero(landmarks.visible)
-        found = Sightings(ids, landmarks.visible[ids], landmarks.found[ids])
+        found = VisibilityCounts(ids, landmarks.visible[ids], landmarks.found[ids])
         landmarks.visible[:] = landmarks.found[:] = 0
         return found
 
-    def _untold_history(self) -> Entries:
-        entries = self.history.since(self._told_frames)
-        self._told_frames += len(entries)
+    def _unsent_history(self) -> Entries:
+        entries = self.history.since(self._sent_frames)
+        self._sent_frames += len(entries)
         return entries
 
 
 def _parent(lost: NewKeyframe) -> tuple[int, Array]:
-    """The keyframe that takes the frames of one that cannot be in the map, and T_heir_lost."""
+    """The keyframe to which a lost keyframe's frames are attached, and T_parent_lost (4, 4)."""
     if lost.reference is None:
         return NOBODY, np.eye(4)
     parent_id, T_world_parent = lost.reference

@@ -1,4 +1,4 @@
-"""Masks of keyframes from a process of their own: the newest keyframe first."""
+"""Segmentation of keyframes in a process of its own, the newest keyframe first."""
 
 from __future__ import annotations
 
@@ -11,23 +11,21 @@ from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import ImageToSegment, Masks, NotSegmented, Ready
-from bmask_slam.live.processes.supervision import Patience, SupervisedWorker
+from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 logger = logging.getLogger(__name__)
 
 NICENESS = 15
-
-
-WAITING = 4
-"""Keyframes that wait for masks at most; the oldest are passed over."""
+MAX_WAITING = 4
+"""Largest number of keyframes that wait for segmentation; the oldest are skipped."""
 
 
 def serve_segmenter(
     channel: Channel, options: SegmenterOptions, sequence: Path, waiting: int
 ) -> None:
-    """Segment images until the channel ends, the newest first, never more than these waiting."""
+    """Segment images until the channel ends, the newest first; at most ``waiting`` wait."""
     os.nice(NICENESS)
     segmenter = make_segmenter(options, sequence, find_weights)
     channel.send(Ready(segmenter.labels.names))
@@ -49,55 +47,55 @@ def serve_segmenter(
 
 
 class RemoteSegmenter:
-    """Gives keyframes' images to a process and collects their masks.
+    """Sends keyframes' images to a process and receives their masks.
 
     Attributes:
-        labels: what its numbers mean.
-        dropped: keyframes that were passed over.
-        segmentation_ms: time of each keyframe that was not.
+        labels: classes of the segmenter.
+        dropped: number of keyframes that were skipped.
+        segmentation_ms: time of each keyframe that was segmented.
     """
 
     def __init__(
-        self, options: SegmenterOptions, sequence: Path, rules: Patience | None = None
+        self, options: SegmenterOptions, sequence: Path, policy: RestartPolicy | None = None
     ) -> None:
-        """Start it, and wait until it knows its labels. Raises InputError if it cannot start."""
+        """Start the process and wait until it is ready. Raises InputError if it cannot start."""
         self.dropped = 0
         self.segmentation_ms: list[float] = []
-        self._asked: dict[int, ImageToSegment] = {}
-        target, arguments = f"{__name__}:serve_segmenter", (options, sequence, WAITING)
-        self._worker = SupervisedWorker("segmenter", target, arguments, rules or Patience())
-        self.labels = LabelSet(self._worker.first_words().labels)
+        self._requested: dict[int, ImageToSegment] = {}
+        target, arguments = f"{__name__}:serve_segmenter", (options, sequence, MAX_WAITING)
+        self._worker = SupervisedWorker("segmenter", target, arguments, policy or RestartPolicy())
+        self.labels = LabelSet(self._worker.wait_until_ready().labels)
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Process id."""
         return self._worker.pid
 
     @property
     def deaths(self) -> int:
-        """How often the process died or hung."""
+        """How often a process died or hung."""
         return self._worker.deaths
 
     @property
     def waiting(self) -> int:
-        """Keyframes whose masks have not come."""
-        return len(self._asked)
+        """Number of keyframes whose masks have not come."""
+        return len(self._requested)
 
     def awaits(self, keyframe_id: int) -> bool:
         """Whether the masks of a keyframe may still come."""
-        return keyframe_id in self._asked
+        return keyframe_id in self._requested
 
-    def ask(self, image: ImageToSegment) -> None:
-        """Ask for the masks of a keyframe; returns at once."""
-        begins = not self._asked
-        self._asked[image.keyframe_id] = image
+    def request(self, image: ImageToSegment) -> None:
+        """Request the masks of a keyframe; returns at once."""
+        begins = not self._requested
+        self._requested[image.keyframe_id] = image
         self._worker.send(image, begins)
 
-    def answers(self) -> list[Masks]:
-        """The masks that have come. A process that died or hangs is started again."""
+    def receive_masks(self) -> list[Masks]:
+        """The masks that have come. A process that died or hangs is restarted."""
         found = []
         for message in self._worker.receive():
-            self._asked.pop(message.keyframe_id, None)
+            self._requested.pop(message.keyframe_id, None)
             match message:
                 case Masks():
                     self.segmentation_ms.append(message.segmentation_ms)
@@ -105,13 +103,13 @@ class RemoteSegmenter:
                 case NotSegmented():
                     self.dropped += 1
                     logger.info("keyframe %d has no masks: %s", message.keyframe_id, message.reason)
-        if self._worker.was_restarted(busy=bool(self._asked)):
-            for image in self._asked.values():
+        if self._worker.restart_if_needed(busy=bool(self._requested)):
+            for image in self._requested.values():
                 self._worker.send(image)
         if self._worker.given_up:
-            self._asked.clear()
+            self._requested.clear()
         return found
 
     def close(self) -> None:
-        """End the process at once."""
+        """Kill the process."""
         self._worker.close()

@@ -1,4 +1,4 @@
-"""A worker that is started again when it dies or hangs: it costs its work, never the loop."""
+"""A worker that is started again when it dies or hangs, so that the live loop goes on."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Patience:
+class RestartPolicy:
     """When a worker counts as hanging, and how often it is started again.
 
     Attributes:
-        start_s: how long it may take to start; a busy machine needs minutes to load a network.
-        answer_s: how long it may be silent over its work.
-        restarts: at most.
+        start_s: longest time of its start; a busy machine needs minutes to load a network.
+        answer_s: longest time without a message while it works.
+        restarts: largest number of restarts.
     """
 
     start_s: float = 300.0
@@ -29,8 +29,8 @@ class Patience:
     restarts: int = 3
 
 
-def late_start(name: str, waited_s: float) -> str:
-    """What is said of a process that lives but has not begun in time."""
+def late_start_text(name: str, waited_s: float) -> str:
+    """The error text for a process that runs but is not ready in time."""
     return (
         f"the {name}'s process has not begun within {waited_s:.0f} s; is this machine overloaded? "
         "End other work and try again"
@@ -38,33 +38,40 @@ def late_start(name: str, waited_s: float) -> str:
 
 
 class SupervisedWorker:
-    """A worker and its successors.
+    """A worker, replaced by a new process when it dies or hangs.
 
     Attributes:
-        deaths: how often one died or hung.
+        name: of the worker, for messages.
+        deaths: how often a process died or hung.
     """
 
-    def __init__(self, name: str, target: str, arguments: tuple[Any, ...], rules: Patience) -> None:
+    def __init__(
+        self, name: str, target: str, arguments: tuple[Any, ...], policy: RestartPolicy
+    ) -> None:
         self.name = name
         self.deaths = 0
-        self._target, self._arguments, self._rules = target, arguments, rules
+        self._target, self._arguments, self._policy = target, arguments, policy
         self._heard_s = time.monotonic()
         self._is_ready = False
         self._worker = self._start()
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Process id."""
         return self._worker.pid
 
     @property
     def given_up(self) -> bool:
-        """Whether it died too often to be started again."""
-        return self.deaths > self._rules.restarts
+        """Whether it died too often to be restarted."""
+        return self.deaths > self._policy.restarts
 
-    def first_words(self) -> Ready:
-        """Wait until it can work. Raises InputError, with its own words, if it cannot."""
-        deadline_s = time.monotonic() + self._rules.start_s
+    def wait_until_ready(self) -> Ready:
+        """Wait for its first message.
+
+        Raises:
+            InputError: it cannot start, or is not ready in time.
+        """
+        deadline_s = time.monotonic() + self._policy.start_s
         while True:
             alive = self._worker.alive
             for message in self._worker.receive(0.1):
@@ -80,16 +87,16 @@ class SupervisedWorker:
                 raise InputError(f"the {self.name}'s process did not start; see the lines above")
             if time.monotonic() > deadline_s:
                 self.close()
-                raise InputError(late_start(self.name, self._rules.start_s))
+                raise InputError(late_start_text(self.name, self._policy.start_s))
 
     def send(self, message: Any, begins: bool = False) -> None:
-        """Give it a message; one that ``begins`` work is what its answer is waited for from."""
+        """Send a message; one that ``begins`` work starts the time in which it must answer."""
         if begins:
             self._heard_s = time.monotonic()
         self._worker.send(message)
 
     def receive(self) -> list[Any]:
-        """What has come but for failures, which are logged, and a successor's first words."""
+        """The messages received, without failures, which are logged, and ``Ready``."""
         messages = self._worker.receive()
         if messages:
             self._heard_s = time.monotonic()
@@ -99,21 +106,21 @@ class SupervisedWorker:
                 logger.error("the %s failed: %s", self.name, message.text)
         return [m for m in messages if not isinstance(m, Failure | Ready)]
 
-    def was_restarted(self, busy: bool) -> bool:
-        """Start it again if it has died, or was silent for too long while ``busy``."""
+    def restart_if_needed(self, busy: bool) -> bool:
+        """Restart it if it died, or sent nothing for too long while ``busy``; whether it did."""
         if self.given_up:
             return False
         silent_s = time.monotonic() - self._heard_s
-        limit_s = self._rules.answer_s if self._is_ready else self._rules.start_s
+        limit_s = self._policy.answer_s if self._is_ready else self._policy.start_s
         if self._worker.alive and not (busy and silent_s > limit_s):
             return False
         self.deaths += 1
         self._heard_s, self._is_ready = time.monotonic(), False
         self._worker.kill()
         if self.given_up:
-            logger.error("the %s died %d times and is given up", self.name, self.deaths)
+            logger.error("the %s died %d times; it is not restarted", self.name, self.deaths)
             return False
-        logger.warning("the %s died or hangs; started again", self.name)
+        logger.warning("the %s died or hangs; restarted", self.name)
         self._worker = self._start()
         return True
 

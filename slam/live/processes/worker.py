@@ -1,8 +1,8 @@
-"""A process that works on messages, and how it looks to its owner when it dies.
+"""A child process that handles messages, and its owner's end of the connection.
 
-It is a fresh interpreter with a socket: a caller's script needs no ``if __name__ == "__main__"``,
-and nothing is inherited by accident. It ends when its owner does, however that came. It stays in
-its owner's session, since Linux weighs priorities within a session only (autogroups).
+The child is a new interpreter with a socket, so that the caller's script needs no ``if __name__ ==
+"__main__"`` and nothing else is inherited. It ends when its owner does, for whatever reason. It
+stays in its owner's session, since Linux compares priorities only within a session (autogroups).
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from types import TracebackType
 from typing import Any
 
 from bmask_slam.live.channel import Channel, ForwardedLog
-from bmask_slam.live.shared_memory import SIZE, Ring, nameless_file
+from bmask_slam.live.shared_memory import SIZE, Ring, anonymous_file
 
 logger = logging.getLogger(__name__)
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
-"""Each worker has a core at most: libraries' threads would take tracking's."""
+"""Each worker uses one core at most: more threads of libraries would slow tracking down."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """The last message of a worker that met an error: its traceback."""
+    """The last message of a worker that raised an exception: the traceback."""
 
     text: str
 
@@ -49,7 +49,7 @@ class Worker:
     def __init__(self, name: str, target: str, *arguments: Any) -> None:
         self.name = name
         ours, theirs = socket.socketpair()
-        files = [nameless_file(SIZE) for _ in range(2)]
+        files = [anonymous_file(SIZE) for _ in range(2)]
         descriptors = [theirs.fileno(), *files]
         code = f"from {__name__} import serve; serve(*{descriptors})"
         try:
@@ -58,7 +58,7 @@ class Worker:
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,
                 env=os.environ | ONE_THREAD | safe_import_path(),
-                process_group=0,  # Ctrl-C in a terminal is for the owner to act on
+                process_group=0,  # Ctrl-C in a terminal must reach only the owner
             )
             self._channel = Channel(Connection(ours.detach()), (Ring(files[0]), Ring(files[1])))
         finally:
@@ -69,24 +69,24 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Process id."""
         return self._process.pid
 
     @property
     def alive(self) -> bool:
-        """Whether it still runs and listens."""
+        """Whether the process runs and its connection is open."""
         return self._channel.open and self._process.poll() is None
 
     def send(self, message: Any) -> None:
-        """Give it a message; returns at once, and does nothing once the worker is dead."""
+        """Queue a message; does nothing once the process has ended."""
         self._channel.send(message)
 
     def receive(self, timeout_s: float = 0.0) -> list[Any]:
-        """Every message that has come, waiting for the first for at most ``timeout_s``."""
+        """All messages received so far; waits for the first for at most ``timeout_s``."""
         return self._channel.receive(timeout_s)
 
     def stop(self, timeout_s: float = 5.0) -> None:
-        """Let it finish what it was sent; kill it if that takes too long. May be called twice."""
+        """Let it handle what was sent, then end it; kill it if that takes longer."""
         self._channel.finish(timeout_s)
         try:
             self._process.wait(timeout_s)
@@ -96,17 +96,17 @@ class Worker:
         self._channel.close()
 
     def kill(self) -> None:
-        """End it at once. What it said before can still be received."""
+        """Kill it. The messages that it sent before can still be received."""
         self._process.kill()
         self._process.wait()
-        self._channel.read_to_the_end()
+        self._channel.drain()
         self._channel.close()
 
 
 def safe_import_path() -> dict[str, str]:
-    """Environment of a child that imports from where this process does, but for the current folder.
+    """Environment of a child that imports from this process's folders but the current one.
 
-    The current folder may hold anybody's files, such as a downloaded recording with a ``queue.py``.
+    The current folder may hold foreign files, such as a downloaded recording with a ``queue.py``.
     """
     here = os.path.realpath(os.curdir)
     folders = [p for p in sys.path if os.path.isabs(p) and os.path.realpath(p) != here]
@@ -114,7 +114,7 @@ def safe_import_path() -> dict[str, str]:
 
 
 def serve(connection: int, theirs: int, ours: int) -> None:
-    """The worker's own process, given descriptors: the first message says what to run."""
+    """Main function of the child, given descriptors; the first message says what to run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Channel(Connection(connection), (Ring(ours), Ring(theirs)))
     os.close(theirs)
@@ -122,14 +122,16 @@ def serve(connection: int, theirs: int, ours: int) -> None:
     logging.getLogger().addHandler(ForwardedLog(channel))
     logging.getLogger().setLevel(logging.INFO)
 
-    def tell(kind: type[BaseException], error: BaseException, where: TracebackType | None) -> None:
+    def send_failure(
+        kind: type[BaseException], error: BaseException, where: TracebackType | None
+    ) -> None:
         channel.send(Failure("".join(traceback.format_exception(kind, error, where))))
         channel.finish()
 
-    sys.excepthook = tell
+    sys.excepthook = send_failure
     for target, arguments in itertools.islice(channel.messages(), 1):
         module, _, function = target.partition(":")
         run: Callable[..., None] = getattr(importlib.import_module(module), function)
-        gc.freeze()  # modules are not worth looking through again and again
+        gc.freeze()  # the collector need not scan all modules
         run(channel, *arguments)
     channel.finish()

@@ -16,14 +16,14 @@ from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.live.processes.dense_messages import (
-    DenseOrder,
-    Forget,
+    DenseSetup,
     KeyframeToMap,
     LateMasks,
     Mapped,
     NotMapped,
+    RemoveKeyframes,
 )
-from bmask_slam.live.processes.dense_process import DenseKeeper
+from bmask_slam.live.processes.dense_process import DenseServer
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system_config import SystemConfig
@@ -51,12 +51,12 @@ def snapshot(number: int, T: Array | None = None) -> KeyframeSnapshot:
     return KeyframeSnapshot(number, 0, T, FRAMES[number], ids, points, PIXELS)
 
 
-def keeper(path: Path) -> tuple[DenseKeeper, list[Any]]:
+def make_server(path: Path) -> tuple[DenseServer, list[Any]]:
     path.mkdir()
     (path / "config.yaml").write_text(dump(SystemConfig()))
     said: list[Any] = []
     masks = SegmenterOptions("truth")
-    return DenseKeeper(DenseOrder(path, CAMERA, masks, LABELS, shown=500), said.append), said
+    return DenseServer(DenseSetup(path, CAMERA, masks, LABELS, shown=500), said.append), said
 
 
 def to_map(number: int, instances: list[Instance], T: Array | None = None) -> KeyframeToMap:
@@ -69,9 +69,9 @@ def mapped(said: list[Any]) -> list[int]:
 
 
 def test_a_submap_comes_after_its_neighbours_and_lies_on_the_surface(tmp_path) -> None:
-    keep, said = keeper(tmp_path / "run")
+    server, said = make_server(tmp_path / "run")
     for number in POSES:
-        keep.handle(to_map(number, []))
+        server.handle(to_map(number, []))
     assert mapped(said) == [0, 1]
     submap = DenseFolder.open(tmp_path / "run").submap(1)
     points_world, _ = submap.placed(POSES[1])
@@ -84,18 +84,18 @@ def test_a_submap_comes_after_its_neighbours_and_lies_on_the_surface(tmp_path) -
 
 def test_poses_that_move_before_fusion_are_followed(tmp_path) -> None:
     """Keyframe 0 comes 0.3 m off; were it left there, none of its depth would be confirmed."""
-    keep, _ = keeper(tmp_path / "run")
+    server, _ = make_server(tmp_path / "run")
     off = POSES[0].copy()
     off[2, 3] += 0.3
-    keep.handle(to_map(0, [], off))
+    server.handle(to_map(0, [], off))
     for number in range(1, 7):
         message = to_map(number, [])
-        keep.handle(KeyframeToMap(message.snapshot, [], {k: POSES[k] for k in range(number + 1)}))
+        server.handle(KeyframeToMap(message.snapshot, [], {k: POSES[k] for k in range(number + 1)}))
     folder = DenseFolder.open(tmp_path / "run")
     sigma = float(np.median(np.sqrt(folder.submap(0).variances)))
-    alone, _ = keeper(tmp_path / "alone")
+    alone, _ = make_server(tmp_path / "alone")
     alone.handle(to_map(0, []))
-    alone._tell(alone._fusion.finish())
+    alone._report(alone._fusion.finish())
     single = DenseFolder.open(tmp_path / "alone").submap(0)
     assert sigma < 0.8 * float(np.median(np.sqrt(single.variances)))
 
@@ -104,19 +104,19 @@ def test_poses_that_move_before_fusion_are_followed(tmp_path) -> None:
 def in_time(tmp_path_factory: pytest.TempPathFactory) -> DenseFolder:
     """The dense map of seven keyframes of which the first has masks."""
     path = tmp_path_factory.mktemp("dense") / "run"
-    keep, _ = keeper(path)
+    server, _ = make_server(path)
     for number in range(7):
-        keep.handle(to_map(number, [CHAIR, PERSON] if number == 0 else []))
+        server.handle(to_map(number, [CHAIR, PERSON] if number == 0 else []))
     return DenseFolder.open(path)
 
 
 def with_late_masks(path: Path, last: int) -> DenseFolder:
     """The same, but the masks come after keyframe ``last``."""
-    keep, said = keeper(path)
+    server, said = make_server(path)
     for number in range(7):
-        keep.handle(to_map(number, []))
+        server.handle(to_map(number, []))
         if number == last:
-            keep.handle(LateMasks(0, [CHAIR, PERSON], np.arange(4), PIXELS))
+            server.handle(LateMasks(0, [CHAIR, PERSON], np.arange(4), PIXELS))
     assert mapped(said) == [0]
     return DenseFolder.open(path)
 
@@ -136,9 +136,9 @@ def test_masks_that_come_before_a_keyframe_is_fused_are_as_if_in_time(tmp_path, 
 
 
 def test_a_detection_too_weak_for_an_object_cuts_nothing_out(tmp_path) -> None:
-    keep, _ = keeper(tmp_path / "run")
+    server, _ = make_server(tmp_path / "run")
     for number in range(7):
-        keep.handle(to_map(number, [CHAIR, replace(PERSON, class_score=0.2)]))
+        server.handle(to_map(number, [CHAIR, replace(PERSON, class_score=0.2)]))
     folder = DenseFolder.open(tmp_path / "run")
     assert np.isfinite(folder.fused(0).depth_m()[PERSON.mask]).mean() > 0.9
     assert set(folder.submap(0).instances.tolist()) == {0, 1}
@@ -159,12 +159,12 @@ def test_masks_that_come_after_that_reach_its_submap(tmp_path, in_time) -> None:
 
 
 def test_what_is_forgotten_is_gone_before_and_after_it_is_saved(tmp_path) -> None:
-    keep, said = keeper(tmp_path / "run")
+    server, said = make_server(tmp_path / "run")
     for number in range(7):
-        keep.handle(to_map(number, []))
+        server.handle(to_map(number, []))
     assert mapped(said) == [0]
-    keep.handle(Forget([0, 3]))
-    keep._tell(keep._fusion.finish())
+    server.handle(RemoveKeyframes([0, 3]))
+    server._report(server._fusion.finish())
     assert mapped(said) == [0, 1, 2, 4, 5, 6]
     folder = DenseFolder.open(tmp_path / "run")
     assert [k for k in POSES if folder.is_done(k)] == [1, 2, 4, 5, 6]
@@ -172,17 +172,17 @@ def test_what_is_forgotten_is_gone_before_and_after_it_is_saved(tmp_path) -> Non
 
 
 def test_a_keyframe_that_cannot_be_mapped_is_said(tmp_path) -> None:
-    keep, said = keeper(tmp_path / "run")
-    keep.handle(to_map(0, [], np.full((4, 4), np.nan)))
+    server, said = make_server(tmp_path / "run")
+    server.handle(to_map(0, [], np.full((4, 4), np.nan)))
     assert isinstance(said[0], NotMapped)
     assert "not finite" in said[0].reason
 
 
 def test_what_is_done_is_said_again_to_one_who_missed_it(tmp_path) -> None:
-    keep, _ = keeper(tmp_path / "run")
+    server, _ = make_server(tmp_path / "run")
     for number in range(7):
-        keep.handle(to_map(number, []))
+        server.handle(to_map(number, []))
     said: list[Any] = []
-    again = DenseKeeper(keep._order, said.append)
+    again = DenseServer(server._setup, said.append)
     again.handle(to_map(0, []))
     assert mapped(said) == [0]

@@ -25,7 +25,7 @@ from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live import start
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.processes.remote_dense import LATE, RemoteDenseMapper
-from bmask_slam.live.processes.supervision import Patience
+from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import TrackingStatus
 
@@ -89,7 +89,7 @@ def test_a_killed_process_comes_back_and_no_keyframe_is_left_out(tmp_path) -> No
 
 
 def test_one_that_hangs_is_started_again(tmp_path, monkeypatch) -> None:
-    patient = partial(RemoteDenseMapper, rules=Patience(answer_s=4.0))
+    patient = partial(RemoteDenseMapper, policy=RestartPolicy(answer_s=4.0))
     monkeypatch.setattr(start, "RemoteDenseMapper", patient)
     run = tmp_path / "run"
     with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:

@@ -23,7 +23,7 @@ from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import ImageToSegment
 from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
-from bmask_slam.live.processes.supervision import Patience
+from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.live.recorder import HEALTH_S
 from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
@@ -154,16 +154,16 @@ def test_a_killed_segmenter_costs_masks_alone(tmp_path) -> None:
 
 
 def test_a_segmenter_that_hangs_is_started_again(tmp_path) -> None:
-    rules = Patience(answer_s=2.0)
-    segmenter = RemoteSegmenter(label_image(tmp_path), tmp_path, rules)
+    policy = RestartPolicy(answer_s=2.0)
+    segmenter = RemoteSegmenter(label_image(tmp_path), tmp_path, policy)
     first = segmenter.pid
     try:
         os.kill(first, signal.SIGSTOP)
-        segmenter.ask(ImageToSegment(7, FRAMES[0].rgb, "a.png"))
+        segmenter.request(ImageToSegment(7, FRAMES[0].rgb, "a.png"))
         found, deadline_s = [], time.monotonic() + 60
         while not found and time.monotonic() < deadline_s:
             time.sleep(0.05)
-            found = segmenter.answers()
+            found = segmenter.receive_masks()
         assert [masks.keyframe_id for masks in found] == [7]
         assert (segmenter.deaths, segmenter.waiting) == (1, 0)
         assert segmenter.pid != first

@@ -27,7 +27,7 @@ from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import NewKeyframe
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
-from bmask_slam.live.processes.supervision import Patience
+from bmask_slam.live.processes.supervision import RestartPolicy
 from bmask_slam.run_folder.folder import HEALTH
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system import SlamSystem
@@ -120,15 +120,15 @@ def test_a_map_that_dies_again_and_again_costs_the_map_but_not_the_trajectory(tm
 def poison_next_keyframe(slam: LiveSlam, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Its message kills the map's process; the list will hold its id."""
     remote, poisoned = slam._system.remote, []
-    tell = remote.tell
+    send = remote.send
 
     def poison(message: object) -> None:
         if isinstance(message, NewKeyframe) and not poisoned:
             poisoned.append(message.id)
-            message = replace(message, sightings=None)
-        tell(message)
+            message = replace(message, visibility=None)
+        send(message)
 
-    monkeypatch.setattr(remote, "tell", poison)
+    monkeypatch.setattr(remote, "send", poison)
     return poisoned
 
 
@@ -258,5 +258,5 @@ def test_a_run_that_cannot_start_leaves_no_run_folder(tmp_path) -> None:
 def test_one_that_begins_too_late_is_said_to_be_late(tmp_path) -> None:
     before = children()
     with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):
-        RemoteSegmenter(SegmenterOptions("none"), tmp_path, rules=Patience(start_s=0.0))
+        RemoteSegmenter(SegmenterOptions("none"), tmp_path, policy=RestartPolicy(start_s=0.0))
     assert children() == before

@@ -15,9 +15,9 @@ from bmask_slam.live.messages import (
     NewKeyframe,
     PruneMask,
     RestoreObservations,
-    Sightings,
+    VisibilityCounts,
 )
-from bmask_slam.live.processes.map_process import MapKeeper
+from bmask_slam.live.processes.map_process import MapServer
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.system import SlamSystem
 from bmask_slam.tracking.results import untracked
@@ -30,7 +30,7 @@ def keyframe(
     system: SlamSystem,
     number: int,
     reference: tuple[int, Array] | None,
-    sightings: Sightings | None = None,
+    visibility: VisibilityCounts | None = None,
 ) -> NewKeyframe:
     T_world_camera = se3_exp(np.array([0, 0, 0, 0.02 * number, 0, 0]))
     frame = render_plane(T_world_camera, number)
@@ -43,7 +43,7 @@ def keyframe(
         0,
         reference,
         NO_IDS,
-        sightings or Sightings(NO_IDS, NO_IDS, NO_IDS),
+        visibility or VisibilityCounts(NO_IDS, NO_IDS, NO_IDS),
         entries,
         frame.depth_m[::2, ::2],
     )
@@ -52,12 +52,12 @@ def keyframe(
 def test_after_the_loss_of_its_first_keyframe_a_segment_begins_anew() -> None:
     answers: list[Any] = []
     system = SlamSystem(CAMERA)
-    keeper = MapKeeper(system, answers.append)
+    server = MapServer(system, answers.append)
     nothing = np.zeros(0, ENTRY)
-    keeper.handle(1, LostKeyframe(0, NOBODY, np.eye(4), nothing, 500))
-    keeper.handle(2, keyframe(system, 1, (0, np.eye(4))))  # made while the first was being lost
-    seen = Sightings(np.arange(500), np.ones(500, int), np.ones(500, int))
-    keeper.handle(3, keyframe(system, 2, None, seen))
+    server.handle(1, LostKeyframe(0, NOBODY, np.eye(4), nothing, 500))
+    server.handle(2, keyframe(system, 1, (0, np.eye(4))))  # made while the first was being lost
+    seen = VisibilityCounts(np.arange(500), np.ones(500, int), np.ones(500, int))
+    server.handle(3, keyframe(system, 2, None, seen))
     world = system.mapper.world
     assert list(world.keyframes) == [2]
     assert not world.landmarks.alive[:500].any()
@@ -72,17 +72,17 @@ def test_after_the_loss_of_its_first_keyframe_a_segment_begins_anew() -> None:
 def test_what_was_taken_out_under_a_mask_comes_back() -> None:
     answers: list[Any] = []
     system = SlamSystem(CAMERA)
-    keeper = MapKeeper(system, answers.append)
-    keeper.handle(1, keyframe(system, 0, None))
-    keeper.handle(2, keyframe(system, 1, (0, np.eye(4))))
+    server = MapServer(system, answers.append)
+    server.handle(1, keyframe(system, 0, None))
+    server.handle(2, keyframe(system, 1, (0, np.eye(4))))
     one, landmarks = system.mapper.world.keyframes[1], system.mapper.world.landmarks
     mask = np.zeros((CAMERA.height, CAMERA.width), bool)
     mask[100:300, 200:400] = True
     all_patches, next_id = landmarks.patches_of(one.landmark_ids), len(landmarks)
-    keeper.handle(3, PruneMask(1, PackedMask.of(mask), 0))
+    server.handle(3, PruneMask(1, PackedMask.of(mask), 0))
     under = np.flatnonzero(one.masked)
     assert len(under) > 20
-    keeper.handle(4, RestoreObservations(1, under, all_patches[under]))
+    server.handle(4, RestoreObservations(1, under, all_patches[under]))
     assert not one.masked.any()
     back = one.landmark_ids[under]
     with_depth = np.isfinite(one.features.depth_m[under])
@@ -94,6 +94,6 @@ def test_what_was_taken_out_under_a_mask_comes_back() -> None:
     assert np.isfinite(landmarks.patch_views[back[made]][:, 0]).all()
     told = [answer for answer in answers if isinstance(answer, MapChanged)][-1].delta
     assert np.isin(back[back >= 0], told.ids).all()
-    keeper.handle(5, RestoreObservations(7, under, all_patches[under]))  # culled meanwhile
-    keeper.handle(6, keyframe(system, 2, (1, one.T_world_camera)))
+    server.handle(5, RestoreObservations(7, under, all_patches[under]))  # culled meanwhile
+    server.handle(6, keyframe(system, 2, (1, one.T_world_camera)))
     assert list(system.mapper.world.keyframes) == [0, 1, 2]

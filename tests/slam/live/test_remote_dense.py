@@ -14,23 +14,23 @@ from bmask_slam.graph.geometry import make_pose
 from bmask_slam.live.messages import Masks
 from bmask_slam.live.processes import remote_dense
 from bmask_slam.live.processes.dense_messages import (
-    DenseOrder,
+    Accepted,
+    DenseSetup,
     FinishMap,
-    Forget,
     KeyframeToMap,
     LateMasks,
     Mapped,
     MapWritten,
     NotMapped,
     Preview,
-    Taken,
+    RemoveKeyframes,
 )
 from bmask_slam.live.processes.remote_dense import CROWDED, MAX_WAITING, RemoteDenseMapper
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.world.world_map import WorldMap
 
-ORDER = DenseOrder(Path("run"), CAMERA, SegmenterOptions(), ("background",))
+SETUP = DenseSetup(Path("run"), CAMERA, SegmenterOptions(), ("background",))
 
 
 class StandIn:
@@ -48,7 +48,7 @@ class StandIn:
         found, self.answers = self.answers, []
         return found
 
-    def was_restarted(self, busy: bool) -> bool:
+    def restart_if_needed(self, busy: bool) -> bool:
         died, self.dies = self.dies, False
         self.deaths += died
         return died
@@ -60,7 +60,7 @@ class StandIn:
 @pytest.fixture
 def dense(monkeypatch: pytest.MonkeyPatch) -> RemoteDenseMapper:
     monkeypatch.setattr(remote_dense, "SupervisedWorker", StandIn)
-    return RemoteDenseMapper(ORDER)
+    return RemoteDenseMapper(SETUP)
 
 
 def process(dense: RemoteDenseMapper) -> StandIn:
@@ -83,7 +83,7 @@ def a_map(count: int) -> WorldMap:
 def ask(dense: RemoteDenseMapper, *ids: int) -> Frame:
     frame = Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), np.ones((480, 640), np.float32))
     for number in ids:
-        dense.ask(number, frame)
+        dense.add_keyframe(number, frame)
     return frame
 
 
@@ -95,14 +95,14 @@ def test_the_newest_goes_first_and_one_at_a_time(dense) -> None:
     world, worker = a_map(4), process(dense)
     frame = ask(dense, 0, 1, 2)
     frame.rgb[:] = 7  # the caller's buffer: it may be used again
-    dense.follow(world, no, no)
-    dense.follow(world, no, no)
+    dense.update(world, no, no)
+    dense.update(world, no, no)
     assert worker.keyframes() == [2]
     assert (worker.sent[0].snapshot.frame.rgb == 0).all()
     ask(dense, 3)
     for number in (2, 3, 1, 0):
-        worker.answers = [Taken(number)]
-        dense.follow(world, no, no)
+        worker.answers = [Accepted(number)]
+        dense.update(world, no, no)
     assert worker.keyframes() == [2, 3, 1, 0]
     assert (dense.waiting, dense.dropped) == (0, 0)
     np.testing.assert_array_equal(worker.sent[1].poses[2], world.keyframes[2].T_world_camera)
@@ -111,31 +111,31 @@ def test_the_newest_goes_first_and_one_at_a_time(dense) -> None:
 def test_too_many_drive_out_the_oldest_but_never_one_that_is_promised(dense) -> None:
     world, worker = a_map(MAX_WAITING + 3), process(dense)
     ask(dense, 0)
-    dense.follow(world, no, no)
+    dense.update(world, no, no)
     ask(dense, *range(1, MAX_WAITING + 1))
     assert dense.full
     assert dense.dropped == 0
     ask(dense, MAX_WAITING + 1, MAX_WAITING + 2)
     assert list(dense.left_out) == [1, 2]
     assert (dense.dropped, dense.waiting) == (2, MAX_WAITING + 1)
-    worker.answers = [Taken(0), Mapped(0, None)]
-    dense.follow(world, no, no)
+    worker.answers = [Accepted(0), Mapped(0, None)]
+    dense.update(world, no, no)
     assert dense.submaps == {0}
 
 
 def test_it_waits_for_the_map_and_some_time_for_masks(dense, monkeypatch) -> None:
     world, worker = a_map(3), process(dense)
     ask(dense, 0, 1, 2)
-    dense.follow(world, lambda k: k > 0, lambda k: k < 1)
+    dense.update(world, lambda k: k > 0, lambda k: k < 1)
     assert worker.keyframes() == []
-    dense.see(Masks(0, ["an instance"]), world)
-    dense.follow(world, lambda k: k > 0, no)
+    dense.add_masks(Masks(0, ["an instance"]), world)
+    dense.update(world, lambda k: k > 0, no)
     assert worker.sent[0].instances == ["an instance"]
     monkeypatch.setattr(remote_dense, "MASKS_S", -1.0)
-    worker.answers = [Taken(0)]
-    dense.follow(world, no, lambda k: True)
+    worker.answers = [Accepted(0)]
+    dense.update(world, no, lambda k: True)
     assert worker.keyframes() == [0, 2]
-    dense.see(Masks(2, ["late"]), world)
+    dense.add_masks(Masks(2, ["late"]), world)
     late = worker.sent[-1]
     assert isinstance(late, LateMasks)
     np.testing.assert_array_equal(late.landmark_ids, world.keyframes[2].landmark_ids)
@@ -145,26 +145,26 @@ def test_it_waits_for_the_map_and_some_time_for_masks(dense, monkeypatch) -> Non
 def test_where_many_wait_masks_are_not_waited_for_but_those_that_have_them_go_first(dense) -> None:
     world, worker = a_map(CROWDED + 1), process(dense)
     ask(dense, *range(CROWDED - 1))
-    dense.follow(world, no, lambda k: True)
+    dense.update(world, no, lambda k: True)
     assert worker.keyframes() == []
     ask(dense, CROWDED - 1, CROWDED)
-    dense.follow(world, no, lambda k: k != 1)
-    worker.answers = [Taken(1)]
-    dense.follow(world, lambda k: k == CROWDED, lambda k: True)
+    dense.update(world, no, lambda k: k != 1)
+    worker.answers = [Accepted(1)]
+    dense.update(world, lambda k: k == CROWDED, lambda k: True)
     assert worker.keyframes() == [1, CROWDED - 1]
 
 
 def test_what_leaves_the_map_is_forgotten_and_what_it_does_not_know_yet_is_not(dense) -> None:
     world, worker = a_map(4), process(dense)
     ask(dense, 0, 1)
-    dense.follow(world, no, no)
-    worker.answers = [Taken(1), Mapped(1, None)]
-    dense.follow(world, no, no)
+    dense.update(world, no, no)
+    worker.answers = [Accepted(1), Mapped(1, None)]
+    dense.update(world, no, no)
     ask(dense, 2, 3)
     for number in (1, 2, 3):
         del world.keyframes[number]
-    dense.forget_culled(world, lambda k: k == 3)
-    assert worker.sent[-1] == Forget([1, 2])
+    dense.remove_culled(world, lambda k: k == 3)
+    assert worker.sent[-1] == RemoveKeyframes([1, 2])
     assert dense.submaps == set()
     assert dense.waiting == 2  # 0 is being worked on, 3 is new
 
@@ -172,21 +172,21 @@ def test_what_leaves_the_map_is_forgotten_and_what_it_does_not_know_yet_is_not(d
 def test_what_was_promised_is_sent_again_and_what_kills_twice_is_left_out(dense) -> None:
     world, worker = a_map(3), process(dense)
     ask(dense, 0)
-    dense.follow(world, no, no)
-    worker.answers = [Taken(0)]
+    dense.update(world, no, no)
+    worker.answers = [Accepted(0)]
     ask(dense, 1)
-    dense.follow(world, no, no)
+    dense.update(world, no, no)
     worker.dies = True
-    dense.follow(world, no, no)
+    dense.update(world, no, no)
     assert worker.keyframes() == [0, 1, 0]
-    worker.answers = [Taken(0)]
-    dense.follow(world, no, no)
+    worker.answers = [Accepted(0)]
+    dense.update(world, no, no)
     worker.dies = True
-    dense.follow(world, no, no)
+    dense.update(world, no, no)
     assert worker.keyframes() == [0, 1, 0, 1, 0]
     assert list(dense.left_out) == [1]
-    worker.answers = [Taken(0), Mapped(0, None)]
-    dense.follow(world, no, no)
+    worker.answers = [Accepted(0), Mapped(0, None)]
+    dense.update(world, no, no)
     assert (dense.submaps, dense.waiting) == ({0}, 0)
 
 
@@ -198,7 +198,7 @@ def test_at_the_end_all_that_waits_is_sent_and_a_death_is_made_up_for(dense, mon
     def send(message: Any, begins: bool = False) -> None:
         worker.sent.append(message)
         if isinstance(message, KeyframeToMap):
-            worker.answers.append(Taken(message.id))
+            worker.answers.append(Accepted(message.id))
         elif not worker.deaths:
             worker.dies = True
         else:
@@ -217,9 +217,9 @@ def test_at_the_end_all_that_waits_is_sent_and_a_death_is_made_up_for(dense, mon
 def test_given_up_it_leaves_out_everything_and_the_end_says_so(dense) -> None:
     world, worker = a_map(3), process(dense)
     ask(dense, 0, 1)
-    dense.follow(world, no, no)
+    dense.update(world, no, no)
     worker.given_up = True
-    dense.follow(world, no, no)
+    dense.update(world, no, no)
     ask(dense, 2)
     assert sorted(dense.left_out) == [0, 1, 2]
     assert not dense.full

@@ -6,11 +6,11 @@ import os
 
 import numpy as np
 
-from bmask_slam.live.shared_memory import Ring, nameless_file
+from bmask_slam.live.shared_memory import Ring, anonymous_file
 
 
 def ends(size: int) -> tuple[Ring, Ring]:
-    descriptor = nameless_file(64 + size)
+    descriptor = anonymous_file(64 + size)
     try:
         return Ring(descriptor), Ring(descriptor)
     finally:
@@ -28,14 +28,14 @@ def test_what_goes_in_comes_out_however_often_the_ring_is_gone_round() -> None:
     for _ in range(3000):
         if rng.random() < 0.55:
             sent = data(rng, int(rng.integers(1, 4000)))
-            begin = writer.put(memoryview(sent))
+            begin = writer.write(memoryview(sent))
             if begin is None:
                 refused += 1
             else:
                 waiting.append((begin, sent))
         elif waiting:
             begin, sent = waiting.pop(0)
-            assert reader.take(begin, len(sent)) == sent
+            assert reader.read(begin, len(sent)) == sent
             taken += 1
     assert refused > 100
     assert taken > 500
@@ -43,22 +43,22 @@ def test_what_goes_in_comes_out_however_often_the_ring_is_gone_round() -> None:
 
 def test_what_is_larger_than_the_memory_is_refused() -> None:
     writer, reader = ends(1024)
-    assert writer.put(memoryview(bytes(1025))) is None
-    begin = writer.put(memoryview(bytes(range(256)) * 4))
+    assert writer.write(memoryview(bytes(1025))) is None
+    begin = writer.write(memoryview(bytes(range(256)) * 4))
     assert begin is not None
-    assert writer.put(memoryview(b"x")) is None
-    assert reader.take(begin, 1024) == bytes(range(256)) * 4
-    assert writer.put(memoryview(b"x")) is not None
+    assert writer.write(memoryview(b"x")) is None
+    assert reader.read(begin, 1024) == bytes(range(256)) * 4
+    assert writer.write(memoryview(b"x")) is not None
 
 
 def test_bytes_taken_are_a_copy_that_may_be_written_to() -> None:
     writer, reader = ends(1024)
-    first = writer.put(memoryview(b"first"))
+    first = writer.write(memoryview(b"first"))
     assert first is not None
-    taken = reader.take(first, 5)
+    taken = reader.read(first, 5)
     for _ in range(40):
-        begin = writer.put(memoryview(b"other" * 10))
+        begin = writer.write(memoryview(b"other" * 10))
         assert begin is not None
-        reader.take(begin, 50)
+        reader.read(begin, 50)
     assert taken == b"first"
     np.frombuffer(taken, np.uint8)[0] = 0
