@@ -1,4 +1,4 @@
-"""Which of the map's observations enter the factor graph, and how its answer is read back."""
+"""Which observations of the map enter the factor graph, and how its estimate is read back."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 
 @dataclass(frozen=True)
 class FactorSelectionConfig:
-    """The graph's size decides its cost: measurements are capped per keyframe.
+    """Limits on the size of the graph.
 
-    A landmark enters when ``min_views`` keyframes see it, with all its observations so far. It
-    retires (`graph.marginals.landmark_marginalisation`) when none of the ``window_keyframes`` that
-    share most with the newest one sees it, and as soon as ``marginalise_batch`` wait for it, at
-    most twice as many at once; it comes back when it is seen again. A map of up to
+    A landmark enters when ``min_views`` keyframes see it, with all its observations so far. It is
+    marginalised (`graph.marginals.landmark_marginalisation`) when none of the ``window_keyframes``
+    that share most with the newest one sees it, and as soon as ``marginalise_batch`` wait for it,
+    at most twice as many at once; it enters again when it is seen again. A map of up to
     ``full_keyframes`` keeps every landmark in the graph: that is more accurate, and fast enough. 0
     window keyframes: so does every map.
     """
@@ -51,14 +51,14 @@ class FactorSelector:
         self._removed_keyframes.append(keyframe_id)
 
     def state(self) -> Arrays:
-        """What still has to leave the graph; what entered is known to map and graph."""
+        """Removals that the next update will carry out."""
         return {
             "removed": np.concatenate([np.zeros(0, np.int64), *self._removed]),
             "removed_keyframes": np.array(self._removed_keyframes, np.int64),
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the feed of a state."""
+        """Go on from a state."""
         self._removed = [state["removed"]]
         self._removed_keyframes = state["removed_keyframes"].tolist()
 
@@ -68,8 +68,8 @@ class FactorSelector:
         inside = world.landmarks.in_graph[ids]
         new_ids = self._promoted(world, keyframe, keypoints[~inside], ids[~inside], inside.sum())
         world.landmarks.in_graph[new_ids] = True
-        retired = self._outside_window(world, ids)
-        world.landmarks.in_graph[retired] = False
+        marginalised = self._outside_window(world, ids)
+        world.landmarks.in_graph[marginalised] = False
         begins = world.in_segment(keyframe.segment) == [keyframe]
         return replace(
             self._changes(world),
@@ -78,13 +78,13 @@ class FactorSelector:
             landmark_ids=new_ids,
             points_world=world.landmarks.points_world[new_ids],
             priors=(segment_prior(keyframe),) if begins else (),
-            marginalise_landmarks=retired,
+            marginalise_landmarks=marginalised,
         )
 
     def map_update(self, world: WorldMap) -> GraphUpdate:
-        """The update of what changed in the map, no keyframe being new: fused, forgotten.
+        """The update of what changed in the map without a new keyframe: fusions, removals.
 
-        Retired landmarks that were given observations come back with them.
+        Marginalised landmarks that were given observations enter the graph again.
         """
         again = np.flatnonzero(was_sent(world) & ~world.landmarks.in_graph & world.landmarks.alive)
         unsent = [k.landmark_ids[k.sent_ids != k.landmark_ids] for k in world.keyframes.values()]
@@ -103,7 +103,7 @@ class FactorSelector:
         return update
 
     def whole_update(self, world: WorldMap) -> GraphUpdate:
-        """The update that fills an empty graph with the whole map, one prior a segment."""
+        """The update that fills an empty graph with the whole map, with one prior a segment."""
         self._removed, self._removed_keyframes = [], []
         keyframes = list(world.keyframes.values())
         landmarks = world.landmarks
@@ -124,7 +124,7 @@ class FactorSelector:
     def _promoted(
         self, world: WorldMap, keyframe: Keyframe, keypoints: Ints, ids: Ints, already: int
     ) -> Ints:
-        """Landmarks of the keyframe that enter the graph now: well spread, most seen first."""
+        """Landmarks of the keyframe that enter the graph now, spread over the image."""
         views = world.landmarks.observations[ids]
         enough = views >= self.config.min_views
         keypoints, ids, views = keypoints[enough], ids[enough], views[enough]
@@ -134,7 +134,7 @@ class FactorSelector:
         return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
 
     def _outside_window(self, world: WorldMap, seen_ids: Ints) -> Ints:
-        """Landmarks in the graph that no keyframe of the active window sees, once enough wait.
+        """Landmarks in the graph that no keyframe of the active window sees, if they are enough.
 
         Those that were not seen for longest come first.
         """
@@ -142,7 +142,7 @@ class FactorSelector:
         if not count or len(world.keyframes) <= self.config.full_keyframes:
             return np.zeros(0, np.int64)
         near = [k for _, k in world.covisible(seen_ids, self.config.window_min_shared)[:count]]
-        active = np.zeros(len(landmarks) + 1, bool)  # the last entry answers for id -1
+        active = np.zeros(len(landmarks) + 1, bool)  # the last entry is for id -1
         active[seen_ids] = True
         for keyframe in near:
             active[keyframe.landmark_ids] = True
@@ -158,7 +158,7 @@ class FactorSelector:
 
         Observations that older keyframes gained by fusion are among them.
         """
-        in_graph = np.append(world.landmarks.in_graph, False)  # the last entry answers for id -1
+        in_graph = np.append(world.landmarks.in_graph, False)  # the last entry is for id -1
         parts = []
         for keyframe in world.keyframes.values():
             ids = keyframe.landmark_ids
@@ -170,8 +170,8 @@ class FactorSelector:
 
 
 def was_sent(world: WorldMap) -> Mask:
-    """Mask (N,) of the landmarks of which the graph was given observations, retired ones too."""
-    sent = np.zeros(len(world.landmarks) + 1, bool)  # the last entry answers for id -1
+    """Mask (N,) of landmarks that were in the graph at some time, also marginalised ones."""
+    sent = np.zeros(len(world.landmarks) + 1, bool)  # the last entry is for id -1
     for keyframe in world.keyframes.values():
         sent[keyframe.sent_ids] = True
     return sent[:-1]
@@ -212,7 +212,7 @@ def read_back(world: WorldMap, estimate: GraphEstimate) -> None:
     landmarks = world.landmarks
     before = landmarks.in_graph.copy()
     inside = estimate.landmark_ids[landmarks.alive[estimate.landmark_ids]]
-    landmarks.in_graph[:] = False  # not those either that were sent and refused
+    landmarks.in_graph[:] = False  # nor those that were sent and refused
     landmarks.in_graph[inside] = True
     left_out = np.append(before & ~landmarks.in_graph, False)
     if left_out.any():  # their observations may be sent again later

@@ -1,4 +1,4 @@
-"""What happens to the map at a keyframe: landmarks are made, fused and culled, keyframes culled."""
+"""Landmarks and keyframes over time: how they are made, fused and culled."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def create_landmarks(world: WorldMap, keyframe: Keyframe, camera: Camera) -> Int
 def fuse_into_neighbours(
     world: WorldMap, keyframe: Keyframe, new_ids: Ints, tracker: Tracker, config: MappingConfig
 ) -> Ints:
-    """Look for a keyframe's new landmarks in its covisible neighbours; returns the ids removed."""
+    """Search a keyframe's new landmarks in its covisible neighbours; returns the ids removed."""
     _, tracked = world.observed(keyframe)
     neighbours = [k for _, k in world.covisible(tracked, 15) if k is not keyframe]
     return fuse_into(
@@ -62,7 +62,7 @@ def fuse_into_neighbours(
 def fuse_into(
     world: WorldMap, keyframes: list[Keyframe], ids: Ints, tracker: Tracker, radius_px: float
 ) -> Ints:
-    """Look for landmarks in keyframes that may show them too.
+    """Search landmarks in further keyframes.
 
     A free keypoint there becomes one more observation; one that has another landmark shows a
     duplicate, and the younger is fused into the older. Returns the ids removed.
@@ -99,7 +99,7 @@ def consistent_matches(
 
 
 def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> Ints:
-    """Of the candidates, those rarely found again or seen by too few keyframes; removed here."""
+    """Remove the candidates that are rarely found again or seen by few keyframes; their ids."""
     landmarks = world.landmarks
     ids = landmarks.living(candidates)
     age, views = world.next_keyframe_id - 1 - landmarks.host[ids], landmarks.observations[ids]
@@ -113,7 +113,7 @@ def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> 
 def redundant_keyframe(
     world: WorldMap, candidates: list[Keyframe], config: MappingConfig
 ) -> Keyframe | None:
-    """The first candidate nearly all of whose landmarks enough other keyframes see, if any."""
+    """The first candidate whose landmarks are nearly all seen by enough others, or None."""
     for keyframe in candidates:
         _, ids = world.observed(keyframe)
         if len(ids) == 0:

@@ -117,12 +117,12 @@ class Mapper:
         self.loops.restore(part(state, "loops"), self.world)
 
     def restart(self) -> None:
-        """Build anew, from now on, what a state cannot hold: go on like one that was restored."""
+        """Rebuild what a state cannot hold (ISAM2, index), as a restored mapper does."""
         self.smoother.restart()
         self.loops.index.rebuild()
 
     def begin_session(self) -> None:
-        """Forget the frames that were tracked, and the times; map and graph stay."""
+        """Clear the frame history and the times; map and graph stay."""
         self.history = FrameHistory()
         self.update_ms = []
 
@@ -149,10 +149,10 @@ class Mapper:
         self._cull_keyframe(keyframe)
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
-        """Look for known places from a keyframe; loops that hold move the map and fuse landmarks.
+        """Look for known places from a keyframe; confirmed loops move the map and fuse landmarks.
 
-        The graph is asked afterwards: a loop that does not fit is removed and waits for more
-        support; an older one that no longer fits goes with what it fused.
+        Afterwards loops are tested in the graph: a new one that does not fit is removed and waits
+        for more support; an older one that no longer fits is removed with what it fused.
         """
         confirmed = self.loops.loops_of(keyframe, self.world)
         if not confirmed:
@@ -170,9 +170,9 @@ class Mapper:
         return kept
 
     def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
-        """A frame of one segment was recognised in another: move the segment there, as one map.
+        """Move a segment into another one in which a frame of it was recognised.
 
-        Returns the frame as it is seen in the joined map.
+        Returns the frame as tracked in the joined map.
         """
         joined = join_segment(self.world, segment, tracked, recognised)
         loops = self.smoother.relative_poses("loop")
@@ -216,7 +216,7 @@ class Mapper:
         world.landmarks.give_patches(ids[ids >= 0], patches[ids >= 0])
 
     def finish(self) -> None:
-        """Full bundle adjustment of the graph, then without outliers; the map is then final."""
+        """Full bundle adjustment, again without outliers; the map is then final."""
         if self.world.keyframes:
             self._apply(self.smoother.optimise_batch(drop_outliers=True), timed=False)
 
@@ -228,7 +228,7 @@ class Mapper:
         read_back(self.world, estimate)
 
     def _change_graph(self, **changes: Any) -> None:
-        """An update that moves much of the graph: ISAM2 goes on until nothing moves any more."""
+        """An update that moves much of the graph: ISAM2 is iterated until it converges."""
         rounds = self.loops.config.max_iterations
         update = replace(
             self._factor_selector.map_update(self.world), max_iterations=rounds, **changes
@@ -236,7 +236,7 @@ class Mapper:
         self._apply(self.smoother.update(update))
 
     def _remove_loops(self, refuted: set[tuple[int, int]], fresh: set[tuple[int, int]]) -> None:
-        """Take loops out of the graph, and apart what those that are not fresh have fused."""
+        """Remove loops from the graph; those that are not fresh with what they fused."""
         if not refuted:
             return
         logger.info("loops refuted by the graph: %s", sorted(refuted))
@@ -248,7 +248,7 @@ class Mapper:
             self.loops.closed.pop(ends, None)
 
     def _fuse(self, loops: list[LoopConstraint]) -> None:
-        """Landmarks of both sides that are one become one: first the loops' own pairs."""
+        """Fuse the landmarks of both sides: first the loops' own pairs, then by projection."""
         world = self.world
         old_ids, new_side = self._sides(loops)
         for loop in loops:
@@ -275,13 +275,13 @@ class Mapper:
         return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
 
     def _cull_keyframe(self, newest: Keyframe) -> None:
-        """Take the youngest keyframe out that adds nothing to those around the newest one.
+        """Remove the youngest redundant keyframe around the newest one.
 
-        With it go the landmarks that too few others see. What the map has stood on for longest
-        stays: it would wander if new views took its place.
+        Landmarks that too few others see are removed with it. Older keyframes are kept: the map
+        would drift if newer views replaced them.
         """
         _, seen = self.world.observed(newest)
-        kept = self.loops.ends | {0}  # with a loop's end its relative pose would leave the graph
+        kept = self.loops.ends | {0}  # culling the end of a loop would remove its factor
         near = {k.id: k for _, k in self.world.covisible(seen, 15)}
         old = [near[i] for i in sorted(near.keys() - kept, reverse=True) if i < newest.id - 2]
         redundant = redundant_keyframe(self.world, old, self._mapping)

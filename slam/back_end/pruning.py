@@ -1,4 +1,4 @@
-"""Taking things out of the map and the graph together: what a mask covers, landmarks, a loop.
+"""Removing observations from map and graph together: under a mask, of landmarks, of a loop.
 
 Masks of a keyframe may come seconds after it. By then its landmarks may have been fused into
 others, culled, or marginalised out of the graph, the keyframe may have been culled, its segment
@@ -31,7 +31,7 @@ class PruneReport:
     """What left the map and the graph, and what the graph did about the rest.
 
     Attributes:
-        landmark_ids: (N,) sorted, out of the map and the graph with all their observations.
+        landmark_ids: (N,) sorted, removed from map and graph with all their observations.
         observations: (N, 2) keyframe id, landmark id of those that left alone.
         loops: names of the relative poses that left.
         refused: why nothing was done; "" if it was.
@@ -99,7 +99,7 @@ class MapPruner:
     def prune_landmarks(self, ids: Ints) -> PruneReport:
         """Take landmarks (N,) out entirely; of fused ones, what they were fused into.
 
-        Those that are not in the map, or not any more, are passed over.
+        Ids that are not in the map are skipped.
         """
         landmarks = self.world.landmarks
         known = ids[(ids >= 0) & (ids < len(landmarks))]
@@ -107,11 +107,11 @@ class MapPruner:
         return self._remove(current[landmarks.alive[current]], np.zeros((0, 2), np.int64))
 
     def prune_loop(self, keyframe_a: int, keyframe_b: int) -> PruneReport:
-        """Take a loop out: its relative poses, and every landmark that it fused falls in two.
+        """Remove a loop: its relative poses, and the fusions of landmarks that it caused.
 
-        A landmark is taken for fused by the loop if keyframes around both ends see it (covisible
-        with an end and nearer to it in time), but none in between for half of the way or more;
-        the newer side's views leave it.
+        A landmark counts as fused by the loop if keyframes around both ends see it (covisible with
+        an end and nearer to it in time), but none in between for half of the way or more; the views
+        of the newer side become a landmark of their own.
         """
         ends = sorted((keyframe_a, keyframe_b))
         missing = [k for k in ends if k not in self.world.keyframes]
@@ -145,11 +145,11 @@ class MapPruner:
         return [k for k in near if abs(k.id - end) < abs(k.id - other)]
 
     def _position(self, keyframe_ids: list[int]) -> Ints:
-        """Place (N,) of keyframes among those in the map."""
+        """Positions (N,) of keyframes in the order of the map."""
         return np.searchsorted(sorted(self.world.keyframes), keyframe_ids)
 
     def _longest_pause(self, ids: Ints) -> Ints:
-        """Keyframes (N,) from one view of each landmark to its next, at most; ids sorted."""
+        """Largest number (N,) of keyframes between two views of each landmark; ids are sorted."""
         views = [
             np.stack([np.searchsorted(ids, mine), np.full(len(mine), place)])
             for place, k in enumerate(sorted(self.world.keyframes))

@@ -1,4 +1,4 @@
-"""Joining map segments: what was tracked after a loss is moved to where it belongs."""
+"""Joining map segments: keyframes after a tracking loss are moved into the older segment."""
 
 from __future__ import annotations
 

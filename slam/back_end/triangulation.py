@@ -1,4 +1,4 @@
-"""Landmarks without depth: two views with parallax instead."""
+"""Landmarks from keypoints without depth, triangulated from two views with parallax."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Keypoints and descriptors of a frame, their matching, and the index that finds similar frames."""

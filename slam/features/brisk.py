@@ -20,14 +20,14 @@ FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
 class FeatureConfig:
     """The front end's parameters; pixels are those of the full image.
 
-    The corner threshold is the highest of ``thresholds`` at which FAST, a fortieth of BRISK's
-    cost, finds ``max_keypoints`` in the finest layer; so a blurred frame gets its keypoints and
-    a rich one costs no more. ``octaves`` is BRISK's: each adds a half-scale layer and an
-    intra-octave. Nearer to the border than ``border_px`` BRISK has no descriptor.
-    ``pixel_sigma`` is that of a BRISK keypoint at scale 1. ``disparity_sigma_px`` is the depth
-    sensor's: for structured light a constant in disparity, sigma_z = z^2 / bf * sigma_d, with
-    0.07 px the laboratory value (Nguyen 2012) at bf = 40 px m. ``depth_window_px`` and
-    ``depth_edge_ratio``: see sample_depth.
+    The corner threshold is the highest of ``thresholds`` at which FAST (a fortieth of the cost of
+    BRISK) finds ``max_keypoints`` in the finest layer, so that a blurred frame still has enough
+    keypoints and a frame with much texture takes no longer. ``octaves`` is BRISK's: each adds a
+    half-scale layer and an intra-octave. Keypoints nearer to the image border than ``border_px``
+    have no descriptor. ``pixel_sigma`` is the standard deviation of a BRISK keypoint at scale 1.
+    ``disparity_sigma_px`` is the depth sensor's: for structured light a constant in disparity,
+    sigma_z = z^2 / bf * sigma_d, with 0.07 px the laboratory value (Nguyen 2012) at bf = 40 px m.
+    ``depth_window_px`` and ``depth_edge_ratio``: see sample_depth.
     """
 
     thresholds: tuple[int, ...] = (50, 35, 25, 18, 13)
@@ -81,7 +81,7 @@ class Features:
 
 
 class BriskExtractor:
-    """Detects, buckets and describes; holds OpenCV's detector, so one per thread."""
+    """Detects, buckets and describes. It holds OpenCV's detector: use one per thread."""
 
     def __init__(self, camera: Camera, config: FeatureConfig):
         self.camera = camera
@@ -103,10 +103,10 @@ class BriskExtractor:
         return self._assemble(frame, gray, (raw, scales, angles_rad), descriptors)
 
     def reserve(self, frame: Frame, features: Features, share: float) -> Features:
-        """Further keypoints of a frame, best first, where a share of its features is of no use.
+        """Further keypoints of a frame, best first, for a share of its features that is not used.
 
-        Together with the features they are those of so much larger a search. Their descriptors
-        are 0; see ``described``. With octaves there are none.
+        They and the features together are what a search for that many more keypoints finds. Their
+        descriptors are 0 until ``described``. With octaves there are none.
         """
         gray, width = features.gray, features.gray.shape[1]
         enough = math.ceil(self.config.max_keypoints / (1 - share))
@@ -148,7 +148,7 @@ class BriskExtractor:
         return pixels[strong], response[strong], threshold
 
     def _inside(self, gray: Image) -> Bytes:
-        """255 where a descriptor can be had."""
+        """Mask (H, W): 255 where a descriptor can be computed, else 0."""
         border, (height, width) = self._border_px, gray.shape
         inside = np.zeros_like(gray)
         inside[border : height - border, border : width - border] = 255
@@ -186,7 +186,7 @@ class BriskExtractor:
         keypoints: tuple[Array, Array, Array],
         descriptors: Bits,
     ) -> Features:
-        """With depth and noise, from pixels (N, 2), scales (N,) and angles (N,) in radians."""
+        """Features with depth and noise, from pixels (N, 2), scales (N,), angles (N,) in rad."""
         raw, scales, angles_rad = keypoints
         depth_m, spread_m = sample_depth(frame.depth_m, raw, self.config)
         disparity = self.camera.stereo_bf_px_m / depth_m
@@ -216,7 +216,7 @@ def select(features: Features, rows: Ints) -> Features:
 
 
 def joined(first: Features, second: Features) -> Features:
-    """Keypoints of one frame, found at two times, one after the other."""
+    """Keypoints of one frame from two searches, concatenated."""
     names = [f.name for f in fields(first) if f.name != "gray"]
     pairs = {name: [getattr(first, name), getattr(second, name)] for name in names}
     return replace(first, **{name: np.concatenate(pair) for name, pair in pairs.items()})

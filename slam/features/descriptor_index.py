@@ -20,16 +20,16 @@ ROWS_PER_LIST = 32  # before the index is partitioned
 
 @dataclass(frozen=True)
 class IndexConfig:
-    """Every keyframe votes with ``query_keypoints`` of its descriptors.
+    """A query votes with ``query_keypoints`` of its descriptors.
 
     A descriptor votes for a keyframe where its nearest neighbour there is within ``max_distance``
     bits, and where that distance times ``ratio`` is at most the one in the best keyframe of all.
     If n of K keyframes have a neighbour within the gate, a vote counts
-    log((K + 1) / n) / log(K + 1) (inverse document frequency): 1 for what is seen in one place
-    only, 0 for what is everywhere.
+    log((K + 1) / n) / log(K + 1) (inverse document frequency): 1 for a descriptor of one place
+    only, 0 for one that all keyframes have.
 
-    The index is searched whole until it holds 32 times ``lists`` descriptors. Then each belongs to
-    the nearest of ``lists`` of them, and only the ``probes`` lists nearest to a query are searched.
+    The index is searched exhaustively until it holds 32 times ``lists`` descriptors. Then it is
+    partitioned into ``lists``, of which the ``probes`` nearest to a query are searched.
     """
 
     query_keypoints: int = 450
@@ -41,7 +41,7 @@ class IndexConfig:
 
 @dataclass(frozen=True)
 class Votes:
-    """Keyframe ids (K,) with their weighted votes (K,) > 0, most first, then the oldest first."""
+    """Keyframe ids (K,) with their weighted votes (K,) > 0, by falling votes, then rising id."""
 
     keyframe_ids: Ints
     scores: Array
@@ -54,7 +54,7 @@ class DescriptorIndex:
     """All keyframes' descriptors in a faiss binary index; grows and shrinks by keyframes.
 
     The same calls give the same votes. A removed keyframe's rows stay in the index and are
-    ignored, until they are more than half of it and it is built anew.
+    ignored; the index is rebuilt when they are more than half of it.
     """
 
     def __init__(self, config: IndexConfig | None = None):
@@ -63,34 +63,34 @@ class DescriptorIndex:
         self._clear()
 
     def __len__(self) -> int:
-        """Number of keyframes held."""
+        """Number of keyframes in the index."""
         return len(self._descriptors)
 
     @property
     def keyframe_ids(self) -> list[int]:
-        """The keyframes held, in the order they came."""
+        """Ids of the keyframes in the index, in the order of insertion."""
         return list(self._descriptors)
 
     def add(self, keyframe_id: int, descriptors: Bits) -> None:
-        """Take in a keyframe's descriptors (N, 8); they are not copied and must not change.
+        """Add a keyframe's descriptors (N, 8); they are not copied and must not be changed.
 
         Raises:
             ValueError: the keyframe is held already.
         """
         if keyframe_id in self._descriptors:
-            raise ValueError(f"keyframe {keyframe_id} is in the index already")
+            raise ValueError(f"keyframe {keyframe_id} is already in the index")
         self._descriptors[keyframe_id] = descriptors
         self._append(keyframe_id, descriptors)
         if not self._partitioned and self._rows >= ROWS_PER_LIST * self.config.lists:
             self.rebuild()
 
     def restore(self, descriptors: dict[int, Bits]) -> None:
-        """Hold these keyframes, (N, 8) descriptors by id, and no others."""
+        """Replace the contents by these keyframes, (N, 8) descriptors by id."""
         self._descriptors = dict(descriptors)
         self.rebuild()
 
     def remove(self, keyframe_id: int) -> None:
-        """Forget a keyframe; one that is not held is no error."""
+        """Remove a keyframe; an id that is not in the index is ignored."""
         descriptors = self._descriptors.pop(keyframe_id, None)
         if descriptors is None:
             return
@@ -99,7 +99,7 @@ class DescriptorIndex:
             self.rebuild()
 
     def votes(self, descriptors: Bits, excluded: Collection[int] = ()) -> Votes:
-        """Votes of descriptors (N, 8) for the keyframes held, but for the excluded ones."""
+        """Votes of descriptors (N, 8) for the keyframes in the index, without the excluded ones."""
         excluded = set(excluded)
         candidates = [k for k in self._descriptors if k not in excluded]
         allowed = np.zeros(max(candidates, default=-1) + 2, bool)  # its last entry stays False
@@ -122,12 +122,12 @@ class DescriptorIndex:
         return Votes(ids[order].astype(np.int64), scores[order])
 
     def _near(self, descriptors: Bits) -> tuple[Ints, Ints, Ints]:
-        """All (query row, keyframe id, Hamming distance) within the gate, removed ones too."""
+        """(query row, keyframe id, Hamming distance) within the gate, also of removed keyframes."""
         step = max(-(-len(descriptors) // self.config.query_keypoints), 1)
         query = _bytes(descriptors[::step])
         if self._rows == 0 or len(query) == 0:
             return (np.zeros(0, np.int64),) * 3
-        # faiss takes what is nearer than the radius, strictly
+        # faiss returns distances strictly below the radius
         limits, distance, rows = self._index.range_search(query, self.config.max_distance + 1)
         limits = limits.astype(np.int64)
         owner = np.repeat(np.arange(len(query)), limits[1:] - limits[:-1])
@@ -152,10 +152,10 @@ class DescriptorIndex:
         self._owners: list[int] = []  # and the keyframe whose block it is
 
     def rebuild(self) -> None:
-        """Build the index anew, partitioned if the keyframes hold enough descriptors.
+        """Rebuild the index, partitioned if the keyframes have enough descriptors.
 
-        The lists' centres are descriptors evenly picked from all: measured against k-means they
-        find the same share of neighbours, and need no training.
+        The centres of the lists are descriptors picked at equal intervals. They find the same share
+        of neighbours as k-means does, and need no training.
         """
         self._clear()
         total = sum(map(len, self._descriptors.values()))
@@ -173,7 +173,7 @@ class DescriptorIndex:
 
 
 def _unique_pairs(query: Ints, keyframe_ids: Ints, clear: Mask) -> tuple[tuple[Ints, Ints], Mask]:
-    """Every (query, keyframe) once, and whether any of its neighbours is clear."""
+    """The unique (query, keyframe) pairs, and whether any neighbour of each passes the ratio."""
     order = np.lexsort((~clear, keyframe_ids, query))
     query, keyframe_ids = query[order], keyframe_ids[order]
     first = np.ones(len(query), bool)

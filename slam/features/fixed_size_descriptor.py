@@ -1,8 +1,8 @@
-"""BRISK's descriptor of keypoints of one size, for all of them at once.
+"""BRISK descriptors of keypoints of one size, vectorised over the keypoints.
 
 The pattern, its smoothing, orientation and bits are those of Leutenegger, Chli and Siegwart 2011,
-in OpenCV's order of points and bits, so that its descriptors and these can be matched. A keypoint
-at a time, as OpenCV does it, takes four times as long.
+in OpenCV's order of points and bits, so that these descriptors match those of OpenCV. OpenCV
+describes one keypoint at a time, which takes four times as long.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from bmask_slam.graph.arrays import Array, Bits, Floats, Image
 RING_POINTS = (1, 10, 14, 15, 20)
 RING_RADII = (0.0, 2.465, 4.165, 6.29, 9.18)
 SHORTEST_LONG, LONGEST_SHORT = 8.2, 5.85
-"""Distances of the pairs that make the orientation, and of those that make the bits."""
+"""Limits of the point distances: pairs for the orientation, pairs for the bits."""
 SMOOTHING = 1.3
 """Half the side of a point's box, in distances of neighbours on its ring."""
 _SIZE_STEP = np.log2(30.0) / 64
@@ -29,7 +29,7 @@ class FixedSizeBrisk:
     """Describes keypoints of one size in pixels, as OpenCV's ``KeyPoint.size`` counts it.
 
     Attributes:
-        reach_px: how far from a keypoint the image is looked at.
+        reach_px: largest distance from a keypoint at which the image is sampled.
     """
 
     def __init__(self, size_px: float) -> None:
@@ -60,7 +60,7 @@ class FixedSizeBrisk:
     def describe(self, gray: Image, pixels: Floats) -> tuple[Bits, Array]:
         """Descriptors (N, 8) uint64 and orientations (N,) in radians of pixels (N, 2).
 
-        The image (H, W) must reach ``reach_px`` beyond each of them.
+        Each must be at least ``reach_px`` away from the border of the image (H, W).
         """
         if not len(pixels):
             return np.zeros((0, 8), np.uint64), np.zeros(0)

@@ -11,13 +11,13 @@ from bmask_slam.graph.arrays import Array, Bits, Ints, Mask
 
 _LOW_BYTES = np.uint64(0x00FF00FF00FF00FF)
 _LOWEST_SUM = np.uint64(0xFFFF)
-_INDEX_BITS = 24  # of a sort key: more keypoints than any image has
+_INDEX_BITS = 24  # of a sort key: enough for the keypoints of any image
 _DISTANCE_BITS = 10  # up to 512
 
 
 @dataclass(frozen=True)
 class MatchConfig:
-    """Gates of a match, of BRISK's 512 bits.
+    """Limits for a match of BRISK descriptors (512 bits).
 
     ``ratio`` compares with the second candidate (1 switches it off), ``mutual`` keeps only the
     best query of every keypoint, ``max_angle_rad`` rejects matches whose rotation differs from the
@@ -77,7 +77,7 @@ class WindowIndex:
 
 
 def expand_ranges(start: Ints, stop: Ints) -> tuple[Ints, Ints]:
-    """The integers of all ranges [start, stop), with the index of the range each came from."""
+    """The integers of all ranges [start, stop), and the index of the range of each."""
     lengths = np.maximum(stop - start, 0)
     owner = np.repeat(np.arange(len(start)), lengths)
     offset = np.arange(len(owner)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
@@ -115,7 +115,7 @@ def match_pairs(
 
 
 def _sorted_rows(first: Ints, distance: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
-    """The columns sorted by first, distance, last: as one number, which sorts ten times faster."""
+    """The columns sorted by (first, distance, last), packed into one number: ten times faster."""
     key = (((first << _DISTANCE_BITS) | distance) << _INDEX_BITS) | last
     key.sort()
     rest = key >> _INDEX_BITS

@@ -1,10 +1,10 @@
 """Sub-pixel registration of matched keypoints to the image patch that made their landmark.
 
-A corner is found to half a pixel at best, and anew in every image. The pose error that this causes
-is why dense alignment beats plain features. Aligning the patch around each match with the
-landmark's own patch (Lucas-Kanade, inverse compositional: Baker and Matthews 2004) leaves a
-fraction of that; benchmarks/suite/keypoint_noise.py measures it where the truth is exact. The
-error is then no longer independent from image to image: all observations aligned with one patch
+A corner detector is accurate to half a pixel at best, independently in every image; this is the
+main pose error of feature-based methods against dense alignment. Aligning the patch around each
+match with the landmark's own patch (Lucas-Kanade, inverse compositional: Baker and Matthews 2004)
+leaves a fraction of that; benchmarks/suite/keypoint_noise.py measures it where the truth is exact.
+The error is then no longer independent from image to image: all observations aligned with one patch
 share it. So patches are compared at the scale of the view, and are few
 (``WorldMap.renew_patches``).
 """
@@ -18,18 +18,18 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Image
 
-PATCH_PX = 17  # side of a stored patch: enough of it to be made smaller
-_RADIUS = 5  # of the template; the outermost ring only serves the gradients
+PATCH_PX = 17  # side of a stored patch, with room for shrinking it
+_RADIUS = 5  # side of the template; its outermost ring serves the gradients only
 
 
 @dataclass(frozen=True)
 class SubpixelConfig:
-    """``sigma_px`` is the standard deviation after registration; the rest are its gates.
+    """``sigma_px`` is the standard deviation after registration; the other values are limits.
 
-    A registration counts if it moved the keypoint by less than ``max_shift_px`` times the square
-    root of its scale and the patches then correlate by at least ``min_correlation``. A patch
-    serves views within ``max_angle_deg`` of the direction of its own, nearer or farther by at most
-    the factor ``max_zoom``; a landmark gets a new one where none of its patches serves.
+    A registration is accepted if it moved the keypoint by less than ``max_shift_px`` times the
+    square root of its scale and the patches then correlate by at least ``min_correlation``. A patch
+    is used for views within ``max_angle_deg`` of its own direction, nearer or farther by at most
+    the factor ``max_zoom``; a landmark gets a new one where none of its patches can be used.
     """
 
     enabled: bool = True
@@ -42,7 +42,7 @@ class SubpixelConfig:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """How far from a patch's own view it serves: a turn in radians, a factor of distance."""
+        """Limits between the views of patch and camera: angle in rad, ratio of distances."""
         return math.radians(self.max_angle_deg), self.max_zoom
 
 
@@ -61,13 +61,13 @@ def register_patches(
 ) -> tuple[Array, Array]:
     """Where patches (M, 17, 17) lie in an image near pixels (M, 2).
 
-    Each patch is first magnified by its zoom (M,), 1 without: a corner among other things comes to
-    lie beside its place where the two are not of one scale, every time the same way. Then it is
-    aligned by translation, its brightness and contrast free. Returns the pixels (M, 2) and the
+    Each patch is first magnified by its zoom (M,), 1 if there is none: patches of different scale
+    would be aligned with a systematic shift. Then it is aligned by a translation, with brightness
+    and contrast free. Returns the pixels (M, 2) and the
     correlation (M,) of patch and image there, -1 to 1.
 
-    Inside, the patches are the last axis, so that every operation runs along contiguous memory.
-    A gradient without its mean does not see the image's, and needs no normalised copy of it.
+    Internally the patches are the last axis, so that every operation runs along contiguous memory.
+    A zero-mean gradient is not affected by the mean of the image, which need not be subtracted.
     """
     zooms = np.ones(len(patches)) if zooms is None else zooms
     template = _zoomed(patches, zooms)
@@ -95,7 +95,7 @@ def register_patches(
 def _zoomed(patches: Bytes, zooms: Array) -> Floats:
     """The middles (11, 11, M) of patches (M, 17, 17), each magnified about its centre.
 
-    Interpolated linearly; what lies beyond a patch looks like its rim.
+    Interpolated linearly; beyond a patch its border is repeated.
     """
     at = PATCH_PX // 2 + np.arange(-_RADIUS, _RADIUS + 1)[:, None] / zooms
     at = np.clip(at, 0, PATCH_PX - 1 - 1e-3)  # (11, M), alike for rows and columns

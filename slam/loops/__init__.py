@@ -1,1 +1,1 @@
-"""TODO."""
+"""Loops: recognising places, verifying candidates, closing and refuting loops."""

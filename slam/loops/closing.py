@@ -1,6 +1,6 @@
 """From a keyframe to loops that may enter the graph: recognise, verify, wait for confirmation.
 
-One verified loop can still be wrong: rooms repeat. It waits until others, found from other
+A verified loop can still be wrong, since rooms repeat. It waits until others, found from other
 keyframes, agree with it (pairwise consistency, Mangelson et al., ICRA 2018). What it does to the
 graph is tested once more afterwards, see ``Mapper.close_loops``.
 """
@@ -37,14 +37,14 @@ class LoopClosingConfig:
 
     A candidate's ``neighbours`` most covisible keyframes are verified with it. ``min_support``
     loops from two keyframes must agree with each other at ``probability``; the last ``waiting``
-    ones are remembered. The map is trusted within ``drift_rad_per_m`` and ``drift_m_per_m`` of a
+    ones are kept. The map is trusted within ``drift_rad_per_m`` and ``drift_m_per_m`` of a
     path: a loop must not ask for more drift, and only loops whose ends are within ``comparable_m``
     of path are compared.
 
     A loop's covariance is raised by ``model_sigma_rad``, ``model_sigma_m`` and ``model_share`` of
-    its own turn and shift: what its inliers do not know of, such as calibration. It stays while
-    its chi-square in the graph is below that of ``probability``. A map with a systematic error
-    (a wrong focal length) is surer of itself than it should be and would refute every loop; so
+    its own rotation and translation, for errors that its inliers share, such as calibration. It
+    stays while its chi-square in the graph is below that of ``probability``. A map with a
+    systematic error (a wrong focal length) is overconfident and would refute every loop; therefore
     ``strong_support`` loops from three keyframes enter without a robust kernel and untested.
     ``fuse_keyframes`` of the new side are searched for the old side's landmarks.
     """
@@ -75,7 +75,7 @@ class LoopClosingConfig:
 
 
 class LoopCloser:
-    """Knows every keyframe's descriptors, and which loops wait for confirmation."""
+    """Finds loops by the descriptors of all keyframes; keeps those that wait or were closed."""
 
     def __init__(self, camera: Camera, config: LoopClosingConfig):
         self.config = config
@@ -83,7 +83,7 @@ class LoopCloser:
         self.recogniser = PlaceRecogniser(self.index, config.places)
         self.waiting: list[LoopConstraint] = []
         self.closed: dict[tuple[int, int], bool] = {}
-        """Ends of the loops closed so far, and whether each is believed against the graph."""
+        """Ends of the closed loops, and whether each is trusted more than the graph."""
         self._camera = camera
 
     def state(self) -> Arrays:
@@ -122,15 +122,15 @@ class LoopCloser:
 
     @property
     def ends(self) -> set[int]:
-        """Keyframes that closed loops begin or end in."""
+        """Ids of the keyframes at the ends of closed loops."""
         return {end for pair in self.closed for end in pair}
 
     def add(self, keyframe: Keyframe) -> None:
-        """A keyframe can be recognised from now on."""
+        """Add a keyframe to the index."""
         self.index.add(keyframe.id, keyframe.features.descriptors)
 
     def remove(self, keyframe_id: int) -> None:
-        """A keyframe left the map; loops that end in it are forgotten."""
+        """Remove a keyframe that left the map, with the waiting loops that end in it."""
         self.index.remove(keyframe_id)
         self.waiting = [loop for loop in self.waiting if keyframe_id not in loop.ends]
 
@@ -141,7 +141,7 @@ class LoopCloser:
         return self.confirm(self.propose(keyframe, world), world)
 
     def propose(self, keyframe: Keyframe, world: WorldMap) -> list[LoopConstraint]:
-        """Verified loops that end in a keyframe, each beginning in an older one."""
+        """Verified loops between a keyframe and older ones."""
 
         def covisible(keyframe_id: int) -> list[int]:
             _, ids = world.observed(world.keyframes[keyframe_id])
@@ -171,9 +171,9 @@ class LoopCloser:
         return found
 
     def confirm(self, proposed: list[LoopConstraint], world: WorldMap) -> list[LoopConstraint]:
-        """The largest set that agrees, if it is large enough; the others go on waiting.
+        """The largest set of loops that agree, if it is large enough; the others wait.
 
-        Every member is returned, so that a loop which waited enters with the one that confirms it.
+        All members are returned: loops that waited, and those that confirm them.
         """
         loops = [loop for loop in proposed if self._within_drift(loop, world)]
         if not loops:
@@ -189,12 +189,12 @@ class LoopCloser:
         return confirmed
 
     def is_strong(self, loops: list[LoopConstraint]) -> bool:
-        """Whether a confirmed set is believed against the graph."""
+        """Whether a confirmed set is trusted more than the graph."""
         keyframes = {loop.keyframe_b for loop in loops}
         return len(loops) >= self.config.strong_support and len(keyframes) >= 3
 
     def relative_poses(self, loops: list[LoopConstraint]) -> tuple[RelativePose, ...]:
-        """What enters the graph for a confirmed set."""
+        """The relative poses that a confirmed set adds to the graph."""
         robust = None if self.is_strong(loops) else self.config.robust
         return tuple(
             RelativePose(*k.ends, k.T_a_b, self._loop_covariance(k), robust, "loop") for k in loops
@@ -203,8 +203,8 @@ class LoopCloser:
     def refuted(self, errors: RelativePoseErrors, world: WorldMap) -> set[tuple[int, int]]:
         """Ends of the closed loops that are not in the graph, or do not fit it.
 
-        A strong set is believed against the path, but not one of its loops against the others:
-        their bound is as much wider as their median says that the set fits worse than it should.
+        A strong set is trusted more than the path, but none of its loops more than the others:
+        their bound is widened by the ratio of their median chi-square to its expectation.
         ``errors`` are those of all loops in the graph.
         """
         pairs = list(zip(errors.keyframe_a.tolist(), errors.keyframe_b.tolist(), strict=True))
@@ -218,18 +218,18 @@ class LoopCloser:
         return {
             pair
             for pair in self.closed
-            if world.keyframes.keys() >= set(pair)  # else it left with a culled keyframe
+            if world.keyframes.keys() >= set(pair)  # else it was removed with a culled keyframe
             and not inside.get(pair, False)
         }
 
     def _loop_covariance(self, loop: LoopConstraint) -> Array:
-        """Covariance (6, 6) of a loop with what its inliers do not know of."""
+        """Covariance (6, 6) of a loop, with the errors that its inliers share."""
         rules, change = self.config, np.linalg.norm(se3_log(loop.T_a_b).reshape(2, 3), axis=1)
         sigmas = np.array([rules.model_sigma_rad, rules.model_sigma_m]) + rules.model_share * change
         return loop.covariance + np.diag(np.repeat(sigmas**2, 3))
 
     def _within_drift(self, loop: LoopConstraint, world: WorldMap) -> bool:
-        """Whether the map can have drifted as far as a loop says."""
+        """Whether the drift that a loop implies is possible."""
         a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
         ids, travelled_m = _travelled(world)
         row_a, row_b = np.searchsorted(ids, loop.ends)
@@ -237,11 +237,11 @@ class LoopCloser:
         r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
         fits = bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
         if not fits:
-            logger.info("loop %d-%d asks for too much drift", *loop.ends)
+            logger.info("loop %d-%d implies too much drift", *loop.ends)
         return fits
 
     def _agreement(self, loops: list[LoopConstraint], world: WorldMap) -> Mask:
-        """(N, N) whether loops agree; False where the map cannot say."""
+        """(N, N) whether loops agree; False where their paths are too long to compare."""
         first, second = np.triu_indices(len(loops), 1)
         a, b = (np.array([getattr(k, f"keyframe_{end}") for k in loops]) for end in "ab")
         poses = np.array([k.T_world_camera for k in world.keyframes.values()])
@@ -265,7 +265,7 @@ class LoopCloser:
     def _map_covariances(self, lengths_m: Array) -> Array:
         """Covariances (..., 6, 6) of the map's relative pose over a path of these lengths.
 
-        A turn that grows along a path displaces its end by half of it times the length.
+        A rotation error that grows along a path displaces its end by half of it times the length.
         """
         rules = self.config
         sigmas = np.stack(
@@ -288,7 +288,7 @@ def _travelled(world: WorldMap) -> tuple[Ints, Array]:
 
 
 def _largest_clique(agree: Mask) -> Ints:
-    """Indices of a largest set of which all agree, found greedily from each member."""
+    """Indices of a large set of loops that all agree, found greedily from each member."""
     best: list[int] = []
     order = np.argsort(-agree.sum(axis=1), kind="stable").tolist()
     for start in order:

@@ -1,9 +1,8 @@
 """Which old keyframes show the same place: descriptors vote, and votes must repeat.
 
-An inverted index over all keyframes' BRISK descriptors answers a query in milliseconds. One
-query proves little, so candidates are grouped by covisibility, and a group must return in
-consecutive queries (as in ORB-SLAM, Mur-Artal 2015, VII.A). What is left is a candidate, not a
-loop: that is for slam/loops/verification.py to say.
+Candidates are grouped by covisibility, and a group must be found in consecutive queries (as in
+ORB-SLAM, Mur-Artal 2015, VII.A). The result are candidates; slam/loops/verification.py decides
+whether they are loops.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ Neighbours = Callable[[int], Collection[int]]  # keyframe id -> ids of the covis
 
 @dataclass(frozen=True)
 class PlaceConfig:
-    """What makes a candidate.
+    """Conditions for a candidate.
 
     The ``recent`` last keyframes and those covisible with the query are no candidates. A keyframe
     needs ``min_votes``; a group needs ``group_share`` of the best group's votes, and must have
@@ -41,7 +40,7 @@ class PlaceCandidate:
 
     Attributes:
         keyframe_id: the one with the most votes in its group.
-        votes: its own; ``group_votes``: of it and the keyframes covisible with it.
+        votes: of this keyframe; ``group_votes``: of it and the keyframes covisible with it.
         queries: how many queries in a row, this one included, found this group.
     """
 
@@ -52,7 +51,7 @@ class PlaceCandidate:
 
 
 class PlaceRecogniser:
-    """Remembers what the last query found; the index may be shared with relocalisation."""
+    """Keeps the groups of the last query; the index may be shared with relocalisation."""
 
     def __init__(self, index: DescriptorIndex, config: PlaceConfig | None = None):
         self.index = index
@@ -73,13 +72,15 @@ class PlaceRecogniser:
         groups = np.split(state["members"], np.cumsum(state["sizes"])[:-1])
         self._previous = [
             (frozenset(group.tolist()), queries)
-            for group, queries in zip(groups, state["queries"].tolist(), strict=False)
+            for group, queries in zip(
+                groups[: len(state["queries"])], state["queries"].tolist(), strict=True
+            )
         ]
 
     def query(
         self, keyframe_id: int, descriptors: Bits, covisible: Neighbours
     ) -> list[PlaceCandidate]:
-        """Candidates for a keyframe's place, best group first; call it once for each keyframe.
+        """Candidates for a keyframe's place, best group first; call it once a keyframe.
 
         ``covisible`` gives the ids of the keyframes that share landmarks with one.
         """
@@ -95,7 +96,7 @@ class PlaceRecogniser:
         return consistent[: self.config.candidates]
 
     def excluded(self, keyframe_id: int, covisible: Neighbours) -> set[int]:
-        """The keyframes that are no candidates for this one's place: known to be near anyhow."""
+        """The keyframes that are no candidates: recent ones, and those covisible with this one."""
         recent = self.index.keyframe_ids[-self.config.recent :] if self.config.recent else []
         return {keyframe_id, *recent, *covisible(keyframe_id)}
 
@@ -120,5 +121,5 @@ class PlaceRecogniser:
         return [group for group in groups if group[3] >= limit]
 
     def _repeats(self, group: frozenset[int]) -> int:
-        """The longest row of earlier queries that a group continues."""
+        """The largest number of consecutive earlier queries that found this group."""
         return max((queries for old, queries in self._previous if old & group), default=0)

@@ -18,9 +18,9 @@ MEDIAN_TO_GATE = 2.366 / CHI2_3DOF  # of chi-square
 
 @dataclass(frozen=True)
 class LoopView:
-    """What a keyframe brings to a loop.
+    """A keyframe as loop verification sees it.
 
-    ``features`` are its N keypoints, ``landmark_ids`` (N,) their living landmarks, -1 for none,
+    ``features`` are its N keypoints, ``landmark_ids`` (N,) their landmarks in the map, -1 for none,
     ``points_camera`` (N, 3) these in its camera's frame, NaN also where the keypoint has no depth.
     """
 
@@ -37,10 +37,10 @@ Pairs = tuple[Ints, Ints]  # keypoint a[k] goes with b[k]
 def refine_relative_pose(
     views: Views, pairs: Pairs, T_a_b: Array, camera: Camera
 ) -> tuple[Array, Array, Mask, float]:
-    """T_a_b on pairs, its covariance, which pairs are inliers, and the noise scale.
+    """T_a_b from pairs of keypoints, its covariance, the inliers, and the noise scale.
 
     Gauss-Newton with Cauchy's kernel on all pairs, then on inliers alone. A pair with points on
-    both sides enters each way with half the weight, since it is one piece of information.
+    both sides is used in both directions with half the weight.
     """
     scale, active = 1.0, np.ones(len(pairs[0]), bool)
     for kernel in (16.0, 4.0, 1.0, None, None, None, None):
@@ -58,9 +58,9 @@ def refine_relative_pose(
 
 
 def _linearised(views: Views, pairs: Pairs, T_a_b: Array, camera: Camera) -> tuple[Array, ...]:
-    """Residuals (2, M, 3), Jacobians (2, M, 3, 6), weights (2, M, 3, 3), gates (M,), for two ways.
+    """Residuals (2, M, 3), Jacobians (2, M, 3, 6), weights (2, M, 3, 3) and gates (M,) both ways.
 
-    Way 0 is a's points in b, way 1 b's points in a. For ``T_a_b <- T_a_b @ se3_exp(xi)`` the
+    Direction 0 projects points of a into b, direction 1 points of b into a. For ``T_a_b <- T_a_b @ se3_exp(xi)`` the
     inverse becomes ``T_b_a @ se3_exp(-Ad(T_a_b) @ xi)``. Without a point the weight is zero.
     """
     r_b, J_b, W_b = _way(views, pairs, T_a_b, camera)
@@ -75,7 +75,7 @@ def _linearised(views: Views, pairs: Pairs, T_a_b: Array, camera: Camera) -> tup
 def _way(views: Views, pairs: Pairs, T_source_target: Array, camera: Camera) -> tuple[Array, ...]:
     """Residuals, Jacobians and weights of the source's points in the target's image.
 
-    A point is taken to be as uncertain as its own keyframe's measurement of it alone.
+    The covariance of a point is that of its measurement in its own keyframe alone.
     """
     source, target = views
     own, measured = source.points_camera[pairs[0]], target.features.measurements[pairs[1]]

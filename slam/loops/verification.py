@@ -1,7 +1,7 @@
-"""Whether two keyframes really show the same place, and the pose between them if they do.
+"""Whether two keyframes show the same place, and the pose between them.
 
-Descriptors are matched without a prior and give a pose by RANSAC on 3-D to 3-D triples. There the
-points of each keyframe are searched in the other, and what both ways find refines the pose.
+Descriptors are matched without a prior and give a pose by RANSAC on 3-D to 3-D triples. At that
+pose the points of each keyframe are searched in the other, and the matches refine it.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ NEAREST_M = 0.1
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Gates of a loop.
+    """Parameters and limits of the verification.
 
     ``samples`` triples are drawn with ``seed``; of those whose sides are as long in both keyframes
     the first ``hypotheses`` are tried. A match agrees if it is within ``ransac_px`` in BOTH images.
     Guided matching looks within each of ``radii_px`` in turn. A loop needs ``min_inliers`` matches,
     ``min_share`` of the points that the other keyframe should see, and sigmas below the limits.
-    ``max_turn_rad`` bounds how far a match may turn otherwise in the image than most.
+    ``max_turn_rad`` limits the difference of a match's rotation from the most common one.
     """
 
     seed: int = 0
@@ -64,7 +64,7 @@ Search = tuple[float, Camera, LoopConfig]  # radius in px
 
 
 class NoLoopReason(Enum):
-    """Why a candidate was refused."""
+    """Why a candidate was rejected."""
 
     FEW_MATCHES = "too few descriptors match"
     NO_CONSENSUS = "too few matches agree on a pose"
@@ -75,7 +75,7 @@ class NoLoopReason(Enum):
 
 @dataclass(frozen=True)
 class NoLoop:
-    """A refusal: ``value`` is what was found, ``limit`` what would have been accepted."""
+    """A rejected candidate: ``value`` was found, ``limit`` would have been accepted."""
 
     reason: NoLoopReason
     value: float
@@ -84,15 +84,14 @@ class NoLoop:
 
 @dataclass(frozen=True)
 class LoopConstraint:
-    """A measured pose between two keyframes: what
-    bmask_slam.graph.factors.graph_update.RelativePose takes.
+    """A verified loop: a measured pose between two keyframes.
 
     Attributes:
         T_a_b: (4, 4), ``p_a = T_a_b @ p_b``.
         covariance: (6, 6) of the tangent [rotation rad, translation m] at b (right side).
-        inliers: number of matches that it rests on.
-        noise_scale: residuals over their sigmas, at least 1; it has raised the covariance.
-        landmark_pairs: (P, 2) ids of landmarks, of a and of b, that are one and the same.
+        inliers: number of matches that it is based on.
+        noise_scale: ratio of residuals to their sigmas, at least 1; the covariance is scaled by it.
+        landmark_pairs: (P, 2) ids of landmarks, of a and of b, that are the same point.
     """
 
     keyframe_a: int
@@ -123,7 +122,7 @@ def loop_view(keyframe: Keyframe, world: WorldMap) -> LoopView:
 def verify_loop(
     view_a: LoopView, view_b: LoopView, camera: Camera, config: LoopConfig | None = None
 ) -> LoopConstraint | NoLoop:
-    """The pose of keyframe b in keyframe a from what they see alone; no prior pose is used."""
+    """The pose of keyframe b in keyframe a, from their features alone, without a prior pose."""
     config = config or LoopConfig()
     views = (view_a, view_b)
     matches = _descriptor_matches(views, config)
@@ -165,7 +164,7 @@ def align_triples(points_a: Array, points_b: Array) -> Array:
 
 
 def _descriptor_matches(views: Views, config: LoopConfig) -> Matches:
-    """Keypoints of a (query) and b (train), both with points, of like descriptors and turn."""
+    """Matches of keypoints of a (query) and b (train) that both have points."""
     rows_a, rows_b = (np.flatnonzero(np.isfinite(v.points_camera[:, 2])) for v in views)
     a, b = (view.features for view in views)
     first = MatchConfig(config.first_distance, config.first_ratio)
@@ -196,7 +195,7 @@ def _consensus(views: Views, matches: Matches, search: Search) -> tuple[Array, i
 
 
 def _near(T_x_y: Array, points_y: Array, pixels_x: Array, camera: Camera, px: float) -> Mask:
-    """(..., N) whether points (N, 3) of y come to lie near pixels (N, 2) of x."""
+    """(..., N) whether points (N, 3) of y project near pixels (N, 2) of x."""
     points_x = transform(T_x_y, points_y)
     front = points_x[..., 2] > NEAREST_M
     points_x[..., 2] = np.where(front, points_x[..., 2], 1.0)
@@ -204,7 +203,7 @@ def _near(T_x_y: Array, points_y: Array, pixels_x: Array, camera: Camera, px: fl
 
 
 def _guided_pairs(views: Views, T_a_b: Array, search: Search) -> tuple[Ints, Ints, int]:
-    """Keypoints that match near the pose, neither way in conflict, and how many could have."""
+    """Keypoints (a, b) that match at the pose in both directions, and how many are in view."""
     query_a, train_b, seen_in_b = _guided(views, inverse(T_a_b), search)
     query_b, train_a, seen_in_a = _guided(views[::-1], T_a_b, search)
     pairs = np.unique(np.c_[np.r_[query_a, train_a], np.r_[train_b, query_b]], axis=0)

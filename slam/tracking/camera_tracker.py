@@ -24,7 +24,7 @@ MAX_AGO_S = 0.2
 
 
 class CameraTracker:
-    """Tracks frames against a map that the back end owns, and keeps what one hands to the next.
+    """Tracks frames against a map that the back end owns, and keeps the motion between frames.
 
     Attributes:
         lost_frames: frames since the last pose; 0 while tracking.
@@ -81,9 +81,9 @@ class CameraTracker:
         return self._local_ids
 
     def begin_session(self) -> None:
-        """A new recording in a known map: the first frame is looked for in the largest segment.
+        """A new recording in a known map: the first frame is searched in the largest segment.
 
-        What is not recognised there begins a segment of its own, which is joined once it is.
+        Frames that are not recognised begin a segment of their own, which is joined once one is.
         """
         world = self._map.world
         self.segment = world.largest_segment()
@@ -104,7 +104,7 @@ class CameraTracker:
     def begin_frame(self, timestamp_s: float) -> None:
         """Set the time of the frame that is tracked next.
 
-        Without it the next frame is taken to come as soon as the last one did.
+        Without it the interval is taken to be the same as the last one.
         """
         self._now_s = timestamp_s
 
@@ -113,7 +113,7 @@ class CameraTracker:
         return None if self.lost_frames or self.reference is None else self._predicted()
 
     def preview(self, features: Features) -> Array | None:
-        """The pose that tracking would find, None if it would not; no state is changed."""
+        """The pose that ``track`` would find, None if it would find none; no state is changed."""
         tracked = self._tracked(features, self._map.world.landmarks.living(self._local_ids))
         return None if tracked.status is TrackingStatus.LOST else tracked.T_world_camera
 
@@ -180,10 +180,10 @@ class CameraTracker:
     def update_motion(
         self, T_world_tracked: Array, T_world_camera: Array, landmark_ids: Ints
     ) -> None:
-        """A frame is done, and the next one is predicted from it.
+        """Set the pose that the next frame is predicted from.
 
-        T_world_tracked is its pose as tracked, T_world_camera as optimised; the landmarks (N,) are
-        those that it observes.
+        T_world_tracked is the pose as tracked, T_world_camera as optimised; the landmarks (N,) are
+        those that the frame observes.
         """
         steady = self.lost_frames == 0
         self._T_last_next = inverse(self._T_world_last) @ T_world_tracked if steady else np.eye(4)
@@ -195,8 +195,8 @@ class CameraTracker:
     def follow_map(self, T_old: Array, T_new: Array) -> None:
         """The map was moved by its owner, as a keyframe from T_old to T_new (4, 4).
 
-        The last pose goes along, and landmarks that were fused meanwhile are followed. The owner
-        may have begun anew with fewer landmarks.
+        The last pose is moved with it, and landmarks that were fused since are replaced. The owner
+        may have restarted with fewer landmarks.
         """
         landmarks = self._map.world.landmarks
         self._T_world_last = carried_along(self._T_world_last, T_old, T_new)

@@ -18,7 +18,7 @@ CLOSE_BASELINES = 40
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """The rule's numbers; ``rule`` is "orb" (default) or "paper".
+    """Parameters of the decision; ``rule`` is "orb" (default) or "paper".
 
     "orb" (ORB-SLAM, section V.E, with ORB-SLAM2's extra rule): mapping is idle or more than
     ``max_interval_frames`` have passed, at least ``min_tracked`` points are tracked, and the shared
@@ -26,11 +26,12 @@ class KeyframeConfig:
     or the close points run out: fewer than ``min_close_tracked`` are tracked while
     ``min_close_new`` could be made. ORB-SLAM's 90 % counts only points that three keyframes see;
     here all points of the reference keyframe count, of which BRISK finds about 60 % again in the
-    next frame, so that half is the equal of it. Before a flat wall a slow camera keeps half of its
-    points for seconds, and what is new alone shows how it moved along it; hence ``late_shared``.
-    The reference keyframe is the last one, until a keyframe would be made that another shows more
-    of than the reference does: that one is the reference from then on, and the next frame decides.
-    So a known view needs no new one; with ``max_shared`` of 1 or more no view is known.
+    next frame, so that 0.5 is the equivalent. In front of a flat wall a slow camera keeps half of
+    its points for seconds, and only new points show the motion along the wall; hence
+    ``late_shared``. The reference keyframe is the last one. If another keyframe shares more with a
+    frame that is to become a keyframe, that one becomes the reference, and the next frame is
+    decided against it: a known view needs no new keyframe. With ``max_shared`` of 1 or more this
+    rule is off.
     "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """
@@ -51,7 +52,7 @@ class KeyframeConfig:
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
-    """What the rule looks at.
+    """The quantities that the rule compares.
 
     Attributes:
         frames_since: frames since the last keyframe was made.

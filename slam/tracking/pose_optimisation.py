@@ -41,10 +41,10 @@ class PoseEstimate:
     Attributes:
         T_world_camera: (4, 4).
         inliers: (N,) bool: within the chi-square gate, taken without the robust kernel.
-        noise_scale: factor on the pixel sigmas that the residuals ask for, at least 1.
+        noise_scale: factor on the pixel sigmas by the median of the residuals, at least 1.
         information: (6, 6) in the camera's own tangent [rotation rad, translation m].
         ok: False where too few points were left or a direction of motion is not observed; the
-            rest is then that of the start and must not be used.
+            other values are then those of the initial pose and must not be used.
     """
 
     T_world_camera: Array
@@ -115,8 +115,8 @@ def optimise_pose(
         sigmas_px: (N, 3) their standard deviations.
 
     Inliers are chosen by the chi-square gate of 95 % for 3 or 2 degrees of freedom, taken without
-    the robust kernel, and with the pixel sigmas raised to what the frame's residuals ask for: a
-    blurred or rolling-shutter image has more noise than any constant says.
+    the robust kernel, and with the pixel sigmas scaled to the residuals of the frame, since a
+    blurred or rolling-shutter image has more noise.
     """
     config = config or PoseOptimisationConfig()
     stereo = np.isfinite(measurements[:, 2])
@@ -145,9 +145,9 @@ def optimise_pose(
 def _descend(
     T: Array, matches: Reprojection, kernel: Array | None, iterations: int, tolerance: float
 ) -> tuple[Array, Array]:
-    """Gauss-Newton steps from a pose; its pose and H (6, 6).
+    """Gauss-Newton steps from a pose; returns pose and H (6, 6).
 
-    A direction that nothing observes is left alone, and shows in H.
+    A direction that is not observed is not changed; H shows it.
     """
     for _ in range(iterations):
         H, g = matches.normal_equations(T, kernel)
@@ -159,8 +159,8 @@ def _descend(
 
 
 def _solution(H: Array, b: Array) -> Array:
-    """x (6,) of H x = b for a symmetric H (6, 6), by Cholesky's way where it is positive."""
-    _, x, failure = dposv(H, b)  # a third of numpy's time, which here is not the arithmetic's
+    """x (6,) of H x = b for a symmetric H (6, 6), by Cholesky if it is positive definite."""
+    _, x, failure = dposv(H, b)  # a third of numpy's time, most of which is overhead
     return np.asarray(x if failure == 0 else np.linalg.solve(H, b), dtype=np.float64)
 
 
@@ -171,7 +171,7 @@ def _inliers(T: Array, matches: Reprojection, gate: Array) -> Mask:
 
 
 def _noise_scale(T: Array, matches: Reprojection, gate: Array) -> float:
-    """How many times larger the pixel residuals are than their sigmas say, at least 1.
+    """Ratio of the pixel residuals to their sigmas, at least 1.
 
     The median of chi-square with 2 degrees of freedom is 1.386; gross outliers do not count.
     """
@@ -183,7 +183,7 @@ def _noise_scale(T: Array, matches: Reprojection, gate: Array) -> float:
 
 
 def _well_conditioned(H: Array) -> bool:
-    """Whether the six directions are all observed, judged by H scaled to a unit diagonal."""
+    """Whether all six directions are observed, by the condition of H with unit diagonal."""
     scale = np.sqrt(np.diagonal(H))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
         return False

@@ -22,8 +22,8 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 class RelocalisationConfig:
     """``candidates`` keyframes with the most votes, at least ``min_votes``, are tried.
 
-    A pose needs ``min_inliers``. After ``patience_frames``
-    lost frames a new map segment is begun, if the frame has ``min_new_points`` with depth.
+    A pose needs ``min_inliers``. After ``patience_frames`` lost frames a new map segment is begun,
+    if the frame has ``min_new_points`` with depth.
     """
 
     candidates: int = 4
@@ -46,7 +46,7 @@ def relocalise(
     config: RelocalisationConfig,
     local_map: LocalMapConfig,
 ) -> Tracked | None:
-    """The frame against the first of some keyframes that fits, or None if none does.
+    """The frame tracked against the first candidate that fits; None if none does.
 
     Descriptors are matched without a prior, the pose is found by P3P in RANSAC (OpenCV, whose
     random numbers are seeded, so that runs repeat), then refined on that keyframe's local map.
@@ -67,7 +67,7 @@ def relocalise(
 def similar_keyframes(
     features: Features, keyframes: list[Keyframe], places: DescriptorIndex, min_votes: float
 ) -> list[Keyframe]:
-    """Those of some keyframes that a frame's descriptors vote for, most votes first."""
+    """The keyframes that a frame's descriptors vote for, by falling votes."""
     wanted = {keyframe.id: keyframe for keyframe in keyframes}
     votes = places.votes(features.descriptors, set(places.keyframe_ids) - wanted.keys())
     return [wanted[k] for k in votes.keyframe_ids[votes.scores >= min_votes].tolist()]

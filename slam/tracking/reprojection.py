@@ -1,9 +1,8 @@
 """Reprojection errors of one camera's matches, and their normal equations, made for speed.
 
-What tracking asks a dozen times for every frame. The formulas are those of `residuals` and
-`jacobian` in `tracking.pose_optimisation`, against which the tests hold these; here points are
-columns,
-so that every operation runs along contiguous memory, and residual and Jacobian share what they can.
+Tracking evaluates them a dozen times a frame. The formulas are those of `residuals` and `jacobian`
+in `tracking.pose_optimisation`, with which the tests compare them. Here points are columns, so that
+operations run along contiguous memory; residual and Jacobian share intermediate results.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.camera import Camera
 
-MIN_DEPTH_M = 1e-3  # nearer points are projected as if they were here
+MIN_DEPTH_M = 1e-3  # points with smaller z are projected as if at this z
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +38,7 @@ class Reprojection:
     def of(
         cls, points_world: Array, measurements: Array, weight: Array, camera: Camera
     ) -> Reprojection:
-        """From rows: points (N, 3), measurements (N, 3) px without NaN, weights (N, 3)."""
+        """From points (N, 3), measurements (N, 3) px without NaN, weights (N, 3)."""
         centre = np.array([[camera.cx], [camera.cy], [0.0]])
         focal = np.array([[camera.fx], [camera.fy], [camera.stereo_bf_px_m]])
         rows = np.ascontiguousarray
@@ -54,7 +53,7 @@ class Reprojection:
         )
 
     def weighted(self, factors: Array) -> Reprojection:
-        """The same with the weights of u, v, disparity multiplied by three factors."""
+        """A copy with the weights of u, v, disparity multiplied by three factors."""
         weight = self.weight * factors[:, None]
         return Reprojection(self.points_world, self.offset, weight, self.focal)
 
@@ -78,7 +77,7 @@ class Reprojection:
     def normal_equations(
         self, T_world_camera: Array, kernel: Array | None = None
     ) -> tuple[Array, Array]:
-        """H (6, 6) and gradient (6,) in the camera's tangent; with kernel (N,) Cauchy's weights.
+        """H (6, 6) and gradient (6,) in the camera's tangent; with a kernel (N,), Cauchy weights.
 
         With n = (x/z, y/z) and i = 1/z, d(x/z, y/z)/d(xi) is
         [[nx ny, -1 - nx^2, ny, -i, 0, nx i], [1 + ny^2, -nx ny, -nx, 0, -i, ny i]] and
@@ -116,7 +115,7 @@ class Reprojection:
 def moved(T_world_camera: Array, step: Array) -> Array:
     """The pose after a step (6,) ``[rotation rad, translation m]`` in the camera's frame.
 
-    To first order ``T_world_camera @ se3_exp(step)``, and cheaper.
+    A cheaper first-order approximation of ``T_world_camera @ se3_exp(step)``.
     """
     R = T_world_camera[:3, :3]
     T = T_world_camera.copy()

@@ -12,7 +12,7 @@ from bmask_slam.graph.arrays import Array, Ints
 
 
 class TrackingStatus(Enum):
-    """OK: enough inliers. WEAK: a pose from few inliers. LOST: no pose, and none is made up."""
+    """OK: enough inliers. WEAK: a pose from few inliers. LOST: no pose."""
 
     OK = "OK"
     WEAK = "WEAK"
@@ -73,7 +73,7 @@ class FrameResult:
         inliers: those that agree with the pose.
         ignored: features on moving things, which were not used.
         mostly_moving: too few features would have been left, so that all were used.
-        information: (6, 6) of the pose against a map taken for exact, in the camera's tangent
+        information: (6, 6) of the pose if the map is taken as exact, in the camera's tangent
             [rotation rad, translation m]; None without a pose, and where a frame begins a map.
         keyframe_id: id of the keyframe made from this frame, or None.
         keyframe_reason: why it was made ("" when it was not).
@@ -96,7 +96,7 @@ class FrameResult:
 
     @property
     def covariance(self) -> Array | None:
-        """(6, 6) of the pose against the map, ``[rad, m]`` on the right side; None without."""
+        """(6, 6) of the pose against the map, ``[rad, m]`` on the right side; None without one."""
         if self.information is None:
             return None
         return np.asarray(np.linalg.inv(self.information), float)

@@ -1,9 +1,9 @@
 """Rolling shutter: keypoints moved to where they are at one moment, and the camera's velocity.
 
-An image whose rows are exposed one after the other, top first, shows each row from another pose of
-a camera that moves. To first order a row that is exposed t later than another is seen from
-``T_world_camera @ se3_exp(t * twist)``. The moment that stands for the image is that of the mean
-row of its keypoints: then an error of the velocity moves them apart, but not all one way.
+If the rows of an image are exposed one after the other, top first, a moving camera sees each row
+from another pose. To first order a row that is exposed t later than another is seen from
+``T_world_camera @ se3_exp(t * twist)``. All keypoints are referred to the time of
+their mean row: an error of the velocity then has no mean effect.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.tracking.pose_optimisation import PoseEstimate, jacobian, residuals
 
 ACCELERATION = 2.0
-"""By how much a hand's velocity changes, in rad/s and m/s each second: a standard deviation."""
+"""Standard deviation of the acceleration of a hand-held camera, in rad/s^2 and m/s^2."""
 FAR_M = 1e6
 
 
 @dataclass(frozen=True)
 class PreviousPose:
-    """Where the camera was: T_world_camera (4, 4), and how many seconds before the image."""
+    """An earlier pose: T_world_camera (4, 4), and how many seconds before the image it was."""
 
     T_world_camera: Array
     ago_s: float
@@ -42,7 +42,7 @@ class Motion:
 def motion_since(
     previous: PreviousPose | None, T_world_camera: Array, camera: Camera
 ) -> Motion | None:
-    """The mean motion from a pose to another; None where it is unknown or does not matter."""
+    """The mean motion from a pose to another; None if unknown, or with a global shutter."""
     if previous is None or camera.rolling_shutter_s == 0:
         return None
     between = inverse(previous.T_world_camera) @ T_world_camera
@@ -50,17 +50,17 @@ def motion_since(
 
 
 def share_of_rows(rows: Array, camera: Camera) -> Array:
-    """By what share (N,) of the image, from -1/2 to 1/2, rows (N,) lie below its middle."""
+    """Offsets (N,) of rows (N,) below the image's middle, as shares of its height, -1/2 to 1/2."""
     return (rows + 0.5) / camera.height - 0.5
 
 
 def exposed_after_s(rows: Array, camera: Camera) -> Array:
-    """How many seconds (N,) after the image's middle its rows (N,) are exposed."""
+    """Seconds (N,) from the exposure of the image's middle row to that of rows (N,)."""
     return camera.rolling_shutter_s * share_of_rows(rows, camera)
 
 
 def velocities(points_camera: Array, twist: Array) -> Array:
-    """Velocities (N, 3) in m/s of still points (N, 3) in the frame of a camera that moves.
+    """Velocities (N, 3) in m/s of static points (N, 3) in the frame of a moving camera.
 
     With angular velocity w and velocity v, twist (6,) or (N, 6), this is - w x p - v.
     """
@@ -68,9 +68,9 @@ def velocities(points_camera: Array, twist: Array) -> Array:
 
 
 def at_one_moment(features: Features, camera: Camera, motion: Motion | None) -> Features:
-    """The features as a camera that exposes all rows at once would have them.
+    """The features as seen by a camera that exposes all rows at once.
 
-    Where depth is missing the keypoint moves as at the median depth.
+    Keypoints without depth are corrected with the median depth.
     """
     if motion is None or len(features) == 0:
         return features
@@ -91,7 +91,7 @@ def at_one_moment(features: Features, camera: Camera, motion: Motion | None) -> 
 def corrected(
     motion: Motion, estimate: PoseEstimate, points_world: Array, seen: Features, camera: Camera
 ) -> Motion:
-    """The motion that the landmarks themselves tell, with what was known of it as a prior.
+    """The motion estimated from landmarks, with the previous estimate as a prior.
 
     ``seen`` are N inliers of an estimate, at one moment by that motion, of landmarks (N, 3). A
     pose tangent x and an error d of the twist leave r + J x + t J d of their residuals r, for rows

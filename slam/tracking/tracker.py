@@ -35,16 +35,16 @@ from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import WorldMap
 
 COARSE_STEP = 1e-3
-"""Radians and metres: less than a pixel; nearer the first estimate need not come."""
+"""Tolerance of the first estimate in radians and metres: less than a pixel."""
 
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Search windows in pixels and the numbers of inliers that make a status.
+    """Search windows in pixels, and the numbers of inliers for the status OK and WEAK.
 
-    The first search looks only for the landmarks of the last frame around their predicted
-    places; where that fails, for the whole local map, at last in windows of ``wide_radius_px``. The
-    second looks for the whole local map in windows of ``local_radius_px``.
+    The first search is for the landmarks of the last frame only, around their predicted places; if
+    it fails, for the whole local map, finally in windows of ``wide_radius_px``. The second search
+    is for the whole local map in windows of ``local_radius_px``.
     """
 
     search_radius_px: float = 20.0
@@ -59,7 +59,7 @@ class TrackingConfig:
 
 
 class Tracker:
-    """Holds the camera and the gates; the map is the caller's."""
+    """Tracks one frame against a map that the caller owns; keeps no state between frames."""
 
     def __init__(self, camera: Camera, config: TrackingConfig):
         self.camera = camera
@@ -76,9 +76,9 @@ class Tracker:
         world: WorldMap,
         previous: PreviousPose | None = None,
     ) -> Tracked:
-        """The frame's pose from landmarks seen a moment ago, then from the whole local map.
+        """The frame's pose from the landmarks of the last frame, then from the whole local map.
 
-        The previous pose tells how fast the camera moves, which matters to a rolling shutter.
+        The previous pose gives the camera's velocity, for a rolling shutter.
         """
         recent_ids = world.landmarks.living(recent_ids)
         motion = motion_since(previous, T_predicted, self.camera)
@@ -101,7 +101,7 @@ class Tracker:
         world: WorldMap,
         previous: PreviousPose | None = None,
     ) -> Tracked:
-        """The pose from all landmarks of the local map, given a good first one."""
+        """The pose from all landmarks of the local map, given a good initial one (4, 4)."""
         radius, landmarks = self.config.local_radius_px, world.landmarks
         motion = motion_since(previous, T_world_camera, self.camera)
         still = at_one_moment(features, self.camera, motion)
@@ -142,7 +142,7 @@ class Tracker:
         landmarks: LandmarkTable,
         motion: Motion | None,
     ) -> tuple[Features, PoseEstimate]:
-        """The pose, and the features as they are at one moment, by what they tell of the motion."""
+        """The pose, and the features at one moment, by the motion estimated from them."""
         still = at_one_moment(features, self.camera, motion)
         estimate = self._optimise(still, matches, ids, T_world_camera, landmarks, self._narrow)
         if motion is None or not estimate.ok:
@@ -164,7 +164,7 @@ class Tracker:
         centre_world: Array,
         world: WorldMap,
     ) -> Features:
-        """The features with the matched keypoints moved to where their landmarks' patches lie."""
+        """The features with matched keypoints registered to the patches of their landmarks."""
         config = self.config.subpixel
         start = features.image_pixels[keypoints]
         patches, zooms = world.landmarks.nearest_patches(ids, centre_world, config.limits)
@@ -195,7 +195,7 @@ class Tracker:
 
         A landmark is in view if it projects into the image, and is seen from within
         ``max_view_angle_deg`` of the direction it was last seen from. The window grows with the
-        keypoint's scale; a keypoint of another scale than predicted is no candidate.
+        keypoint's scale; keypoints of another scale than predicted are not candidates.
         """
         ids, pixels, z = self._in_view(T_world_camera, ids, landmarks)
         scale = np.maximum(landmarks.extent[ids] / z, 1.0)

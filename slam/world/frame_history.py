@@ -16,11 +16,11 @@ ENTRY = np.dtype(
 """A frame's stamp and its pose as seen from its reference keyframe."""
 Entries = NDArray[np.void]
 NOBODY = -1
-"""Heir of a keyframe that was lost with its place: its frames have no pose."""
+"""Parent of a keyframe whose pose was lost: its frames have no pose."""
 
 
 class FrameHistory:
-    """One entry a tracked frame; a keyframe that is culled hands its frames to another."""
+    """One entry for each tracked frame; the frames of a culled keyframe go to its parent."""
 
     def __init__(self) -> None:
         self._store: Entries = np.zeros(1024, ENTRY)
@@ -29,13 +29,13 @@ class FrameHistory:
 
     @property
     def parents(self) -> dict[int, tuple[int, Array]]:
-        """Of every culled keyframe the one that took its frames, and T_heir_culled."""
+        """Parent of every culled keyframe, and T_parent_culled (4, 4)."""
         return self._parent
 
     def append(
         self, timestamp_s: float, keyframe_id: int, T_world_keyframe: Array, T_world_camera: Array
     ) -> None:
-        """Remember a frame's pose as seen from a keyframe whose current pose is given."""
+        """Append a frame's pose relative to a keyframe whose current pose is given."""
         T_keyframe_camera = inverse(T_world_keyframe) @ T_world_camera
         self.extend(np.array([(timestamp_s, keyframe_id, T_keyframe_camera)], ENTRY))
 
@@ -44,7 +44,7 @@ class FrameHistory:
         return self._store[count : self._size].copy()
 
     def extend(self, entries: Entries) -> None:
-        """Append what another history holds of the frames that follow."""
+        """Append entries of another history."""
         size = self._size + len(entries)
         if size > len(self._store):
             bigger = np.zeros(max(2 * len(self._store), size), ENTRY)
@@ -64,7 +64,7 @@ class FrameHistory:
         order = np.argsort(which, kind="stable")
         groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(ids)))[:-1])
         poses, segments = np.empty((len(entries), 4, 4)), np.full(len(entries), NOBODY)
-        for keyframe_id, rows in zip(ids.tolist(), groups, strict=False):
+        for keyframe_id, rows in zip(ids.tolist(), groups[: len(ids)], strict=True):
             owner, T = self._resolve(keyframe_id, entries["T_keyframe_camera"][rows])
             if owner == NOBODY:
                 continue
@@ -78,14 +78,14 @@ class FrameHistory:
         }
 
     def parent(self, keyframe_id: int) -> tuple[int, Array]:
-        """The keyframe that stands for one now, or NOBODY, and T_heir_keyframe.
+        """The keyframe of the map that replaces one, or NOBODY, and T_parent_keyframe (4, 4).
 
-        One that has no heir stands for itself.
+        A keyframe that was not culled is its own parent.
         """
         return self._resolve(keyframe_id, np.eye(4))
 
     def state(self) -> Arrays:
-        """All entries, and who inherited whose frames, as arrays."""
+        """All entries, and the parents of culled keyframes, as arrays."""
         entries, parents = self._store[: self._size], list(self._parent.values())
         return {
             "timestamps_s": entries["timestamp_s"].copy(),
@@ -107,7 +107,7 @@ class FrameHistory:
         self._parent = dict(zip(state["culled_ids"].tolist(), parents, strict=True))
 
     def _resolve(self, keyframe_id: int, T: Array) -> tuple[int, Array]:
-        """The keyframe that stands for one, and poses T (..., 4, 4) as seen from it."""
+        """The keyframe that replaces one, and poses T (..., 4, 4) relative to it."""
         while keyframe_id in self._parent:
             keyframe_id, T_parent_keyframe = self._parent[keyframe_id]
             T = T_parent_keyframe @ T

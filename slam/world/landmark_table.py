@@ -17,7 +17,7 @@ PATCHES = 4  # of a landmark: views from one walk past it, of which each patch s
 
 _Columns = dict[str, tuple[tuple[int, ...], type, float]]
 
-_LOOKS: _Columns = {
+_APPEARANCE: _Columns = {
     "descriptors": ((8,), np.uint64, 0),
     "directions": ((3,), np.float64, 0.0),
     "extent": ((), np.float64, 0.0),
@@ -26,7 +26,7 @@ _LOOKS: _Columns = {
     "patches": ((PATCHES, PATCH_PX, PATCH_PX), np.uint8, 0),
     "patch_views": ((PATCHES, 3), np.float64, np.nan),
 }
-"""What only the living have: most landmarks die young, and a session has no end."""
+"""Columns that only landmarks in the map have: most landmarks are removed soon."""
 _OF_ALL: _Columns = {
     "points_world": ((3,), np.float64, np.nan),
     "host": ((), np.int64, -1),
@@ -38,14 +38,14 @@ _OF_ALL: _Columns = {
     "alive": ((), np.bool_, False),
     "in_graph": ((), np.bool_, False),
 }
-_COLUMNS = _OF_ALL | _LOOKS
+_COLUMNS = _OF_ALL | _APPEARANCE
 _PLACE: _Columns = {"place": ((), np.int64, 0)}
 
 
 class Appearance:
-    """A column over landmark ids that has rows for the living alone, at their places.
+    """A column over landmark ids that has rows only for landmarks in the map.
 
-    Place 0 is that of all the dead, who look like nothing: what is written about them is lost.
+    Row 0 is a placeholder for all removed landmarks: it is zero, and what is written to it is lost.
     """
 
     def __init__(self, rows: NDArray, place: Ints) -> None:
@@ -72,7 +72,7 @@ class Appearance:
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """What sub-pixel registration aligns some landmarks with, see LandmarkTable.
+    """Image patches of some landmarks, for sub-pixel registration; see LandmarkTable.
 
     Attributes:
         images: (N, PATCHES, 17, 17) uint8.
@@ -93,7 +93,7 @@ class LandmarkTable:
         points_world: (N, 3) metres.
         descriptors: (N, 8) uint64, BRISK's bits in the keyframe that saw it last.
         directions: (N, 3) unit vector from the point towards that keyframe's camera.
-        extent: (N,) keypoint scale times z there, so that scale at depth z is extent / z.
+        extent: (N,) keypoint scale times z there; the scale at depth z is extent / z.
         angles_rad: (N,) the keypoint's orientation there.
         colours: (N, 3) uint8.
         host: (N,) keyframe that made it; it moves the landmark while it is not in the graph.
@@ -104,10 +104,10 @@ class LandmarkTable:
         visible, found: (N,) frames in which it should have been, and was, matched.
         replaced_by: (N,) the landmark that this one was fused into, -1 for none.
         alive, in_graph: (N,) bool.
-        place: (N,) where a living one's looks are kept, 0 for the dead.
+        place: (N,) row of its appearance, 0 for removed landmarks.
 
-    Descriptors, directions, extent, angles, colours and patches are those of the living: a dead
-    landmark looks like nothing, and its place serves another.
+    Descriptors, directions, extent, angles, colours and patches are kept for landmarks in the map
+    only; those of removed landmarks are zero, and their rows are used again.
     """
 
     points_world: Array
@@ -131,7 +131,7 @@ class LandmarkTable:
     def __init__(self) -> None:
         self._size = 0
         self._store = {name: _filled(1024, column) for name, column in (_OF_ALL | _PLACE).items()}
-        self._appearance = {name: _filled(1, column) for name, column in _LOOKS.items()}
+        self._appearance = {name: _filled(1, column) for name, column in _APPEARANCE.items()}
         self._free: list[int] = []
         self._make_views()
 
@@ -151,7 +151,7 @@ class LandmarkTable:
         return ids
 
     def extend_to(self, size: int) -> None:
-        """Rows up to a size, those that are new not alive: to be filled from another table."""
+        """Add rows up to a size, not alive, to be filled from another table."""
         self._vacate(np.arange(size, self._size))
         capacity, old = len(self._store["alive"]), self._size
         for name, (shape, dtype, fill) in (_OF_ALL | _PLACE).items():
@@ -164,21 +164,20 @@ class LandmarkTable:
         self._make_views()
 
     def set_alive(self, alive: Mask) -> None:
-        """Exactly these of all (N,) are alive; those that are new look like nothing yet."""
+        """Set which of all landmarks (N,) are alive; the appearance of new ones is zero."""
         self._vacate(np.flatnonzero((self.place > 0) & ~alive))
         self._settle(np.flatnonzero((self.place == 0) & alive))
         self.alive[:] = alive
 
     def living(self, ids: Ints) -> Ints:
-        """Those of the ids that are still in the map."""
+        """Those of the ids that are in the map."""
         ids = ids[ids >= 0]
         return ids[self.alive[ids]]
 
     def current(self, ids: Ints) -> Ints:
-        """The ids (N,) >= 0 that stand for these now, in their order, fused ones followed.
+        """The present ids (N,) of landmarks (N,) that may have been fused since, in the same order.
 
-        A late answer about landmarks may name some that were fused or culled meanwhile; those
-        that were culled stay as they are, not alive.
+        Ids are >= 0. Those that were removed stay as they are, and are not alive.
         """
         ids = ids.copy()
         while len(fused := np.flatnonzero(self.replaced_by[ids] >= 0)):
@@ -186,15 +185,15 @@ class LandmarkTable:
         return ids
 
     def remove(self, ids: Ints) -> None:
-        """Take landmarks out of the map; keyframes drop them when they next look."""
+        """Remove landmarks from the map; keyframes drop them when they are next read."""
         self.alive[ids] = False
         self.in_graph[ids] = False
         self._vacate(np.unique(ids))
 
     def patch_distances(self, ids: Ints, views: Array, limits: tuple[float, float]) -> Array:
-        """How far (N, PATCHES) patches are from views (N, 3), as shares of the limits.
+        """Distances (N, PATCHES) of patches from views (N, 3), as shares of the limits.
 
-        The limits are a turn in radians and a factor of distance, of which the larger share
+        The limits are an angle in radians and a ratio of distances, of which the larger share
         counts. Infinite where there is no patch.
         """
         max_turn_rad, max_zoom = limits
@@ -209,9 +208,9 @@ class LandmarkTable:
     def nearest_patches(
         self, ids: Ints, centre_world: Array, limits: tuple[float, float]
     ) -> tuple[Bytes, Array]:
-        """Of every landmark the patch (N, 17, 17) of the view most like that from a camera (3,).
+        """Of every landmark the patch (N, 17, 17) of the view nearest to that of a camera (3,).
 
-        Also its zoom (N,): how many times larger than in the patch things look from there.
+        Also its zoom (N,): the scale in the camera's image relative to the patch.
         """
         views = centre_world - self.points_world[ids]
         nearest = self.patch_distances(ids, views, limits).argmin(axis=1)
@@ -220,20 +219,20 @@ class LandmarkTable:
         return self.patches.pick(ids, nearest), np.nan_to_num(zooms, nan=1.0)
 
     def patches_of(self, ids: Ints) -> Patches:
-        """All patches of landmarks (N,); of an id of -1 none."""
+        """All patches of landmarks (N,); none for an id of -1."""
         images = np.zeros((len(ids), PATCHES, PATCH_PX, PATCH_PX), np.uint8)
         views, known = np.full((len(ids), PATCHES, 3), np.nan), ids >= 0
         images[known], views[known] = self.patches[ids[known]], self.patch_views[ids[known]]
         return Patches(images, views)
 
     def give_patches(self, ids: Ints, patches: Patches) -> None:
-        """Those of the landmarks (N,), each once, that have no patch have these now."""
+        """Store patches of landmarks (N,), each given once, that have no patch."""
         without = np.isnan(self.patch_views[ids]).all(axis=(1, 2))
         self.patches[ids[without]] = patches.images[without]
         self.patch_views[ids[without]] = patches.views[without]
 
     def put_patches(self, ids: Ints, slots: Ints, patches: Bytes, views: Array) -> None:
-        """Give landmarks (N,), each once, patches (N, 17, 17) and their views (N, 3) in slots."""
+        """Store patches (N, 17, 17) and their views (N, 3) of landmarks (N,), each given once."""
         for column, values in ((self.patches, patches), (self.patch_views, views)):
             all_slots = column[ids]
             all_slots[np.arange(len(ids)), slots] = values
@@ -249,25 +248,25 @@ class LandmarkTable:
         self.points_world[ids] = transform(T_move, self.points_world[ids][:, None])[:, 0]
 
     def state(self) -> Arrays:
-        """The living landmarks; of dead ones nothing but their number matters any more."""
+        """The landmarks in the map; of removed ones only the number is kept."""
         ids = np.flatnonzero(self.alive)
         columns = {name: getattr(self, name)[ids] for name in _COLUMNS if name != "alive"}
         return {"size": np.array(self._size), "ids": ids, **columns}
 
     def restore(self, state: Arrays) -> None:
-        """Become the table of a state; this one must be new."""
+        """Become the table of a state; this table must be new."""
         self.extend_to(int(state["size"]))
         self._settle(state["ids"])
         for name in _COLUMNS:
             getattr(self, name)[state["ids"]] = True if name == "alive" else state[name]
 
     def _settle(self, ids: Ints) -> None:
-        """Places for landmarks (N,) that have none."""
+        """Assign rows of the appearance to landmarks (N,) that have none."""
         missing = len(ids) - len(self._free)
         if missing > 0:
             capacity = len(self._appearance["extent"])
             more = max(missing, capacity)
-            for name, column in _LOOKS.items():
+            for name, column in _APPEARANCE.items():
                 self._appearance[name] = np.concatenate(
                     [self._appearance[name], _filled(more, column)]
                 )
@@ -278,10 +277,10 @@ class LandmarkTable:
             del self._free[-len(ids) :]
 
     def _vacate(self, ids: Ints) -> None:
-        """Landmarks (N,), each once, give up their places, which look like nothing again."""
+        """Release the rows of landmarks (N,), each given once, and set them to zero."""
         places = self.place[ids]
         places = places[places > 0]
-        for name, (_, _, fill) in _LOOKS.items():
+        for name, (_, _, fill) in _APPEARANCE.items():
             self._appearance[name][places] = fill
         self.place[ids] = 0
         self._free += places[::-1].tolist()

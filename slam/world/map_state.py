@@ -1,4 +1,4 @@
-"""The map as named arrays and back: what all keyframes have is joined end to end."""
+"""The map as named arrays and back: the arrays of all keyframes are concatenated."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _FEATURE: _Columns = {
     "disparity_px": ((), np.float64),
     "sigmas_px": ((3,), np.float64),
     "colours": ((3,), np.uint8),
-}  # a keyframe's features have no image any more
+}  # features of a keyframe have no image
 _CULLED: _Columns = {"image_pixels": ((2,), np.float64), "landmark_ids": ((), np.int64)}
 
 
@@ -95,7 +95,7 @@ def _culled_state(culled: dict[int, CulledKeyframe]) -> Arrays:
 def _culled_of(state: Arrays) -> dict[int, CulledKeyframe]:
     borders = np.cumsum(state["size"])[:-1]
     pieces = (np.split(state[name], borders) for name in _CULLED)
-    return dict(zip(state["id"].tolist(), map(CulledKeyframe, *pieces), strict=False))
+    return dict(zip(state["id"].tolist(), map(CulledKeyframe, *pieces), strict=True))
 
 
 def _joined(objects: Sequence[Any], columns: _Columns) -> Arrays:

@@ -9,9 +9,9 @@ from bmask_slam.graph.arrays import Array, Ints, Mask
 
 
 def keypoints_under(mask: Mask, image_pixels: Array, border_px: int) -> Ints:
-    """Indices of the pixels (N, 2), as detected, that lie in a mask (H, W) less its border.
+    """Indices of the pixels (N, 2), as detected, that lie in a mask (H, W) narrowed by a border.
 
-    A negative border widens the mask. The image's own edge is no border of the mask.
+    A negative border widens the mask. At the edge of the image the mask is not narrowed.
     """
     side = 2 * abs(border_px) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))

@@ -1,4 +1,4 @@
-"""The map that the front end tracks against: keyframes, landmarks and who sees what."""
+"""The map that the front end tracks against: keyframes, landmarks, observations."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ class Keyframe:
 
     @property
     def free(self) -> Mask:
-        """Keypoints (N,) that observe nothing and may."""
+        """Mask (N,) of the keypoints that observe no landmark and are not masked."""
         return (self.landmark_ids < 0) & ~self.masked
 
 
 @dataclass(frozen=True)
 class CulledKeyframe:
-    """What late news about a culled keyframe need: image_pixels (N, 2) and landmark_ids (N,)."""
+    """What late masks of a culled keyframe need: image_pixels (N, 2) and landmark_ids (N,)."""
 
     image_pixels: Array
     landmark_ids: Ints
@@ -64,7 +64,7 @@ class CulledKeyframe:
 class WorldMap:
     """Keyframes by id, in the order they were made, and the landmark table.
 
-    ``culled`` remembers the keyframes that left last.
+    ``culled`` holds the keyframes that were culled last.
     """
 
     keyframes: dict[int, Keyframe] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class WorldMap:
     culled: dict[int, CulledKeyframe] = field(default_factory=dict)
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
-        """Take a keyframe in; its id must be ``next_keyframe_id``."""
+        """Add a keyframe; its id must be ``next_keyframe_id``."""
         self.keyframes[keyframe.id] = keyframe
         self.next_keyframe_id = keyframe.id + 1
 
@@ -93,13 +93,13 @@ class WorldMap:
         return int(np.bincount(segments).argmax())
 
     def observed(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
-        """Keypoint indices and ids of the living landmarks that a keyframe observes."""
+        """Keypoint indices and ids of the landmarks in the map that a keyframe observes."""
         keypoints = np.flatnonzero(keyframe.landmark_ids >= 0)
         keypoints = keypoints[self.landmarks.alive[keyframe.landmark_ids[keypoints]]]
         return keypoints, keyframe.landmark_ids[keypoints]
 
     def make_landmarks(self, keyframe: Keyframe, keypoints: Ints, points_world: Array) -> Ints:
-        """Landmarks at points (N, 3), made and observed by keypoints (N,); returns their ids."""
+        """Make landmarks at points (N, 3) that keypoints (N,) observe; returns their ids."""
         ids = self.landmarks.add(
             {
                 "points_world": points_world,
@@ -113,7 +113,7 @@ class WorldMap:
     def attach(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:
         """Record that keypoints (N,) of a keyframe observe landmarks (N,), and refresh these.
 
-        Masked keypoints are passed over.
+        Masked keypoints are skipped.
         """
         usable = ~keyframe.masked[keypoints]
         keypoints, landmark_ids = keypoints[usable], landmark_ids[usable]
@@ -124,19 +124,19 @@ class WorldMap:
     def mask(self, keyframe: Keyframe, keypoints: Ints) -> None:
         """Record that keypoints (N,) of a keyframe lie on something that moves.
 
-        They observe nothing any more, unless they are unmasked.
+        They observe nothing until they are unmasked.
         """
         keyframe.masked[keypoints] = True
         self.detach(keyframe, keypoints)
 
     def unmask(self, keyframe: Keyframe, keypoints: Ints) -> None:
-        """Keypoints (N,) of a keyframe lie on something that stands after all."""
+        """Record that keypoints (N,) of a keyframe lie on something static."""
         keyframe.masked[keypoints] = False
 
     def detach(self, keyframe: Keyframe, keypoints: Ints) -> None:
-        """Record that keypoints (N,) of a keyframe observe nothing after all.
+        """Record that keypoints (N,) of a keyframe observe nothing.
 
-        Landmarks that looked as here take their looks from the newest keyframe that is left.
+        Landmarks whose appearance was from here get it from the newest keyframe that is left.
         """
         landmarks, ids = self.landmarks, keyframe.landmark_ids[keypoints]
         keyframe.landmark_ids[keypoints] = keyframe.sent_ids[keypoints] = -1
@@ -150,10 +150,10 @@ class WorldMap:
             self._refresh(other, rows, other.landmark_ids[rows])
 
     def split(self, landmark_ids: Ints, keyframes: list[Keyframe], camera: Camera) -> Ints:
-        """Undo a wrong fusion: what these keyframes see becomes landmarks of its own.
+        """Undo a wrong fusion: what these keyframes observe becomes new landmarks.
 
-        Each lies where the first of the keyframes that measures its depth sees it; without any,
-        its views are given up. Returns the new ids.
+        Each is placed where the first of the keyframes that measures its depth observes it; if none
+        does, its observations are dropped. Returns the new ids.
         """
         twin = np.full(len(self.landmarks) + 1, -1, np.int64)
         for keyframe in keyframes:
@@ -170,8 +170,8 @@ class WorldMap:
         return twin[twin >= 0]
 
     def mask_landmarks(self, landmark_ids: Ints) -> None:
-        """Take landmarks out for good: the keypoints that observe them are masked."""
-        gone = np.zeros(len(self.landmarks) + 1, bool)  # the last entry answers for id -1
+        """Remove landmarks, and mask the keypoints that observe them."""
+        gone = np.zeros(len(self.landmarks) + 1, bool)  # the last entry is for id -1
         gone[landmark_ids] = True
         for keyframe in self.keyframes.values():
             rows = gone[keyframe.landmark_ids]
@@ -181,7 +181,7 @@ class WorldMap:
         self.landmarks.remove(landmark_ids)
 
     def _refresh(self, keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> None:
-        """Landmarks (N,) look as these keypoints (N,), where no newer keyframe sees them."""
+        """Appearance of landmarks (N,) from keypoints (N,), unless a newer keyframe sees them."""
         landmarks, features = self.landmarks, keyframe.features
         newest = landmarks.last_keyframe[landmark_ids] <= keyframe.id
         ids, rows = landmark_ids[newest], keypoints[newest]
@@ -194,7 +194,7 @@ class WorldMap:
         landmarks.extent[ids] = features.scales[rows] * np.maximum(z, 0.05)
 
     def remove_keyframe(self, keyframe: Keyframe, parent: Keyframe) -> None:
-        """Take a keyframe out of the map; the landmarks it made follow the heir from now on."""
+        """Take a keyframe out of the map; the landmarks it made follow the parent from now on."""
         _, ids = self.observed(keyframe)
         self.landmarks.observations[ids] -= 1
         self.landmarks.host[self.landmarks.host == keyframe.id] = parent.id
@@ -205,11 +205,11 @@ class WorldMap:
             del self.culled[next(iter(self.culled))]
 
     def renew_patches(self, keyframe: Keyframe, config: SubpixelConfig) -> None:
-        """Give landmarks a patch of a keyframe that sees them unlike all that they have.
+        """Store patches of landmarks that a keyframe sees from a view no patch of theirs covers.
 
-        It takes the place of the least similar one. Every new patch moves the landmark's image a
-        little, so one is kept as long as it may serve: where a place is passed again, its
-        landmarks are what they were the first time.
+        The new patch replaces the least similar one. Every new patch shifts the landmark's image a
+        little; so patches are kept as long as they can be used, and a place that is visited again
+        is matched with its first patches.
         """
         landmarks, features = self.landmarks, keyframe.features
         rows, ids = self.observed(keyframe)
@@ -221,8 +221,8 @@ class WorldMap:
         landmarks.put_patches(ids[unlike], slots, patches, views[unlike])
 
     def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
-        """(shared landmarks, keyframe) of all that share at least a minimum, most shared first."""
-        seen = np.zeros(len(self.landmarks) + 1, bool)  # the last entry answers for id -1
+        """(shared landmarks, keyframe) of all that share at least a minimum, by falling number."""
+        seen = np.zeros(len(self.landmarks) + 1, bool)  # the last entry is for id -1
         seen[landmark_ids] = True
         shared = [(int(np.count_nonzero(seen[k.landmark_ids])), k) for k in self.keyframes.values()]
         strong = [pair for pair in shared if pair[0] >= minimum]
@@ -237,7 +237,7 @@ class WorldMap:
         remap = np.arange(len(self.landmarks) + 1)
         remap[-1] = -1
         remap[old_ids] = new_ids
-        while (remap[remap] != remap).any():  # a chain of duplicates ends in one landmark
+        while (remap[remap] != remap).any():  # follow chains of duplicates
             remap = remap[remap]
         new_ids = remap[old_ids]
         involved = np.zeros(len(self.landmarks) + 1, bool)
