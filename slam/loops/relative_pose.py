@@ -60,8 +60,9 @@ def refine_relative_pose(
 def _linearised(views: Views, pairs: Pairs, T_a_b: Array, camera: Camera) -> tuple[Array, ...]:
     """Residuals (2, M, 3), Jacobians (2, M, 3, 6), weights (2, M, 3, 3) and gates (M,) both ways.
 
-    Direction 0 projects points of a into b, direction 1 points of b into a. For ``T_a_b <- T_a_b @ se3_exp(xi)`` the
-    inverse becomes ``T_b_a @ se3_exp(-Ad(T_a_b) @ xi)``. Without a point the weight is zero.
+    Direction 0 projects points of a into b, direction 1 points of b into a. For ``T_a_b <- T_a_b @
+    se3_exp(xi)`` the inverse becomes ``T_b_a @ se3_exp(-Ad(T_a_b) @ xi)``. Without a point the
+    weight is zero.
     """
     r_b, J_b, W_b = _way(views, pairs, T_a_b, camera)
     r_a, J_a, W_a = _way(views[::-1], pairs[::-1], inverse(T_a_b), camera)
