@@ -1,1 +1,1 @@
-"""TODO."""
+"""A recorded sequence through the system: the run, its checkpoints, localisation in a map."""

@@ -1,7 +1,7 @@
-"""Self-calibration in rounds: run again with the camera that was found, and calibrate that run.
+"""Self-calibration in rounds: run again with the estimated camera, and calibrate that run.
 
-A run with a wrong camera matches, gates and registers with it, and what it keeps leans toward it;
-the second run is free of most of that.
+A run with a wrong camera matches and checks observations with that camera, so the observations that
+it keeps are biased toward it; a second run removes most of this bias.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ logger = logging.getLogger(__name__)
 
 
 def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = False) -> Calibrated:
-    """Calibrate a run, and ``rounds - 1`` times one that is made anew with what was found.
+    """Calibrate a run, then ``rounds - 1`` times a new run made with the estimated camera.
 
-    The runs made here are configured as the first and are not kept. The file is written at the end.
+    The new runs have the configuration of the first and are not kept. The camera file is written at
+    the end.
 
     Returns:
         The last calibration; its ``before`` is the camera of the first run.
 
     Raises:
-        InputError: as by `calibrate_run`, or no round.
+        InputError: as `calibrate_run`, or ``rounds`` is below 1.
     """
     if rounds < 1:
         raise InputError(f"--rounds {rounds}: must be a whole number of at least 1")
@@ -60,7 +61,7 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
 
 
 def _again(before: Path, sequence: Path, camera: Path, out: Path, quiet: bool) -> RunOptions:
-    """The same frames with the same configuration and another camera."""
+    """Options for the same frames and configuration with another camera."""
     config = before / "config.yaml"
     frames = frame_stamps(before / "trajectory.txt")
     return RunOptions(

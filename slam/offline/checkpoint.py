@@ -1,7 +1,7 @@
-"""Checkpoints: where a run was, as one file in its folder, so that a killed run can go on.
+"""Checkpoints: the state of a run in one file of its folder, from which a killed run is resumed.
 
-A run with checkpoints and one that was killed and resumed end in the same bytes. What a state
-cannot hold (ISAM2) is therefore built anew at each checkpoint in both: `SlamSystem.restart`.
+A run with checkpoints and one that was killed and resumed write the same bytes. ISAM2, which cannot
+be saved, is therefore rebuilt at each checkpoint in both: `SlamSystem.restart`.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ CHECKPOINT_FILE = FileKind("checkpoint", 6)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Where a run was after some frames.
+    """The state of a run after some frames.
 
     Attributes:
-        options: what it was told.
-        camera: the sequence's.
-        stamps: digest of all its timestamps.
+        options: of the run.
+        camera: of the sequence.
+        stamps: digest of all timestamps of the sequence.
         skipped: index and reason of the broken frames so far.
         frames_bytes: size of frames.csv.
-        tally: what was counted.
+        counters: of the frames so far.
         state: of the system.
     """
 
@@ -57,42 +57,42 @@ class Checkpoint:
     state: Arrays
 
     def check_sequence(self, sequence: Sequence) -> None:
-        """Refuse a sequence that is not the run's. Raises InputError."""
+        """Raise InputError for a sequence with another camera or other timestamps."""
         for what, same in (
             ("camera", sequence.camera == self.camera),
             ("frames", digest(sequence) == self.stamps),
         ):
             if not same:
                 raise InputError(
-                    f"{sequence.folder}: not the {what} that the run was begun with; "
+                    f"{sequence.folder}: not the {what} that the run was started with; "
                     "restore the sequence, or start a new run"
                 )
 
 
 def digest(sequence: Sequence) -> str:
-    """A short text that two sequences share only if their timestamps are equal."""
+    """SHA-256 of a sequence's timestamps."""
     return hashlib.sha256(sequence.timestamps_s.tobytes()).hexdigest()
 
 
 class Checkpoints:
-    """Writes the checkpoints of one run, if its options ask for them."""
+    """Writes the checkpoints of one run; none without ``checkpoint_every``."""
 
     def __init__(self, folder: RunFolder, options: RunOptions, sequence: Sequence) -> None:
         self._folder = folder
         self._options = options
         self._sequence = sequence
         self._every = options.checkpoint_every
-        self._frames = -1  # of the last one
+        self._frames = -1  # number of frames at the last checkpoint
 
     def after_frame(self, system: System, counters: RunCounters) -> None:
-        """Write one if it is due."""
+        """Write a checkpoint if it is due."""
         if self._every is not None and counters.frames % self._every == 0:
             self.write(system, counters)
 
     def write(self, system: System, counters: RunCounters) -> None:
-        """Write one now, over the last, which stays until the new one is whole.
+        """Write a checkpoint, unless the last one is of the same frame.
 
-        Nothing is written where the last one is of the same frame.
+        The last one stays until the new one is complete.
         """
         if self._every is None or counters.frames == self._frames:
             return
@@ -134,17 +134,17 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """The checkpoint of a run folder.
+    """Read the checkpoint of a run folder.
 
     Raises:
-        InputError: it is missing, foreign, broken or of another version, or config.yaml is not
-            what it was made with.
+        InputError: it is missing, broken, of another kind or version, or config.yaml has changed
+            since it was written.
     """
     path = folder / CHECKPOINT
     if not path.exists():
         raise InputError(
             f"{folder}: holds no checkpoint, so there is nothing to resume; give the folder of a "
-            "run that was begun with --checkpoint-every, or start the run again with --overwrite"
+            "run that was started with --checkpoint-every, or start the run again with --overwrite"
         )
     header, arrays = read_arrays(path, CHECKPOINT_FILE)
     config = resolve(SystemConfig, folder / "config.yaml")

@@ -1,4 +1,4 @@
-"""Localisation in a finished map: frames in, poses in the map's frame out, nothing learned."""
+"""Localisation in a finished map, which is not changed: frames in, poses in its frame out."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ REFRESH_FRAMES = 5  # a sixth of a second at 30 Hz
 
 
 class MapLocalisation(SlamSystem):
-    """A system that was restored from a map and is only to find frames in its largest segment.
+    """A system, restored from a map, that only locates frames in the map's largest segment.
 
-    No keyframe is made and nothing is optimised. Every few frames, and wherever a frame was
-    recognised, the local map is chosen anew around what was seen.
+    It makes no keyframes and optimises nothing. Every few frames, and after every relocalisation,
+    the local map is chosen anew around the landmarks that were observed.
     """
 
     def begin_session(self) -> None:
-        """Forget where the camera was; the map stays."""
+        """Start without a known camera pose in the map."""
         super().begin_session()
         self._frames_since_refresh = 0
-        self._found: list[tuple[float, Array]] = []
+        self._located: list[tuple[float, Array]] = []
 
     def process(self, frame: Frame, features: Features | None = None) -> FrameResult:
-        """Find a frame in the map."""
+        """Locate a frame in the map."""
         frame = self._begin(frame)
         features = self._extract(frame, features)
         tracked = self._find(features)
@@ -49,16 +49,16 @@ class MapLocalisation(SlamSystem):
         )
 
     def finish(self) -> None:
-        """Nothing was learned that could be optimised."""
+        """Do nothing: the map has not changed."""
 
     def segments(self) -> dict[int, Trajectory]:
-        """The frames that were found, all in the map's largest segment."""
-        stamps_s, poses = [stamp_s for stamp_s, _ in self._found], [T for _, T in self._found]
+        """The frames that were located, all in the map's largest segment."""
+        stamps_s, poses = [stamp_s for stamp_s, _ in self._located], [T for _, T in self._located]
         segment = self.camera_tracker.segment
         return {segment: Trajectory(np.array(stamps_s), np.array(poses))} if poses else {}
 
     def files(self) -> dict[str, Callable[[Path], None]]:
-        """None: the map is as it was."""
+        """No files: the map has not changed."""
         return {}
 
     @stage("tracking")
@@ -71,7 +71,7 @@ class MapLocalisation(SlamSystem):
             return None
         T, ids, world = tracked.T_world_camera, tracked.landmark_ids, self.map.world
         self.camera_tracker.update_motion(T, T, ids)
-        self._found.append((frame.timestamp_s, T))
+        self._located.append((frame.timestamp_s, T))
         self._frames_since_refresh += 1
         elsewhere = not np.isin(ids, self.camera_tracker.local_ids).all()
         if elsewhere or self._frames_since_refresh >= REFRESH_FRAMES:

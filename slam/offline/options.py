@@ -1,4 +1,4 @@
-"""What a run is told, and how that is written into its folder so that it can be resumed."""
+"""The options of a run, and how a checkpoint keeps them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bmask_slam.system_config import SystemConfig
 _PATHS = ("sequence", "camera", "reference", "map")
 _RECORDED = (*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense")
 _FLAGS = {"map": "--continue", "dense": "--map"}
-"""Of options that are not called as their field is."""
+"""Flags that differ from the name of their field."""
 
 
 @dataclass(frozen=True)
@@ -23,17 +23,18 @@ class RunOptions:
     Attributes:
         sequence: folder in TUM layout.
         config: of the system.
-        config_name: for the name of the run folder, where ``out`` is None.
+        config_name: part of the run folder's name where ``out`` is None.
         out: the run folder; None: the first free ``runs/<sequence>[-<config_name>][-<n>]``.
         overwrite: replace the run that ``out`` holds.
         camera: a camera.yaml to use in place of the sequence's own.
         reference: TUM file or sequence folder to compare with; None: the sequence's own, if any.
         max_frames: stop after so many frames.
         stride: take every n-th frame.
-        checkpoint_every: frames from one checkpoint to the next; None: none is written.
-        map: map file, or run folder that holds one, to go on from.
-        localise: the same, to find the frames in; it stays as it is.
-        dense: also make a dense map, keyframes being fused on the way.
+        checkpoint_every: frames from one checkpoint to the next; None: no checkpoints.
+        map: map file, or run folder with one, that the run continues.
+        localise: map file, or run folder with one, in which the frames are located; it is not
+            changed.
+        dense: also make a dense map, fusing keyframes while the run goes on.
         quiet: no progress bar.
     """
 
@@ -62,12 +63,12 @@ class RunOptions:
         for option in ("map", "checkpoint_every", "dense"):
             if getattr(self, option):
                 raise InputError(
-                    f"--localise {self.localise}: learns nothing that {_flag(option)} could go on "
-                    "from; leave one of the two away"
+                    f"--localise {self.localise}: does not extend the map, which {_flag(option)} "
+                    "needs; give one of the two"
                 )
 
     def recorded(self) -> dict[str, Any]:
-        """What a checkpoint must know of these, as JSON values, with absolute paths."""
+        """The options that a checkpoint keeps, as JSON values; paths are absolute."""
         found = {name: getattr(self, name) for name in _RECORDED}
         return found | {name: str(found[name].absolute()) for name in _PATHS if found[name]}
 
@@ -81,12 +82,12 @@ class RunOptions:
         return cls(**{**found, **paths}, config=config, out=out.absolute())
 
     def with_given(self, given: Mapping[str, Any]) -> RunOptions:
-        """These options of a begun run, with what the user gives again when resuming it.
+        """The options to resume a run with, when the user repeats some of them.
 
-        The sequence may have been moved; all else must be as it was.
+        The sequence may have been moved; all others must be as they were.
 
         Raises:
-            InputError: something is different.
+            InputError: an option differs.
         """
         free = ("sequence", "quiet")
         for option in (name for name in given if name not in free):
@@ -94,8 +95,7 @@ class RunOptions:
             if own != (value.absolute() if isinstance(value, Path) else value):
                 was = "another configuration" if option == "config" else own
                 raise InputError(
-                    f"{_flag(option)}: the run was begun with {was}; leave it away, or start a "
-                    "new run"
+                    f"{_flag(option)}: the run was started with {was}; omit it, or start a new run"
                 )
         return replace(self, **{name: given[name] for name in free if name in given})
 

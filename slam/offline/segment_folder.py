@@ -24,7 +24,7 @@ def segment_folder(
     """Segment every colour image of a sequence in TUM layout, or every image of a folder.
 
     Raises:
-        InputError: no images, or as for ``make_segmenter`` and ``cache_masks``.
+        InputError: no images, or as `make_segmenter` and `cache_masks`.
     """
     files = colour_images(source)
     segmenter = make_segmenter(options, source, find_weights)
@@ -33,10 +33,10 @@ def segment_folder(
 
 
 def colour_images(source: Path) -> list[tuple[str, Path]]:
-    """Name relative to ``source`` and file of each colour image, in the order of stamps or names.
+    """Name relative to ``source`` and path of each colour image, ordered by stamp or name.
 
     Raises:
-        InputError: there is none.
+        InputError: there are no images.
     """
     if (source / "rgb.txt").is_file():
         files = list(read_list(source / "rgb.txt").files)

@@ -1,1 +1,1 @@
-"""TODO."""
+"""A run folder: its files, written while a run goes on and read back by `Run`."""

@@ -1,4 +1,4 @@
-"""Covariances of keyframes: from the graph, to a file, and back by `read_covariances`."""
+"""covariances.txt: covariances of keyframes, computed from the graph, written and read back."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def find_covariances(smoother: Smoother, stamps_s: dict[int, float]) -> Keyframe
 
 
 def write_covariances(path: Path, found: KeyframeCovariances) -> None:
-    """Write the file, which appears whole or not at all."""
+    """Write the file; it appears complete or not at all."""
     rows = zip(
         found.keyframe_ids.tolist(),
         found.timestamps_s.tolist(),
@@ -75,8 +75,9 @@ def read_covariances(path: Path) -> KeyframeCovariances:
     """Read what `write_covariances` wrote.
 
     Raises:
-        InputError: no file, no line, a wrong number of columns, a value that is no finite number,
-            an id that is no whole number, or a matrix that is no covariance.
+        InputError: no such file, an empty file, a wrong number of columns, a value that is not a
+            finite number, an id that is not a whole number, or a matrix that is not positive
+            definite.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; run with --covariances to get it")
@@ -93,7 +94,7 @@ def read_covariances(path: Path) -> KeyframeCovariances:
     if bad.any():
         k = int(table[bad][0, 0])
         raise InputError(
-            f"{path}: the matrix of keyframe {k} is no covariance; correct or remove its line"
+            f"{path}: the matrix of keyframe {k} is not positive definite; correct its line"
         )
     return KeyframeCovariances(table[:, 0].astype(np.int64), table[:, 1], covariances)
 
@@ -103,5 +104,5 @@ def _row(line: str, where: str) -> list[float]:
     if len(words) != _COLUMNS:
         raise InputError(f"{where}: {len(words)} columns, expected {_COLUMNS}; correct the line")
     if not words[0].isdigit():
-        raise InputError(f"{where}: {words[0][:40]!r} is no keyframe id; correct the line")
+        raise InputError(f"{where}: {words[0][:40]!r} is not a keyframe id; correct the line")
     return [finite_number(word, where) for word in words]

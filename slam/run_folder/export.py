@@ -1,4 +1,4 @@
-"""What a run, a trajectory or a graph holds, written for other programs."""
+"""Export of runs, trajectories and graphs to the formats of other programs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ POINTS_COMMENT = "bmask-slam landmarks of a graph, world frame, metres"
 
 @dataclass(frozen=True)
 class Exported:
-    """The files written, and in words what is in them and what is not."""
+    """The files written, and a text on what they contain and omit."""
 
     files: tuple[Path, ...]
     contents: str
@@ -41,14 +41,14 @@ class Exported:
 def export(source: Path, form: ExportFormat, out: Path, times: Path | None = None) -> Exported:
     """Write a run folder, a trajectory or a g2o file with landmarks in another format.
 
-    ``times`` holds the stamps of a trajectory in the format of KITTI.
+    ``times`` is a file with the stamps of a trajectory in KITTI's format.
 
     Raises:
-        InputError: broken input, a source that does not hold what the format needs, or an output
-            whose folder is not there or that is the input.
+        InputError: broken input, a source without the data that the format needs, or an output
+            that is the input or lies in a missing folder.
     """
     if not out.parent.is_dir():
-        raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
+        raise InputError(f"{out}: the folder {out.parent} does not exist; make it first")
     if out.is_dir():
         raise InputError(f"{out}: a folder; give the name of a file to write")
     if not source.exists():
@@ -66,7 +66,7 @@ def export(source: Path, form: ExportFormat, out: Path, times: Path | None = Non
 
 def _graph(source: Path, out: Path) -> Exported:
     if not (source / "graph").is_file():
-        raise InputError(f"{source}: holds no graph, which g2o needs; give a run folder")
+        raise InputError(f"{source}: has no graph, which g2o needs; give a run folder")
     tables, camera = read_graph(source / "graph")
     write_landmark_graph(out, tables, camera)
     seen = tables.observations.select(tables.observations.all_rows())
@@ -91,9 +91,9 @@ def _points_of_graph(source: Path, form: ExportFormat, out: Path) -> Exported:
 
 
 def _ids(ids: Ints) -> NDArray[np.int32]:
-    """Ids as PLY can hold them."""
+    """Ids as 32-bit integers, the largest that PLY has. Raises InputError beyond them."""
     if len(ids) and ids.max() > np.iinfo(np.int32).max:
-        raise InputError("landmark ids beyond 32 bits, which PLY has not; renumber them")
+        raise InputError("landmark ids exceed 32 bits, the largest integers of PLY; renumber them")
     return ids.astype(np.int32)
 
 
@@ -116,7 +116,7 @@ def _trajectory(source: Path, form: ExportFormat, out: Path, times: Path | None)
 
 
 def _write(trajectory: Trajectory, form: ExportFormat, out: Path) -> tuple[tuple[Path, ...], str]:
-    """The files written, and what is in a line of them."""
+    """Write a trajectory; the files, and a text on what a line contains."""
     if form == "tum":
         write_tum(out, trajectory)
         return (out,), "stamp in seconds, position in metres, quaternion x y z w"

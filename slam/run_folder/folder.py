@@ -1,4 +1,4 @@
-"""The run folder: a contract that other tools read, complete after a run and usable in the middle.
+"""The run folder: files that other tools read, complete after a run and usable during it.
 
 ====================  ============================================================================
 config.yaml           the resolved configuration; ``--config RUN/config.yaml`` repeats it
@@ -14,17 +14,17 @@ objects.json, .ply    with a segmenter: objects with label, box, keyframes; the 
 objects.png           with a segmenter: landmarks by label and objects, from above
 dense/                with ``--map``, run or live, or by ``bmask-slam map``: `dense.folder`
 covariances.txt       with ``--covariances``: of every keyframe's pose, see
-`run_folder.covariance_file`
+                      `run_folder.covariance_file`
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference
-log.txt               what the program had to say
+log.txt               the log
 health.json           of a live run: rates, delays, queues, what was dropped, every second
-checkpoint            while a run with ``--checkpoint-every`` is not finished: all it needs to
-                      be resumed (``run --resume``); it is gone when the run is complete
+checkpoint            while a run with ``--checkpoint-every`` is not finished: the state from
+                      which ``run --resume`` goes on; removed when the run is complete
 ====================  ============================================================================
 
 ``frames.csv`` and ``log.txt`` grow line by line; everything else is written under a temporary name
-and renamed, so that a killed run leaves whole files.
+and renamed, so that a killed run leaves complete files.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def free_run_path(stem: str, root: Path = Path("runs")) -> Path:
 
 
 class _LogFile(logging.FileHandler):
-    """A log whose own failure is quiet: a full disk is met, and told, by whoever writes data."""
+    """A log file that ignores its own OSErrors: a full disk is reported where data are written."""
 
     def handleError(self, record: logging.LogRecord) -> None:
         if not isinstance(sys.exc_info()[1], OSError):
@@ -85,29 +85,30 @@ class _LogFile(logging.FileHandler):
 class RunFolder:
     """An open run folder; a context manager that closes its files.
 
-    A run that is refused before its first frame leaves nothing: the folder is removed again.
-    While it is open no other process can write a run there.
+    If an InputError ends the block before the first frame, the folder is removed again. While it
+    is open, no other process can write a run there.
     """
 
     def __init__(
         self, path: Path, overwrite: bool = False, resume_bytes: int | None = None
     ) -> None:
-        """Make the folder, with an empty frames.csv and log.txt; or go on with the run it holds,
-        frames.csv being cut to ``resume_bytes``.
+        """Make the folder with an empty frames.csv and log.txt, or reopen it to resume its run.
+
+        To resume, frames.csv is cut to ``resume_bytes``.
 
         Raises:
-            InputError: it cannot be written, or already holds a run and ``overwrite`` is not set,
-                or a process still writes there, or frames.csv is not that of the run to resume.
+            InputError: it cannot be written, another process writes there, it holds a run and
+                ``overwrite`` is not set, or frames.csv does not belong to the run to resume.
         """
         self.path = path
-        self._begun = resume_bytes is not None
-        self._made = [] if self._begun else _make_folder(path)
+        self._keep = resume_bytes is not None
+        self._made = [] if self._keep else _make_folder(path)
         if resume_bytes is None:
             _clear(path, overwrite)
         else:
             _check_frames(path / "frames.csv", resume_bytes)
         try:
-            mode = "a" if self._begun else "x"
+            mode = "a" if self._keep else "x"
             self._frames = (path / "frames.csv").open(mode, encoding="utf-8", newline="")
             _lock(self._frames, path)
             self._log = _LogFile(path / "log.txt", mode=mode, encoding="utf-8")
@@ -116,7 +117,7 @@ class RunFolder:
             _remove_empty(self._made)
             raise _unwritable(path, error) from error
         self._rows = csv.DictWriter(self._frames, COLUMNS, lineterminator="\n")
-        if not self._begun:
+        if not self._keep:
             self._rows.writeheader()
             self._frames.flush()
         self._levels: dict[str, int] = {}
@@ -151,7 +152,7 @@ class RunFolder:
                 file.close()
             except OSError as unwritten:
                 error = error or unwritten
-        if isinstance(error, InputError) and not self._begun:
+        if isinstance(error, InputError) and not self._keep:
             _remove(self.path, (*SOMETIMES, *FILES))
             _remove_empty(self._made)
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
@@ -160,26 +161,26 @@ class RunFolder:
             ) from error
 
     def write_frame(self, result: FrameResult) -> None:
-        """Append a frame to frames.csv, at once on disk.
+        """Append a frame to frames.csv and flush it.
 
         Raises:
-            ValueError: a stage that is no column.
+            ValueError: ``stage_ms`` has an unknown stage.
         """
         self._rows.writerow(frame_row(result))
         self._frames.flush()
-        self._begun = True
+        self._keep = True
 
     def synced_bytes(self) -> int:
-        """The size of frames.csv, all of it on disk."""
+        """Write frames.csv to disk; its size in bytes."""
         os.fsync(self._frames.fileno())
         return os.fstat(self._frames.fileno()).st_size
 
     def complete(self) -> None:
-        """Say that the run is finished: there is nothing to resume."""
+        """Mark the run as finished by removing its checkpoint."""
         _remove(self.path, [CHECKPOINT])
 
     def write_trajectory(self, trajectory: Trajectory, name: str = "trajectory.txt") -> None:
-        """Replace trajectory.txt (or keyframes.txt) by the poses of T_world_camera."""
+        """Replace trajectory.txt, or the file ``name``, by the poses T_world_camera."""
         write_tum(self.path / name, trajectory)
 
     def write_text(self, name: str, text: str) -> None:
@@ -189,7 +190,7 @@ class RunFolder:
 
     @contextmanager
     def replacing(self, name: str) -> Iterator[Path]:
-        """A temporary path beside ``name``, a file or a folder, that takes its place at the end."""
+        """A temporary path, for a file or a folder, that replaces ``name`` when the block ends."""
         path = self.path / name
         temporary = path.with_name(f".partial-{name}")
         try:
@@ -202,7 +203,7 @@ class RunFolder:
 
 
 def _clear(path: Path, overwrite: bool) -> None:
-    """Remove the run that a folder holds, its checkpoint first. Raises InputError."""
+    """Remove the run in a folder, its checkpoint first. Raises InputError."""
     held = [name for name in (*SOMETIMES, *FILES) if os.path.lexists(path / name)]
     if held and not overwrite:
         cure = "go on with --resume, " if held[0] == CHECKPOINT else ""
@@ -220,7 +221,7 @@ def _clear(path: Path, overwrite: bool) -> None:
 
 
 def _lock(file: IO[Any], path: Path) -> None:
-    """Keep other processes from writing here as long as the file is open, or refuse to."""
+    """Lock the file until it is closed. Raises InputError if another process holds the lock."""
     if sys.platform == "win32":
         return
     import fcntl  # noqa: PLC0415 - Unix only
@@ -234,19 +235,19 @@ def _lock(file: IO[Any], path: Path) -> None:
 
 
 def _check_frames(frames: Path, size: int) -> None:
-    """Refuse a frames.csv that does not begin with the bytes of a checkpoint."""
+    """Raise InputError if frames.csv is shorter than at the checkpoint or has other columns."""
     header, found = ",".join(COLUMNS), b""
     if frames.is_file():
         found = frames.read_bytes()[: max(size, 0)]
     if len(found) < size or found.partition(b"\n")[0] != header.encode():
         raise InputError(
-            f"{frames}: not the file that the checkpoint knows, with {size} bytes or more and the "
+            f"{frames}: not the file of the checkpoint, which has at least {size} bytes and the "
             f"columns {header}; start the run again with --overwrite"
         )
 
 
 def _make_folder(path: Path) -> list[Path]:
-    """Make a folder and its parents; those that were made, the innermost first."""
+    """Make a folder and its parents; returns those that were made, the innermost first."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -263,14 +264,14 @@ def _unwritable(path: Path, error: OSError) -> InputError:
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove folders from the innermost on, as far as they are empty."""
+    """Remove these folders, given from the innermost on, while they are empty."""
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()
 
 
 def _remove(folder: Path, names: Iterable[str]) -> None:
-    """Remove these files and folders where they exist."""
+    """Remove the files and folders that exist."""
     for name in names:
         path = folder / name
         if path.is_dir() and not path.is_symlink():

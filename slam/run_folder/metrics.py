@@ -1,4 +1,4 @@
-"""What is known at the end of a run: its metrics and the files of the result."""
+"""The end of a run: its metrics and its result files."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ EVALUATION_ROWS = (
 
 @dataclass
 class RunCounters:
-    """What is counted while frames go by.
+    """Counts and times of the frames so far.
 
     Attributes:
-        tracking_ms: of each frame, features, what moves and tracking, without what a keyframe adds.
-        next_index: the first index of the sequence that was not reached.
-        keyframes: frames that became one.
-        lost: frames without a pose.
-        wall_s: time of the whole loop, without what a kill threw away.
+        tracking_ms: time of each frame in features, moving objects and tracking, without the work
+            that a keyframe adds.
+        next_index: the first index of the sequence that was not processed.
+        keyframes: number of keyframes made.
+        lost: number of frames without a pose.
+        wall_s: time of the whole loop, without frames that a kill discarded.
     """
 
     tracking_ms: list[float] = field(default_factory=list)
@@ -89,7 +90,7 @@ def row(name: str, value: float, unit: str) -> Row:
 
 
 def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
-    """Median and 95th percentile; nothing of nothing."""
+    """Rows of the median and the 95th percentile; none without values."""
     if not values_ms:
         return []
     median, high = np.percentile(values_ms, (50, 95))
@@ -99,7 +100,7 @@ def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
 def save(
     system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
 ) -> None:
-    """Write everything that is known only at the end."""
+    """Write the result files."""
     trajectory = system.trajectory()
     folder.write_trajectory(trajectory)
     folder.write_trajectory(system.keyframe_trajectory(), "keyframes.txt")

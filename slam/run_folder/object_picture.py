@@ -1,4 +1,4 @@
-"""The picture of a run's things: landmarks by label and objects, from above."""
+"""objects.png: landmarks by label and objects, from above."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _MIN_NAMED_M = 0.25
 def draw_objects(
     path: Path, cloud: LandmarkCloud, found: MapObjects, trajectory: Trajectory
 ) -> None:
-    """Write the picture: what the map shows seen along ``up_world``, metres on both axes.
+    """Draw the map along ``up_world``, in metres, and write the picture.
 
-    Only larger objects bear their number; the legend counts those of each class.
+    Only larger objects get their id; the legend has the number of objects of each class.
     """
     assert cloud.labels is not None
     R_upright_world = gravity_axes(found.up_world).T

@@ -1,4 +1,4 @@
-"""Asking a run where things are."""
+"""Queries for the objects of a run by label."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bmask_slam.run_folder.semantic_files import SavedObject, read_objects
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Objects of one label, the surest first; ``counts`` says how many there are of each label."""
+    """Objects of one label, the most probable first, and the number of objects of each label."""
 
     label: str
     objects: tuple[SavedObject, ...]
@@ -22,10 +22,10 @@ class Answer:
 
 
 def query(run: Path, label: str | None) -> Answer:
-    """The objects of a run whose likeliest label is this; all of them without a label.
+    """The objects of a run with this most probable label; all objects without a label.
 
     Raises:
-        InputError: the run has no objects file, or does not know the label.
+        InputError: the run has no objects.json, or its label set lacks the label.
     """
     names, objects = read_objects(run)
     counts = dict(sorted(Counter(o.label for o in objects).items()))
@@ -40,7 +40,7 @@ def query(run: Path, label: str | None) -> Answer:
 
 
 def format_answer(answer: Answer) -> str:
-    """A line an object: position and size in metres, how sure, and the keyframes that saw it."""
+    """One line an object: position and size in metres, probability, observing keyframes."""
     if not answer.objects:
         return f"no {answer.label or 'object'}; the run holds {_listed(answer.counts)}"
     head = f"{'label':<16}{'id':>5}  {'x, y, z (world, m)':<24}{'size (m)':<19}{'sure':>5}"
@@ -58,7 +58,7 @@ def _listed(counts: dict[str, int]) -> str:
 
 
 def _ranges(numbers: list[int]) -> str:
-    """Rising numbers as "1-4, 7"."""
+    """Ascending numbers as "1-4, 7"."""
     parts: list[list[int]] = []
     for n in numbers:
         if parts and n == parts[-1][-1] + 1:

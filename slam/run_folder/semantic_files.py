@@ -1,4 +1,4 @@
-"""What a run says about the things in its map, as files, and read back."""
+"""labels.csv, objects.json and objects.ply: written at the end of a run, and read back."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class LabelTable:
 
     Attributes:
         ids: (N,) of the landmarks.
-        labels: N class names, "unknown" for what is on no known object.
+        labels: N class names, "unknown" for a landmark on no known object.
         probability: (N,) of the label.
         entropy: (N,) of the distribution over all labels, in nats.
-        views: (N,) keyframes that said something.
+        views: (N,), number of keyframes whose masks voted.
     """
 
     ids: Ints
@@ -61,7 +61,7 @@ def semantic_writers(
 
 
 def write_labels(path: Path, cloud: LandmarkCloud) -> None:
-    """Write a line a landmark."""
+    """Write one line a landmark."""
     assert cloud.labels is not None
     names, found = cloud.labels.names, cloud.labels.estimates
     rows = zip(
@@ -82,7 +82,7 @@ def read_labels(run: Path) -> LabelTable:
     """The label table of a run folder.
 
     Raises:
-        InputError: no such file, other columns, or a value that is no number.
+        InputError: no such file, other columns, or a value that is not a number.
     """
     path = run / LABELS
     if not path.is_file():
@@ -105,9 +105,13 @@ class SavedObject:
     """An object of a run, read back.
 
     Attributes:
-        id, label, probability: its number, class name and how sure that is.
-        centroid_world: (3,) m. box: around it.
-        keyframes: (K,) that saw it. landmarks: (N,) on it.
+        id: number of the object.
+        label: class name.
+        probability: of the label.
+        centroid_world: (3,) in metres.
+        box: around the object.
+        keyframes: (K,) ids of the keyframes that observed it.
+        landmarks: (N,) ids of the landmarks on it.
         first_seen_s, last_seen_s: stamps.
     """
 
@@ -159,10 +163,10 @@ def _rounded(values: Array) -> list[float]:
 
 
 def read_objects(run: Path) -> tuple[tuple[str, ...], list[SavedObject]]:
-    """The class names that a run knew, and its objects.
+    """The class names of a run's segmenter, and its objects.
 
     Raises:
-        InputError: no such file, or not as `write_objects` made it.
+        InputError: no such file, or a file that `write_objects` did not make.
     """
     path = run / OBJECTS
     if not path.is_file():
@@ -192,7 +196,7 @@ def _from_json(o: dict[str, Any]) -> SavedObject:
 
 
 def write_boxes(path: Path, found: MapObjects) -> None:
-    """Write the boxes' edges as a line set in ASCII PLY, in the colours of the classes."""
+    """Write the edges of the boxes as lines in ASCII PLY, in the colours of the classes."""
     corners = [o.box.corners_world for o in found.objects]
     colours = [class_colour(o.label).round().astype(int).tolist() for o in found.objects]
     count = len(found.objects)

@@ -201,20 +201,20 @@ def test_a_moved_sequence_and_equal_options_are_accepted(begun: Path, sequence: 
 
 def test_another_sequence_is_refused(begun: Path, sequence: Path, refused) -> None:
     shorter = make_sequence(sequence.with_name("shorter"), 19)
-    refused(r"shorter: not the frames that the run was begun with", {"sequence": shorter})
+    refused(r"shorter: not the frames that the run was started with", {"sequence": shorter})
     camera = (sequence / "camera.yaml").read_text()
     (sequence / "camera.yaml").write_text(camera.replace("fx: 30", "fx: 30.5"))
-    refused(r"seq: not the camera that the run was begun with")
+    refused(r"seq: not the camera that the run was started with")
     shutil.rmtree(sequence)
     refused(r"seq: no such folder")
 
 
 def test_other_options_are_refused(begun: Path, refused) -> None:
-    refused(r"--stride: the run was begun with 1; leave it away", {"stride": 3})
-    refused(r"--out: the run was begun with .*out; leave", {"out": begun.parent})
-    refused(r"--continue: the run was begun with None", {"map": begun.parent})
+    refused(r"--stride: the run was started with 1; omit it", {"stride": 3})
+    refused(r"--out: the run was started with .*out; omit", {"out": begun.parent})
+    refused(r"--continue: the run was started with None", {"map": begun.parent})
     other = SystemConfig(tracking=TrackingConfig(min_inliers=41))
-    refused(r"--config: the run was begun with another configuration", {"config": other})
+    refused(r"--config: the run was started with another configuration", {"config": other})
     (begun / "config.yaml").write_text("{tracking: {min_inliers: 41}}")
     refused(r"config\.yaml: not the configuration that checkpoint was made with")
 
@@ -222,7 +222,7 @@ def test_other_options_are_refused(begun: Path, refused) -> None:
 def test_a_frames_file_that_is_not_the_checkpoints_is_refused(begun: Path, refused) -> None:
     whole = (begun / "frames.csv").read_text()
     (begun / "frames.csv").write_text(whole[:300])
-    refused(r"frames\.csv: not the file that the checkpoint knows, with \d+ bytes or more")
+    refused(r"frames\.csv: not the file of the checkpoint, which has at least \d+ bytes")
     (begun / "frames.csv").write_text(whole.replace("matches", "guesses"))
     refused(r"and the columns index,timestamp,status")
     (begun / "frames.csv").unlink()

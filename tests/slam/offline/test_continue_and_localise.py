@@ -159,7 +159,7 @@ def test_maps_that_are_none_are_refused(state: Arrays, tmp_path: Path) -> None:
 def test_a_map_of_another_camera_is_not_continued(state: Arrays, tmp_path: Path) -> None:
     write_map(tmp_path / "map", state, CAMERA)
     options = RunOptions(make_sequence(tmp_path / "seq"), out=tmp_path / "out", quiet=True)
-    with pytest.raises(InputError, match=r"map: made with Camera.* \(--localise takes any\)"):
+    with pytest.raises(InputError, match=r"map: made with Camera.* \(--localise accepts any\)"):
         run(replace(options, map=tmp_path / "map"), FakeSystem)
     assert not (tmp_path / "out").exists()
 
@@ -168,8 +168,8 @@ def test_a_map_of_another_camera_is_not_continued(state: Arrays, tmp_path: Path)
     ("other", "flag"),
     [("map", "continue"), ("dense", "map"), ("checkpoint_every", "checkpoint-every")],
 )
-def test_localisation_excludes_what_learns(other: str, flag: str) -> None:
-    with pytest.raises(InputError, match=f"--localise m: learns nothing that --{flag} could"):
+def test_localisation_excludes_options_that_extend_the_map(other: str, flag: str) -> None:
+    with pytest.raises(InputError, match=f"--localise m: does not extend the map, which --{flag} needs"):
         RunOptions(Path("x"), localise=Path("m"), **{other: 7})
 
 

@@ -52,9 +52,9 @@ def test_the_columns_are_the_upper_triangle_row_by_row(tmp_path: Path) -> None:
     [
         (lambda s: "", "no covariance in the file"),
         (lambda s: s.replace("\n", " 5\n"), "24 columns"),
-        (lambda s: "x" + s, "no keyframe id"),
+        (lambda s: "x" + s, "not a keyframe id"),
         (lambda s: s.rsplit(" ", 1)[0] + " nan\n", "not a finite number"),
-        (lambda s: s.rsplit(" ", 1)[0] + " -1.0\n", "keyframe 0 is no covariance"),
+        (lambda s: s.rsplit(" ", 1)[0] + " -1.0\n", "keyframe 0 is not positive definite"),
     ],
 )
 def test_bad_files_are_refused_with_line_and_cure(tmp_path: Path, change, text: str) -> None:

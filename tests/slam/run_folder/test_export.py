@@ -100,12 +100,12 @@ def test_points(run: Path, tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["none", "--format", "tum", "--out", "a"], "none: no such file or folder"),
-        (["run", "--format", "tum", "--out", "no/a"], "the folder no is not there"),
+        (["run", "--format", "tum", "--out", "no/a"], "the folder no does not exist"),
         (["run", "--format", "tum", "--out", "run"], "a folder; give the name of a file"),
         (["run", "--format", "tum", "--out", "run/trajectory.txt"], "is (in) the input"),
         (
             ["run/trajectory.txt", "--format", "g2o", "--out", "a"],
-            "holds no graph, which g2o needs",
+            "has no graph, which g2o needs",
         ),
         (["a.g2o", "--format", "tum", "--out", "a"], "a graph has no stamps, which tum needs"),
         (["kitti.txt", "--format", "tum", "--out", "a"], "has no stamps; give them with --times"),
