@@ -169,7 +169,7 @@ def test_a_map_of_another_camera_is_not_continued(state: Arrays, tmp_path: Path)
     [("map", "continue"), ("dense", "map"), ("checkpoint_every", "checkpoint-every")],
 )
 def test_localisation_excludes_options_that_extend_the_map(other: str, flag: str) -> None:
-    with pytest.raises(InputError, match=f"--localise m: does not extend the map, which --{flag} needs"):
+    with pytest.raises(InputError, match=f"--localise m: does not .*, which --{flag} needs"):
         RunOptions(Path("x"), localise=Path("m"), **{other: 7})
 
 
