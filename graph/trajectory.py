@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
+from bmask_slam.graph.whole_file import whole_file
 
 MAX_TIME_DIFFERENCE_S = 0.02
 MAX_TYPICAL_STEP_S = 5.0
@@ -75,7 +75,7 @@ class Trajectory:
 def nearest_indices(stamps_s: Array, queries_s: Array) -> Ints:
     """Index (M,) of the stamp nearest to each query; ``stamps_s`` (N,) sorted and not empty.
 
-    Of two equally near stamps the earlier is taken.
+    Of two equally near stamps it is the earlier.
     """
     right = np.clip(np.searchsorted(stamps_s, queries_s), 1, max(len(stamps_s) - 1, 1))
     right = np.minimum(right, len(stamps_s) - 1)
@@ -89,9 +89,9 @@ def associate_stamps(
 ) -> tuple[Ints, Ints]:
     """Pairs of stamps that belong together: indices into ``a_s`` (N,) and ``b_s`` (M,), sorted.
 
-    The closest pair is taken first, then the closest of what is left, as TUM's associate script
-    does, so that each stamp is used at most once. That greedy choice is reached here by taking
-    all mutually nearest pairs at once and repeating on the rest; two or three rounds are usual.
+    The closest pair is taken first, then the closest of the rest, as in TUM's associate script, so
+    that each stamp is used at most once. The same result is reached here by taking all mutually
+    nearest pairs at once and repeating on the rest; two or three rounds are usual.
     Pairs that cross in time (possible where the limit is longer than the steps) exchange their
     partners, which makes no difference larger than the larger of the two: both results increase.
     """
@@ -142,7 +142,7 @@ def check_seconds(stamps_s: Array, path: Path) -> None:
 def read_tum(path: Path) -> Trajectory:
     """Read ``timestamp tx ty tz qx qy qz qw`` lines (seconds, metres, T_world_camera).
 
-    Lines may come in any order; empty lines and those that begin with # are passed over. Of
+    Lines may come in any order; empty lines and those that begin with # are ignored. Of
     lines with the same stamp the first is kept, with a warning: TUM's own freiburg2_desk ground
     truth has such a pair.
 
@@ -197,6 +197,5 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in row)
         for stamp, row in zip(trajectory.timestamps_s, numbers, strict=True)
     ]
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text("\n".join([TUM_HEADER, *rows]) + "\n", encoding="utf-8", newline="\n")
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        temporary.write_text("\n".join([TUM_HEADER, *rows]) + "\n", encoding="utf-8", newline="\n")

@@ -1,4 +1,4 @@
-"""Trajectories as KITTI and EuRoC write them, and files of any format told apart.
+"""Trajectories in the formats of KITTI and EuRoC, and recognition of a file's format.
 
 TUM's format is in ``graph.trajectory``.
 """
@@ -28,9 +28,9 @@ TrajectoryFormat = Literal["tum", "kitti", "euroc"]
 
 
 def read_trajectory(path: Path, stamps_s: Array | None = None) -> Trajectory:
-    """Read a trajectory in any of the three formats, known by its first line.
+    """Read a trajectory in any of the three formats, recognised by its lines.
 
-    KITTI has no stamps: ``stamps_s`` (N,) are those of its lines; the other formats ignore them.
+    KITTI has no stamps: ``stamps_s`` (N,) are those of its lines; ignored for other formats.
 
     Raises:
         InputError: no file, what the format's reader refuses, or KITTI without stamps, or with
@@ -64,10 +64,12 @@ def recognise(path: Path) -> TrajectoryFormat:
     lines = [line for _, line in _lines(path)]
     if lines and len(lines[0].split()) == KITTI_COLUMNS:
         return "kitti"
-    ends = [lines[k].split(",")[0].strip() for k in (0, -1)] if lines else []
-    if not all("," in lines[k] and end.isdigit() for k, end in zip((0, -1), ends, strict=False)):
+    if not lines or not all("," in line for line in (lines[0], lines[-1])):
         return "tum"
-    step = (int(ends[-1]) - int(ends[0])) / max(len(lines) - 1, 1) if ends else 0.0
+    ends = [lines[k].split(",")[0].strip() for k in (0, -1)]
+    if not all(end.isdigit() for end in ends):
+        return "tum"
+    step = (int(ends[-1]) - int(ends[0])) / max(len(lines) - 1, 1)
     return "euroc" if step > MIN_STEP_NS or (len(lines) == 1 and int(ends[0]) > 1e12) else "tum"
 
 
@@ -135,7 +137,7 @@ def write_euroc(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_euroc(path: Path) -> Trajectory:
-    """Read ``ns,px,py,pz,qw,qx,qy,qz`` lines; columns that follow are passed over.
+    """Read ``ns,px,py,pz,qw,qx,qy,qz`` lines; further columns are ignored.
 
     Stamps become seconds in float64, which keeps them to a quarter of a microsecond today.
 

@@ -92,9 +92,6 @@ PENDING: dict[str, set[str]] = {
         "slam/commands",
     },
     "functions": {
-        "graph/g2o/landmark_reader.py read_landmark_graph",
-        "graph/pose_graph/loop_consistency.py loop_support",
-        "graph/pose_graph/optimisation.py optimise_pose_graph",
         "semantics/training/loop.py train",
         "slam/api.py run",
         "slam/calibration/views.py make_views",

@@ -45,14 +45,14 @@ _FIXED_COVARIANCE = 1e-12 * np.eye(6)  # micrometres, microradians
 
 @dataclass
 class _Notes:
-    """What the comments say."""
+    """What bmask-slam's comments in a file say."""
 
     camera: list[float] = field(default_factory=list)
     landmark_offset: int = 0
     edges: dict[int, tuple[str, str | None]] = field(default_factory=dict)
 
     def read(self, path: Path, line: str, number: int) -> None:
-        """Take in a comment line; others than ours are passed over."""
+        """Read a comment line; those of other programs are ignored."""
         words = line.removeprefix(MARK).split()
         if not line.startswith(MARK + " ") or len(words) < 2:
             return
@@ -73,49 +73,53 @@ class _Notes:
 def read_landmark_graph(
     path: Path, config: SmootherConfig | None = None
 ) -> tuple[FactorTables, Camera]:
-    """Read a graph with landmarks; of parts that nothing connects, those that are held.
+    """Read a graph with landmarks; of several connected components, those with a prior.
 
-    Keyframes that are fixed get a very firm prior. If nothing is held the largest part is taken and
-    its first keyframe gets the smoother's prior. Landmarks that no keyframe sees are left out, with
-    a warning, as are lines of other types.
+    Fixed keyframes get a very firm prior. Without any prior the largest component is read and its
+    first keyframe gets the smoother's prior. Landmarks without an observation are left out, with a
+    warning, as are lines of other types.
 
     Raises:
         InputError: naming file and line, as ``graph.g2o.pose_graphs.read_g2o``; also cameras that
-        differ or are
-            not at their vertex, and information that correlates u, v and 1/z.
+            differ or are not at their vertex, and information that correlates u, v and 1/z.
     """
-    notes = _Notes()
+    notes, tables = _Notes(), FactorTables()
     rows, fixed = read_rows(path, TAGS, lambda line, k: notes.read(path, line, k))
     if not rows[VIEW].lines:
         raise InputError(f"{path}: no {VIEW} line; nothing was seen")
     camera = _camera(rows, notes, path)
+    names = np.array(rows[VIEW].ids, np.int64)
+    _add_vertices(tables, rows, names, notes.landmark_offset, path)
+    tables.observations.add(_views(rows[VIEW], names, notes.landmark_offset, camera, path))
+    tables.add_pose_factors(_pose_factors(rows, notes, tables.keyframes.ids, path))
+    check_fixed(fixed, tables.keyframes.ids, path)
+    held = tables.keyframes.get(np.array(sorted(fixed), np.int64))
+    priors = zip(sorted(fixed), held, strict=True)
+    tables.add_pose_factors([PosePrior(k, T, _FIXED_COVARIANCE) for k, T in priors])
+    _keep_components_with_priors(tables, path)
+    anchor_components(tables, config or SmootherConfig())
+    return tables, camera
+
+
+def _add_vertices(
+    tables: FactorTables, rows: dict[str, Rows], views: Ints, offset: int, path: Path
+) -> None:
+    """Keyframes, and the landmarks that ``views`` (M, 3) name; their ids are less ``offset``."""
     keyframe_ids, keyframe_rows = vertex_ids(rows[POSE], path)
     landmark_ids, landmark_rows = vertex_ids(rows[POINT], path)
     both = np.intersect1d(keyframe_ids, landmark_ids)
     if len(both):
         at = rows[POINT].lines[landmark_rows[np.searchsorted(landmark_ids, both[0])]]
         raise InputError(f"{path}:{at}: vertex {both[0]} is there twice; remove one")
-    names = np.array(rows[VIEW].ids, np.int64)
-    indices_of(names[:, 0], rows[VIEW].lines, keyframe_ids, path)
-    indices_of(names[:, 1], rows[VIEW].lines, landmark_ids, path)
-    tables = FactorTables()
+    indices_of(views[:, 0], rows[VIEW].lines, keyframe_ids, path)
+    indices_of(views[:, 1], rows[VIEW].lines, landmark_ids, path)
     poses = poses_of_columns(np.array(rows[POSE].numbers)[keyframe_rows])
     tables.keyframes.insert(keyframe_ids, poses)
-    seen = np.isin(landmark_ids, names[:, 1])
+    seen = np.isin(landmark_ids, views[:, 1])
     if not seen.all():
-        logger.warning("%s: %d landmarks that nothing sees left out", path, np.sum(~seen))
+        logger.warning("%s: %d landmarks without observations left out", path, np.sum(~seen))
     points = np.array(rows[POINT].numbers)[landmark_rows]
-    offset = notes.landmark_offset
     tables.landmarks.insert(landmark_ids[seen] - offset, points[seen])
-    tables.observations.add(_views(rows[VIEW], names, offset, camera, path))
-    tables.add_pose_factors(_pose_factors(rows, notes, keyframe_ids, path))
-    check_fixed(fixed, keyframe_ids, path)
-    held = tables.keyframes.get(np.array(sorted(fixed), np.int64))
-    priors = zip(sorted(fixed), held, strict=True)
-    tables.add_pose_factors([PosePrior(k, T, _FIXED_COVARIANCE) for k, T in priors])
-    _keep_held_parts(tables, path)
-    anchor_components(tables, config or SmootherConfig())
-    return tables, camera
 
 
 def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:
@@ -217,8 +221,8 @@ def _measured(rows: Rows, path: Path) -> tuple[Array, Array]:
     return poses_of_columns(numbers[:, :7]), covariances
 
 
-def _keep_held_parts(tables: FactorTables, path: Path) -> None:
-    """Of several parts keep those with a prior; if there is none, the largest."""
+def _keep_components_with_priors(tables: FactorTables, path: Path) -> None:
+    """Keep the connected components with a prior; if there is none, the largest."""
     ids = tables.keyframes.ids
     edges = [factor.keyframes for factor in tables.pose_factors.values()]
     seen = tables.observations.select(tables.observations.used_rows())

@@ -9,7 +9,6 @@ such files do; g2o's own 3-D edge measures half angles (the quaternion's vector 
 from __future__ import annotations
 
 import logging
-import os
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 from bmask_slam.graph.pose_graph.pose_graph import planar_coordinates, planar_poses
+from bmask_slam.graph.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -54,8 +54,8 @@ def read_rows(
 ) -> tuple[dict[str, Rows], dict[int, int]]:
     """Lines of the given tags, and line numbers of FIX by vertex id.
 
-    Lines of other tags are left out, with one warning a tag. ``on_comment`` is told each comment
-    line and its number.
+    Lines of other tags are left out, with one warning a tag. ``on_comment`` gets each comment line
+    and its number.
 
     Raises:
         InputError: naming file and line: a wrong number of columns, a value that is no finite
@@ -105,7 +105,7 @@ def _row(words: list[str], tag: Tag, where: str) -> tuple[list[int], list[float]
 
 
 def _id(word: str, where: str) -> int:
-    """The id that a word is."""
+    """The vertex id in a word."""
     if not (word.isascii() and word.isdigit() and int(word) <= MAX_ID):
         raise InputError(f"{where}: {word[:40]!r} is no vertex id; ids are whole numbers from 0 on")
     return int(word)
@@ -182,6 +182,5 @@ def numbers_text(numbers: Array) -> str:
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:
     """Write a file that appears whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")

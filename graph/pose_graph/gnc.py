@@ -1,4 +1,4 @@
-"""Wrong loops of a pose graph: graduated non-convexity on the edges that can be right."""
+"""Wrong loops of a pose graph, by graduated non-convexity on the edges that may be right."""
 
 from __future__ import annotations
 
@@ -9,49 +9,49 @@ from scipy.stats import chi2
 
 from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.factors.gnc import first_mu, gnc_weights
-from bmask_slam.graph.pose_graph.loop_consistency import LoopSupport
+from bmask_slam.graph.pose_graph.loop_consistency import LoopConsistency
 from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, is_connected
 from bmask_slam.graph.pose_graph.solver import PoseGraphConfig, PoseGraphSolver
 
-LEAST_WEIGHT = 1e-6  # where odometry does not connect: what one edge alone holds stays solvable
+LEAST_WEIGHT = 1e-6  # if odometry does not connect: vertices with a single edge stay solvable
 MAX_ROUNDS = 20
 
 
 def find_wrong_loops(
-    graph: PoseGraph, solver: PoseGraphSolver, config: PoseGraphConfig, support: LoopSupport
+    graph: PoseGraph, solver: PoseGraphSolver, config: PoseGraphConfig, loops: LoopConsistency
 ) -> Mask:
-    """(M,) the wrong edges, those without which a truncated least-squares cost is least.
+    """(M,) the wrong edges: without them a truncated least-squares cost is minimal.
 
-    From the solution of odometry and the loops that others confirm, those loops are let in that it
-    does not refute, its own uncertainty counted: a random edge is not among them, a right one that
-    closes a long drift is. GNC (Yang et al., RA-L 2020) then decides among what was let in. What it
-    keeps may allow others, so that this is repeated while the cost falls. Random edges would fill
-    the factorisation and are left out of it from the start.
+    Candidates are the loops that the solution of odometry and consistent loops does not contradict,
+    with its own uncertainty: no random edges, but right ones that close a long drift. GNC (Yang et
+    al., RA-L 2020) then decides among the candidates. Those that it keeps may make others
+    candidates, so this is repeated while the cost falls. Random edges would fill the factorisation
+    and are left out of it from the start.
 
-    Odometry edges keep weight 1. Where they leave gaps, or no loop confirms another, GNC starts
-    with all loops. The solver is left at the solution of the right edges.
+    Odometry edges keep weight 1. If they do not connect the graph, or no loops are consistent, GNC
+    starts with all loops. The solver ends at the solution of the right edges.
     """
-    search = _Search(graph, solver, config, support.noise_scale)
+    search = _Search(graph, solver, config, loops.noise_scale)
     known = search.known
     if not is_connected(graph.with_edges(known)):
         solver.run(config.gnc_inner_iterations)
-        is_right = search.graduated(~known, LEAST_WEIGHT)
+        is_right = search.inliers(~known, LEAST_WEIGHT)
         return ~is_right & ~_needed(graph, np.where(is_right, 1e-3, solver.chi_squares()))
-    right = known | support.supported
-    if not support.supported.any():
+    right = known | loops.consistent
+    if not loops.consistent.any():
         solver.run(config.gnc_inner_iterations)
-        right = search.graduated(~known)
-    cost = search.settle(right)
+        right = search.inliers(~known)
+    cost = search.solve(right)
     for _ in range(MAX_ROUNDS):
         poses = solver.poses
-        allowed = right | search.allowed(right)
+        allowed = right | search.candidates(right)
         if (allowed > right).any():
-            search.settle(allowed)
-        tried = search.graduated(allowed & ~known)
+            search.solve(allowed)
+        tried = search.inliers(allowed & ~known)
         if (tried == right).all():
             break
-        new_cost = search.settle(tried)
+        new_cost = search.solve(tried)
         if new_cost >= cost * (1 - config.relative_tolerance):
             solver.start_from(poses)
             break
@@ -60,7 +60,7 @@ def find_wrong_loops(
 
 
 class _Search:
-    """Solutions of one graph with different loops left out."""
+    """Solutions of one graph with different sets of loops."""
 
     def __init__(
         self,
@@ -74,25 +74,25 @@ class _Search:
         self.limit = noise_scale * float(chi2.ppf(config.inlier_probability, degrees))
         self.known = graph.is_odometry
 
-    def settle(self, right: Mask) -> float:
-        """Solve with these edges (M,); the truncated cost with the others at their bound."""
+    def solve(self, right: Mask) -> float:
+        """Solve with these edges (M,); the truncated cost, in which the others are at the bound."""
         self._solver.weigh(right.astype(float))
         self._solver.run(self._config.max_iterations)
         c = self._solver.chi_squares()
         loops = np.minimum(c[~self.known], self.limit).sum()
         return 0.5 * float(c[self.known].sum() + loops)
 
-    def allowed(self, used: Mask) -> Mask:
-        """(M,) the edges beyond ``used`` that its solution, the solver's, does not refute."""
+    def candidates(self, used: Mask) -> Mask:
+        """(M,) the other edges that the solution of ``used``, the solver's, does not contradict."""
         asked = np.flatnonzero(~used)
-        allowed = np.zeros(len(used), bool)
+        candidates = np.zeros(len(used), bool)
         if len(asked):
             predicted = predicted_chi2(self._graph.with_poses(self._solver.poses), used, asked)
-            allowed[asked[predicted <= self.limit]] = True
-        return allowed
+            candidates[asked[predicted <= self.limit]] = True
+        return candidates
 
-    def graduated(self, loops: Mask, least: float = 0.0) -> Mask:
-        """(M,) the right edges, by GNC on these loops (M,) from where the solver stands.
+    def inliers(self, loops: Mask, least: float = 0.0) -> Mask:
+        """(M,) the right edges, by GNC on these loops (M,) from the solver's current values.
 
         mu starts where the cost is convex and grows until every weight is 0 or 1.
         """
@@ -116,7 +116,7 @@ class _Search:
 
 
 def _needed(graph: PoseGraph, costs: Array) -> Mask:
-    """(M,) edges of the cheapest tree: without them a vertex would hang loose."""
+    """(M,) edges of the cheapest spanning tree, which keep the graph connected."""
     size = len(graph.ids)
     low, high = np.sort(graph.edges, axis=1).T
     order = np.lexsort((costs, high, low))

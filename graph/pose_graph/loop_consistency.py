@@ -20,41 +20,54 @@ from bmask_slam.graph.pose_graph.pose_graph import (
 
 WINDOW = 3  # steps of odometry on either side of a cycle
 PROBABILITY = 0.999
-MIN_CYCLES = 20  # to judge the noise by
-SCALE_MARGIN = 10.0  # below which a scale of the noise is not told from 1
+MIN_CYCLES = 20  # to estimate the noise from
+SCALE_MARGIN = 10.0  # a smaller scale of the noise cannot be distinguished from 1
 
 
 @dataclass(frozen=True, eq=False)
-class LoopSupport:
-    """What short cycles say of a pose graph.
+class LoopConsistency:
+    """What short cycles say of the loop edges of a pose graph.
 
     Attributes:
-        supported: (M,) bool, loop edges that another one confirms.
-        noise_scale: by which the bounds of chi-squares are to be multiplied; 1 where the
-            information matrices are about right, or where there are too few cycles to tell.
+        consistent: (M,) bool, loop edges that agree with another one.
+        noise_scale: factor for the bounds of chi-squares; 1 where the information matrices are
+            about right, or where there are too few cycles to tell.
     """
 
-    supported: Mask
+    consistent: Mask
     noise_scale: float
 
 
-def loop_support(graph: PoseGraph) -> LoopSupport:
-    """Which loops confirm each other; none where odometry leaves gaps.
+def loop_consistency(graph: PoseGraph) -> LoopConsistency:
+    """Which loop edges agree with each other; none if odometry does not connect the graph.
 
     Two loops (i, j) and (k, l) whose ends are few odometry steps apart close a cycle,
-    ``E = inverse(T_i_j) @ T_i_k @ T_k_l @ T_l_j``, the identity but for the noise of its edges. A
-    random loop has no such partner. Absence of one proves nothing: the place was seen only once.
+    ``E = inverse(T_i_j) @ T_i_k @ T_k_l @ T_l_j``, the identity but for noise. A random loop agrees
+    with no other. A loop without a partner may be right: the place was then seen only once.
 
     Some files state information that is off by orders of magnitude, parking-garage's by four. All
-    loops would then confirm each other, or none. Cycles of right loops, the majority, show it: the
-    median of their chi-squares against that of the distribution. A margin is left, for what is
-    neglected here and because unconfirmed loops may be worse than confirmed ones.
+    loops would then agree, or none. The cycles of right loops, the majority, show it: the median of
+    their chi-squares against that of the distribution. A margin is left for what is neglected here,
+    and because other loops may be less accurate than consistent ones.
     """
-    supported = np.zeros(len(graph.edges), bool)
+    consistent = np.zeros(len(graph.edges), bool)
     odometry = graph.with_edges(graph.is_odometry)
     loops = np.flatnonzero(~graph.is_odometry)
     if len(loops) < 2 or not is_connected(odometry):
-        return LoopSupport(supported, 1.0)
+        return LoopConsistency(consistent, 1.0)
+    a, b, chi_squares = _short_cycles(graph, odometry, loops)
+    expected = chi2(graph.information.shape[-1])
+    scale = 1.0
+    if len(chi_squares) >= MIN_CYCLES:
+        ratio = float(np.median(chi_squares) / expected.median())
+        scale = max(min(1.0, SCALE_MARGIN * ratio), ratio / SCALE_MARGIN)
+    agree = chi_squares < scale * expected.ppf(PROBABILITY)
+    consistent[loops[a[agree]]] = consistent[loops[b[agree]]] = True
+    return LoopConsistency(consistent, scale)
+
+
+def _short_cycles(graph: PoseGraph, odometry: PoseGraph, loops: Ints) -> tuple[Ints, Ints, Array]:
+    """Pairs (P,), (P,) of rows into ``loops`` that close short cycles, and their chi-squares."""
     i, j = graph.edges[loops].T
     swapped = i > j
     T = np.where(
@@ -67,18 +80,10 @@ def loop_support(graph: PoseGraph) -> LoopSupport:
     loop_covariance = np.linalg.inv(graph.information[loops])
     step_covariance = np.linalg.inv(odometry.information).mean(axis=0)
     steps = np.abs(i[a] - i[b]) + np.abs(j[a] - j[b])
-    # Covariances are added as they are: cycles are short, and the gate is wide.
+    # Covariances are added without adjoints: cycles are short, and the bound is wide.
     S = loop_covariance[a] + loop_covariance[b] + steps[:, None, None] * step_covariance
     r = planar_coordinates(E) if graph.is_planar else se3_log(E)
-    chi_squares = mahalanobis(r, S)
-    expected = chi2(r.shape[1])
-    scale = 1.0
-    if len(chi_squares) >= MIN_CYCLES:
-        ratio = float(np.median(chi_squares) / expected.median())
-        scale = max(min(1.0, SCALE_MARGIN * ratio), ratio / SCALE_MARGIN)
-    agree = chi_squares < scale * expected.ppf(PROBABILITY)
-    supported[loops[a[agree]]] = supported[loops[b[agree]]] = True
-    return LoopSupport(supported, scale)
+    return a, b, mahalanobis(r, S)
 
 
 def cycle_chi2(
@@ -90,8 +95,8 @@ def cycle_chi2(
 ) -> Array:
     """Chi-square (P,), 6 degrees of freedom, of the cycles that pairs of loops close.
 
-    For loops (a, b) and (c, d): ``E = inverse(T_a_b) @ T_a_c @ T_c_d @ T_d_b``, whose middle steps
-    are the map's. Covariances are carried to E's right side by adjoints.
+    For loops (a, b) and (c, d): ``E = inverse(T_a_b) @ T_a_c @ T_c_d @ T_d_b``, where T_a_c and
+    T_d_b are the map's. Covariances are transformed to E's right side by adjoints.
 
     Args:
         T_a_b: (N, 4, 4) measured; covariances: (N, 6, 6) on their right side.

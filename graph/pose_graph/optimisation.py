@@ -7,7 +7,7 @@ inverse(T_world_i) @ T_world_j``.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.pose_graph.factors import chordal_poses, pose_graph_cost
 from bmask_slam.graph.pose_graph.gnc import find_wrong_loops
-from bmask_slam.graph.pose_graph.loop_consistency import loop_support
+from bmask_slam.graph.pose_graph.loop_consistency import loop_consistency
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, spanning_tree_poses
 from bmask_slam.graph.pose_graph.solver import Method, PoseGraphConfig, PoseGraphSolver
 
@@ -25,11 +25,11 @@ __all__ = ["Method", "PoseGraphConfig", "PoseGraphResult", "optimise_pose_graph"
 
 @dataclass(frozen=True, eq=False)
 class PoseGraphResult:
-    """An optimised graph and how it came about.
+    """An optimised graph and how it was reached.
 
     Attributes:
         graph: the input with the optimised poses, all edges still in it.
-        given: where the poses before come from: file, or odometry where the file has none.
+        given: source of the poses before: file, or odometry if the file has none.
         given_poses: (N, 4, 4) those, and given_cost their cost.
         start: the initial value that was taken: file, odometry or chordal.
         initial_cost, final_cost: from there to the end, the latter without the outliers.
@@ -48,7 +48,7 @@ class PoseGraphResult:
     final_cost: float
     iterations: int
     is_outlier: Mask
-    duration_ms: float
+    duration_ms: float = 0.0
 
 
 def optimise_pose_graph(
@@ -56,33 +56,39 @@ def optimise_pose_graph(
     config: PoseGraphConfig | None = None,
     progress: Progress = lambda iteration, cost: None,
 ) -> PoseGraphResult:
-    """Optimise a connected pose graph from the best initial value that is at hand.
+    """Optimise a connected pose graph from the best available initial value.
 
-    The gauge is held by the fixed vertices, or by the first if none is fixed.
+    The gauge is fixed by the fixed vertices, or by the first if there is none.
 
     Raises:
-        InputError: the graph cannot be solved, whatever the reason is that GTSAM gives.
+        InputError: the graph cannot be solved, with GTSAM's reason.
     """
     config = config or PoseGraphConfig()
     begin_s = time.perf_counter()
-    solver = PoseGraphSolver(graph, config, progress)
     try:
-        is_outlier = np.zeros(len(graph.edges), bool)
-        support, trusted = None, ~is_outlier
-        if config.method == "gnc":
-            support = loop_support(graph)
-            trusted = support.supported | graph.is_odometry
-            trusted = trusted if support.supported.any() else ~is_outlier
-        given = "file" if graph.has_poses else "odometry"
-        given_poses = graph.poses if graph.has_poses else spanning_tree_poses(graph)
-        start, poses = _best_start(graph, {given: given_poses}, trusted)
-        solver.start_from(poses)
-        if support is not None:
-            is_outlier = find_wrong_loops(graph, solver, config, support)
-        solver.weigh(np.where(is_outlier, 0.0, 1.0))
-        final_cost = solver.run(config.max_iterations)
+        result = _optimise(graph, config, PoseGraphSolver(graph, config, progress))
     except RuntimeError as error:  # GTSAM's exceptions all arrive as this
         raise InputError(f"the pose graph cannot be solved: {error}") from error
+    return replace(result, duration_ms=1e3 * (time.perf_counter() - begin_s))
+
+
+def _optimise(
+    graph: PoseGraph, config: PoseGraphConfig, solver: PoseGraphSolver
+) -> PoseGraphResult:
+    is_outlier = np.zeros(len(graph.edges), bool)
+    loops, trusted = None, ~is_outlier
+    if config.method == "gnc":
+        loops = loop_consistency(graph)
+        if loops.consistent.any():
+            trusted = loops.consistent | graph.is_odometry
+    given = "file" if graph.has_poses else "odometry"
+    given_poses = graph.poses if graph.has_poses else spanning_tree_poses(graph)
+    start, poses = _best_start(graph, {given: given_poses}, trusted)
+    solver.start_from(poses)
+    if loops is not None:
+        is_outlier = find_wrong_loops(graph, solver, config, loops)
+    solver.weigh(np.where(is_outlier, 0.0, 1.0))
+    final_cost = solver.run(config.max_iterations)
     return PoseGraphResult(
         graph=graph.with_poses(solver.poses),
         method=config.method,
@@ -94,7 +100,6 @@ def optimise_pose_graph(
         final_cost=final_cost,
         iterations=solver.iterations,
         is_outlier=is_outlier,
-        duration_ms=1e3 * (time.perf_counter() - begin_s),
     )
 
 
@@ -104,7 +109,7 @@ def optimise_pose_graph(
 def _best_start(graph: PoseGraph, given: dict[str, Array], trusted: Mask) -> tuple[str, Array]:
     """Name and poses of the cheapest initial value, judged by the trusted edges (M,) alone.
 
-    Where several vertices are fixed, the given poses: the chordal solution knows of one anchor.
+    If several vertices are fixed, the given poses: the chordal solution fixes only one.
     """
     if graph.fixed.sum() > 1:
         return next(iter(given.items()))

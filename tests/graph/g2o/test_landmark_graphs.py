@@ -154,7 +154,7 @@ def test_a_file_of_another_program(tmp_path: Path, caplog: pytest.LogCaptureFixt
     np.testing.assert_allclose(np.diag(np.linalg.inv(edge.covariance)), [4, 5, 6, 1, 2, 3])
     assert isinstance(prior, PosePrior)  # nothing held it: the first keyframe does
     assert prior.keyframe_id == 0
-    assert "1 landmarks that nothing sees" in caplog.text
+    assert "1 landmarks without observations" in caplog.text
     assert "unknown type ROBOTLASER1" in caplog.text
     assert adjust(tables, camera).final_cost < 1
 

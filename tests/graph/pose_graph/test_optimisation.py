@@ -11,7 +11,7 @@ from bmask_slam.graph.factors.gnc import truncated_weights
 from bmask_slam.graph.g2o.pose_graphs import read_g2o
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.pose_graph.factors import chordal_poses, pose_graph_cost
-from bmask_slam.graph.pose_graph.loop_consistency import loop_support
+from bmask_slam.graph.pose_graph.loop_consistency import loop_consistency
 from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
 from bmask_slam.graph.pose_graph.optimisation import (
     PoseGraphConfig,
@@ -200,10 +200,10 @@ def test_a_prediction_is_what_the_cost_rises_by(planar: bool) -> None:
 
 
 @BOTH
-def test_right_loops_that_close_a_long_drift_are_kept_without_support(planar: bool) -> None:
+def test_right_loops_that_close_a_long_drift_are_kept_without_consistent_ones(planar: bool) -> None:
     graph = far_loops(ring(120, planar, seed=4, sigma=0.02))
     loops = np.flatnonzero(~graph.is_odometry)
-    assert 0 < loop_support(graph).supported.sum() < len(loops) - 5
+    assert 0 < loop_consistency(graph).consistent.sum() < len(loops) - 5
     wrong = np.zeros(len(graph.edges), bool)
     wrong[loops[PER_LAP + 2 :: 4]] = True
     T = graph.measurements.copy()
@@ -214,17 +214,17 @@ def test_right_loops_that_close_a_long_drift_are_kept_without_support(planar: bo
 
 
 @BOTH
-def test_loops_are_confirmed_by_their_neighbours(planar: bool) -> None:
+def test_loops_are_consistent_with_their_neighbours(planar: bool) -> None:
     graph, wrong = with_wrong_loops(ring(90, planar, seed=2, sigma=0.01), 10)
-    supported = loop_support(graph).supported
-    assert not supported[wrong].any()
-    assert supported[~wrong & ~graph.is_odometry].mean() > 0.95
+    consistent = loop_consistency(graph).consistent
+    assert not consistent[wrong].any()
+    assert consistent[~wrong & ~graph.is_odometry].mean() > 0.95
     turned = graph.edges[:, ::-1].copy(), inverse(graph.measurements)
     loops = ~graph.is_odometry
     edges, measurements = graph.edges.copy(), graph.measurements.copy()
     edges[loops], measurements[loops] = turned[0][loops], turned[1][loops]
-    again = loop_support(replace(graph, edges=edges, measurements=measurements)).supported
-    assert (again == supported).mean() > 0.98
+    again = loop_consistency(replace(graph, edges=edges, measurements=measurements)).consistent
+    assert (again == consistent).mean() > 0.98
     assert PER_LAP > 6  # no loop of a lap lies in the window of another lap's
 
 
@@ -236,7 +236,7 @@ def test_wrong_loops_are_found_where_the_stated_information_is_off(
     """Information 1e-5 of what the noise is (as parking-garage's): random loops would fit in."""
     graph, wrong = with_wrong_loops(ring(90, planar, seed=2, sigma=0.01), 20)
     graph = replace(graph, information=stated * graph.information)
-    assert 1.0 <= loop_support(graph).noise_scale / scale < 10.0
+    assert 1.0 <= loop_consistency(graph).noise_scale / scale < 10.0
     result = optimise_pose_graph(graph, PoseGraphConfig(method="gnc"))
     assert result.is_outlier[wrong].all()
     assert result.is_outlier[~wrong].sum() <= 1
