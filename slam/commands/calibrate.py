@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TypeAlias
 
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
+from bmask_slam.commands.arguments import Commands
 
 TEXT = "calibrate the camera of a run from its own observations, and write camera.yaml"
 MORE = """\
@@ -18,7 +17,7 @@ matched leans toward that camera: --rounds 2 runs the sequence again with the ca
 calibrates that run. Use the result with "bmask-slam run SEQUENCE --camera RUN/camera.yaml"."""
 
 
-def add_calibrate(commands: _Commands) -> None:
+def add_calibrate(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("calibrate", help=TEXT, description=f"{TEXT}. {MORE}")
     parser.set_defaults(handler=_calibrate)
@@ -30,12 +29,21 @@ def add_calibrate(commands: _Commands) -> None:
     parser.add_argument(
         "--sequence", type=Path, metavar="DIR", help="the run's images (default: where they were)"
     )
+    _add_metric_arguments(parser)
     parser.add_argument(
-        "--reference",
-        type=Path,
-        metavar="GT",
-        help="TUM trajectory in metres, or sequence with one",
+        "--fix", action="append", default=[], metavar="NAME", help="keep a parameter, such as k1"
     )
+    parser.add_argument("--k3", action="store_true", help="estimate k3 too")
+    parser.add_argument(
+        "--rounds", type=int, default=1, metavar="N", help="calibrate N times (default: 1)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print only the file's path")
+
+
+def _add_metric_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what gives the scale: a reference, or a known distance."""
+    text = "TUM trajectory in metres, or sequence with one"
+    parser.add_argument("--reference", type=Path, metavar="GT", help=text)
     parser.add_argument(
         "--hand-eye",
         action="store_true",
@@ -51,14 +59,6 @@ def add_calibrate(commands: _Commands) -> None:
     parser.add_argument(
         "--anchor-sigma", type=float, default=0.01, metavar="M", help="of these (default: 0.01)"
     )
-    parser.add_argument(
-        "--fix", action="append", default=[], metavar="NAME", help="keep a parameter, such as k1"
-    )
-    parser.add_argument("--k3", action="store_true", help="estimate k3 too")
-    parser.add_argument(
-        "--rounds", type=int, default=1, metavar="N", help="calibrate N times (default: 1)"
-    )
-    parser.add_argument("--quiet", action="store_true", help="print only the file's path")
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
+from bmask_slam.commands.arguments import Commands
 from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
     from bmask_slam.comparison.experiment.options import CompareOptions
-
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
 TEXT = "compare configurations and other systems on sequences, with a report"
 MORE = """\
@@ -26,7 +25,7 @@ examples:
 """
 
 
-def add_compare(commands: _Commands) -> None:
+def add_compare(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser(
         "compare",

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
-from bmask_slam.commands.run import CONFIG_HELP, SET_HELP
-from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
-from bmask_slam.commands.view import add_view_arguments, view_options
+from bmask_slam.commands.arguments import (
+    Commands,
+    add_config_arguments,
+    add_segmenter_arguments,
+    add_view_arguments,
+    chosen_config,
+    view_options,
+)
 
 if TYPE_CHECKING:
+    from bmask_slam.live.live_slam import LiveOptions, LiveSlam
     from bmask_slam.live.sources.opening import SourceOptions
-
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
+    from bmask_slam.live.sources.source import Source
 
 TEXT = "track a source of frames as they come"
 MORE = """\
@@ -27,7 +31,7 @@ folder in TUM layout, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the Re
 plugged in, or opencv:N for device N of OpenNI 2"""
 
 
-def add_live(commands: _Commands) -> None:
+def add_live(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("live", help=TEXT, description=f"{TEXT}. {MORE}")
     parser.set_defaults(handler=_live)
@@ -40,8 +44,7 @@ def add_live(commands: _Commands) -> None:
         help="play a recording at its own speed, dropping frames that there is no time for",
     )
     _add_source_arguments(parser)
-    parser.add_argument("--config", metavar="F", help=CONFIG_HELP)
-    parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
+    add_config_arguments(parser)
     parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--map", action="store_true", help="also a dense map, as by bmask-slam map")
@@ -86,47 +89,50 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
 
 
 def _live(arguments: argparse.Namespace) -> int:
-    from bmask_slam.config.configuration import find_config, resolve
-    from bmask_slam.evaluation import format_table
-    from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+    from bmask_slam.live.live_slam import LiveSlam
     from bmask_slam.live.play import PlayOptions, play
-    from bmask_slam.live.sources.bags import is_bag
     from bmask_slam.live.sources.opening import open_source
-    from bmask_slam.run_folder.folder import free_run_path
     from bmask_slam.runtime.progress import console_log
-    from bmask_slam.system_config import SystemConfig
 
-    file = find_config(arguments.config) if arguments.config else None
-    plain = resolve(SystemConfig, file, arguments.set)
-    segmenter = segmenter_options(arguments, plain.semantics.segmenter)
-    config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
+    config = chosen_config(arguments).config
     with (
         console_log(),
         closing(open_source(arguments.source, source_options(arguments))) as source,
     ):
-        out = arguments.out or free_run_path(f"{source.name}-live")
-        folder = Path(arguments.source)
-        images = folder if folder.is_dir() and not is_bag(folder) else Path()
-        view = view_options(arguments, arguments.view)
-        options = LiveOptions(
-            out,
-            arguments.overwrite,
-            source.groundtruth,
-            view,
-            images,
-            source.name,
-            arguments.map,
-        )
+        options = _live_options(arguments, source)
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
             ended_by = play(slam, source, PlayOptions(not source.waits, quiet=arguments.quiet))
     if arguments.quiet:
-        print(out)
+        print(options.out)
     else:
-        left_out = source.counts.line()
-        print(f"{format_table(slam.rows)}\n\nRun folder  {out}")
-        if slam.dense is not None:
-            print(f"Dense map   {out / 'dense'}, {slam.dense.points} points")
-        if left_out:
-            print(f"Source      {left_out}")
+        _print_summary(slam, source)
     return 128 + ended_by if ended_by else 0
+
+
+def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
+    """Where the run is written, and what the source says about itself."""
+    from bmask_slam.live.live_slam import LiveOptions
+    from bmask_slam.live.sources.bags import is_bag
+    from bmask_slam.run_folder.folder import free_run_path
+
+    folder = Path(arguments.source)
+    return LiveOptions(
+        out=arguments.out or free_run_path(f"{source.name}-live"),
+        overwrite=arguments.overwrite,
+        reference=source.groundtruth,
+        view=view_options(arguments, arguments.view),
+        images=folder if folder.is_dir() and not is_bag(folder) else Path(),
+        title=source.name,
+        dense=arguments.map,
+    )
+
+
+def _print_summary(slam: LiveSlam, source: Source) -> None:
+    from bmask_slam.evaluation import format_table
+
+    print(f"{format_table(slam.rows)}\n\nRun folder  {slam.options.out}")
+    if slam.dense is not None:
+        print(f"Dense map   {slam.options.out}/dense, {slam.dense.points} points")
+    if left_out := source.counts.line():
+        print(f"Source      {left_out}")

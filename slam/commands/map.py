@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
-from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.arguments import Commands, add_segmenter_arguments, segmenter_options
 
 if TYPE_CHECKING:
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
-
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
 TEXT = "make a dense map of a finished run: cloud, mesh, floor plan"
 MORE = """\
@@ -20,7 +18,7 @@ that are finished are not done again. Points get labels if the run had a segment
 --segmenter or --masks; what became of a label in the run's map shows here when called again."""
 
 
-def add_map(commands: _Commands) -> None:
+def add_map(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("map", help=TEXT, description=f"{TEXT}. {MORE}")
     parser.set_defaults(handler=_map)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
+from bmask_slam.commands.arguments import Commands
 from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
     from bmask_slam.graph.batch.iteration import Progress
     from bmask_slam.graph.pose_graph.optimisation import Method
-
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
 TEXT = "optimise a run folder or a graph in g2o format, offline"
 MORE = """\
@@ -22,7 +21,7 @@ along. So does a g2o file with observations of landmarks, as `bmask-slam export`
 pose graph, 2-D or 3-D, are written to the file --out."""
 
 
-def add_optimise(commands: _Commands) -> None:
+def add_optimise(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("optimise", help=TEXT, description=f"{TEXT}. {MORE}")
     parser.set_defaults(handler=_optimise)

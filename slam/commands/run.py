@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
-from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.arguments import (
+    ChosenConfig,
+    Commands,
+    add_config_arguments,
+    add_segmenter_arguments,
+    chosen_config,
+)
 from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
     from bmask_slam.offline.runner import RunSummary
 
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
-
-CONFIG_HELP = "YAML file, or the name of a shipped one such as 'paper'"
-SET_HELP = "one value of the configuration, such as tracking.min_inliers=20; may be repeated"
 EPILOG = """\
 long runs and known places:
   bmask-slam run hall --out h --checkpoint-every 300   one that may be killed
@@ -25,6 +26,7 @@ long runs and known places:
   bmask-slam run hall3 --localise h                    only where the camera was in that map
 """
 OPTIONS = (
+    "sequence",
     "out",
     "camera",
     "reference",
@@ -37,7 +39,7 @@ OPTIONS = (
 )
 
 
-def add_run(commands: _Commands) -> None:
+def add_run(commands: Commands) -> None:
     """Add the command to the parser."""
     text = "run the system over a sequence and write a run folder"
     parser = commands.add_parser(
@@ -51,19 +53,21 @@ def add_run(commands: _Commands) -> None:
     parser.add_argument("sequence", type=Path, nargs="?", help="folder in TUM layout")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<sequence>, numbered)")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --out holds")
-    parser.add_argument("--config", metavar="F", help=CONFIG_HELP)
-    parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=SET_HELP)
+    add_config_arguments(parser)
     parser.add_argument("--print-config", action="store_true", help="print it resolved, and end")
     parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
     parser.add_argument("--reference", type=Path, metavar="F", help="trajectory to compare to")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--stride", type=int, metavar="N", help="take every N-th frame")
-    parser.add_argument(
-        "--checkpoint-every",
-        type=int,
-        metavar="N",
-        help="write a checkpoint every N frames; 300 is a good number",
-    )
+    _add_map_arguments(parser)
+    add_segmenter_arguments(parser, "light")
+    parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
+
+
+def _add_map_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add checkpoints, the map to begin with, and what is written beside the usual files."""
+    text = "write a checkpoint every N frames; 300 is a good number"
+    parser.add_argument("--checkpoint-every", type=int, metavar="N", help=text)
     parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with a killed run")
     parser.add_argument(
         "--continue", dest="map", type=Path, metavar="MAP", help="run or map file to go on with"
@@ -80,45 +84,41 @@ def add_run(commands: _Commands) -> None:
         const="covariances=true",
         help="also write covariances.txt: how sure the graph is of each keyframe",
     )
-    add_segmenter_arguments(parser, "light")
-    parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from bmask_slam.config.configuration import dump, find_config, resolve
-    from bmask_slam.offline.runner import RunOptions, resume, run
+    from bmask_slam.config.configuration import dump
     from bmask_slam.runtime.progress import console_log
-    from bmask_slam.system_config import SystemConfig
 
-    file = find_config(arguments.config) if arguments.config else None
-    plain = resolve(SystemConfig, file, arguments.set)
-    segmenter = segmenter_options(arguments, plain.semantics.segmenter)
-    config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
+    chosen = chosen_config(arguments)
     if arguments.print_config:
-        print(dump(config), end="")
+        print(dump(chosen.config), end="")
         return 0
-    given: dict[str, Any] = {"quiet": arguments.quiet}
-    given |= {name: v for name in OPTIONS if (v := getattr(arguments, name)) is not None}
-    if arguments.sequence:
-        given["sequence"] = arguments.sequence
-    if arguments.resume:
-        if file or arguments.set or config != plain:
-            given["config"] = config
-        if arguments.overwrite:
-            raise InputError("--overwrite: would delete what --resume needs; give one of the two")
-        with console_log():
-            summary = resume(arguments.resume, given)
-    elif arguments.sequence:
-        given |= {"config": config, "config_name": file.stem if file else ""}
-        with console_log():
-            summary = run(RunOptions(**given, overwrite=arguments.overwrite))
-    else:
-        raise InputError("run: no sequence; give a folder in TUM layout, or --resume RUN")
+    with console_log():
+        summary = _run_or_resume(arguments, chosen)
     if summary is None:
         print(arguments.resume if arguments.quiet else f"{arguments.resume} is finished already")
         return 0
     _print_summary(summary, arguments.quiet)
     return 128 + summary.stopped_by if summary.stopped_by else 0
+
+
+def _run_or_resume(arguments: argparse.Namespace, chosen: ChosenConfig) -> RunSummary | None:
+    """How the run ended; None if the one to be resumed is finished already."""
+    from bmask_slam.offline.runner import RunOptions, resume, run
+
+    given: dict[str, Any] = {"quiet": arguments.quiet}
+    given |= {name: v for name in OPTIONS if (v := getattr(arguments, name)) is not None}
+    if arguments.resume:
+        if not chosen.is_default:
+            given["config"] = chosen.config
+        if arguments.overwrite:
+            raise InputError("--overwrite: would delete what --resume needs; give one of the two")
+        return resume(arguments.resume, given)
+    if not arguments.sequence:
+        raise InputError("run: no sequence; give a folder in TUM layout, or --resume RUN")
+    given |= {"config": chosen.config, "config_name": chosen.name}
+    return run(RunOptions(**given, overwrite=arguments.overwrite))
 
 
 def _print_summary(summary: RunSummary, quiet: bool) -> None:

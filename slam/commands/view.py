@@ -4,49 +4,25 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
+
+from bmask_slam.commands.arguments import Commands, add_view_arguments, view_options
 
 if TYPE_CHECKING:
-    from bmask_slam.viewer.scene import ViewOptions
-
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
+    pass
 
 TEXT = "show a finished run in Rerun"
 MORE = """\
 The map with labels and objects, the camera's path, loops, the dense cloud where there is one, and
 status and times of every frame. Needs  pip install 'bmask-slam[view]'."""
-WEB_PORT = 9090
 
 
-def add_view(commands: _Commands) -> None:
+def add_view(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser("view", help=TEXT, description=f"{TEXT}. {MORE}")
     parser.set_defaults(handler=_view)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a finished run")
     add_view_arguments(parser)
-
-
-def add_view_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add where it goes: --record or --serve."""
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--record", type=Path, metavar="F.rrd", help="write a Rerun recording")
-    where.add_argument(
-        "--serve",
-        type=int,
-        nargs="?",
-        const=WEB_PORT,
-        default=0,
-        metavar="PORT",
-        help=f"show it in a browser (port {WEB_PORT})",
-    )
-
-
-def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
-    """What was asked for; ``window``: Rerun's own window, if nothing else was."""
-    from bmask_slam.viewer.scene import ViewOptions
-
-    elsewhere = arguments.record is not None or arguments.serve > 0
-    return ViewOptions(arguments.record, arguments.serve, window and not elsewhere)
 
 
 def _view(arguments: argparse.Namespace) -> int:

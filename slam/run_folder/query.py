@@ -14,15 +14,25 @@ from bmask_slam.run_folder.semantic_files import SavedObject, read_objects
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Objects of one label, the most probable first, and the number of objects of each label."""
+    """The objects that were asked for.
+
+    Attributes:
+        label: of all of them; "" for any.
+        objects: by label, the most probable first; or the most probable of any label first.
+        counts: number of objects of the run by label.
+        omitted: number of objects beyond those that were asked for.
+    """
 
     label: str
     objects: tuple[SavedObject, ...]
     counts: dict[str, int]
+    omitted: int = 0
 
 
-def query(run: Path, label: str | None) -> Answer:
-    """The objects of a run with this most probable label; all objects without a label.
+def query(run: Path, label: str | None, most: int | None = None) -> Answer:
+    """The objects of a run with this most probable label; of all labels without one.
+
+    With ``most`` only so many, the most probable.
 
     Raises:
         InputError: the run has no objects.json, or its label set lacks the label.
@@ -36,7 +46,10 @@ def query(run: Path, label: str | None) -> Answer:
         )
     chosen = [o for o in objects if label in (None, o.label)]
     order = sorted(chosen, key=lambda o: (o.label, -o.probability, -len(o.keyframes), o.id))
-    return Answer(label or "", tuple(order), counts)
+    if most is None:
+        return Answer(label or "", tuple(order), counts)
+    surest = sorted(order, key=lambda o: -o.probability)
+    return Answer(label or "", tuple(surest[:most]), counts, max(len(surest) - most, 0))
 
 
 def format_answer(answer: Answer) -> str:
@@ -50,6 +63,8 @@ def format_answer(answer: Answer) -> str:
         size = " ".join(f"{v:5.2f}" for v in (*-np.sort(-o.box.size_m[:2]), o.box.size_m[2]))
         seen = _ranges(o.keyframes.tolist())
         lines.append(f"{o.label:<16}{o.id:>5}  {place:<24}{size:<19}{o.probability:>5.2f}  {seen}")
+    if answer.omitted:
+        lines.append(f"and {answer.omitted} objects that are less sure: --all")
     return "\n".join(lines)
 
 

@@ -15,6 +15,7 @@ from repository import ROOT
 
 import bmask_slam.rendering.sequence
 from bmask_slam import cli
+from bmask_slam.commands import sequences
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
@@ -226,7 +227,7 @@ def test_expected_errors(capsys, monkeypatch, error, status: int, expected: str)
     def fail(arguments: object) -> int:
         raise error
 
-    monkeypatch.setattr(cli, "_info", fail)
+    monkeypatch.setattr(sequences, "_info", fail)
     found = call(capsys, "info", "x")
     assert found[0] == status
     assert found[2].startswith(expected)
@@ -236,7 +237,7 @@ def test_unknown_errors_keep_their_traceback(monkeypatch) -> None:
     def fail(arguments: object) -> int:
         raise PermissionError(13, "Permission denied", "f")
 
-    monkeypatch.setattr(cli, "_info", fail)
+    monkeypatch.setattr(sequences, "_info", fail)
     with pytest.raises(PermissionError):
         cli.main(["info", "x"])
 

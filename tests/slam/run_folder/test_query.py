@@ -72,6 +72,22 @@ def test_the_surest_comes_first(run: Path, capsys: pytest.CaptureFixture[str]) -
     assert second.endswith("0-2, 5")
 
 
+def test_only_the_surest_objects_are_listed_unless_all_are_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    things = [thing(k, 1 + k % 3, 0.5 + k / 100, [k]) for k in range(12)]
+    write_objects(tmp_path / OBJECTS, MapObjects(NAMES, things, np.array([0.0, -1.0, 0.0])))
+    assert [o.id for o in query(tmp_path, None, 10).objects] == list(range(11, 1, -1))
+    assert main(["query", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 12
+    assert lines[-1] == "and 2 objects that are less sure: --all"
+    assert main(["query", str(tmp_path), "--all"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 13
+    assert main(["query", str(tmp_path), "chair"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 5
+
+
 def test_labels_that_are_not_there(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no cup; the run holds chair (2), desk (1)" in format_answer(query(run, "cup"))
     assert main(["query", str(run), "horse"]) == 1

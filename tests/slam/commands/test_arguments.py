@@ -6,7 +6,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from bmask_slam.commands.segmenter_arguments import add_segmenter_arguments, segmenter_options
+from bmask_slam.commands.arguments import add_segmenter_arguments, segmenter_options
 from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 

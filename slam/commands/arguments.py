@@ -1,0 +1,114 @@
+"""Arguments that several commands share: configuration, segmenter, viewer."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+    from bmask_slam.system_config import SystemConfig
+    from bmask_slam.viewer.scene import ViewOptions
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
+
+WEB_PORT = 9090
+SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth or none"
+
+
+def add_segmenter_arguments(parser: argparse.ArgumentParser, default: str) -> None:
+    """Add --segmenter and what the segmenters need; ``default`` is for the help alone."""
+    parser.add_argument("--segmenter", metavar="NAME", help=f"{SEGMENTERS} (default: {default})")
+    parser.add_argument("--weights", metavar="F", help="weights file, or torchvision:NAME")
+    parser.add_argument(
+        "--proposals", type=Path, metavar="F", help="YOLOX network in ONNX that finds the boxes"
+    )
+    parser.add_argument(
+        "--masks", type=Path, metavar="F", help="of precomputed: COCO file or folder of label PNGs"
+    )
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="segment on a Ray cluster: host:port, auto or local"
+    )
+    parser.add_argument("--labels", metavar="F", help="label set: file, or coco, coco91, paper")
+
+
+def segmenter_options(arguments: argparse.Namespace, base: SegmenterOptions) -> SegmenterOptions:
+    """The options with what was given on the command line; files by their absolute paths.
+
+    Where a run's segmenter is not configured and --proposals is given, weak detections do not vote
+    on labels: a detector of photographs is too often wrong there. In the red kitchen its weak books
+    became the table.
+    """
+    from bmask_slam.labelling.config import SemanticsConfig
+
+    given = {name: getattr(arguments, name) for name in ("weights", "labels", "ray")}
+    given["name"] = arguments.segmenter
+    for name in ("proposals", "masks"):
+        path = getattr(arguments, name)
+        given[name] = path.absolute() if path else None
+    if arguments.proposals and base == SemanticsConfig().segmenter:
+        given["min_score"] = SemanticsConfig.object_score
+    if arguments.weights and Path(arguments.weights).is_file():
+        given["weights"] = str(Path(arguments.weights).absolute())
+    return replace(base, **{name: value for name, value in given.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class ChosenConfig:
+    """The configuration that was asked for.
+
+    Attributes:
+        config: of the system.
+        name: of its file, without the suffix; "" without a file.
+        is_default: nothing was asked for.
+    """
+
+    config: SystemConfig
+    name: str
+    is_default: bool
+
+
+def add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --config and --set."""
+    text = "YAML file, or the name of a shipped one such as 'paper'"
+    parser.add_argument("--config", metavar="F", help=text)
+    text = "one value of the configuration, such as tracking.min_inliers=20; may be repeated"
+    parser.add_argument("--set", metavar="A.B=C", action="append", default=[], help=text)
+
+
+def chosen_config(arguments: argparse.Namespace) -> ChosenConfig:
+    """The configuration by --config, --set and the segmenter's arguments. Raises InputError."""
+    from bmask_slam.config.configuration import find_config, resolve
+    from bmask_slam.system_config import SystemConfig
+
+    file = find_config(arguments.config) if arguments.config else None
+    plain = resolve(SystemConfig, file, arguments.set)
+    segmenter = segmenter_options(arguments, plain.semantics.segmenter)
+    config = replace(plain, semantics=replace(plain.semantics, segmenter=segmenter))
+    is_default = not (file or arguments.set) and config == plain
+    return ChosenConfig(config, file.stem if file else "", is_default)
+
+
+def add_view_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add where it goes: --record or --serve."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--record", type=Path, metavar="F.rrd", help="write a Rerun recording")
+    where.add_argument(
+        "--serve",
+        type=int,
+        nargs="?",
+        const=WEB_PORT,
+        default=0,
+        metavar="PORT",
+        help=f"show it in a browser (port {WEB_PORT})",
+    )
+
+
+def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
+    """What was asked for; ``window``: Rerun's own window, if nothing else was."""
+    from bmask_slam.viewer.scene import ViewOptions
+
+    elsewhere = arguments.record is not None or arguments.serve > 0
+    return ViewOptions(arguments.record, arguments.serve, window and not elsewhere)

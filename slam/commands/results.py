@@ -1,0 +1,64 @@
+"""``bmask-slam query`` and ``export``: what a finished run holds."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bmask_slam.commands.arguments import Commands
+
+MOST = 10
+QUERY = "say where a run has found the objects of a label"
+QUERY_MORE = """\
+For each object: position and size in metres in the run's world frame (the first keyframe's
+camera; sizes are length, width, height), how sure its label is, and the keyframes that saw it.
+Without a label the surest are listed. objects.json in the run folder holds the same and more."""
+EXPORT = "write a trajectory, a graph or landmarks in a format that other programs read"
+EXPORT_MORE = """\
+From a run folder: its trajectory as tum, kitti or euroc, its graph with landmarks and what was seen
+of them as g2o, its landmarks as ply. From a trajectory: tum, kitti, euroc, or its positions as ply.
+From a g2o file with landmarks: ply. KITTI's format has no stamps: they go to a second file."""
+
+
+def add_query(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser("query", help=QUERY, description=f"{QUERY}. {QUERY_MORE}")
+    parser.set_defaults(handler=_query)
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run with a segmenter")
+    text = f'class name, such as "chair"; default: the {MOST} surest objects of all classes'
+    parser.add_argument("label", nargs="?", help=text)
+    parser.add_argument("--all", action="store_true", help="without a label: all objects")
+
+
+def _query(arguments: argparse.Namespace) -> int:
+    from bmask_slam.run_folder.query import format_answer, query
+
+    limited = arguments.label is None and not arguments.all
+    print(format_answer(query(arguments.run, arguments.label, MOST if limited else None)))
+    return 0
+
+
+def add_export(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser("export", help=EXPORT, description=f"{EXPORT}. {EXPORT_MORE}")
+    parser.set_defaults(handler=_export)
+    parser.add_argument("input", type=Path, metavar="INPUT", help="run folder, trajectory, or g2o")
+    formats = ("tum", "kitti", "euroc", "g2o", "ply")
+    parser.add_argument("--format", choices=formats, required=True, help="what to write")
+    parser.add_argument("--out", type=Path, required=True, metavar="F", help="file to write")
+    parser.add_argument(
+        "--times", type=Path, metavar="F", help="stamps of a KITTI trajectory, one a line"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print only the paths")
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from bmask_slam.run_folder.export import export
+    from bmask_slam.runtime.progress import console_log
+
+    with console_log():
+        exported = export(arguments.input, arguments.format, arguments.out, arguments.times)
+    print("\n".join(str(path) for path in exported.files))
+    if not arguments.quiet:
+        print(f"\n{exported.contents}")
+    return 0

@@ -1,0 +1,118 @@
+"""``bmask-slam render``, ``info`` and ``download``: sequences, made, described and fetched."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from pathlib import Path
+
+from bmask_slam.commands.arguments import Commands
+
+DOWNLOAD = "fetch published recordings (TUM, Bonn, ICL-NUIM) from where they were published"
+DOWNLOAD_MORE = """\
+A download that was interrupted goes on where it stopped. Size and SHA-256 are checked where they
+are known; where they are not, those of the first download are kept in DIR/SHA256SUMS, and later
+ones must agree. compare finds the recordings in DIR by --data DIR."""
+
+
+def add_render(commands: Commands) -> None:
+    """Add the command to the parser."""
+    text = "render an indoor sequence with exact ground truth, in TUM layout"
+    parser = commands.add_parser("render", help=text, description=text)
+    parser.set_defaults(handler=_render)
+    scenes = "office, busy_office, crowded_office, living_room, corridor or room"
+    parser.add_argument("name", help=scenes)
+    parser.add_argument("--out", type=Path, required=True, help="folder to make")
+    parser.add_argument("--frames", type=int, metavar="N", help="number of frames (default: all)")
+    parser.add_argument(
+        "--rounds", type=int, default=1, metavar="N", help="walk the corridor N times"
+    )
+    parser.add_argument("--fps", type=float, default=30.0, help="frame rate (default: 30)")
+    parser.add_argument("--width", type=int, default=640, metavar="PX", help="default: 640")
+    parser.add_argument("--height", type=int, default=480, metavar="PX", help="default: 480")
+    parser.add_argument("--seed", type=int, default=0, help="of people, noise, textures, room")
+    parser.add_argument("--people", type=int, default=0, metavar="N", help="people in the scene")
+    parser.add_argument(
+        "--carry", action="store_true", help="the first carries a box, pulls a chair"
+    )
+    parser.add_argument("--no-noise", action="store_true", help="exact depth and colours")
+    parser.add_argument("--exposure-change", action="store_true", help="brightness that varies")
+    parser.add_argument("--motion-blur", action="store_true", help="blur along the motion")
+    parser.add_argument(
+        "--depth-delay-ms", type=float, default=0.0, metavar="MS", help="depth taken so much later"
+    )
+    parser.add_argument("--sweeping", action="store_true", help="tilt and roll, as to calibrate")
+    parser.add_argument("--true-depth", action="store_true", help="also write noise-free depth")
+    parser.add_argument("--normals", action="store_true", help="also write surface normals")
+    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+
+
+def _render(arguments: argparse.Namespace) -> int:
+    from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+    from bmask_slam.runtime.progress import console_log, counting_bar
+
+    names = (f.name for f in fields(RenderConfig) if f.name != "noise")
+    given = {name: getattr(arguments, name) for name in names}
+    config = RenderConfig(noise=not arguments.no_noise, **given)
+    with console_log(), counting_bar(arguments.quiet) as progress:
+        folder = render_sequence(config, arguments.out, progress)
+    print(folder if arguments.quiet else f"Sequence {folder}; next: bmask-slam run {folder}")
+    return 0
+
+
+def add_info(commands: Commands) -> None:
+    """Add the command to the parser."""
+    text = "say what a sequence holds: frames, camera, depth, ground truth; of a bag its topics"
+    parser = commands.add_parser("info", help=text, description=text)
+    parser.set_defaults(handler=_info)
+    parser.add_argument("sequence", type=Path, help="folder in TUM layout, or ROS bag")
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from bmask_slam.live.sources.bags import format_topics, is_bag, open_bag
+    from bmask_slam.runtime.progress import console_log
+    from bmask_slam.sequences import format_info, open_sequence, sequence_info
+
+    if is_bag(arguments.sequence):
+        with open_bag(arguments.sequence) as bag:
+            print(format_topics(bag))
+        return 0
+    with console_log():
+        info = sequence_info(open_sequence(arguments.sequence))
+    print(format_info(info))
+    return 0
+
+
+def add_download(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "download", help=DOWNLOAD, description=f"{DOWNLOAD}. {DOWNLOAD_MORE}"
+    )
+    parser.set_defaults(handler=_download)
+    parser.add_argument("names", nargs="*", metavar="SEQUENCE", help="such as tum/freiburg1_xyz")
+    parser.add_argument("--to", type=Path, default=Path("data"), metavar="DIR",
+                        help="where sequences go, each to DIR/SET/NAME (data)")  # fmt: skip
+    parser.add_argument("--list", action="store_true", help="name all sequences, with sizes")
+    parser.add_argument("--keep-archive", action="store_true", help="do not remove the archive")
+    parser.add_argument("--catalogue", type=Path, metavar="F", help="another list of sequences")
+    parser.add_argument("--quiet", action="store_true", help="print only the folders' paths")
+
+
+def _download(arguments: argparse.Namespace) -> int:
+    from bmask_slam.datasets.catalogue import find, format_catalogue, read_catalogue
+    from bmask_slam.datasets.obtain import obtain
+    from bmask_slam.graph.errors import InputError
+    from bmask_slam.runtime.progress import byte_bars, console_log
+
+    catalogue = read_catalogue(arguments.catalogue)
+    if arguments.list:
+        print(format_catalogue(catalogue))
+        return 0
+    if not arguments.names:
+        raise InputError("download: no sequence is named; --list names all")
+    for recording in [find(catalogue, name) for name in arguments.names]:
+        with console_log(), byte_bars(arguments.quiet) as progress:
+            folder = obtain(recording, arguments.to, progress, arguments.keep_archive)
+        about = f"  ({recording.title}; {recording.licence}; {recording.page})"
+        print(folder if arguments.quiet else f"Sequence {folder}{about}")
+    return 0
