@@ -50,8 +50,6 @@ def tsdf_mesh(
         raise InputError(f"no mesh: no keyframe has depth below {MAX_DEPTH_M:g} m")
     mesh = volume.extract_triangle_mesh(weight_threshold=1.0).to_legacy()
     mesh.compute_vertex_normals()
-    colours = np.clip(np.asarray(mesh.vertex_colors), 0, 1)  # rounding errors exceed the range
-    mesh.vertex_colors = load_open3d().utility.Vector3dVector(colours)
     return mesh
 
 

@@ -75,7 +75,7 @@ def _run_folder(arguments: argparse.Namespace, progress: Progress) -> str:
 
 def _file(arguments: argparse.Namespace, progress: Progress) -> str:
     from bmask_slam.graph.g2o.landmark_graphs import has_landmarks
-    from bmask_slam.refinement.adjustment_report import format_adjustment
+    from bmask_slam.refinement.adjustment import format_adjustment
     from bmask_slam.refinement.optimise import adjust_file, format_result, optimise_file
 
     for option in ("reference", "overwrite"):

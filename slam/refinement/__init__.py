@@ -1,1 +1,1 @@
-"""TODO."""
+"""Offline refinement: bundle adjustment of a finished run, optimisation of g2o files."""

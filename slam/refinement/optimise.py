@@ -1,4 +1,4 @@
-"""Offline optimisation of a g2o file, with landmarks or without: read, optimise, write, draw."""
+"""Offline optimisation of a g2o file, with or without landmarks: read, optimise, write, draw."""
 
 from __future__ import annotations
 
@@ -20,8 +20,13 @@ from bmask_slam.graph.pose_graph.optimisation import (
     optimise_pose_graph,
 )
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph
-from bmask_slam.refinement.adjustment_plot import View, check_picture, draw_before_after
-from bmask_slam.refinement.adjustment_report import Placed, draw_adjustment
+from bmask_slam.refinement.adjustment_plot import (
+    GraphSnapshot,
+    View,
+    check_picture,
+    draw_adjustment,
+    draw_before_after,
+)
 
 
 def optimise_file(
@@ -31,11 +36,11 @@ def optimise_file(
     plot: Path | None = None,
     progress: Progress = lambda iteration, cost: None,
 ) -> PoseGraphResult:
-    """Optimise a g2o file and write the graph, without the edges found wrong, to ``out``.
+    """Optimise a g2o file and write the graph, without its outlier edges, to ``out``.
 
     Raises:
-        InputError: an output whose folder is not there, a picture of a type that is
-            not known, or a file that ``read_g2o`` or the solver refuses.
+        InputError: the output's folder is not there, the type of the picture is not known, or
+            ``read_g2o`` or the solver refuses the file.
     """
     _check_output(out)
     if plot is not None:
@@ -56,7 +61,7 @@ def adjust_file(
     out: Path,
     plot: Path | None = None,
     progress: Progress = lambda iteration, cost: None,
-) -> tuple[Adjustment, Placed]:
+) -> tuple[Adjustment, GraphSnapshot]:
     """Adjust the graph with landmarks of a g2o file and write it, without outliers, to ``out``.
 
     Raises:
@@ -66,12 +71,12 @@ def adjust_file(
     if plot is not None:
         check_picture(plot)
     tables, camera = read_landmark_graph(file)
-    before = Placed.of(tables)
+    before = GraphSnapshot.of(tables)
     try:
         adjustment = adjust(tables, camera, progress=progress)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
-    after = Placed.of(tables)
+    after = GraphSnapshot.of(tables)
     write_landmark_graph(out, tables, camera)
     if plot is not None:
         draw_adjustment(plot, before, after, adjustment)
@@ -79,7 +84,7 @@ def adjust_file(
 
 
 def _check_output(out: Path) -> None:
-    """What would fail after the work is refused before it."""
+    """Raises InputError if the output could not be written, before the work is done."""
     if not out.parent.is_dir():
         raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
     if out.is_dir():
@@ -87,7 +92,7 @@ def _check_output(out: Path) -> None:
 
 
 def format_result(result: PoseGraphResult) -> str:
-    """A few lines on what was optimised, from where, and how it ended."""
+    """A few lines: the graph, the initial value, costs and outliers."""
     graph = result.graph
     rows = [
         ("vertices", f"{len(graph.ids)} ({'2-D' if graph.is_planar else '3-D'})"),
@@ -105,14 +110,11 @@ def format_result(result: PoseGraphResult) -> str:
     return "\n".join(f"{name:15}{value}" for name, value in rows)
 
 
-# --- picture -------------------------------------------------------------------------------------
-
-
 def _draw(result: PoseGraphResult, path: Path) -> None:
-    """Draw the graph at the poses given (or the odometry) and at the optimised ones.
+    """Draw the graph at the given poses (or the odometry) and at the optimised ones.
 
-    Odometry is blue, loops are grey, and those found wrong are red, in the left picture alone. A
-    3-D graph is seen from above when it is nearly flat, else in perspective.
+    Odometry is blue, loops are grey, and outliers are red and only in the left picture. A 3-D graph
+    is drawn from above when it is nearly flat, else in perspective.
     """
     graph = result.graph
     spatial = not graph.is_planar and not _is_flat(graph.poses[:, :3, 3])
@@ -134,7 +136,7 @@ def _is_flat(points: Array) -> bool:
 
 
 def _edges(graph: PoseGraph, is_outlier: Mask) -> list[tuple[Ints, str, float]]:
-    """Loops, wrong loops and odometry, with colours and widths."""
+    """Loops, outliers and odometry, with colours and widths."""
     odometry = graph.is_odometry
     return [
         (graph.edges[~odometry & ~is_outlier], "0.7", 0.4),

@@ -1,4 +1,4 @@
-"""``bmask-slam optimise RUN``: frames carried along exactly, a real run made no worse."""
+"""``bmask-slam optimise RUN``: frames move exactly with keyframes; a real run gets no worse."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp
 from bmask_slam.graph.smoother.storage import read_graph, write_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.offline.runner import RunOptions, run
-from bmask_slam.refinement.adjustment import carry_along
+from bmask_slam.refinement.carried_along import move_frames
 from bmask_slam.run_folder.map_file import read_map, read_run
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.map_state import world_of
@@ -33,16 +33,16 @@ def random_poses(count: int, seed: int) -> np.ndarray:
 def test_frames_move_with_the_world_when_all_keyframes_do() -> None:
     poses, T = random_poses(7, 0), random_poses(1, 1)[0]
     frames = Trajectory(np.arange(7.0), poses)
-    carried = carry_along(frames, np.array([1.0, 4.0]), poses[[1, 4]], T @ poses[[1, 4]])
+    carried = move_frames(frames, np.array([1.0, 4.0]), poses[[1, 4]], T @ poses[[1, 4]])
     np.testing.assert_allclose(carried.poses_world_camera, T @ poses, atol=1e-12)
 
 
-def test_a_keyframes_frame_follows_it_and_those_between_share() -> None:
+def test_a_keyframes_frame_moves_with_it_and_frames_between_are_blended() -> None:
     """Two keyframes turn about their own centres and shift; the frame halfway gets the half."""
     poses = make_pose(np.eye(3), np.arange(5.0)[:, None] * [1.0, 0, 0])
     turn = so3_exp(np.array([0, 0.2, 0]))
     after = np.stack([poses[1], make_pose(turn, poses[3, :3, 3] + [0, 0.4, 0])])
-    carried = carry_along(
+    carried = move_frames(
         Trajectory(np.arange(5.0), poses), np.array([1, 3.0]), poses[[1, 3]], after
     )
     T = carried.poses_world_camera
@@ -54,15 +54,15 @@ def test_a_keyframes_frame_follows_it_and_those_between_share() -> None:
     assert 0.45 < T[2, 1, 3] / by_second[1, 3] < 0.55
 
 
-def test_keyframes_of_other_trajectories_have_no_say() -> None:
+def test_keyframes_of_other_trajectories_do_not_count() -> None:
     poses, moved = random_poses(4, 2), random_poses(3, 3)
     stamps_s = np.array([1.0, np.nan, 2.5])  # of this run, of another one, of another segment
     before = np.stack([poses[1], poses[0], poses[2]])
     frames = Trajectory(np.arange(4.0), poses)
-    carried = carry_along(frames, stamps_s, before, moved)
+    carried = move_frames(frames, stamps_s, before, moved)
     expected = moved[0] @ inverse(poses[1]) @ poses
     np.testing.assert_allclose(carried.poses_world_camera, expected, atol=1e-12)
-    assert carry_along(frames, stamps_s[1:], before[1:], moved[1:]) is frames
+    assert move_frames(frames, stamps_s[1:], before[1:], moved[1:]) is frames
 
 
 # --- a real run -----------------------------------------------------------------------------------
@@ -122,16 +122,16 @@ def test_keyframes_landmarks_and_graph_fit_together(kitchen: Path, tmp_path: Pat
     )
     rows = np.searchsorted(old["id"], cloud["id"])
     moved = points - np.stack([old[axis] for axis in "xyz"], axis=1)[rows]
-    assert 0 < np.abs(moved[~inside]).max() < 0.05  # the others went along
-    # what is optimal stays: once more changes nothing, with observations kept
+    assert 0 < np.abs(moved[~inside]).max() < 0.05  # the others moved too
+    # a second adjustment changes nothing, and keeps the observations
     again = tmp_path / "again"
     assert optimise(out, "--out", again, "--quiet") == 0
     T = read_tum(again / "trajectory.txt").poses_world_camera
     assert np.abs(T - frames.poses_world_camera).max() < 5e-3
 
 
-def test_the_map_that_is_left_is_the_adjusted_one(kitchen: Path, tmp_path: Path) -> None:
-    """Its poses are the graph's, and other runs are localised in it, or go on with it."""
+def test_the_saved_map_is_the_adjusted_one(kitchen: Path, tmp_path: Path) -> None:
+    """Its poses are the graph's; a run can be localised in it, or continue it."""
     out = tmp_path / "adjusted"
     assert optimise(kitchen, "--out", out, "--quiet") == 0
     state, camera = read_map(out)
@@ -173,7 +173,7 @@ def test_the_exported_graph_is_adjusted_to_the_same_cost(kitchen: Path, tmp_path
     assert plot.stat().st_size > 1000
 
 
-def test_of_the_configuration_only_the_graphs_part_counts(kitchen: Path, tmp_path: Path) -> None:
+def test_only_the_graph_section_of_the_configuration_is_read(kitchen: Path, tmp_path: Path) -> None:
     """A run of another version, whose other settings have other names, is adjusted too."""
     other = tmp_path / "other"
     shutil.copytree(kitchen, other)
@@ -184,7 +184,7 @@ def test_of_the_configuration_only_the_graphs_part_counts(kitchen: Path, tmp_pat
         read_run(other)
 
 
-def test_what_cannot_be_is_refused(capsys, kitchen: Path, tmp_path: Path) -> None:
+def test_impossible_options_are_refused(capsys, kitchen: Path, tmp_path: Path) -> None:
     def error(*words: object) -> str:
         assert optimise(*words) == 1
         return capsys.readouterr().err
