@@ -1,4 +1,4 @@
-"""Anchors: the boxes of fixed shape, at every cell of every pyramid level, that the RPN judges."""
+"""Anchors: boxes of fixed shapes at every cell of every pyramid level, for the RPN."""
 
 from __future__ import annotations
 

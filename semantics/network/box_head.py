@@ -1,4 +1,4 @@
-"""The box head: what class a proposal holds, and its corrected box for each class."""
+"""The box head: class of each proposal, and a corrected box for each class."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class ClassifiedBoxes:
     """Detections of one image, best first.
 
     Attributes:
-        boxes: (N, 4) in pixels of the image that they were found in.
+        boxes: (N, 4) in pixels of their image.
         labels: (N,) int64, 1..classes-1.
         scores: (N,) probability of the label.
         distributions: (N, classes) probabilities, background first; they sum to 1.
@@ -71,7 +71,7 @@ class ClassifiedBoxes:
     distributions: Tensor
 
     def to(self, device: str) -> ClassifiedBoxes:
-        """The same on a device."""
+        """A copy on a device."""
         return ClassifiedBoxes(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 

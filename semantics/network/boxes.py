@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 MAX_LOG_SCALE = math.log(1000.0 / 16)
-"""A box grows at most by this factor (in the logarithm), so that exp cannot overflow."""
+"""Logarithm of the largest growth of a box, so that exp cannot overflow."""
 RPN_WEIGHTS = (1.0, 1.0, 1.0, 1.0)
 BOX_WEIGHTS = (10.0, 10.0, 5.0, 5.0)
 """Factors of the coded (dx, dy, dw, dh), which bring them to about unit variance."""
 
 AT_ONCE = 8192
-"""Overlaps with so many boxes are worked out together: what is in between stays in the cache."""
+"""Overlaps are computed for this many boxes at a time, so that intermediates stay in the cache."""
 
 Weights = tuple[float, float, float, float]
 
@@ -51,14 +51,14 @@ def decode(offsets: Tensor, references: Tensor, weights: Weights) -> Tensor:
 
 
 def clip(boxes: Tensor, size: tuple[int, int]) -> Tensor:
-    """Boxes (..., 4) cut at the border of an image of (height, width)."""
+    """Boxes (..., 4) clipped to an image of (height, width)."""
     height, width = size
     upper = boxes.new_tensor([width, height, width, height])
     return torch.minimum(boxes.clamp(min=0), upper)
 
 
 def mirrored(boxes: Tensor, width: float) -> Tensor:
-    """Boxes (..., 4) in the mirror image, left and right exchanged."""
+    """Boxes (..., 4) in the image mirrored left to right."""
     x1, y1, x2, y2 = boxes.unbind(-1)
     return torch.stack([width - x2, y1, width - x1, y2], dim=-1)
 
@@ -72,7 +72,7 @@ def enlarged(boxes: Tensor, factor: float) -> Tensor:
 
 
 def at_least(boxes: Tensor, min_px: float) -> Tensor:
-    """Which boxes (N, 4) are at least so wide and high; (N,) bool."""
+    """Whether boxes (N, 4) are at least ``min_px`` wide and high; (N,) bool."""
     return ((boxes[:, 2:] - boxes[:, :2]) >= min_px).all(dim=1)
 
 
@@ -98,6 +98,6 @@ def _iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _overlap(low_a: Tensor, high_a: Tensor, low_b: Tensor, high_b: Tensor) -> Tensor:
-    """Length (N, M) that intervals (N,) and (M,) share; planes of one axis are fast to make."""
+    """Length (N, M) of the intersection of intervals (N,) and (M,)."""
     high = torch.minimum(high_a[:, None], high_b.contiguous()[None])
     return high.sub_(torch.maximum(low_a[:, None], low_b.contiguous()[None])).clamp_(min=0)

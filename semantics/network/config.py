@@ -1,4 +1,4 @@
-"""What a network is made of: one dataclass, and the variants that have names."""
+"""The configuration of a network, and the named variants."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ class ImageConfig:
     """How an image becomes the network's input.
 
     Attributes:
-        short_px: length that the shorter side is scaled to ...
-        long_px: ... unless the longer side would exceed this.
-        mean, std: of red, green, blue in 0..1, subtracted and divided.
+        short_px: length that the shorter side is scaled to, unless the longer side would exceed
+            ``long_px``.
+        long_px: largest length of the longer side.
+        mean, std: of red, green, blue in 0..1, for normalisation.
     """
 
     short_px: int = 800
@@ -26,13 +27,13 @@ class ImageConfig:
 
 @dataclass(frozen=True)
 class AnchorConfig:
-    """The boxes that the RPN judges at every cell of a level.
+    """The anchor boxes at every cell of a level.
 
     Attributes:
         sizes_px: square root of their area, one a level, finest first.
         ratios: height over width of each.
-        half_ratios: the same of more anchors, of half the level's size: for what is smaller than
-            the finest level's size, or so thin that it overlaps nothing else well.
+        half_ratios: height over width of additional anchors of half the level's size, for objects
+            that are smaller than the finest level's size, or thin.
     """
 
     sizes_px: tuple[float, ...] = (32, 64, 128, 256, 512)
@@ -41,18 +42,18 @@ class AnchorConfig:
 
     @property
     def count(self) -> int:
-        """Anchors of a cell."""
+        """Number of anchors of a cell."""
         return len(self.ratios) + len(self.half_ratios)
 
 
 @dataclass(frozen=True)
 class ProposalConfig:
-    """How the RPN's boxes are thinned out.
+    """How the RPN's boxes are selected.
 
     Attributes:
-        before_nms: best boxes of each pyramid level that enter the suppression.
-        after_nms: best boxes that leave it.
-        nms_iou: overlap above which the worse of two boxes goes.
+        before_nms: number of best boxes of each pyramid level before the suppression.
+        after_nms: number of best boxes after it.
+        nms_iou: overlap above which the worse of two boxes is removed.
     """
 
     before_nms: int = 1000
@@ -77,9 +78,9 @@ class NetworkConfig:
         classes: number of classes, background (0) included.
         backbone: the convolutional body under the feature pyramid.
         channels: channels of every pyramid level.
-        norm: "frozen": batch norm in the body only, its statistics fixed (torchvision's v1).
-            "batch": batch norm in body, pyramid and heads (v2). "none": none anywhere, since it
-            is folded into the weights (MobileNetV2).
+        norm: "frozen": batch norm with fixed statistics in the body only (torchvision's v1).
+            "batch": batch norm in body, pyramid and heads (v2). "none": no batch norm, since it is
+            folded into the weights (MobileNetV2).
         norm_eps: added to the variance. torchvision sets it to 0 for its published v1 weights.
         stride_in_1x1: the bottleneck's stride sits in its first convolution, as in the ResNets
             of Caffe and of the original Mask Scoring R-CNN, and not in the 3x3 one.
@@ -90,9 +91,9 @@ class NetworkConfig:
         maskiou_channels: the same of the MaskIoU head; 0: there is no such head.
         maskiou_hidden: width of its two hidden layers.
         class_agnostic: one mask and one IoU a box instead of one for each class (He et al. 2017,
-            section 4.2); so all objects teach the same mask, where those of a class are few.
-        mask_context: boxes are enlarged by this factor about their centres for masks and IoUs, so
-            that a mask can reach beyond a box that was found too small.
+            section 4.2), so that all objects train the same mask where classes have few examples.
+        mask_context: factor by which boxes are enlarged about their centres for masks and IoUs, so
+            that a mask can extend beyond a box that is too small.
     """
 
     classes: int = 91
@@ -116,7 +117,7 @@ class NetworkConfig:
 
     @property
     def mask_outputs(self) -> int:
-        """Masks, and IoUs, that are predicted for each box."""
+        """Number of masks, and of IoUs, predicted for each box."""
         return 1 if self.class_agnostic else self.classes
 
     def with_maskiou(self) -> NetworkConfig:

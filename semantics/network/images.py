@@ -1,4 +1,4 @@
-"""Images to the network's input: normalised, resized, padded into one batch."""
+"""The network's input: images normalised, resized and padded to one batch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MULTIPLE_PX = 32
 
 @dataclass(frozen=True)
 class ImageBatch:
-    """Images as the network sees them.
+    """A batch of prepared images.
 
     Attributes:
         tensor: (B, 3, H, W), channels last in memory, padded with zeros right and below.
@@ -36,7 +36,7 @@ class ImageBatch:
 
 
 def resize_factor(size: tuple[int, int], config: ImageConfig) -> float:
-    """Factor for an image of (height, width): the short side to its length, if the long fits."""
+    """Scale of an image of (height, width): short side to its length, unless the long exceeds."""
     return min(config.short_px / min(size), config.long_px / max(size))
 
 

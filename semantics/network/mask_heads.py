@@ -1,4 +1,4 @@
-"""The mask head, and the MaskIoU head that says how good a mask is (Huang et al. 2019)."""
+"""The mask head, and the MaskIoU head that predicts a mask's quality (Huang et al. 2019)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bmask_slam.semantics.network.config import NetworkConfig
 BINS = 14
 """RoIAlign bins of both heads; masks have twice as many."""
 OUTPUT_STD = 0.01
-"""Of the last layers' weights at the beginning, so that training starts without large errors."""
+"""Initial standard deviation of the last layers' weights, so that first errors are small."""
 
 
 def make_mask_head(config: NetworkConfig) -> nn.Sequential:
@@ -31,7 +31,7 @@ def make_mask_head(config: NetworkConfig) -> nn.Sequential:
 
 
 class MaskPredictor(nn.Module):
-    """Doubles the size and gives one mask a class, or one in all."""
+    """Doubles the resolution and predicts one mask a class, or a single one."""
 
     def __init__(self, channels: int, outputs: int) -> None:
         super().__init__()
@@ -46,9 +46,9 @@ class MaskPredictor(nn.Module):
 
 
 class MaskIoUHead(nn.Module):
-    """Predicts the IoU of a mask with the whole object, one value a class, or one in all.
+    """Predicts the IoU of a mask with the whole object, one value a class, or a single one.
 
-    Input is the RoI's feature from before the mask head, with the mask as one channel more.
+    The input is the RoI's feature from before the mask head, with the mask as an extra channel.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -75,17 +75,17 @@ class MaskIoUHead(nn.Module):
 
 
 def of_class(values: Tensor, labels: Tensor) -> Tensor:
-    """values[r, labels[r]]: what belongs to each RoI's own class; or the only one there is."""
+    """values[r, labels[r]]: the value of each RoI's class; or the single value there is."""
     if values.shape[1] == 1:
         return values[:, 0]
     return values[torch.arange(len(labels), device=values.device), labels]
 
 
 def expected_iou(masks: Tensor) -> Tensor:
-    """IoU (R,) of masks, binarised at 0.5, to expect if the probabilities (R, M, M) are right.
+    """Expected IoU (R,) of masks, binarised at 0.5, if their probabilities (R, M, M) are right.
 
-    That is the expected intersection with the object over the expected union, where each cell is
-    the object's with its probability (Nowozin 2014, "Optimal decisions from probabilistic models:
+    The expected intersection with the object over the expected union, where each cell belongs to
+    the object with its probability (Nowozin 2014, "Optimal decisions from probabilistic models:
     the intersection-over-union case"); 0 for an empty mask.
     """
     inside = masks > 0.5

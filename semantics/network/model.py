@@ -1,4 +1,4 @@
-"""The whole network: images in, instances out."""
+"""The whole network: body and feature pyramid (Lin et al. 2017), RPN, heads."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from bmask_slam.semantics.network import box_head, mask_heads
-from bmask_slam.semantics.network.backbone.pyramid import BackboneWithPyramid
+from bmask_slam.semantics.network.backbone import mobilenet, resnet
+from bmask_slam.semantics.network.backbone.layers import ConvBlock, NormKind
 from bmask_slam.semantics.network.box_head import (
     BoxPredictor,
     ClassifiedBoxes,
@@ -29,18 +31,18 @@ from bmask_slam.semantics.network.roi_align import FeatureTable, feature_table, 
 from bmask_slam.semantics.network.rpn import RegionProposalNetwork
 
 ROI_LEVELS = 4
-"""The coarsest pyramid level serves the RPN alone."""
+"""Levels that RoIs are read from; the coarsest level is for the RPN only."""
 
 
 @dataclass(frozen=True)
 class Detections:
-    """What the network says about one image, best class score first.
+    """Detections in one image, best class score first.
 
     Attributes:
         found: boxes in pixels of the original image, labels, scores, class distributions.
         masks: (N, 28, 28) probabilities inside ``mask_boxes``, of each one's label.
         mask_boxes: (N, 4) the boxes, enlarged by the network's ``mask_context``.
-        mask_ious: (N,) predicted IoU of the mask, in 0..1; ones without a MaskIoU head.
+        mask_ious: (N,) predicted IoU of the mask, in 0..1; 1 without a MaskIoU head.
     """
 
     found: ClassifiedBoxes
@@ -49,8 +51,50 @@ class Detections:
     mask_ious: Tensor
 
 
+class FeaturePyramid(nn.Module):
+    """Adds each level, upsampled by 2, to the next finer one; and one coarser level on top."""
+
+    def __init__(self, inputs: Sequence[int], channels: int, norm: NormKind) -> None:
+        super().__init__()
+        inner = [ConvBlock((n, channels), 1, norm, relu=False) for n in inputs]
+        self.inner_blocks = nn.ModuleList(inner)
+        layer = [ConvBlock((channels, channels), 3, norm, relu=False) for _ in inputs]
+        self.layer_blocks = nn.ModuleList(layer)
+        for conv in self.modules():
+            if isinstance(conv, nn.Conv2d):
+                nn.init.kaiming_uniform_(conv.weight, a=1)
+
+    def forward(self, features: Sequence[Tensor]) -> list[Tensor]:
+        """Levels (B, channels, H_l, W_l), finest first; one more than there are features."""
+        top = self.inner_blocks[-1](features[-1])
+        levels = [self.layer_blocks[-1](top)]
+        for i in range(len(features) - 2, -1, -1):
+            lateral = self.inner_blocks[i](features[i])
+            top = lateral + F.interpolate(top, size=lateral.shape[-2:], mode="nearest")
+            levels.insert(0, self.layer_blocks[i](top))
+        return [*levels, F.max_pool2d(levels[-1], 1, 2)]
+
+
+class BackboneWithPyramid(nn.Module):
+    """Images (B, 3, H, W) to the levels of strides 4, 8, 16, 32 and 64."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.body: nn.Module
+        if config.backbone == "mobilenet_v2":
+            self.body, inputs = mobilenet.MobileNetV2(), mobilenet.CHANNELS
+        else:
+            self.body, inputs = resnet.ResNet(config), resnet.CHANNELS
+        norm: NormKind = "batch" if config.norm == "batch" else "none"
+        self.fpn = FeaturePyramid(inputs, config.channels, norm)
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """Five levels, finest first."""
+        return self.fpn(self.body(images))
+
+
 class RoIHeads(nn.Module):
-    """What is computed for each box: class and box, mask, MaskIoU."""
+    """The heads of each box: class and box, mask, MaskIoU."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -92,8 +136,8 @@ class MaskRCNN(nn.Module):
     def forward(self, images: Sequence[Tensor], min_score: float = 0.0) -> list[Detections]:
         """Detections of each image (3, H, W), float32, red green blue in 0..1.
 
-        Those of a class score below ``min_score``, or below the network's own limit, get no mask
-        and are left out.
+        Those with a class score below ``min_score``, or below the network's own limit, are dropped
+        before the masks are computed.
         """
         batch = prepare(images, self.config.image)
         levels = self.backbone(batch.tensor)
@@ -130,7 +174,7 @@ class MaskRCNN(nn.Module):
     def _with_masks(
         self, table: FeatureTable, found: Sequence[ClassifiedBoxes], batch: ImageBatch
     ) -> list[Detections]:
-        """Masks added, boxes back in pixels of the original images."""
+        """Add masks, and scale boxes back to pixels of the original images."""
         counts = [len(f.boxes) for f in found]
         labels = torch.cat([f.labels for f in found])
         around = [enlarged(f.boxes, self.config.mask_context) for f in found]

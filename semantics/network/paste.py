@@ -1,4 +1,4 @@
-"""Small masks of boxes to masks of the whole image."""
+"""Pasting the masks of boxes into masks of the whole image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 PADDING = 1
-"""Zeros around the small mask, so that it fades out at the border of its box."""
+"""Cells of zeros around a mask, so that it fades out at the border of its box."""
 
 
 def paste(masks: Tensor, boxes: Tensor, size: tuple[int, int]) -> Tensor:
@@ -26,7 +26,7 @@ def paste(masks: Tensor, boxes: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _grown(boxes: Tensor, factor: float) -> Tensor:
-    """Boxes (N, 4) grown about their centres, as whole first and last pixels (towards zero)."""
+    """Boxes (N, 4) enlarged about their centres, as first and last pixels (rounded to zero)."""
     half = (boxes[:, 2:] - boxes[:, :2]) * 0.5 * factor
     centre = (boxes[:, 2:] + boxes[:, :2]) * 0.5
     return torch.cat([centre - half, centre + half], dim=1).long()

@@ -1,9 +1,9 @@
 """RoIAlign (He et al. 2017): features of any box, resampled to a small fixed grid.
 
 Each bin averages 2x2 bilinear samples. Bilinear weights are separable, so a bin is a weighted sum
-of 4 rows times 4 columns = 16 feature vectors. ``embedding_bag`` is exactly a weighted sum of rows
-of a table: with all pyramid levels as one table of feature vectors, every bin of every box is
-one of its bags, and nothing is stored in between. Works on CPU and CUDA, with gradients.
+of 4 rows times 4 columns = 16 feature vectors. ``embedding_bag`` computes weighted sums of rows of
+a table: with all pyramid levels as one table of feature vectors, every bin of every box is a bag,
+and no intermediate is stored. Works on CPU and CUDA, with gradients.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def feature_table(levels: Sequence[Tensor], image_height_px: int) -> FeatureTabl
 
 
 def assign_levels(boxes: Tensor, first_level: int, count: int) -> Tensor:
-    """Which level (N,), from 0, each box (N, 4) is read from (Lin et al. 2017, eq. 1)."""
+    """The level (N,), from 0, that each box (N, 4) is read from (Lin et al. 2017, eq. 1)."""
     size_px = torch.sqrt(area(boxes))
     level = torch.floor(CANONICAL_LEVEL + torch.log2(size_px / CANONICAL_SIZE_PX) + 1e-6)
     return level.clamp(first_level, first_level + count - 1).long() - first_level

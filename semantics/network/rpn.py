@@ -1,4 +1,4 @@
-"""The region proposal network (Ren et al. 2015): which anchors hold an object, and where."""
+"""The region proposal network (Ren et al. 2015): objectness and offsets of anchors."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RPNHead(nn.Module):
 
 
 class RegionProposalNetwork(nn.Module):
-    """Anchors, judged, moved, and thinned out."""
+    """Proposals from anchors: scored, moved by their offsets, suppressed."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -69,8 +69,8 @@ def select_proposals(
     Args:
         anchors: (A_l, 4) of each level.
         logits, offsets: (B, A_l) and (B, A_l, 4) of each level.
-        sizes: (height, width) of each image, where proposals are cut.
-        config: how many, and how different.
+        sizes: (height, width) of each image, to which proposals are clipped.
+        config: numbers of boxes and overlap of the suppression.
 
     Returns:
         (N, 4) of each image, best first. The suppression compares boxes of one level only.

@@ -202,11 +202,8 @@ class InstanceTracks:
             return np.zeros(0, np.int64)
         centres = np.array([s.centroid_world for s in sightings])
         sizes = np.array([s.half_size for s in sightings])
-        affinity = [
-            [_affinity(a.distribution, b.distribution) for b in sightings] for a in sightings
-        ]
         within = _within(centres, centres, sizes, R_world_box)
-        within &= np.array(affinity) >= self.config.same_class
+        within &= _affinities(sightings, sightings) >= self.config.same_class
         np.fill_diagonal(within, True)
         volume = sizes.prod(axis=1)
         whole = np.where(within, volume, -1.0).argmax(axis=1)
@@ -222,9 +219,8 @@ class InstanceTracks:
             return
         centres = np.array([self.predicted(track, time_s).mean[:3] for track in others])
         means, sizes = np.array([t.mean[:3] for t in now]), np.array([t.half_size for t in now])
-        affinity = [[_affinity(a.distribution, b.distribution) for b in now] for a in others]
         double = _within(centres, means, sizes, R_world_box)
-        double &= np.array(affinity) >= self.config.same_class
+        double &= _affinities(others, now) >= self.config.same_class
         ended = {others[k].id for k in np.flatnonzero(double.any(axis=1)).tolist()}
         self.tracks = [track for track in self.tracks if track.id not in ended]
 
@@ -291,6 +287,11 @@ def _within(points: Array, centres: Array, sizes: Array, R_world_box: Array) -> 
     """Whether points (N, 3) lie in boxes at centres (M, 3) of half sizes (M, 3): (N, M)."""
     away = np.abs((points[:, None] - centres) @ R_world_box)
     return np.asarray((away <= sizes).all(axis=2))
+
+
+def _affinities(a: Sequence[Sighting | Track], b: Sequence[Sighting | Track]) -> Array:
+    """The affinity (N, M) of each pair of N and M sightings or tracks."""
+    return np.array([[_affinity(x.distribution, y.distribution) for y in b] for x in a])
 
 
 def _affinity(a: Floats, b: Floats) -> float:

@@ -1,4 +1,4 @@
-"""Convolutions with their batch norm, which is folded into the weights while its statistics rest.
+"""Convolutions with batch norm, which is folded into the weights while its statistics are fixed.
 
 Child modules are numbered as torchvision's ``Conv2dNormActivation`` numbers them, so that the
 names of parameters agree: "0" is the convolution, "1" its norm.
@@ -48,8 +48,8 @@ def conv_norm(conv: nn.Conv2d, norm: Norm, x: Tensor) -> Tensor:
     """norm(conv(x)), as one convolution if the statistics are fixed.
 
     (W x - mean) * w / sqrt(var + eps) + b is a convolution with scaled weights. Scaling them at
-    every call costs little beside a pass over the activations, and leaves no second copy of the
-    weights that could go stale.
+    every call is cheap compared with a pass over the activations, and needs no second copy of the
+    weights.
     """
     if isinstance(norm, nn.BatchNorm2d) and norm.training:
         return norm(conv(x))
@@ -84,7 +84,7 @@ class ConvBlock(nn.Sequential):
 
 
 def keep_variance(module: nn.Module) -> None:
-    """Draw all weights inside so that ReLU layers keep the variance (He et al. 2015)."""
+    """Initialise all weights inside so that ReLU layers keep the variance (He et al. 2015)."""
     for part in module.modules():
         if isinstance(part, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             nn.init.kaiming_normal_(part.weight, nonlinearity="relu")
@@ -93,6 +93,6 @@ def keep_variance(module: nn.Module) -> None:
 
 
 def conv_stack(channels: int, width: int, count: int, norm: NormKind) -> list[ConvBlock]:
-    """3x3 blocks one after the other, the first from ``channels`` to ``width``."""
+    """A sequence of 3x3 blocks, the first from ``channels`` to ``width``."""
     inputs = [channels, *[width] * (count - 1)]
     return [ConvBlock((n, width), 3, norm) for n in inputs[:count]]
