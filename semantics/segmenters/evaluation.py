@@ -1,4 +1,4 @@
-"""COCO's figures for a segmenter: box and mask AP, with and without the predicted mask IoU."""
+"""COCO's metrics of a segmenter: box and mask AP, with and without the predicted mask IoU."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from bmask_slam.semantics.segmenters.segmenter import Segmenter
 CLASS_SCORE = "class score"
 MASK_SCORE = "class score x MaskIoU"
 MATCH_IOU = 0.5
-"""A detection stands for the object of its class that its box overlaps most, by at least this; so
-are boxes chosen in which mask and MaskIoU are learnt."""
+"""A detection matches the object of its class with the largest box overlap of at least this, as in
+the training of the mask and MaskIoU heads."""
 AP_50 = 0
 """Index of the threshold 0.5 among COCO's ten."""
 
@@ -54,14 +54,14 @@ class ApCurve:
 
 @dataclass(frozen=True, eq=False)
 class SegmentationResult:
-    """All figures of one segmenter on one data set.
+    """All metrics of one segmenter on one data set.
 
     Attributes:
         curves: box AP by class score, mask AP by class score, mask AP by mask score.
-        iou_correlation: Pearson's, of predicted and true mask IoU of the detections that stand
-            for an object; NaN for fewer than 3 or where no IoU is predicted.
-        iou_correlation_of_good: the same of those alone whose true IoU is at least 0.5.
-        images, instances: how many.
+        iou_correlation: Pearson's, of predicted and true mask IoU of matched detections; NaN for
+            fewer than 3, or without predicted IoUs.
+        iou_correlation_of_good: the same of those with a true IoU of at least 0.5.
+        images, instances: their numbers.
     """
 
     curves: tuple[ApCurve, ...]
@@ -77,9 +77,9 @@ def evaluate_segmenter(
     folder: Path,
     progress: Callable[[int, int], None],
 ) -> SegmentationResult:
-    """Run a segmenter over the images of a COCO file and compare, classes matched by name.
+    """Run a segmenter on the images of a COCO file and compare; classes are matched by name.
 
-    Objects of classes that the segmenter does not know are left out of the truth.
+    Objects of classes that are not in the segmenter's label set are removed from the truth.
 
     Raises:
         InputError: the label sets have no class in common.
@@ -106,7 +106,7 @@ def evaluate_segmenter(
 
 
 def _truth(images: Sequence[CocoImage], numbers: Sequence[int]) -> dict[str, Any]:
-    """The annotations in pycocotools' form, under the segmenter's labels."""
+    """The annotations in pycocotools' format, with the segmenter's labels."""
     annotations: list[dict[str, Any]] = []
     for k, image in enumerate(images, 1):
         for o in image.objects:
@@ -152,7 +152,7 @@ def _average_precision(
 
 
 def _iou_pairs(found: Sequence[Instance], image: CocoImage, numbers: Sequence[int]) -> Array:
-    """(N, 2) predicted and true mask IoU of the detections that stand for an object."""
+    """(N, 2) predicted and true mask IoU of the detections that match an object."""
     pairs = []
     for i in found:
         same = [o for o in image.objects if numbers[o.label] == i.label and not o.crowd]

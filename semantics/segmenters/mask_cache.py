@@ -1,4 +1,4 @@
-"""Masks of many images on disk: made once, one file an image, and as one COCO file at the end."""
+"""Masks of many images on disk: one file an image, made once, and one COCO file of all."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ SETTINGS = "settings.json"
 
 @dataclass(frozen=True)
 class CacheResult:
-    """What was done.
+    """Counts of a run.
 
     Attributes:
         file: the COCO file of all images.
-        images, instances: how many it holds.
-        reused: images whose masks were there already.
-        broken: images that could not be read; they are left out.
+        images, instances: their numbers in it.
+        reused: number of images whose masks were on disk already.
+        broken: number of images that could not be read and are not in the file.
     """
 
     file: Path
@@ -45,12 +45,12 @@ class CacheResult:
 
 @dataclass(frozen=True)
 class CacheOptions:
-    """Where masks go.
+    """Where and how masks are written.
 
     Attributes:
         out: the folder.
-        settings: what they are made with; a folder holds masks of one setting.
-        overlays: also draw them over the images.
+        settings: how the masks are made; a folder holds masks of one setting.
+        overlays: whether they are also drawn over the images.
     """
 
     out: Path
@@ -64,7 +64,7 @@ def cache_masks(
     options: CacheOptions,
     progress: Callable[[int, int], None],
 ) -> CacheResult:
-    """Segment images (name, file), skipping those that are done, and write one COCO file.
+    """Segment images (name, file) that are not in the cache, and write one COCO file of all.
 
     Raises:
         InputError: the folder holds masks made with other settings, or no image can be read.
@@ -82,7 +82,7 @@ def cache_masks(
                 entries.append(_segmented(segmenter, name, path, options))
                 _write_json(cached, entries[-1])
             except InputError as error:
-                if k == 0:  # most likely all are like that
+                if k == 0:  # most likely all images are like that
                     raise
                 logger.warning("%s; left out", error)
                 broken += 1
@@ -113,7 +113,7 @@ def _check_settings(options: CacheOptions) -> None:
 def _segmented(
     segmenter: Segmenter, name: str, path: Path, options: CacheOptions
 ) -> dict[str, Any]:
-    """One image's entry; its overlay is drawn on the way."""
+    """The entry of one image; writes its overlay if asked."""
     image = read_colour(path)
     instances = segmenter.segment(image, name)
     if options.overlays:

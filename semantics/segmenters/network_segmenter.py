@@ -23,13 +23,13 @@ MASK_THRESHOLD = 0.5
 
 
 class NetworkSegmenter:
-    """Mask (Scoring) R-CNN on one image after the other.
+    """Mask (Scoring) R-CNN, one image at a time.
 
     Args:
         network: weights and class names.
         min_score: class score below which a detection is dropped.
-        detector: finds the boxes instead of the network's own RPN and box head.
-        device: "cpu", "cuda", or None for CUDA where there is any.
+        detector: finds the boxes in place of the network's RPN and box head.
+        device: "cpu", "cuda", or None for CUDA if available.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class NetworkSegmenter:
 
     @torch.inference_mode()
     def segment(self, image: Image, name: str) -> list[Instance]:
-        """Instances in an image (H, W, 3), best mask score first; none in an empty scene."""
+        """Instances in an image (H, W, 3), best mask score first."""
         check_image(image, name)
         tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1).float() / 255
         if self._detector is None:
@@ -59,11 +59,11 @@ class NetworkSegmenter:
 
 
 def segment_both_ways(model: MaskRCNN, image: Tensor, found: ClassifiedBoxes) -> Detections:
-    """Masks of boxes in an image (3, H, W): means of those there and in its mirror image.
+    """Masks of boxes in an image (3, H, W): means of those in the image and in its mirror image.
 
-    The errors of the two are in part independent, so their mean is smaller, for twice the time.
-    So is that of the MaskIoU head's values and the IoU that the mean mask's own probabilities
-    promise; fitted to true IoUs by least squares, these two get equal weights.
+    The errors of the two are partly independent, so the error of the mean is smaller, for twice the
+    time. The mask IoU is the mean of the MaskIoU head's values and of the IoU to expect from the
+    mean mask's probabilities; a least-squares fit to true IoUs gives both equal weights.
     """
     turned = replace(found, boxes=mirrored(found.boxes, image.shape[2]))
     one, other = model.segment([image, image.flip(2)], [found, turned])
@@ -75,7 +75,7 @@ def segment_both_ways(model: MaskRCNN, image: Tensor, found: ClassifiedBoxes) ->
 
 
 def as_instances(found: Detections, size: tuple[int, int], min_score: float) -> list[Instance]:
-    """Detections as instances with masks of (height, width); without those whose mask is empty."""
+    """Detections as instances with masks of (height, width); empty masks are dropped."""
     keep = found.found.scores >= min_score
     boxes = found.found.boxes[keep]
     masks = (paste(found.masks[keep], found.mask_boxes[keep], size) > MASK_THRESHOLD).cpu().numpy()

@@ -1,4 +1,4 @@
-"""The one way to a Ray cluster (``pip install 'bmask-slam[ray]'``)."""
+"""Connection to a Ray cluster (``pip install 'bmask-slam[ray]'``)."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ TIMEOUT_S = 5.0
 def connect(address: str, local_cpus: int | None = None) -> Any:
     """The ``ray`` module, connected to a cluster.
 
-    ``address`` is a cluster's, "auto" for the one that this machine belongs to, or "local" for one
-    that is started here, with so many CPUs, and ends with this process.
+    ``address`` is a cluster's, "auto" for the cluster of this machine, or "local" to start one
+    here with ``local_cpus`` CPUs, which ends with this process.
 
     Raises:
         InputError: Ray is not installed, or there is no cluster at the address.
@@ -46,7 +46,7 @@ def connect(address: str, local_cpus: int | None = None) -> Any:
 
 
 def _check_address(address: str) -> None:
-    """Refuse HOST:PORT where nothing listens: Ray itself would try for minutes."""
+    """Refuse HOST:PORT without a listener: Ray itself would try for minutes."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if not (colon and port.isdigit()):
         return

@@ -1,4 +1,4 @@
-"""``Segmenter``: anything that finds instances in an image; and the simple ones."""
+"""The ``Segmenter`` protocol, and the segmenters that need no network."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import LabelSet, label_set
 
 INSTANCES_A_CLASS = 1000
-"""In a label PNG, value = 1000 * label + instance; below 1000 the value is the label alone."""
+"""In a label PNG, value = 1000 * label + instance; a value below 1000 is a label."""
 
 
 class Segmenter(Protocol):
-    """Finds instances. ``labels`` says what their numbers mean."""
+    """Finds instances in images; ``labels`` is the set of their labels."""
 
     labels: LabelSet
 
     def segment(self, image: Image, name: str) -> list[Instance]:
         """Instances in an image (H, W, 3), red first, best mask score first.
 
-        ``name`` is the image's file name, relative to its sequence, for those who look it up.
+        ``name`` is the image's file name relative to its sequence, for look-ups and errors.
         """
 
 
 def check_image(image: Image, name: str) -> None:
-    """Refuse anything but a colour image of 8 bits with pixels in it.
+    """Refuse anything but a colour image of 8 bits that is not empty.
 
     Raises:
         InputError: another shape or type.
@@ -56,7 +56,7 @@ class NoSegmenter:
 
 
 class CocoSegmenter:
-    """Looks instances up in a COCO file: cached masks, or the truth of a rendered sequence."""
+    """Reads instances from a COCO file: cached masks, or the truth of a rendered sequence."""
 
     def __init__(self, path: Path) -> None:
         content = read_coco(path)
@@ -65,10 +65,10 @@ class CocoSegmenter:
         self._images = {Path(i.file_name).as_posix(): i for i in content.images}
 
     def segment(self, image: Image, name: str) -> list[Instance]:
-        """What the file says about the image of this name.
+        """The instances in the file for the image of this name.
 
         Raises:
-            InputError: the file does not know the image, or knows it in another size.
+            InputError: the file does not have the image, or in another size.
         """
         check_image(image, name)
         known = self._images.get(Path(name).as_posix())
@@ -96,14 +96,14 @@ def _instances(image: CocoImage, classes: int) -> list[Instance]:
 
 
 class LabelImageSegmenter:
-    """Reads label PNGs of any tool: one of the image's name in a folder, 8 or 16 bits."""
+    """Reads label PNGs of any tool: one for each image, of its name, with 8 or 16 bits."""
 
     def __init__(self, folder: Path, labels: LabelSet) -> None:
         self.folder = folder
         self.labels = labels
 
     def segment(self, image: Image, name: str) -> list[Instance]:
-        """An instance for each value in the PNG but 0.
+        """One instance for each value in the PNG except 0.
 
         Raises:
             InputError: no PNG for the image, one of another size, or a label that is not known.
@@ -130,6 +130,6 @@ class LabelImageSegmenter:
         return found
 
     def _file(self, name: str) -> Path:
-        """The PNG of an image: under the same path, or the same file name alone."""
+        """The PNG of an image: under the same relative path, or directly in the folder."""
         whole = (self.folder / name).with_suffix(".png")
         return whole if whole.is_file() else self.folder / f"{Path(name).stem}.png"

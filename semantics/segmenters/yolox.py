@@ -20,8 +20,8 @@ from bmask_slam.semantics.network.nms import grouped_nms
 
 STRIDES = (8, 16, 32)
 SIZES_PX = (416, 640)
-"""Input sizes of the published networks: Nano and Tiny, and the larger ones. A file whose shapes
-are not fixed takes both, and is run at both: the larger one finds small objects."""
+"""Input sizes of the published networks: of Nano and Tiny, and of the larger ones. A file without
+fixed shapes is run at both: the larger size finds small objects."""
 PAD_VALUE = 114
 GEOMETRY = 5
 """x, y, width, height and objectness come before the class probabilities."""
@@ -33,13 +33,13 @@ class YoloxConfig:
 
     Attributes:
         min_score: class probability times objectness below which a box is dropped.
-        nms_iou: overlap above which the worse of two boxes of a class goes.
-        vote_iou: overlap from which boxes of a class, also those that went, count in the place of
-            the one that stays.
-        max_count: at most so many boxes stay.
-        mirror: the mirror image is looked at as well, for twice the time.
-        sizes_px: sides of the square input; those that the file takes are used, one after the
-            other, and all their boxes count.
+        nms_iou: overlap above which the worse of two boxes of a class is removed.
+        vote_iou: overlap above which boxes of a class, removed ones included, are averaged into the
+            one that is kept.
+        max_count: largest number of boxes.
+        mirror: detect in the mirror image as well, for twice the time.
+        sizes_px: sides of the square input; the network runs at each that the file accepts, and all
+            boxes count.
     """
 
     min_score: float = 0.001
@@ -70,20 +70,20 @@ class YoloxDetector:
         self._sides_px = self._find_sides()
 
     def detect(self, image: Image, labels: LabelSet) -> ClassifiedBoxes:
-        """Boxes in an image (H, W, 3), red first, of the classes that ``labels`` knows."""
-        looks = [self._look(image, side) for side in self._sides_px]
+        """Boxes in an image (H, W, 3), red first, of the classes in ``labels``."""
+        passes = [self._run(image, side) for side in self._sides_px]
         if self._config.mirror:
             other = np.ascontiguousarray(image[:, ::-1])
-            mirrored = [self._look(other, side) for side in self._sides_px]
+            mirrored = [self._run(other, side) for side in self._sides_px]
             for boxes, _ in mirrored:
                 boxes[:, [2, 0]] = image.shape[1] - boxes[:, [0, 2]]
-            looks += mirrored
-        every, probabilities = (np.concatenate(part) for part in zip(*looks, strict=True))
+            passes += mirrored
+        every, probabilities = (np.concatenate(part) for part in zip(*passes, strict=True))
         numbers = np.array([labels.number(name) for name in self._classes.names[1:]])
         return self._select(every, probabilities, numbers, len(labels))
 
-    def _look(self, image: Image, side_px: int) -> tuple[NDArray, NDArray]:
-        """Boxes (P, 4) in the image's pixels and class probabilities (P, 80), as they come."""
+    def _run(self, image: Image, side_px: int) -> tuple[NDArray, NDArray]:
+        """All boxes (P, 4) in the image's pixels, and class probabilities (P, 80)."""
         blob, factor = letterbox(image, side_px)
         self._network.setInput(blob)
         boxes, probabilities = decode(self._network.forward()[0], side_px)
@@ -116,17 +116,17 @@ class YoloxDetector:
         )  # fmt: skip
 
     def _find_sides(self) -> tuple[int, ...]:
-        """The input sizes, by trying: the file's shapes are not shown by OpenCV."""
+        """The accepted input sizes, found by trial: OpenCV does not show a file's shapes."""
         sides = tuple(side for side in self._config.sizes_px if self._takes(side))
         if not sides:
             raise InputError(
                 f"{self._path}: not a YOLOX network for COCO's 80 classes at one of "
-                f"{self._config.sizes_px} pixels; give such a one"
+                f"{self._config.sizes_px} pixels; give one of these"
             )
         return sides
 
     def _takes(self, side_px: int) -> bool:
-        """Whether an input of this size gives what a YOLOX network gives."""
+        """Whether an input of this size gives an output of YOLOX's shape."""
         self._network.setInput(np.zeros((1, 3, side_px, side_px), np.float32))
         try:
             output = self._network.forward()
@@ -137,7 +137,7 @@ class YoloxDetector:
 
 
 def voted(boxes: Tensor, scores: Tensor, labels: Tensor, keep: Tensor, min_iou: float) -> Tensor:
-    """The kept boxes (K, 4), each the mean of those of its class that lie almost on it.
+    """The kept boxes (K, 4), each the mean of the boxes of its class with at least ``min_iou``.
 
     Weights are the scores (Gidaris and Komodakis 2015, section 4).
     """
@@ -149,7 +149,7 @@ def voted(boxes: Tensor, scores: Tensor, labels: Tensor, keep: Tensor, min_iou: 
 def letterbox(image: Image, side_px: int) -> tuple[Floats, float]:
     """The network's input (1, 3, side, side), blue first in 0..255, and the factor of its scale.
 
-    The image fills the upper left; the rest is grey.
+    The image is at the upper left; the rest is grey.
     """
     height, width = image.shape[:2]
     factor = min(side_px / height, side_px / width)

@@ -17,7 +17,7 @@ OLD_TORCHVISION = (
     (r"^roi_heads\.mask_head\.mask_fcn3\.", "roi_heads.mask_head.2.0."),
     (r"^roi_heads\.mask_head\.mask_fcn4\.", "roi_heads.mask_head.3.0."),
 )
-"""torchvision's published files keep the names of its first versions."""
+"""Names in torchvision's published files, which are those of its first versions."""
 
 MASK_SCORING = (
     (r"^backbone\.body\.stem\.", "backbone.body."),
@@ -34,13 +34,13 @@ MASK_SCORING = (
     (r"^roi_heads\.maskiou\.feature_extractor\.", "roi_heads.maskiou_head."),
     (r"^roi_heads\.maskiou\.predictor\.", "roi_heads.maskiou_head."),
 )  # fmt: skip
-"""The original Mask Scoring R-CNN, built on maskrcnn-benchmark."""
+"""Names in the original Mask Scoring R-CNN, which is built on maskrcnn-benchmark."""
 MASK_SCORING_SIGN = "roi_heads.box.feature_extractor.fc6.weight"
 _CONSTANTS = re.compile(r"\.anchor_generator\.cell_anchors\.|\.body\..*num_batches_tracked$")
 
 
 def current_names(state: Mapping[str, Tensor]) -> State:
-    """The same weights under this network's names; names that are current stay as they are."""
+    """The weights under this network's names; current names are kept."""
     plain = {name.removeprefix("module."): value for name, value in state.items()}
     if not is_mask_scoring(plain):
         return _renamed(plain, OLD_TORCHVISION)

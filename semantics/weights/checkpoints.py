@@ -1,4 +1,4 @@
-"""Weight files: read without running what is in them, recognised, compared, written."""
+"""Weight files: read without running code in them, recognised, checked, written."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from bmask_slam.semantics.network.model import MaskRCNN
 from bmask_slam.semantics.weights.checkpoint_names import State, current_names, is_mask_scoring
 
 NO_EPS = "maskrcnn_resnet50_fpn_coco-"
-"""Files of this name were made with an eps of 0 in batch norm."""
+"""Files with names that begin so need an eps of 0 in batch norm."""
 CAFFE_IMAGES = ImageConfig(
     mean=(122.7717 / 255, 115.9465 / 255, 102.9801 / 255), std=(1 / 255, 1 / 255, 1 / 255)
 )
@@ -42,21 +42,21 @@ SHOWN = 4
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """A network with its weights, and the names of its classes."""
+    """A network with its weights and the label set of its classes."""
 
     model: MaskRCNN
     labels: LabelSet
 
 
 def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
-    """The network that a file holds the weights of, ready to detect.
+    """Load the network of a weights file, in evaluation mode.
 
-    Files of this project (.safetensors with its configuration) say what they are; others are
-    recognised by their names and shapes: torchvision's, and the original Mask Scoring R-CNN's.
+    Files of this project (.safetensors) hold the configuration; torchvision's and the original Mask
+    Scoring R-CNN's are recognised by the names and shapes of their parameters.
 
     Raises:
-        InputError: an unreadable file, or weights that fit no network, or another label set; the
-            message says what differs.
+        InputError: an unreadable file, or weights of another network or label set; the message says
+            what differs.
     """
     state, metadata = read_state(path)
     own: LabelSet | None
@@ -82,7 +82,7 @@ def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
 
 
 def load_mobilenet(model: MaskRCNN, path: Path) -> None:
-    """Give a light network the body of an ImageNet classifier; its last layers are not needed.
+    """Load the body of an ImageNet classifier into a light network, without its last layers.
 
     Raises:
         InputError: the file is not a MobileNetV2 with batch norm folded into its weights.
@@ -99,7 +99,7 @@ def load_mobilenet(model: MaskRCNN, path: Path) -> None:
 
 
 def save_network(network: TrainedNetwork, path: Path, half: bool = True) -> None:
-    """Write weights, configuration and class names; in half precision unless told otherwise."""
+    """Write weights, configuration and class names; by default in half precision."""
     state = {}
     for name, value in network.model.state_dict().items():
         small = value.half() if half and value.is_floating_point() else value
@@ -114,7 +114,7 @@ def save_network(network: TrainedNetwork, path: Path, half: bool = True) -> None
 
 
 def read_state(path: Path) -> tuple[State, dict[str, str]]:
-    """Tensors by name, and the metadata of a safetensors file; no code in the file is run.
+    """Tensors by name, and the metadata of a safetensors file. No code in the file is run.
 
     Raises:
         InputError: no such file, a truncated one, or a pickle of anything but tensors.
@@ -144,14 +144,14 @@ def read_state(path: Path) -> tuple[State, dict[str, str]]:
             content = content[key]
     if not isinstance(content, Mapping) or not content:
         raise InputError(f"{path}: holds a {type(content).__name__}, not a state_dict")
-    stranger = next((k for k, v in content.items() if not isinstance(v, Tensor)), None)
-    if stranger is not None:
-        raise InputError(f"{path}: the entry {stranger!r} is no tensor; save the state_dict alone")
+    other = next((k for k, v in content.items() if not isinstance(v, Tensor)), None)
+    if other is not None:
+        raise InputError(f"{path}: the entry {other!r} is no tensor; save the state_dict alone")
     return {str(name): value for name, value in content.items()}, {}
 
 
 def recognise(path: Path, state: State) -> NetworkConfig:
-    """The configuration whose parameters agree best with a state_dict in any known naming."""
+    """The configuration whose parameter names agree best with a state_dict."""
     caffe = is_mask_scoring(state)
     state = current_names(state)
     candidates = [RESNET50, RESNET50_V2, RESNET101]
@@ -174,7 +174,7 @@ def _names(config: NetworkConfig) -> set[str]:
 
 
 def _check(path: Path, state: State, model: MaskRCNN) -> None:
-    """Refuse weights that are not exactly the model's, and say what differs."""
+    """Raise InputError with the differences unless the weights are exactly the model's."""
     wanted = model.state_dict()
     missing, extra = sorted(wanted.keys() - state.keys()), sorted(state.keys() - wanted.keys())
     shaped = [
@@ -197,7 +197,7 @@ def _check(path: Path, state: State, model: MaskRCNN) -> None:
 
 
 def _described(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkConfig, LabelSet]:
-    """What a file of this project says about itself."""
+    """Configuration and label set from the metadata of a file of this project."""
     parts = {
         "image": ImageConfig,
         "anchors": AnchorConfig,
@@ -213,10 +213,10 @@ def _described(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkConfig, 
         names = tuple(json.loads(metadata["labels"]))
         return NetworkConfig(**values), label_set(names[1:])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: made by another version of this project ({error})") from error
+        raise InputError(f"{path}: made by another version of this program ({error})") from error
 
 
 def _published_labels(classes: int) -> LabelSet | None:
-    """COCO's label set with this many entries, background included."""
+    """COCO's label set with this number of classes, background included, if there is one."""
     known = {len(s): s for s in (read_label_set("coco91"), read_label_set("coco"))}
     return known.get(classes)
