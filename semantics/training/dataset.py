@@ -1,4 +1,4 @@
-"""Training images from COCO files: split, translated to a label set, augmented."""
+"""Training images from COCO files: split, mapped to a label set, augmented."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.training.targets import Target
 
 MIN_OBJECT_PX = 16
-"""Objects with fewer pixels, after augmentation, are no examples."""
+"""Objects with fewer pixels after augmentation are not used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +40,12 @@ class Sample:
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """How images are varied.
+    """How images are augmented.
 
     Attributes:
-        flip: share of images that are mirrored.
+        flip: share of mirrored images.
         min_scale, max_scale: range of the random factor on the size.
-        paste: share of images that get objects of another image pasted in (Ghiasi et al. 2021).
+        paste: share of images with objects of another image pasted in (Ghiasi et al. 2021).
     """
 
     flip: float = 0.5
@@ -57,7 +57,7 @@ class AugmentConfig:
 class Dataset:
     """The images of a COCO file that hold at least one object of a label set.
 
-    Classes are matched by name; objects of other classes, and crowds, are no examples.
+    Classes are matched by name; crowds and objects of other classes are not used.
 
     Raises:
         InputError: no image has an object of the label set.
@@ -78,13 +78,13 @@ class Dataset:
         return len(self.images)
 
     @property
-    def upright(self) -> Mask:
-        """Which images are higher than wide."""
+    def portrait(self) -> Mask:
+        """Whether each image is higher than wide."""
         return np.array([image.height > image.width for image in self.images])
 
     @cached_property
     def objects(self) -> Array:
-        """How many objects each image has."""
+        """The number of objects of each image."""
         return np.array([len(self._objects(image)) for image in self.images], np.float64)
 
     def load(self, index: int) -> Sample:
@@ -109,7 +109,7 @@ class Dataset:
 
 
 class JoinedDatasets:
-    """Several data sets, one after the other, as one."""
+    """The concatenation of several data sets."""
 
     def __init__(self, parts: Sequence[Dataset]) -> None:
         self._parts = parts
@@ -119,13 +119,13 @@ class JoinedDatasets:
         return int(self._ends[-1])
 
     @property
-    def upright(self) -> Mask:
-        """Which images are higher than wide."""
-        return np.concatenate([part.upright for part in self._parts])
+    def portrait(self) -> Mask:
+        """Whether each image is higher than wide."""
+        return np.concatenate([part.portrait for part in self._parts])
 
     @cached_property
     def objects(self) -> Array:
-        """How many objects each image has."""
+        """The number of objects of each image."""
         return np.concatenate([part.objects for part in self._parts])
 
     def load(self, index: int) -> Sample:
@@ -135,9 +135,10 @@ class JoinedDatasets:
 
 
 def split(content: CocoFile, share: float, seed: int) -> tuple[CocoFile, CocoFile]:
-    """Training part and validation part of a file, whole images, drawn at random from a seed.
+    """Split a file's images at random into a training part and a validation part.
 
-    Images are drawn in the order of their ids, so the split depends on nothing else.
+    Images are drawn in the order of their ids, so that the split depends only on these and the
+    seed. ``share`` is that of the validation part.
     """
     images = sorted(content.images, key=lambda i: i.number)
     order = np.random.default_rng(seed).permutation(len(images))
@@ -152,10 +153,7 @@ def split(content: CocoFile, share: float, seed: int) -> tuple[CocoFile, CocoFil
 def augmented(
     sample: Sample, other: Callable[[], Sample], config: AugmentConfig, rng: np.random.Generator
 ) -> Sample:
-    """A random variation of a sample, with objects of another one pasted in now and then.
-
-    ``other`` loads that one, if it is wanted.
-    """
+    """A random augmentation of a sample; ``other`` loads the sample to paste objects from."""
     if rng.random() < config.paste:
         sample = copy_paste(sample, other(), rng)
     if rng.random() < config.flip:
@@ -170,10 +168,10 @@ def flipped(sample: Sample) -> Sample:
 
 
 def scaled(sample: Sample, factor: float) -> Sample:
-    """The sample shown larger or smaller in a frame of its own size.
+    """The sample scaled about its centre in an image of the same size.
 
-    Larger: its middle is cut out. Smaller: it stands in the middle, grey around it. So the size
-    of objects varies although the network resizes every image to one size.
+    It is cropped if larger and padded with grey if smaller, so that the size of objects varies
+    although the network resizes every image to one size.
     """
     height, width = sample.image.shape[:2]
     centre = np.array([(width - 1) / 2, (height - 1) / 2])
@@ -190,7 +188,7 @@ def scaled(sample: Sample, factor: float) -> Sample:
 
 
 def copy_paste(sample: Sample, other: Sample, rng: np.random.Generator) -> Sample:
-    """Up to three objects of another image pasted over this one; what they hide is hidden."""
+    """The sample with up to three objects of another one pasted over it; masks are occluded."""
     height, width = sample.image.shape[:2]
     count = min(3, len(other.labels))
     chosen = rng.permutation(len(other.labels))[:count]
@@ -207,13 +205,13 @@ def copy_paste(sample: Sample, other: Sample, rng: np.random.Generator) -> Sampl
 
 
 def _visible(sample: Sample) -> Sample:
-    """Without the objects of which too little is left."""
-    seen = sample.masks.sum(axis=(1, 2)) >= MIN_OBJECT_PX
-    return Sample(sample.image, sample.masks[seen], sample.labels[seen])
+    """The sample without objects of which too few pixels are visible."""
+    visible = sample.masks.sum(axis=(1, 2)) >= MIN_OBJECT_PX
+    return Sample(sample.image, sample.masks[visible], sample.labels[visible])
 
 
 def as_tensors(sample: Sample) -> tuple[torch.Tensor, Target]:
-    """The image (3, H, W) in 0..1, and its objects."""
+    """The image (3, H, W) in 0..1 and its objects."""
     image = torch.from_numpy(sample.image).permute(2, 0, 1).float() / 255
     boxes = np.array([mask_box(m) for m in sample.masks], np.float32).reshape(-1, 4)
     labels, masks = torch.from_numpy(sample.labels), torch.from_numpy(sample.masks)

@@ -1,4 +1,4 @@
-"""Training of the MaskIoU head alone, in the boxes that another detector finds."""
+"""Training of the MaskIoU head alone, in the boxes of another detector."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ from bmask_slam.semantics.training.targets import Target
 MASK_THRESHOLD = 0.5
 MATCH_IOU = 0.5
 WARM_UP = 20
-FIRST_LOOK = 256
-"""So many examples say how far the mean of the head's values is off at the beginning."""
+OFFSET_EXAMPLES = 256
+"""Number of examples that the initial offset of the head's values is estimated from."""
 
 
 @dataclass(frozen=True)
 class DetectedConfig:
-    """Which boxes are learnt from, and how.
+    """Which boxes are examples, and how to train.
 
-    ``min_overlap``: of the box with an object of its class, so that badly placed boxes teach as
-    well. ``min_score``: of the class; of the many boxes below it only well placed ones are taken.
+    ``min_overlap``: least overlap of a box with an object of its class; low, so that badly placed
+    boxes are examples too. ``min_score``: class score below which only well placed boxes are used,
+    since there are many others.
     """
 
     min_overlap: float = 0.1
@@ -49,14 +50,13 @@ class DetectedConfig:
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """Boxes of a detector as the MaskIoU head sees them.
+    """Boxes of a detector as input of the MaskIoU head.
 
     Attributes:
-        features: (N, 2, C, 14, 14) half precision, of the image and of its mirror image.
-        masks: (N, 28, 28) half precision, the mean of both, as it is in the image.
+        features: (N, 2, C, 14, 14) half precision, in the image and in its mirror image.
+        masks: (N, 28, 28) half precision, the mean of both, oriented as in the image.
         labels: (N,) int64.
-        ious: (N,) IoU of the mask, pasted into the image, with the object of its
-            class that it overlaps most.
+        ious: (N,) largest IoU of the mask, pasted into the image, with an object of its class.
     """
 
     features: Tensor
@@ -104,8 +104,8 @@ def examples(
     around = enlarged(boxes, model.config.mask_context)
     pasted = paste(masks, around, (image.shape[1], image.shape[2])) > MASK_THRESHOLD
     ious = (mask_iou(pasted, target.masks) * same[kept]).amax(dim=1)
-    seen = pasted.flatten(1).any(dim=1)
-    return Examples(features[seen].half(), masks[seen].half(), labels[seen], ious[seen])
+    filled = pasted.flatten(1).any(dim=1)
+    return Examples(features[filled].half(), masks[filled].half(), labels[filled], ious[filled])
 
 
 def _both_ways(model: MaskRCNN, image: Tensor, boxes: Tensor) -> Tensor:
@@ -123,7 +123,7 @@ def _both_ways(model: MaskRCNN, image: Tensor, boxes: Tensor) -> Tensor:
 
 
 def mask_iou(a: Tensor, b: Tensor) -> Tensor:
-    """IoU (N, G) of masks (N, H, W) and (G, H, W); 0 of two empty ones."""
+    """IoU (N, G) of masks (N, H, W) and (G, H, W); 0 if both are empty."""
     both = a.flatten(1).float() @ b.flatten(1).float().T
     either = a.sum(dim=(1, 2))[:, None] + b.sum(dim=(1, 2)) - both
     return both / either.clamp(min=1)
@@ -134,8 +134,8 @@ def train_maskiou(
 ) -> float:
     """Train so that the mean of the head's value and the expected IoU is the true IoU.
 
-    That mean is the mask's score where masks are made both ways. Returns the mean squared error
-    over the second half of the steps.
+    That mean is the mask score of ``segment_both_ways``. Returns the mean squared error over the
+    second half of the steps.
     """
     rng = np.random.default_rng(config.seed)
     expected = expected_iou(given.masks.float())
@@ -151,8 +151,8 @@ def train_maskiou(
         for group in optimiser.param_groups:
             group["lr"] = config.rate * min((step + 1) / WARM_UP, 1) * cosine
         ways = torch.from_numpy(rng.integers(0, 2, len(chosen)))
-        judged = _judged(head, given, torch.from_numpy(chosen), ways)
-        loss = ((judged + expected[chosen]) / 2 - given.ious[chosen]).square().mean()
+        predicted = _predicted_ious(head, given, torch.from_numpy(chosen), ways)
+        loss = ((predicted + expected[chosen]) / 2 - given.ious[chosen]).square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(head.parameters(), config.max_gradient)
@@ -167,14 +167,14 @@ def train_maskiou(
 def _remove_offset(
     head: MaskIoUHead, given: Examples, expected: Tensor, rng: np.random.Generator
 ) -> None:
-    """Move the head's values by a constant, so that they are right in the mean."""
-    some = torch.from_numpy(rng.choice(len(given), FIRST_LOOK))
-    judged = _judged(head, given, some, torch.zeros(len(some), dtype=torch.int64))
-    head.maskiou.bias.add_((2 * given.ious[some] - expected[some] - judged).mean())
+    """Shift the head's values by a constant so that their mean error is zero."""
+    some = torch.from_numpy(rng.choice(len(given), OFFSET_EXAMPLES))
+    predicted = _predicted_ious(head, given, some, torch.zeros(len(some), dtype=torch.int64))
+    head.maskiou.bias.add_((2 * given.ious[some] - expected[some] - predicted).mean())
 
 
-def _judged(head: MaskIoUHead, given: Examples, chosen: Tensor, ways: Tensor) -> Tensor:
-    """The head's values (B,) of chosen examples (B,), as they are (way 0) or mirrored (1)."""
+def _predicted_ious(head: MaskIoUHead, given: Examples, chosen: Tensor, ways: Tensor) -> Tensor:
+    """The head's values (B,) for chosen examples (B,), as they are (way 0) or mirrored (1)."""
     masks = given.masks[chosen].float()
     masks = torch.where(ways[:, None, None].bool(), masks.flip(2), masks)
     values = head(given.features[chosen, ways].float(), masks)

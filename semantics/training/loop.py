@@ -1,4 +1,4 @@
-"""The training loop: batches, optimiser, curves, and checkpoints that it resumes from."""
+"""The training loop: batches, optimiser, loss curves, and checkpoints to resume from."""
 
 from __future__ import annotations
 
@@ -44,17 +44,16 @@ class TrainingConfig:
         batch: images in a batch.
         optimiser: "adamw", or "sgd" with momentum 0.9.
         rate: learning rate after the warm-up; it falls to nothing along a half cosine.
-        body_rate: factor on the rate for the body, which has learnt before.
+        body_rate: factor on the rate for the pretrained body.
         warm_up: steps over which the rate rises.
         decay: weight decay.
-        max_gradient: gradients longer than this are shortened.
-        freeze: beginnings of names of parameters that stay as they are.
-        only: "masks": the RPN and the box head are not trained, for a network whose boxes come
-            from another detector; "maskiou": the MaskIoU head alone is; "boxes": the RPN and the
-            box head alone are; "": all are.
-        crowd: an image's chance to be drawn grows with its number of objects to this power, so
-            that 0 draws images alike and 1 objects alike.
-        rois: where masks are learnt: in the RPN's proposals, or in boxes around the objects.
+        max_gradient: largest norm of the gradient; it is scaled down to this.
+        freeze: beginnings of the names of parameters that are not trained.
+        only: "masks": all but the RPN and the box head, for a network whose boxes come from another
+            detector; "maskiou": the MaskIoU head; "boxes": the RPN and the box head; "": all.
+        crowd: images are drawn in proportion to their number of objects to this power: with 0 all
+            images are equally likely, with 1 all objects.
+        rois: where masks are trained: in the RPN's proposals, or in boxes around the objects.
         precision: "float32", or "mixed": float16 on a GPU, bfloat16 on a CPU.
         save_every: steps between checkpoints.
         seed: of batches, samples and augmentation.
@@ -89,18 +88,17 @@ def train(
     config: TrainingConfig,
     progress: Callable[[int, int], None],
 ) -> Path:
-    """Train and write weights, loss curves and a checkpoint; goes on from the one in ``out``.
+    """Train and write weights, loss curves and a checkpoint; resume from one in ``out``.
 
     Returns:
         the weights file.
 
     Raises:
-        InputError: ``out`` holds a training with another configuration, or a loss that is no
-            number.
+        InputError: ``out`` holds a training with another configuration, or a loss is not finite.
     """
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = network.model.to(device).train()
-    parameters = trainable(model, config)
+    trainable(model, config)
     optimiser = _optimiser(model, config)
     halves = device == "cuda" and config.precision == "mixed"
     scaler = torch.amp.GradScaler(device, enabled=halves)
@@ -114,12 +112,7 @@ def train(
             total = sum(losses.values(), torch.zeros((), device=device))
             if not math.isfinite(value := float(total.detach())):
                 raise InputError(f"step {step}: the loss is {value}; lower the rate {config.rate}")
-            optimiser.zero_grad(set_to_none=True)
-            scaler.scale(total).backward()
-            scaler.unscale_(optimiser)
-            nn.utils.clip_grad_norm_(parameters, config.max_gradient)
-            scaler.step(optimiser)
-            scaler.update()
+            _descend(total, optimiser, scaler, config)
             _log(writer, step, losses)
             if (step + 1) % config.save_every == 0 or step + 1 == config.steps:
                 file.flush()
@@ -129,8 +122,24 @@ def train(
     return out / WEIGHTS
 
 
+def _descend(
+    loss: Tensor,
+    optimiser: torch.optim.Optimizer,
+    scaler: torch.amp.GradScaler,
+    config: TrainingConfig,
+) -> None:
+    """One step of the optimiser, with a limited gradient."""
+    optimiser.zero_grad(set_to_none=True)
+    scaler.scale(loss).backward()
+    scaler.unscale_(optimiser)
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    nn.utils.clip_grad_norm_(parameters, config.max_gradient)
+    scaler.step(optimiser)
+    scaler.update()
+
+
 def trainable(model: nn.Module, config: TrainingConfig) -> list[nn.Parameter]:
-    """The parameters that are trained; the others get no gradient.
+    """The parameters to train; the others get no gradient.
 
     Raises:
         InputError: a name to freeze that no parameter begins with, or nothing left to train.
@@ -149,7 +158,7 @@ def trainable(model: nn.Module, config: TrainingConfig) -> list[nn.Parameter]:
 
 
 def _learns(name: str, only: Only) -> bool:
-    """Whether the parameter of this name takes part where only some heads are trained."""
+    """Whether the parameter of this name is trained."""
     if only == MASKIOU:
         return f".{MASKIOU}" in name
     if only == "":
@@ -158,7 +167,7 @@ def _learns(name: str, only: Only) -> bool:
 
 
 def _optimiser(model: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
-    """Over what is trained, in groups that say their share of the rate."""
+    """The optimiser of trainable parameters, in groups with their factor on the rate."""
     learning = [(n, p) for n, p in model.named_parameters() if p.requires_grad]
     groups = [
         {"params": [p for n, p in learning if n.startswith(BODY)], "share": config.body_rate},
@@ -181,7 +190,7 @@ def _set_rate(optimiser: torch.optim.Optimizer, step: int, config: TrainingConfi
 def _step_losses(
     model: Any, data: Dataset | JoinedDatasets, step: int, config: TrainingConfig, device: str
 ) -> Losses:
-    """The losses of a step's batch, which depends on the seed and the step alone."""
+    """The losses of a step's batch, which depends only on the seed and the step."""
     rng = np.random.default_rng([config.seed, step])
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     images, targets = zip(*_batch(data, rng, config, device), strict=True)
@@ -204,15 +213,15 @@ def _batch(
 def draw_batch(
     data: Dataset | JoinedDatasets, rng: np.random.Generator, config: TrainingConfig
 ) -> list[int]:
-    """Indices of a batch's images, all as wide or all as high: so there is little padding."""
+    """Indices of a batch's images: all portrait or all landscape, so that padding is small."""
     chance = data.objects**config.crowd
     first = int(rng.choice(len(data), p=chance / chance.sum()))
-    chance *= data.upright == data.upright[first]
+    chance *= data.portrait == data.portrait[first]
     return [first, *rng.choice(len(data), config.batch - 1, p=chance / chance.sum()).tolist()]
 
 
 def _log(writer: Any, step: int, losses: Losses) -> None:
-    """A line a step and loss: step, name, value."""
+    """Write one line for each loss: step, name, value."""
     for name, value in losses.items():
         writer.writerow([step, name, f"{float(value.detach()):.6g}"])
 
@@ -234,7 +243,7 @@ def _save(
 def _resume(
     out: Path, model: nn.Module, optimiser: torch.optim.Optimizer, config: TrainingConfig
 ) -> int:
-    """The step to go on from: 0, or after the checkpoint, whose curves are cut to fit."""
+    """Load the checkpoint, if any, and cut the curves at it; the next step."""
     if not (out / STATE).is_file():
         (out / CURVES).write_text("step,loss,value\n")
         return 0

@@ -1,4 +1,4 @@
-"""The losses: those of the paper's eq. (10), corrected, and a dice loss of the masks."""
+"""The losses of the paper's eq. (10), corrected, and a dice loss of the masks."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from bmask_slam.semantics.training.targets import (
 
 SMOOTH_L1_BETA = 1 / 9
 PROPOSALS_FACTOR = 2
-"""So many times as many proposals are looked at in training."""
+"""Factor on the number of proposals in training."""
 JITTERS = 3
-"""Boxes drawn around each object, if masks are learnt there."""
+"""Number of boxes drawn around each object, if masks are trained there."""
 JITTER_SHARE = 0.25
-"""Their corners move by up to a share of the box's size that is drawn from 0 to this, so that there
-are good boxes and bad ones: the MaskIoU head must have seen masks of both."""
+"""Largest displacement of their corners, relative to the box's size. Each box draws its own from 0
+to this, since the MaskIoU head needs examples of good and of bad masks."""
 MAX_ROIS = 64
-"""Of them at most so many are drawn from an image."""
+"""Largest number of these boxes in an image."""
 
 Losses = dict[str, Tensor]
 MaskRois = Literal["proposals", "objects"]
@@ -51,7 +51,7 @@ class Rois:
 
     Attributes:
         boxes: (R_b, 4) of each image, in pixels of the batch.
-        owners: (R_b,) each one's object.
+        owners: (R_b,) the object of each box.
     """
 
     boxes: list[Tensor]
@@ -66,12 +66,12 @@ def network_losses(
     rois: MaskRois = "proposals",
     only: Only = "",
 ) -> Losses:
-    """Every loss of a batch; their sum is what training minimises.
+    """All losses of a batch; training minimises their sum.
 
     Args:
-        rois: where masks are learnt: in the RPN's proposals, or in boxes around the objects.
-        only: "boxes": the losses of the RPN and the box head alone; "masks" or "maskiou": without
-            those, where boxes come from another detector.
+        rois: where masks are trained: in the RPN's proposals, or in boxes around the objects.
+        only: "boxes": the losses of the RPN and the box head; "masks" or "maskiou": those of the
+            other heads, for boxes from another detector; "": all.
     """
     batch = prepare(images, model.config.image)
     scaled = [
@@ -100,21 +100,21 @@ def rpn_losses(
     targets: Sequence[Target],
     generator: torch.Generator,
 ) -> tuple[Losses, list[Tensor]]:
-    """Losses of objectness and anchor offsets over drawn anchors; and the proposals."""
+    """Losses of objectness and anchor offsets over sampled anchors; and the proposals."""
     logits, offsets = model.rpn.head(levels)
     anchors = make_anchors(levels, batch.size, model.config.anchors)
     every, all_logits, all_offsets = torch.cat(anchors), torch.cat(logits, 1), torch.cat(offsets, 1)
-    judged, moved, wanted, truth = [], [], [], []
+    scored, moved, wanted, truth = [], [], [], []
     for b, (boxes, target) in enumerate(zip(objects, targets, strict=True)):
         matched = match(every, boxes, RPN_RULE)
         positive, negative = draw_samples(matched, target.labels, RPN_RULE, generator)
-        judged.append(all_logits[b, torch.cat([positive, negative])])
+        scored.append(all_logits[b, torch.cat([positive, negative])])
         truth.append(torch.cat([torch.ones(len(positive)), torch.zeros(len(negative))]))
         moved.append(all_offsets[b, positive])
         wanted.append(
             box_ops.encode(boxes[matched[positive]], every[positive].float(), box_ops.RPN_WEIGHTS)
         )
-    scores = torch.cat(judged).float()
+    scores = torch.cat(scored).float()
     objectness = F.binary_cross_entropy_with_logits(scores, torch.cat(truth).to(scores))
     box = _smooth_l1(torch.cat(moved), torch.cat(wanted), len(scores))
     usual = model.config.proposals
@@ -131,7 +131,7 @@ def box_losses(
     targets: Sequence[Target],
     generator: torch.Generator,
 ) -> tuple[Losses, Rois]:
-    """Losses of class and box over drawn proposals, the objects themselves among them."""
+    """Losses of class and box over sampled proposals and the objects' own boxes."""
     chosen, labels, wanted, positives = [], [], [], Rois([], [])
     for found, boxes, target in zip(proposals, objects, targets, strict=True):
         candidates = torch.cat([found, boxes])
@@ -157,7 +157,7 @@ def around_objects(
     batch: ImageBatch,
     generator: torch.Generator,
 ) -> Rois:
-    """Boxes near each object, as an imperfect detector would give them."""
+    """Random boxes near each object, similar to those of an imperfect detector."""
     found = Rois([], [])
     for boxes, target, size in zip(objects, targets, batch.sizes, strict=True):
         owner = torch.arange(len(boxes), device=boxes.device).repeat(JITTERS)
@@ -180,7 +180,7 @@ def mask_losses(
     targets: Sequence[Target],
     batch: ImageBatch,
 ) -> Losses:
-    """Losses of the masks, and of the predicted IoUs, on the object's own class (eq. 11)."""
+    """Losses of the masks and of the predicted IoUs, of each object's class (eq. 11)."""
     heads = model.roi_heads
     context = model.config.mask_context
     found = Rois([box_ops.enlarged(b, context) for b in found.boxes], found.owners)
@@ -209,18 +209,18 @@ def mask_losses(
 def dice_loss(masks: Tensor, wanted: Tensor) -> Tensor:
     """Mean of 1 - 2 |A B| / (|A|^2 + |B|^2) over masks (R, M, M) in 0..1 (Milletari et al. 2016).
 
-    It counts a mask's share that is right and not its cells, so that thin parts (leaves, legs,
-    shelves), which are outvoted cell by cell, are worth their place.
+    It is relative to the mask's area, so that thin structures (leaves, legs, shelves) count, which
+    the mean over cells neglects.
     """
     both = (masks * wanted).sum(dim=(1, 2))
-    alone = masks.square().sum(dim=(1, 2)) + wanted.square().sum(dim=(1, 2))
-    return (1 - (2 * both + 1) / (alone + 1)).mean()
+    areas = masks.square().sum(dim=(1, 2)) + wanted.square().sum(dim=(1, 2))
+    return (1 - (2 * both + 1) / (areas + 1)).mean()
 
 
 def _wanted_masks(
     found: Rois, targets: Sequence[Target], batch: ImageBatch, bins: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mask targets (R, bins, bins), areas (R,) of objects and boxes in the images' own pixels."""
+    """Mask targets (R, bins, bins), areas (R,) of objects and of boxes in original pixels."""
     wanted, object_px, box_px = [], [], []
     for b, (boxes, owner, target) in enumerate(
         zip(found.boxes, found.owners, targets, strict=True)
@@ -233,6 +233,6 @@ def _wanted_masks(
 
 
 def _smooth_l1(found: Tensor, wanted: Tensor, count: int) -> Tensor:
-    """Sum over the boxes' offsets, divided by the number of all drawn boxes."""
+    """Sum over the boxes' offsets, divided by the number of all sampled boxes."""
     total = F.smooth_l1_loss(found.float(), wanted.float(), beta=SMOOTH_L1_BETA, reduction="sum")
     return total / max(count, 1)

@@ -1,4 +1,4 @@
-"""A training from files: which network, which data, and the picture of its curves."""
+"""Training from files: the initial network, the data, and a plot of the losses."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ SMOOTHING_STEPS = 25
 
 @dataclass(frozen=True)
 class Source:
-    """Images to learn from.
+    """Training images.
 
     Attributes:
         file, images: COCO file and the folder of its images.
-        held_out: share of the images that is left for testing.
-        split_seed: says which; None: the training's own seed does.
+        held_out: share of the images that is held out for testing.
+        split_seed: seed of this split; None: the training's seed.
     """
 
     file: Path
@@ -51,13 +51,14 @@ class TrainingRun:
     """What to train, on what.
 
     Attributes:
-        data: where images come from; one that stands there twice is seen twice as often.
+        data: sources of images; one that is listed twice is drawn twice as often.
         out: folder of the results.
-        weights: to start from; None: a new light network ...
-        light: they take the light network's anchors and numbers of proposals and detections.
-        backbone: ... with this ImageNet MobileNetV2 as its body.
-        labels: label set to learn, by name or file.
-        freeze: parameters that stay, by the beginning of their names.
+        weights: to start from; None: a new light network with the body ``backbone``.
+        light: whether ``weights`` get the light network's anchors and numbers of proposals and
+            detections.
+        backbone: weights of an ImageNet MobileNetV2.
+        labels: label set, by name or file.
+        freeze: beginnings of the names of parameters that are not trained.
         settings: other values of ``TrainingConfig``.
     """
 
@@ -99,7 +100,7 @@ def run_training(run: TrainingRun, progress: Callable[[int, int], None]) -> Path
 
 
 def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork:
-    """The network to begin with."""
+    """The initial network."""
     torch.manual_seed(seed)
     if run.weights is not None:
         like = LIGHT if run.light else None

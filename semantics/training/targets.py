@@ -1,4 +1,4 @@
-"""Which box stands for which object, which ones enter a loss, and what a mask should be."""
+"""Targets of training: matching of boxes to objects, sampling of boxes, masks and IoUs."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class MatchRule:
     """How boxes are matched to objects, and how many are drawn (Ren et al. 2015).
 
     Attributes:
-        positive_iou: at least this overlap makes a box the object's.
-        negative_iou: below this it is background; in between it is left out.
-        rescue: an object's best box is its own however small the overlap.
-        count: boxes drawn from an image ...
-        positive_share: ... at most this share of them positive.
+        positive_iou: overlap from which a box is matched to an object.
+        negative_iou: overlap below which it is background; in between it is ignored.
+        rescue: whether an object's best box is matched to it however small the overlap.
+        count: number of boxes drawn from an image.
+        positive_share: largest share of positive boxes among them.
     """
 
     positive_iou: float
@@ -73,7 +73,7 @@ def draw_samples(
 ) -> tuple[Tensor, Tensor]:
     """Indices of positive and of negative boxes, drawn at random from matches (N,).
 
-    ``labels`` (G,) are the objects' classes, which have equal chances among the positives.
+    ``labels`` (G,) are the objects' classes, which are equally likely among the positives.
     """
     positive, negative = torch.nonzero(matched >= 0)[:, 0], torch.nonzero(matched == NOTHING)[:, 0]
     count = min(int(rule.count * rule.positive_share), len(positive))
@@ -85,10 +85,10 @@ def draw_samples(
 
 
 def draw_evenly(labels: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Up to ``count`` places in ``labels`` (N,) at random, of each label equally many if it can be.
+    """Up to ``count`` random indices into ``labels`` (N,), balanced over the labels.
 
-    A shelf holds a hundred books: drawn one by one from all objects of an image, they would leave
-    no room for the chair in front of it.
+    If all objects were equally likely, the hundred books of a shelf would crowd out the chair in
+    front of it.
     """
     order = torch.randperm(len(labels), generator=generator).to(labels.device)
     by_label, place = labels[order].sort(stable=True)
@@ -99,8 +99,8 @@ def draw_evenly(labels: Tensor, count: int, generator: torch.Generator) -> Tenso
 def mask_targets(masks: Tensor, owner: Tensor, boxes: Tensor, bins: int) -> Tensor:
     """Share (R, bins, bins) of each bin of the boxes (R, 4) that the masks (G, H, W) cover.
 
-    ``owner`` (R,) is each box's mask. The sum of a mask over a rectangle is a difference of its
-    integral image at the corners; between pixels that image is bilinear, so the share is exact.
+    ``owner`` (R,) is the mask of each box. The sum of a mask over a rectangle follows from its
+    integral image at the corners, which is bilinear between pixels, so that the share is exact.
     """
     integral = F.pad(masks.float().cumsum(1).cumsum(2), (1, 0, 1, 0))
     steps = torch.linspace(0, 1, bins + 1, device=boxes.device)
@@ -113,7 +113,7 @@ def mask_targets(masks: Tensor, owner: Tensor, boxes: Tensor, bins: int) -> Tens
 
 
 def _bilinear(images: Tensor, which: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Values (R, K, K) of images (G, H, W) at every pair of the rows y (R, K), columns x (R, K)."""
+    """Values (R, K, K) of images (G, H, W) at all pairs of rows y (R, K) and columns x (R, K)."""
     height, width = images.shape[1:]
     x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
     left, top = x.floor().long().clamp(max=width - 2), y.floor().long().clamp(max=height - 2)
@@ -131,7 +131,7 @@ def iou_targets(predicted: Tensor, wanted: Tensor, object_px: Tensor, box_px: Te
         predicted: (R, M, M) probabilities, binarised at 0.5.
         wanted: (R, M, M) shares of the object inside the box.
         object_px: (R,) area of the whole object, also outside the box.
-        box_px: (R,) area of the box, which tells how much a cell is.
+        box_px: (R,) area of the box, from which that of a cell follows.
     """
     mask, inside = (predicted > 0.5).float(), (wanted > 0.5).float()
     cell_px = box_px / predicted.shape[1] ** 2

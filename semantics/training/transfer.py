@@ -1,4 +1,4 @@
-"""A trained network for other labels or anchors: what both know is kept, the rest starts anew."""
+"""Transfer of a trained network to other labels or anchors."""
 
 from __future__ import annotations
 
@@ -18,21 +18,20 @@ PER_CLASS = {
     "roi_heads.mask_predictor.mask_fcn_logits": 1,
     "roi_heads.maskiou_head.maskiou": 1,
 }
-"""Layers with outputs for each class, and how many a class."""
+"""Layers with outputs for each class, and the number of outputs a class."""
 PER_ANCHOR = ("rpn.head.cls_logits", "rpn.head.bbox_pred")
-"""Layers with outputs for each anchor of a cell, those of half the size last."""
+"""Layers with outputs for each anchor of a cell, those of half size last."""
 
 
 def transferred(
     network: TrainedNetwork, labels: LabelSet, like: NetworkConfig | None = None
 ) -> TrainedNetwork:
-    """The network with these labels and a MaskIoU head.
+    """The network with other labels and a MaskIoU head.
 
-    ``like`` gives the anchors, and how many proposals and detections there are.
-
-    Every parameter that does not depend on the classes is kept; in the layers that do, the rows
-    of classes of the same name (and of the background) are kept, in the RPN's those of the
-    anchors that were there. New rows, and a new MaskIoU head, are drawn at random.
+    Parameters that do not depend on the classes are copied; in layers that do, the rows of classes
+    of the same name and of the background; in the RPN, the rows of existing anchors. New rows and a
+    new MaskIoU head are initialised at random. ``like`` gives the anchors and the numbers of
+    proposals and detections.
     """
     config = replace(network.model.config, classes=len(labels))
     config = config if config.maskiou_channels else config.with_maskiou()

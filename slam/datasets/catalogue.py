@@ -25,9 +25,9 @@ class Recording:
     Attributes:
         name: such as ``tum/freiburg1_xyz``; also its folder.
         url: of its archive.
-        size, sha256: of the archive; None and "" where nobody has said.
-        layout: of what the archive holds.
-        camera: what camera.yaml should hold where the archive brings none; empty: nothing.
+        size, sha256: of the archive; None and "" if unknown.
+        layout: layout of the files in the archive.
+        camera: content of camera.yaml where the archive has none; empty: none is written.
         title, page, licence: of the data set.
     """
 
@@ -43,10 +43,10 @@ class Recording:
 
 
 def read_catalogue(file: Path | None = None) -> dict[str, Recording]:
-    """Recordings by name, from the shipped catalogue or another of its form.
+    """Recordings by name, from the shipped catalogue or another one in its format.
 
     Raises:
-        InputError: it is missing or not of this form.
+        InputError: it is missing or in another format.
     """
     file = file or data_path(CATALOGUE)
     sets = read_yaml(file)
@@ -62,7 +62,7 @@ def find(catalogue: dict[str, Recording], name: str) -> Recording:
     """The recording of a name.
 
     Raises:
-        InputError: there is none; it names those that are called alike.
+        InputError: there is none; the message suggests similar names.
     """
     if name in catalogue:
         return catalogue[name]

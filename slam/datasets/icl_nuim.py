@@ -1,4 +1,4 @@
-"""ICL-NUIM's recordings in TUM's layout."""
+"""Conversion of ICL-NUIM's recordings to TUM's layout."""
 
 from __future__ import annotations
 

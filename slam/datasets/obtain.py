@@ -1,4 +1,4 @@
-"""A published recording in a folder of its own: downloaded, checked, unpacked, complete."""
+"""Download of a published recording: checked, unpacked, converted to TUM's layout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bmask_slam.graph.whole_file import whole_file
 SUMS = "SHA256SUMS"
 LISTS = ("rgb.txt", "associations.txt")
 Progress = Callable[[str, int, int], None]
-"""Called with what is done, and the bytes that are done and all of them (0: unknown)."""
+"""Called with the name of the step, the bytes done and all bytes (0: unknown)."""
 
 
 def obtain(
@@ -27,17 +27,17 @@ def obtain(
     progress: Progress | None = None,
     keep_archive: bool = False,
 ) -> Path:
-    """The recording's folder, ``folder/SET/SEQUENCE``; nothing is done where it is there already.
+    """The recording's folder, ``folder/SET/SEQUENCE``; downloads it unless it is there already.
 
-    The folder appears when it is complete. The archive's SHA-256 is noted in ``folder/SHA256SUMS``
-    (``sha256sum`` reads it), and a later download of a recording that the catalogue has no SHA-256
-    of must agree with it.
+    The folder appears when it is complete. The archive's SHA-256 is stored in ``folder/SHA256SUMS``
+    (in the format of ``sha256sum``); if the catalogue has none, a later download must agree with
+    it.
 
     Raises:
         InputError: no connection, a file that is not the one expected, a broken or dangerous
             archive, or one without image lists.
     """
-    tell = progress or (lambda what, done, total: None)
+    report = progress or (lambda what, done, total: None)
     place = folder / recording.name
     if place.is_dir():
         return place
@@ -48,13 +48,13 @@ def obtain(
     found = download(
         WebFile(recording.url, expected, recording.size),
         archive,
-        lambda done, total: tell("download", done, total),
+        lambda done, total: report("download", done, total),
     )
     write_sums(folder / SUMS, known | {archive.name: found})
     unpacked = place.with_name(f".{place.name}.unpacking")
     shutil.rmtree(unpacked, ignore_errors=True)
     try:
-        unpack(archive, unpacked, lambda done, total: tell("unpack", done, total))
+        unpack(archive, unpacked, lambda done, total: report("unpack", done, total))
         os.replace(_completed(unpacked, recording), place)
     finally:
         shutil.rmtree(unpacked, ignore_errors=True)
@@ -64,21 +64,21 @@ def obtain(
 
 
 def read_sums(path: Path) -> dict[str, str]:
-    """SHA-256 by file name, of lines as ``sha256sum`` writes them; empty without the file."""
+    """SHA-256 by file name, from a file in the format of ``sha256sum``; empty if missing."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     pairs = (line.split(maxsplit=1) for line in lines if line.strip())
     return {name.strip(): digest for digest, name in pairs}
 
 
 def write_sums(path: Path, sums: dict[str, str]) -> None:
-    """Write such lines, sorted by name."""
+    """Write SHA-256 by file name in the format of ``sha256sum``, sorted by name."""
     text = "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items()))
     with whole_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def _completed(unpacked: Path, recording: Recording) -> Path:
-    """The folder with the image lists within what was unpacked, with all that a run needs."""
+    """The unpacked folder with the image lists, with the files added that a run needs."""
     inner = [path for path in unpacked.iterdir() if path.is_dir()]
     candidates = [unpacked, *sorted(inner)]
     root = next((p for p in candidates if any((p / name).is_file() for name in LISTS)), None)

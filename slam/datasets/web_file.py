@@ -1,4 +1,4 @@
-"""A file from a web address: resumed where it stopped, checked, and there whole or not at all."""
+"""Download of a file over HTTP: resumed, checked, and complete or absent."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ CHUNK_BYTES = 1 << 20
 TIMEOUT_S = 30.0
 TRIES = 5
 FIRST_PAUSE_S = 1.0
-"""Before the second try; twice as long before each that follows."""
-HOPELESS = (400, 401, 403, 404, 410, 451)
-"""Answers that another try will not change."""
+"""Pause before the second try; it doubles with each further one."""
+PERMANENT = (400, 401, 403, 404, 410, 451)
+"""HTTP status codes that another try will not change."""
 RANGE_REFUSED = 416
 
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
-"""Called with the bytes that are there and those of the whole file, 0 where unknown."""
+"""Called with the bytes received and those of the whole file, 0 if unknown."""
 
 
 @dataclass(frozen=True)
 class WebFile:
-    """A file on the web and what is known of it.
+    """A file on the web.
 
     Attributes:
         url: its address.
-        sha256: its SHA-256 in hexadecimal, or the beginning; "" where it is not known.
-        size: its bytes; None where they are not known.
+        sha256: its SHA-256 in hexadecimal, or the first digits; "" if unknown.
+        size: its size in bytes; None if unknown.
     """
 
     url: str
@@ -50,7 +50,7 @@ class WebFile:
 
 
 class _InterruptedError(Exception):
-    """The connection ended before the file did."""
+    """The connection ended before the end of the file."""
 
 
 CONNECTION_ERRORS = (
@@ -63,29 +63,29 @@ CONNECTION_ERRORS = (
 
 
 def download(file: WebFile, path: Path, progress: Progress | None = None) -> str:
-    """Bring a file to ``path`` unless it is there already and whole; its SHA-256.
+    """Download a file to ``path`` unless it is there already and correct; its SHA-256.
 
-    What arrives is kept as NAME.part, and the next call goes on from there if the server can and
-    its file is the same. Two processes wait for each other.
+    Received bytes are kept as NAME.part; the next call resumes from there if the server supports
+    it and its file is unchanged. Concurrent downloads to one folder run one after the other.
 
     Raises:
-        InputError: no connection, another size or SHA-256, or no room on the disk.
+        InputError: no connection, another size or SHA-256, or too little disk space.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _alone(path.parent):
+    with _locked(path.parent):
         if path.is_file() and not _difference(file, path):
             return sha256(path)
         part = path.with_name(f"{path.name}.part")
-        _fill(file, part, progress or (lambda done, total: None))
+        _complete(file, part, progress or (lambda done, total: None))
         difference = _difference(file, part)
         if difference:
-            _forget(part)
+            _remove_part(part)
             raise InputError(
-                f"{file.url}: {difference}: the file was changed on the way, or is another by "
-                f"now; try again, or {_by_hand(part)}"
+                f"{file.url}: {difference}: the file was damaged in transfer or has been replaced; "
+                f"try again, or {_by_hand(part)}"
             )
         os.replace(part, path)
-        _forget(part)
+        _remove_part(part)
         return sha256(path)
 
 
@@ -96,7 +96,7 @@ def sha256(path: Path) -> str:
 
 
 def _difference(file: WebFile, path: Path) -> str:
-    """What a file on disk has another of than it should; "" where nothing."""
+    """How a file on disk differs from the expected size and SHA-256; "" if it does not."""
     size = path.stat().st_size
     if file.size is not None and size != file.size:
         return f"{size} bytes, not {file.size}"
@@ -106,8 +106,8 @@ def _difference(file: WebFile, path: Path) -> str:
     return ""
 
 
-def _fill(file: WebFile, part: Path, progress: Progress) -> None:
-    """Try until all is there; five times without a byte end it, at once what has no hope."""
+def _complete(file: WebFile, part: Path, progress: Progress) -> None:
+    """Receive until the file is complete; give up after TRIES failures without progress."""
     failures = 0
     while True:
         before = _size(part)
@@ -115,19 +115,19 @@ def _fill(file: WebFile, part: Path, progress: Progress) -> None:
             return _receive(file, part, progress)
         except (_InterruptedError, http.client.HTTPException, OSError) as error:
             if not isinstance(error, CONNECTION_ERRORS):
-                raise  # the disk's
+                raise  # an error of the disk
             failures = 1 if _size(part) > before else failures + 1
-            if failures == TRIES or _hopeless(error):
-                raise _given_up(file, part, error) from error
+            if failures == TRIES or _is_permanent(error):
+                raise _failed(file, part, error) from error
             pause_s = FIRST_PAUSE_S * 2 ** (failures - 1)
             logger.warning("%s: %s; trying again in %g s", file.url, _reason(error), pause_s)
             time.sleep(pause_s)
 
 
-def _hopeless(error: Exception) -> bool:
-    """Whether another try would end alike: no such file, no such server, nobody there."""
+def _is_permanent(error: Exception) -> bool:
+    """Whether another try would fail too: no such file, no such server, connection refused."""
     if isinstance(error, urllib.error.HTTPError):
-        return error.code in HOPELESS
+        return error.code in PERMANENT
     return isinstance(getattr(error, "reason", error), (socket.gaierror, ConnectionRefusedError))
 
 
@@ -138,19 +138,19 @@ def _reason(error: Exception) -> str:
 
 
 def _by_hand(part: Path) -> str:
-    return f"fetch it otherwise and put it to {part.with_suffix('')}"
+    return f"fetch it by other means and put it to {part.with_suffix('')}"
 
 
-def _given_up(file: WebFile, part: Path, error: Exception) -> InputError:
+def _failed(file: WebFile, part: Path, error: Exception) -> InputError:
     size = _size(part)
-    kept = f"; {size} bytes are kept, the same command goes on from there" if size else ""
+    kept = f"; {size} bytes are kept, the same command resumes from there" if size else ""
     return InputError(
         f"{file.url}: cannot be downloaded ({_reason(error)}){kept}; {_by_hand(part)}"
     )
 
 
 def _receive(file: WebFile, part: Path, progress: Progress) -> None:
-    """Append what the server has beyond the part, or begin anew where it cannot."""
+    """Append the rest of the file to the part, or start again if the server cannot resume."""
     request = urllib.request.Request(file.url)
     mark, begin = _mark_file(part), _size(part)
     if begin and mark.is_file():
@@ -161,14 +161,14 @@ def _receive(file: WebFile, part: Path, progress: Progress) -> None:
     except urllib.error.HTTPError as error:
         if error.code != RANGE_REFUSED:
             raise
-        _forget(part)  # longer than the server's file
+        _remove_part(part)  # it is longer than the server's file
         raise _InterruptedError("the part on disk does not belong to the file") from error
     with response:
         begin = begin if _continues(response, begin) else 0
         length = response.headers.get("Content-Length")
         total = begin + int(length) if length and length.isdigit() else file.size or 0
         _check_room(file, part, total)
-        _remember(response.headers, mark)
+        _write_mark(response.headers, mark)
         with part.open("r+b" if begin else "wb") as out:
             out.seek(begin)
             done = _copy(response, out, begin, total, progress)
@@ -177,13 +177,13 @@ def _receive(file: WebFile, part: Path, progress: Progress) -> None:
 
 
 def _continues(response: http.client.HTTPResponse, begin: int) -> bool:
-    """Whether an answer begins where the part on disk ends."""
+    """Whether a response begins where the part on disk ends."""
     stated = response.headers.get("Content-Range", "")
     return response.status == http.HTTPStatus.PARTIAL_CONTENT and f"bytes {begin}-" in stated
 
 
 def _copy(source: IO[bytes], out: IO[bytes], done: int, total: int, progress: Progress) -> int:
-    """Copy to the end; how many bytes are there then."""
+    """Copy to the end; returns the bytes in ``out``."""
     while chunk := source.read(CHUNK_BYTES):
         out.write(chunk)
         done += len(chunk)
@@ -192,7 +192,7 @@ def _copy(source: IO[bytes], out: IO[bytes], done: int, total: int, progress: Pr
 
 
 def _check_room(file: WebFile, part: Path, total: int) -> None:
-    """Refuse at once what will not be the file, or has no room."""
+    """Refuse a file of another size, or without enough disk space, before receiving it."""
     if file.size is not None and total not in (0, file.size):
         raise InputError(
             f"{file.url}: {total} bytes, not {file.size}: another file; {_by_hand(part)}"
@@ -205,8 +205,8 @@ def _check_room(file: WebFile, part: Path, total: int) -> None:
         )
 
 
-def _remember(headers: http.client.HTTPMessage, mark: Path) -> None:
-    """Keep what tells the server's file from a later one; without it nothing is resumed."""
+def _write_mark(headers: http.client.HTTPMessage, mark: Path) -> None:
+    """Store the version of the server's file (ETag or date), which resuming needs."""
     strong = headers.get("ETag", "")
     known = strong if strong and not strong.startswith("W/") else headers.get("Last-Modified", "")
     if known:
@@ -219,7 +219,7 @@ def _mark_file(part: Path) -> Path:
     return part.with_name(f"{part.name}.mark")
 
 
-def _forget(part: Path) -> None:
+def _remove_part(part: Path) -> None:
     part.unlink(missing_ok=True)
     _mark_file(part).unlink(missing_ok=True)
 
@@ -229,8 +229,8 @@ def _size(path: Path) -> int:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, where the system has locks."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold a lock of the folder, where the system has locks."""
     try:
         import fcntl  # noqa: PLC0415 - Unix only
     except ImportError:

@@ -17,7 +17,7 @@ from bmask_slam.semantics.segmenters.network_segmenter import segment_both_ways
 from bmask_slam.semantics.training.detected import (
     DetectedConfig,
     Examples,
-    _judged,
+    _predicted_ious,
     examples,
     mask_iou,
     train_maskiou,
@@ -95,8 +95,8 @@ def test_a_mirrored_example_is_what_the_network_sees_in_the_mirror_image() -> No
     there = examples(model, image.flip(2), turned, mirrored, config)
     first = torch.tensor([0])
     with torch.no_grad():
-        other_way = _judged(head, here, first, torch.tensor([1]))
-        same = _judged(head, there, first, torch.tensor([0]))
+        other_way = _predicted_ious(head, here, first, torch.tensor([1]))
+        same = _predicted_ious(head, there, first, torch.tensor([0]))
     torch.testing.assert_close(other_way, same, atol=1e-3, rtol=0)
 
 
