@@ -1,12 +1,7 @@
-"""Tracking's side of the map: a copy to track against, and the process that owns the original.
-
-Messages to the process are kept until it has saved a state that contains them. If it dies, a new
-process starts from that state and gets the later messages again; tracking goes on meanwhile.
-"""
+"""Tracking's side of the map: a copy to track against, and the process that owns the original."""
 
 from __future__ import annotations
 
-import logging
 import time
 from pathlib import Path
 from typing import Any
@@ -27,15 +22,11 @@ from bmask_slam.live.messages import (
     NewKeyframe,
     PruneLandmarks,
     PruneMask,
-    Ready,
     RestoreObservations,
     SaveState,
-    Started,
-    StateSaved,
     VisibilityCounts,
 )
-from bmask_slam.live.processes.supervision import late_start_text
-from bmask_slam.live.processes.worker import Failure, Worker
+from bmask_slam.live.processes.map_worker import MapWorker
 from bmask_slam.live.replica import apply_delta
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.semantics.instances.instances import PackedMask
@@ -46,14 +37,10 @@ from bmask_slam.world.frame_history import NOBODY, Entries, FrameHistory
 from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
-logger = logging.getLogger(__name__)
-
 SAVE_EVERY = 20
 """Interval of saved states in keyframes."""
 MAX_PENDING = 3
 """Largest number of keyframes that wait for the process; then no further one is accepted."""
-MAX_DEATHS = 3
-"""Deaths of the process without a saved state between them after which it is not restarted."""
 
 
 class RemoteMapper:
@@ -65,7 +52,6 @@ class RemoteMapper:
         places: index of the keyframes' descriptors, for relocalisation.
         update_ms: time that the process took for each keyframe.
         changes: how often the copy was updated.
-        deaths: how often the process has died.
         reference: the keyframe that tracking refers to; set before ``insert``.
     """
 
@@ -77,25 +63,17 @@ class RemoteMapper:
         self.update_ms: list[float] = []
         self.loops_closed = 0
         self.changes = 0
-        self.deaths = 0
         self.reference: Keyframe | None = None
-        self._arguments = (camera, config, names)
         self._folder = folder
-        self._state: Path | None = None
-        self._journal: dict[int, Any] = {}
-        self._number = 0
         self._sent_frames = 0
         self._saved_keyframes = 0
-        self._deaths_in_a_row = 0
         self._pending: set[int] = set()
-        self._is_ready = False
-        self._started = self._died_at = 0
-        self._worker = self._start()
+        self._process = MapWorker((camera, config, names), self._replacement)
 
     @property
     def pid(self) -> int:
         """Process id."""
-        return self._worker.pid
+        return self._process.pid
 
     @property
     def pending(self) -> int:
@@ -119,7 +97,12 @@ class RemoteMapper:
     @property
     def given_up(self) -> bool:
         """Whether the process died too often to be restarted."""
-        return self._deaths_in_a_row >= MAX_DEATHS
+        return self._process.given_up
+
+    @property
+    def deaths(self) -> int:
+        """How often the process has died."""
+        return self._process.deaths
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Add a tracked frame to the copy as a keyframe, and send it to the process.
@@ -171,53 +154,29 @@ class RemoteMapper:
 
     def send(self, message: Any) -> None:
         """Send a message, which is sent again to a new process if this one dies."""
-        self._number += 1
-        self._journal[self._number] = message
-        self._worker.send((self._number, message))
+        self._process.send(message)
 
     def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
         """Apply the process's answers to the copy; waits at most so long for the first.
 
         Returns the messages that are not about the map: masks, for the moving-object filter.
         """
-        others = self._apply_answers(self._worker.receive(timeout_s))
-        if not self._worker.alive and not self.given_up:
-            self._worker.kill()
-            others += self._apply_answers(self._worker.receive())
-            self._restart()
+        others = self._apply_answers(self._process.receive(timeout_s))
+        if self._process.died:
+            others += self._apply_answers(self._process.receive_last())
+            self._process.restart()
         return others
 
     def _apply_answers(self, messages: list[Any]) -> list[Any]:
-        """Apply the answers that are about the map; returns the others."""
-        others = []
+        """Apply the changes of the map; returns the other messages."""
         for message in messages:
-            match message:
-                case Started():
-                    self._started = message.number
-                case MapChanged():
-                    self._apply(message)
-                case StateSaved():
-                    self._journal = {n: m for n, m in self._journal.items() if n > message.number}
-                    self._state, self._deaths_in_a_row = message.path, 0
-                case Ready():
-                    self._is_ready = True
-                case Failure():
-                    logger.error("the map's process failed: %s", message.text)
-                case _:
-                    others.append(message)
-        return others
+            if isinstance(message, MapChanged):
+                self._apply(message)
+        return [message for message in messages if not isinstance(message, MapChanged)]
 
     def wait_until_ready(self, timeout_s: float) -> None:
         """Wait until the process is ready. Raises InputError if it cannot start."""
-        deadline_s = time.monotonic() + timeout_s
-        while not self._is_ready:
-            if self.given_up:
-                self.close()
-                raise InputError("the map's process did not start; see the lines above")
-            if time.monotonic() > deadline_s:
-                self.close()
-                raise InputError(late_start_text("map", timeout_s))
-            self.catch_up(0.1)
+        self._process.wait_until_ready(timeout_s)
 
     def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:
         """Wait until a keyframe has its landmarks; False after the timeout, or if it was lost."""
@@ -238,54 +197,27 @@ class RemoteMapper:
         path = self._folder / ".live-final"
         self.send(Finish(path, self._unsent_history()))
         deadline_s = time.monotonic() + timeout_s
-        while self._journal and not self.given_up and time.monotonic() < deadline_s:
+        while self._process.busy and not self.given_up and time.monotonic() < deadline_s:
             self.catch_up(0.1)
-        self._worker.stop()
-        if self._journal:
+        self._process.stop()
+        if self._process.busy:
             raise InputError(f"{self._folder}: the map's process did not finish")
         return path
 
     def close(self) -> None:
         """Kill the process and remove its files."""
-        self._worker.kill()
+        self._process.kill()
         for path in self._folder.glob(".live-*"):
             path.unlink(missing_ok=True)
 
-    def _start(self) -> Worker:
-        return Worker(
-            "map", "bmask_slam.live.processes.map_process:serve_map", *self._arguments, self._state
-        )
-
-    def _restart(self) -> None:
-        """Start a new process from the last saved state, and send the later messages again."""
-        self.deaths += 1
-        self._deaths_in_a_row += 1
-        if self.given_up:
-            logger.error(
-                "the map's process died %d times in a row; it is not restarted", MAX_DEATHS
-            )
-            return
-        logger.warning(
-            "the map's process died; restarted, %d messages are sent again", len(self._journal)
-        )
-        if self._died_at == self._started > 0:
-            self._skip_message(self._started)
-        self._died_at = self._started
-        self._worker = self._start()
-        for number, message in sorted(self._journal.items()):
-            self._worker.send((number, message))
-
-    def _skip_message(self, number: int) -> None:
-        """Replace a message of which two processes died."""
-        message = self._journal.pop(number, None)
-        logger.error("message %d, %s, is skipped", number, type(message).__name__)
-        match message:
-            case NewKeyframe():
-                parent_id, T_parent_lost = _parent(message)
-                self.history.hand_over(message.id, parent_id, T_parent_lost)
-                known = len(self.world.landmarks)
-                about = (message.id, parent_id, T_parent_lost, message.history, known)
-                self._journal[number] = LostKeyframe(*about)
+    def _replacement(self, message: Any) -> LostKeyframe | None:
+        """The message in place of one of which two processes died, if it needs one."""
+        if not isinstance(message, NewKeyframe):
+            return None
+        parent_id, T_parent_lost = _parent(message)
+        self.history.hand_over(message.id, parent_id, T_parent_lost)
+        known = len(self.world.landmarks)
+        return LostKeyframe(message.id, parent_id, T_parent_lost, message.history, known)
 
     def _apply(self, message: MapChanged) -> None:
         apply_delta(message.delta, self.world, self.history)
