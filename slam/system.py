@@ -111,7 +111,7 @@ class SlamSystem(SystemResults):
         return self.extractor.extract(frame)
 
     def insert(self, frame: Frame, tracked: Tracked, local_ids: Ints) -> tuple[Tracked, Keyframe]:
-        """Make a frame a keyframe; its segment is joined to another that shows it too.
+        """Make a frame a keyframe; if it is recognised in another segment, they are joined.
 
         ``local_ids`` are the landmarks that it was tracked against. Returns the frame as it is
         tracked in the joined map, and the keyframe.
@@ -126,7 +126,9 @@ class SlamSystem(SystemResults):
             self.mapper.finish()
         known = self.map.world.in_segment(largest(self.segments()))
         if self._first_keyframe and known and known[0].id >= self._first_keyframe:
-            logger.warning("never recognised in the map: the trajectory has a frame of its own")
+            logger.warning(
+                "no frame was recognised in the map: the trajectory has its own coordinate frame"
+            )
 
     def state(self) -> Arrays:
         """All that the system has learned, as named arrays."""
@@ -157,7 +159,7 @@ class SlamSystem(SystemResults):
         self._first_keyframe = int(state["first_keyframe"])
 
     def restart(self) -> None:
-        """From here on, go on exactly like a system restored from the present state."""
+        """Rebuild what a state cannot hold: from here on the system goes on like a restored one."""
         self.mapper.restart()
 
     def begin_session(self) -> None:
@@ -195,10 +197,10 @@ class SlamSystem(SystemResults):
     def _make_keyframe(
         self, frame: Frame, tracked: Tracked, restored: bool
     ) -> tuple[Tracked, Keyframe | None, str]:
-        """A keyframe of the frame and why; None if it is not to become one.
+        """The frame as a keyframe, and why; None if it does not become one.
 
-        Where observations were restored after tracking, the frame does not say how much of the map
-        it shows.
+        It does not if observations were restored after it was tracked, since the decision compares
+        the tracked landmarks with those of the map.
         """
         reason = "" if restored else self.keyframes.reason(tracked)
         if not reason:
@@ -221,7 +223,7 @@ class SlamSystem(SystemResults):
         self.semantics.observe(frame, keyframe)
 
     def _join_segments(self, tracked: Tracked) -> Tracked:
-        """Where other segments exist, look for this frame in them; found, they become one map."""
+        """Search the frame in other map segments; if it is recognised, they are joined."""
         world, tracker = self.map.world, self.camera_tracker
         others = [k for k in world.keyframes.values() if k.segment != tracker.segment]
         recognised = tracker.recognise(tracked.features, others) if others else None

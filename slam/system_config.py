@@ -1,4 +1,4 @@
-"""Everything that can be configured, in one place."""
+"""The configuration of the whole system."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bmask_slam.tracking.tracker import TrackingConfig
 
 @dataclass(frozen=True)
 class SystemConfig:
-    """Everything that can be configured; YAML files hold only what differs from these defaults.
+    """All settings; YAML files hold only what differs from these defaults.
 
     ``final_adjustment``: a full bundle adjustment ends the run. ``covariances``: those of all
     keyframes are written with its results.

@@ -1,4 +1,4 @@
-"""What a run asks of a SLAM system, so that another one can take its place."""
+"""The protocol of a SLAM system, as runs use it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bmask_slam.tracking.results import FrameResult
 
 
 class System(Protocol):
-    """What a run asks of a SLAM system; ``system.SlamSystem`` is the real one."""
+    """A SLAM system as runs use it; ``system.SlamSystem`` implements it."""
 
     def prepare(self, frame: Frame) -> Any: ...
     def process(self, frame: Frame, features: Any = None) -> FrameResult: ...

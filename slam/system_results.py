@@ -1,4 +1,4 @@
-"""What a system knows about the camera's path and the map whenever it is asked."""
+"""Results of a system at any time: trajectory, landmarks, objects, files, statistics."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from bmask_slam.system_config import SystemConfig
 
 
 class SystemResults(ABC):
-    """Answers of a system; to give them changes nothing."""
+    """Results of a system; reading them changes nothing."""
 
     camera: Camera
     config: SystemConfig
@@ -40,7 +40,7 @@ class SystemResults(ABC):
         """The owner of map and graph, where they are in this process.
 
         Raises:
-            RuntimeError: another process has them; a live system brings them home at its end.
+            RuntimeError: they are in another process, until a live system is finished.
         """
         if not isinstance(self.map, Mapper):
             raise RuntimeError("map and graph are in another process until the run is finished")
@@ -48,7 +48,7 @@ class SystemResults(ABC):
 
     @abstractmethod
     def state(self) -> Arrays:
-        """All that the past has left behind, as named arrays."""
+        """The whole state of the system, as named arrays."""
 
     def trajectory(self) -> Trajectory:
         """Every frame with a pose in the largest segment, from the keyframes as they are now."""
@@ -57,7 +57,7 @@ class SystemResults(ABC):
         return segments.get(largest(segments), nothing)
 
     def segments(self) -> dict[int, Trajectory]:
-        """The frames of every map segment that was not joined, each in a frame of its own."""
+        """The frames of every map segment, each in the segment's own coordinate frame."""
         return self.map.history.trajectories(self.map.world)
 
     def keyframe_trajectory(self) -> Trajectory:
@@ -68,12 +68,12 @@ class SystemResults(ABC):
         return Trajectory(np.array([k.timestamp_s for k in chosen]), poses)
 
     def keyframe_covariances(self) -> KeyframeCovariances:
-        """How sure the graph is of the keyframes of the largest segment."""
+        """Covariances of the keyframes of the largest segment."""
         chosen = self.map.world.in_segment(largest(self.segments()))
         return find_covariances(self.mapper.smoother, {k.id: k.timestamp_s for k in chosen})
 
     def landmarks(self) -> LandmarkCloud:
-        """The living landmarks of the largest segment, with their colours."""
+        """The landmarks of the largest segment, with their colours."""
         table = self.map.world.landmarks
         chosen = self.map.world.in_segment(largest(self.segments()))
         hosts = [k.id for k in chosen]
@@ -87,7 +87,7 @@ class SystemResults(ABC):
         return self.semantics.map_objects(self.map.world.in_segment(largest(self.segments())))
 
     def files(self) -> dict[str, Callable[[Path], None]]:
-        """What it saves so that it loads again: a function that writes a file, by its name."""
+        """Functions that write the files of the results, by file name."""
         found: dict[str, Callable[[Path], None]] = {
             "graph": self.mapper.smoother.save,
             MAP: self.save_map,
@@ -99,7 +99,7 @@ class SystemResults(ABC):
         return found
 
     def save_map(self, path: Path) -> None:
-        """Write all that was learned, but no times: the same run gives the same bytes."""
+        """Write the state without times, so that the same run gives the same bytes."""
         write_map(path, self.state() | {"mapper.update_ms": np.zeros(0)}, self.camera)
 
     def statistics(self) -> dict[str, float | list[float]]:

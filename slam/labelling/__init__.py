@@ -1,1 +1,1 @@
-"""TODO."""
+"""Labels and objects of the map, from the masks of keyframes."""

@@ -11,12 +11,12 @@ from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
 DEFAULT_SEGMENTER = "light"
 VOTE_SCORE = 0.1
-"""Instances with a lower class score are not asked of the default segmenter."""
+"""Least class score of the instances of the default segmenter."""
 
 
 @dataclass(frozen=True)
 class SemanticsConfig:
-    """Where masks come from, and what is believed of them.
+    """Where masks come from, and how they are used.
 
     Instances with a class score below ``object_score`` vote on labels only: they make no objects,
     and are no evidence of motion.

@@ -1,4 +1,4 @@
-"""Which landmarks a keyframe shows, when its masks come."""
+"""Which landmarks a keyframe sees, by the time its masks arrive."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 _REACH = 0.02
-"""How far off the depth image a landmark may lie, as a share of its depth."""
+"""Largest distance of a visible landmark from the depth image, as a share of its depth."""
 _NINE = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(9, 2)
 
 
@@ -21,7 +21,7 @@ _NINE = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).re
 class Observed:
     """Pixels (N, 2), as detected, and landmark ids (N,) of a keyframe, which may be culled.
 
-    It stands in the frame of a keyframe of the map, ``anchor``: itself or its heir.
+    Its pose is relative to a keyframe of the map, ``anchor``: itself or its parent.
     """
 
     pixels: Array
@@ -34,7 +34,7 @@ class Observed:
         return self.anchor.T_world_camera @ self.T_anchor_camera
 
     def located(self, world: WorldMap) -> VisibleLandmarks:
-        """Its landmarks with their depths at its present pose."""
+        """Its landmarks, with their depths at the present pose."""
         T_world_camera = self.T_world_camera
         points = world.landmarks.points_world[self.landmark_ids]
         z_m = transform(inverse(T_world_camera), points)[:, 2]
@@ -45,9 +45,9 @@ class Observed:
 
 @dataclass(frozen=True, eq=False)
 class VisibleLandmarks:
-    """Landmarks in a keyframe's image: pixels (N, 2), depth (N,), ids (N,).
+    """Landmarks in a keyframe's image: pixels (N, 2), depths (N,) in m, ids (N,).
 
-    It stands at ``T_world_camera`` in a map segment.
+    The keyframe is at ``T_world_camera`` in a map segment.
     """
 
     pixels: Array
@@ -57,7 +57,7 @@ class VisibleLandmarks:
     segment: int
 
     def among(self, wanted: Mask) -> VisibleLandmarks:
-        """Those of the ``wanted`` landmarks, a mask over all."""
+        """Those that are ``wanted``, a mask over all landmarks."""
         keep = wanted[self.landmark_ids]
         kept = self.pixels[keep], self.z_m[keep], self.landmark_ids[keep]
         return VisibleLandmarks(*kept, self.T_world_camera, self.segment)
@@ -69,12 +69,11 @@ class VisibleLandmarks:
         world: WorldMap,
         wanted: Mask | None = None,
     ) -> VisibleLandmarks:
-        """These and all others of the segment that lie where the keyframe's depth shows surface.
+        """These and others of the segment on the surface that the keyframe's depth image shows.
 
-        It need not be at the very pixel: at the rim of a thing, where many landmarks are, colour
-        and depth disagree by a pixel or two. ``depth_m`` (H / s, W / s) is every s-th pixel of the
-        depth image both ways, of which the nearest nine are looked at; ``wanted`` says which of
-        all landmarks are asked for, else all that live are.
+        The nearest nine of ``depth_m`` (H / s, W / s), every s-th pixel of the depth image, are
+        compared: at the border of an object, where many landmarks are, colour and depth disagree by
+        a pixel or two. ``wanted`` is a mask over all landmarks; without it all in the map are used.
         """
         landmarks = world.landmarks
         others = (landmarks.alive if wanted is None else wanted).copy()
@@ -104,7 +103,7 @@ class VisibleLandmarks:
 
 
 def observed_by(keyframe_id: int, map_reader: MapReader) -> Observed | None:
-    """What a keyframe of the map, or a culled one, sees of the landmarks that live."""
+    """The landmarks of the map that a keyframe, which may be culled, observes."""
     world = map_reader.world
     keyframe = world.keyframes.get(keyframe_id)
     if keyframe is not None:

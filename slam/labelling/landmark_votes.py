@@ -1,4 +1,4 @@
-"""Keyframes' masks vote on the labels of landmarks: of those in sight, and of those made later."""
+"""Votes of keyframes' masks on the labels of landmarks, also of landmarks made later."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.world.map_editor import MapReader
 
 RECENT = 8
-"""Of so many keyframes the masks vote on landmarks that are made later."""
+"""Number of keyframes whose masks vote on landmarks that are made later."""
 _NO_MASK = np.zeros((0, 0), bool)
 
 
 class LabelVotes:
-    """Gives what masks say of landmarks to a label store.
+    """Votes of masks on landmarks, for a label store.
 
-    A landmark is often made by a keyframe later than those that show its place best. It is then
-    voted on by the last RECENT keyframes whose masks came before it, as if it had been there.
+    A landmark is often made later than the keyframes that see its place best. The masks of the last
+    RECENT keyframes therefore vote on new landmarks too, at the places where they would have been.
     """
 
     _recent: dict[int, PixelAssignment]
@@ -33,14 +33,14 @@ class LabelVotes:
         self._camera, self._config, self._map = camera, config, map_reader
         self._recent = {}
 
-    def take(
+    def vote(
         self,
         keyframe_id: int,
         assignment: PixelAssignment,
         observed: Observed,
         store: LabelStore,
     ) -> Ints:
-        """All of a keyframe's instances vote on all landmarks in sight; the ids (N,) of those."""
+        """Let a keyframe's instances vote on all visible landmarks; returns their ids (N,)."""
         world = self._map.world
         new = world.landmarks.alive.copy()
         new[store.known()] = False
@@ -66,7 +66,7 @@ class LabelVotes:
         return ids
 
     def state(self) -> Arrays:
-        """What later landmarks will be voted on with, as named arrays."""
+        """The masks of the last keyframes, as named arrays."""
         views = list(self._recent.values())
         instances = [i for c in views for i in c.instances]
         return {
@@ -86,7 +86,7 @@ class LabelVotes:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the votes of a state."""
+        """Go on from a state."""
         count = len(state["keyframes"])
         shape, depth_shape = (state[n][:2].tolist() for n in ("shape", "depth_shape"))
         images = {n: state[n].reshape(count, *shape) for n in ("owner", "under", "inner")}

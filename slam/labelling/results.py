@@ -1,4 +1,4 @@
-"""What the system says of its map: the landmarks with their labels, the objects."""
+"""The results of mapping: landmarks with their labels, and objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the map's things are: keyframes' masks vote on landmarks and make objects."""
+"""Semantics of the map: the masks of keyframes label landmarks and make objects."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from bmask_slam.world.world_map import Keyframe
 logger = logging.getLogger(__name__)
 
 DEPTH_STEP = 2
-"""Of a keyframe's depth image every second pixel each way waits for its masks."""
+"""Every second pixel of a keyframe's depth image is kept until its masks arrive."""
 MAX_WAITING = 100
 
 
@@ -50,9 +50,9 @@ class Attachment:
     """What became of a keyframe's masks.
 
     Attributes:
-        keyframe_id: whose they are.
-        instances: how many there were.
-        landmark_ids: (N,) that they spoke about.
+        keyframe_id: of the keyframe.
+        instances: number of instances.
+        landmark_ids: (N,) landmarks that they voted on.
         refused: why they were not used; "" if they were.
     """
 
@@ -64,14 +64,14 @@ class Attachment:
 
 @dataclass(frozen=True, eq=False)
 class _Waiting:
-    """What a keyframe's masks will need: its stamp and every second pixel of its depth (h, w)."""
+    """What the masks of a keyframe will need: its stamp and its thinned depth (h, w)."""
 
     timestamp_s: float
     depth_m: Floats
 
 
 class SemanticMapper:
-    """Segments keyframes and keeps what their masks say about the map, also when they come late.
+    """Segments keyframes; keeps labels and objects of the map, also from masks that come late.
 
     Without a segmenter and without masks it does nothing. It reads the map and does not change it;
     what masks say about motion is passed to ``on_masks``.
@@ -98,14 +98,14 @@ class SemanticMapper:
 
     @property
     def enabled(self) -> bool:
-        """Whether there are labels to tell apart."""
+        """Whether there is more than the label "unknown"."""
         return len(self.names) > 1
 
     def observe(self, frame: Frame, keyframe: Keyframe) -> None:
         """Follow the map's changes, then segment a keyframe and use its masks.
 
         Raises:
-            InputError: the first keyframe cannot be segmented; later ones are passed over.
+            InputError: the first keyframe cannot be segmented; later ones are skipped.
         """
         self.follow_map()
         if not len(self.segmenter.labels) > 1:
@@ -120,7 +120,7 @@ class SemanticMapper:
             logger.warning("keyframe %d has no masks: %s", keyframe.id, error)
 
     def await_masks(self, keyframe: Keyframe, depth_m: Floats) -> None:
-        """Keep of a keyframe what its masks will need, its ``kept_depth``, until they come."""
+        """Keep the ``kept_depth`` of a keyframe until its masks arrive."""
         self._waiting[keyframe.id] = _Waiting(keyframe.timestamp_s, depth_m)
         self._gravity.add(keyframe.id, depth_m, self._rays)
         if len(self._waiting) > MAX_WAITING:
@@ -129,7 +129,8 @@ class SemanticMapper:
     def attach(self, keyframe_id: int, instances: Sequence[Instance]) -> Attachment:
         """Use the masks of a keyframe, at any time after it was made, once.
 
-        Fused landmarks are followed; a culled keyframe's masks still reach its landmarks.
+        Landmarks that were fused since are replaced by their successors; the masks of a culled
+        keyframe still label its landmarks.
 
         Raises:
             InputError: masks of another size or with labels that are not in the label set.
@@ -153,7 +154,7 @@ class SemanticMapper:
         ids = observed.landmark_ids[votes.rows[votes.sure]]
         on = votes.instances[votes.sure]
         everything = assign_pixels(instances, waiting.depth_m, size, self.config.votes, True)
-        spoken = self._label_votes.take(keyframe_id, everything, observed, self.labels)
+        spoken = self._label_votes.vote(keyframe_id, everything, observed, self.labels)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
             objects = self._add_objects((keyframe_id, waiting), assignment, observed)[on]
             self.objects.place_landmarks(ids[objects >= 0], objects[objects >= 0])
@@ -167,8 +168,8 @@ class SemanticMapper:
     def follow_map(self) -> None:
         """Keep up with what became of landmarks and keyframes.
 
-        Landmarks that were fused take what was known of them along, culled ones lose it; points
-        of objects in a culled keyframe's frame go on in its parent's.
+        The labels of fused landmarks go to their successors, those of culled ones are dropped;
+        points of objects relative to a culled keyframe are moved to its parent.
         """
         landmarks, keyframes = self._map.world.landmarks, self._map.world.keyframes
         known = np.union1d(self.labels.known(), self.objects.points.landmarks())
@@ -185,7 +186,7 @@ class SemanticMapper:
         self._gravity.keep(keyframes.keys() | self._waiting.keys())
 
     def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
-        """What landmarks (N,) are; None where nothing tells labels apart."""
+        """The labels of landmarks (N,); None without a segmenter."""
         return LandmarkLabels(self.names, self.labels.estimates(ids)) if self.enabled else None
 
     def map_objects(self, keyframes: Sequence[Keyframe]) -> MapObjects:
@@ -195,7 +196,7 @@ class SemanticMapper:
         return MapObjects(self.names, self.objects.objects(poses, up_world), up_world)
 
     def state(self) -> Arrays:
-        """All that was learned, as named arrays."""
+        """All labels and objects, as named arrays."""
         waiting = list(self._waiting.values())
         return {
             "names": np.array(self.names.names),
@@ -239,11 +240,11 @@ class SemanticMapper:
         self._waiting = dict(zip(state["waiting"].tolist(), waiting, strict=True))
 
     def begin_session(self) -> None:
-        """Masks of keyframes of an earlier recording are not waited for."""
+        """Another recording begins: masks of earlier keyframes are not awaited."""
         self._waiting = {}
 
     def _begin(self, names: LabelSet) -> None:
-        """Know nothing yet."""
+        """Begin with empty stores."""
         self.names = names
         self.labels = LabelStore(len(names), self.config.labels)
         self._label_votes = LabelVotes(self.camera, self.config.votes, self._map)

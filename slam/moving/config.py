@@ -1,4 +1,4 @@
-"""Which evidence of motion counts, and how."""
+"""Settings of the moving-object filter."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from bmask_slam.semantics.tracks.instance_tracks import TrackConfig
 
 @dataclass(frozen=True)
 class MovingObjectConfig:
-    """Which evidence of motion counts: that of masks by their ``labels``, that of ``geometry``.
+    """Which evidence of motion is used: ``labels`` of masks, ``geometry`` of depth images.
 
-    ``priors`` is a YAML file of P(moving) by class, or the name of one in ``data/labels``. With
-    fewer than ``min_static`` keypoints left all are used, and the frame says so. If more than
-    ``doubt_share`` of them seem to move, the pose is looked at again. Masks of moving
-    things are widened by ``mask_border_px``. An instance is judged by at least ``min_judged`` of
-    its pixels.
+    ``priors`` is a YAML file of P(moving) by class, or the name of one in ``data/labels``. If fewer
+    than ``min_static`` static keypoints are left, all are used, and the frame result says so. If
+    more than ``doubt_share`` of the keypoints seem to move, and fewer than ``settled_share`` lie
+    where a surface was seen, the predicted pose is checked by tracking with all of them. Masks of
+    moving things are widened by ``mask_border_px``. An instance is judged only with at least
+    ``min_judged`` pixels.
     """
 
     labels: bool = True

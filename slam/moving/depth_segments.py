@@ -1,6 +1,6 @@
-"""Pieces of a depth image that hang together: what moves in part moves as a whole.
+"""Connected segments of a depth image: a segment that moves in part moves as a whole.
 
-What moves also takes along what it holds, of which no view says anything.
+Unobserved samples that are connected to a moving segment (a carried box) move with it.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ _FAR_M = np.float32(1e6)
 
 @dataclass(frozen=True)
 class DepthSegmentConfig:
-    """When samples belong together, and when their region moves.
+    """When samples form a segment, and when a segment moves.
 
-    Samples lie ``step_px`` apart both ways; neighbours whose depths differ by less than ``jump``
-    of it are one region, which parts a floor that falls away steeply from who stands on it. A
-    region moves if at least ``least`` of its samples lie in free space and they are at least
-    ``share`` of those that views speak of: a surface that stood still can never lie in free
-    space, but what moves often lies near where it, or something else, was. A region of more than
-    ``largest`` of all samples is no single thing.
+    Samples lie ``step_px`` apart in both directions. Neighbours whose depths differ by less than
+    ``jump`` times the depth are in one segment; a steep floor is thereby separated from a person on
+    it. A segment moves if at least ``least`` of its samples lie in free space, and these are at
+    least ``share`` of the samples that earlier views observed: a static surface is never in free
+    space, but a moving one is often near a place where a surface was. A segment of more than
+    ``largest`` of all samples is not taken as one thing.
 
-    Samples that no view speaks of are held by what moves if they are joined to it by depths that
-    differ by less than ``held_jump``, more than ``jump`` since the side of a box falls away, and
-    if they are at most ``load`` times as many.
+    Samples that no view observed are carried by a moving segment if they are connected to it with
+    depth differences below ``held_jump`` (larger than ``jump``, for the side of a box), and are at
+    most ``load`` times as many as its samples.
     """
 
     step_px: int = 16
@@ -52,10 +52,10 @@ class DepthSegmentConfig:
 
 @dataclass(frozen=True, eq=False)
 class DepthSegments:
-    """The regions of a depth image at every ``step``-th pixel both ways.
+    """The segments of a depth image, at every ``step``-th pixel in both directions.
 
     Attributes:
-        labels: (h, w) number of each sample's region, 0 where depth is missing.
+        labels: (h, w) number of the segment of each sample, 0 where depth is missing.
         depth_m: (h, w) NaN where missing.
     """
 
@@ -64,7 +64,7 @@ class DepthSegments:
     config: DepthSegmentConfig
 
     def moving(self, point_motions: PointMotions) -> Mask:
-        """Which samples (h, w) are of moving regions, by what views say about each (h, w)."""
+        """Mask (h, w) of samples in moving segments, from the motion (h, w) by earlier views."""
         count = int(self.labels.max()) + 1
         labels = self.labels.ravel()
         free, surface, size = (
@@ -77,11 +77,11 @@ class DepthSegments:
         return np.asarray(moves[self.labels])
 
     def held(self, moving: Mask, point_motions: PointMotions) -> Mask:
-        """Which samples (h, w) moving ones (h, w) take along, as a man does a box before him.
+        """Mask (h, w) of samples that moving ones (h, w) carry, such as a box held by a person.
 
-        Only samples that no view speaks of: a table that he touches was seen to stand. They and
-        the moving ones fall into pieces; in each the load must not be too large for its holder,
-        nor both together for a single thing, as all of a space that was never seen would be.
+        Only samples that no view observed: a table that the person touches was seen to be static.
+        Carried and moving samples are split into connected pieces; in each the load must not be too
+        large for what carries it, nor both together too large for one thing.
         """
         free_to_go = ~moving & (point_motions == 0) & (self.labels > 0)
         pieces = _joined_up(self.depth_m, moving | free_to_go, self.config.held_jump)
@@ -92,7 +92,7 @@ class DepthSegments:
         return np.asarray(free_to_go & takes[pieces])
 
     def space(self, moving: Mask) -> MovingSpace:
-        """Where moving samples (h, w) are."""
+        """The depth ranges of moving samples (h, w)."""
         window, slack = np.ones((3, 3), np.uint8), 2 * self.config.jump
         nearest = cv2.erode(np.where(moving, self.depth_m, _FAR_M), window)
         farthest = cv2.dilate(np.where(moving, self.depth_m, -_FAR_M), window)
@@ -101,11 +101,11 @@ class DepthSegments:
 
 @dataclass(frozen=True, eq=False)
 class MovingSpace:
-    """Between which depths an image's moving things lie.
+    """Depth ranges of the moving things in an image.
 
     Attributes:
-        low_m, high_m: (h, w) around every ``step_px``-th pixel both ways; nothing moves where
-            ``high_m`` is less.
+        low_m, high_m: (h, w) around every ``step_px``-th pixel in both directions; nothing moves
+            where ``high_m`` is less.
     """
 
     low_m: Floats
@@ -113,16 +113,16 @@ class MovingSpace:
     step_px: int
 
     def on(self, pixels: Array, depth_m: Array) -> Mask:
-        """Which keypoints (N, 2) with depths (N,), NaN where missing, are on moving things.
+        """Mask (N,) of the pixels (N, 2) with depths (N,), NaN where missing, on moving things.
 
-        Of the samples around a keypoint some must move, and it must be as far away as they are, or
-        have no depth.
+        Some of the samples around a pixel must move, and its depth must be in their range, or
+        missing.
         """
         columns, rows = np.rint(pixels / self.step_px).astype(np.int64).T
         return self._at((self._inside(rows, 0), self._inside(columns, 1)), depth_m)
 
     def covers(self, depth_m: Floats, step: int) -> Mask:
-        """Which of every ``step``-th pixel both ways (H', W') are on moving things, likewise."""
+        """Mask (H', W') of every ``step``-th pixel in both directions, by the same rule."""
         rows, columns = (np.rint(np.arange(n) * step / self.step_px) for n in depth_m.shape)
         place = self._inside(rows.astype(np.int64), 0), self._inside(columns.astype(np.int64), 1)
         return self._at(np.ix_(*place), depth_m)
@@ -136,15 +136,15 @@ class MovingSpace:
 
 
 def depth_segments(depth_m: Floats, config: DepthSegmentConfig) -> DepthSegments:
-    """The regions of a depth image (H, W) in metres, NaN where missing."""
+    """The segments of a depth image (H, W) in metres, NaN where missing."""
     few = depth_m[:: config.step_px, :: config.step_px]
     return DepthSegments(_joined_up(few, np.isfinite(few), config.jump), few, config)
 
 
 def _joined_up(depth_m: Floats, chosen: Mask, jump: float) -> NDArray[np.int32]:
-    """Numbers (h, w) of the pieces of ``chosen`` samples (h, w), 0 for the others.
+    """Numbers (h, w) of the connected pieces of ``chosen`` samples (h, w), 0 for the others.
 
-    Neighbours hang together if their depths differ by less than ``jump`` of it.
+    Neighbours are connected if their depths differ by less than ``jump`` times the depth.
     """
     links = np.zeros((2 * depth_m.shape[0] - 1, 2 * depth_m.shape[1] - 1), np.uint8)
     links[::2, ::2] = chosen

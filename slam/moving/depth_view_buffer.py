@@ -1,4 +1,4 @@
-"""What the last keyframes, or frames, saw of space."""
+"""The depth views of the last keyframes, or frames, with their poses."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from bmask_slam.world.map_editor import MapReader
 
 @dataclass(frozen=True, eq=False)
 class BufferedView:
-    """The depth that a frame saw, and when; ``view`` is without what moved, ``seen`` with it.
+    """The depth view of a frame: ``seen`` as recorded, ``view`` without what moved.
 
-    Its pose is ``T_keyframe_camera`` (4, 4) from a keyframe, which is mostly itself.
+    Its pose is ``T_keyframe_camera`` (4, 4) relative to a keyframe, which is mostly itself.
     """
 
     keyframe_id: int
@@ -28,7 +28,7 @@ class BufferedView:
 
 
 class PosedView(NamedTuple):
-    """A remembered view, ``T_world_camera`` (4, 4)."""
+    """A buffered view with its pose ``T_world_camera`` (4, 4)."""
 
     keyframe_id: int
     timestamp_s: float
@@ -38,11 +38,11 @@ class PosedView(NamedTuple):
 
 
 THINNED = 2
-"""Of a view that is remembered every second pixel each way is kept."""
+"""Every second pixel of a view in each direction is kept."""
 
 
 class DepthViewBuffer:
-    """The depth of the last ``count`` keyframes, or frames, at least ``interval_s`` apart."""
+    """Depth views of the last ``count`` keyframes, or frames, at least ``interval_s`` apart."""
 
     def __init__(self, count: int, interval_s: float) -> None:
         self.count, self.interval_s = count, interval_s
@@ -56,9 +56,9 @@ class DepthViewBuffer:
         moving: MovingSpace | None = None,
         T_keyframe_camera: Array | None = None,
     ) -> None:
-        """Remember what a keyframe saw, or a frame at a pose (4, 4) from it; of what moved nothing.
+        """Add the view of a keyframe, or of a frame at a pose (4, 4) relative to it.
 
-        It is not remembered if the last is too recent.
+        Where something moved the view is cleared. Nothing is added if the last view is too recent.
         """
         if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.interval_s:
             return
@@ -71,7 +71,7 @@ class DepthViewBuffer:
         del self.views[: -self.count]
 
     def posed(self, segment: int, map_reader: MapReader) -> list[PosedView]:
-        """What is remembered of a map segment, with poses as optimised since."""
+        """The views of a map segment, at their present poses."""
         found = []
         for kept in self.views:
             parent_id, T_parent_keyframe = map_reader.history.parent(kept.keyframe_id)
@@ -83,23 +83,23 @@ class DepthViewBuffer:
         return found
 
     def clear_depth(self, keyframe_id: int, covered: Mask) -> None:
-        """A keyframe's view says nothing about space where something (H, W) moved."""
+        """Clear a keyframe's view where a mask (H, W) shows something that moved."""
         for kept in self._of(keyframe_id):
             _clear(kept.view, _thinned_to(kept.view, covered))
 
     def restore_depth(self, keyframe_id: int, covered: Mask) -> None:
-        """A keyframe's view says all it saw where something (H, W) stood after all."""
+        """Restore a keyframe's view where a mask (H, W) shows something static."""
         for kept in self._of(keyframe_id):
             where = _thinned_to(kept.view, covered)
             kept.view.nearest_m[where] = kept.seen.nearest_m[where]
             kept.view.farthest_m[where] = kept.seen.farthest_m[where]
 
     def clear(self) -> None:
-        """Forget all: another recording."""
+        """Remove all views: another recording begins."""
         self.views = []
 
     def state(self) -> Arrays:
-        """All views as named arrays; of those without what moved, where they say something."""
+        """All views as named arrays; of ``view`` only where it is not cleared."""
         views = self.views
         speak = [(v.view.nearest_m != 0) | (v.view.farthest_m != 0) for v in views]
         return {
@@ -114,7 +114,7 @@ class DepthViewBuffer:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the memory of a state."""
+        """Go on from a state."""
         ids = state["keyframe_ids"].tolist()
         size = len(ids), *(state["shape"].tolist() or [0, 0])
         stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
@@ -141,5 +141,5 @@ def _thinned_to(view: DepthView, mask: Mask) -> Mask:
 
 
 def _clear(view: DepthView, where: Mask) -> None:
-    """Let a view say nothing at some of its pixels (h, w)."""
+    """Clear a view at some of its pixels (h, w)."""
     view.nearest_m[where] = view.farthest_m[where] = 0.0

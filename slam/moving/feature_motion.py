@@ -1,4 +1,4 @@
-"""Which of a frame's keypoints lie on what moves: by earlier views, and by boxes in space."""
+"""Which keypoints of a frame lie on moving things, by earlier views and by boxes in space."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bmask_slam.semantics.objects.object_map import pixel_rays
 from bmask_slam.sequences.frame import Frame
 
 NEAREST_M = 0.2
-"""A box whose middle is nearer to the camera is not looked for in the image."""
+"""Boxes whose centre is nearer to the camera are not projected into the image."""
 
 
 Boxes = tuple[Array, Array]
@@ -27,14 +27,14 @@ the depth."""
 
 
 class FeatureMotions(NamedTuple):
-    """What is said about features (N,), and where the frame moves; None if no view says it."""
+    """The motion of features (N,), and where the frame moves; None without views."""
 
     point_motions: PointMotions
     space: MovingSpace | None
 
 
 class FeatureMotion:
-    """Judges keypoints and the depth regions that they lie on: pure functions of a camera."""
+    """Finds moving keypoints and depth segments: pure functions of a camera."""
 
     def __init__(self, camera: Camera, check: FreeSpaceCheck, config: DepthSegmentConfig) -> None:
         self.camera = camera
@@ -52,9 +52,9 @@ class FeatureMotion:
         views: Sequence[PosedView],
         moving: Boxes,
     ) -> FeatureMotions:
-        """What earlier keyframes and boxes that move say about features, at a predicted pose.
+        """The motion of features at a predicted pose, by earlier views and by moving boxes.
 
-        What was seen to be static stays so in a box.
+        Features that a view saw to be static stay static inside a box.
         """
         judged = FeatureMotions(np.zeros(len(features), np.int8), None)
         if views:
@@ -74,23 +74,23 @@ class FeatureMotion:
         views: Sequence[PosedView],
         boxes_world: Boxes,
     ) -> FeatureMotions:
-        """What views say about features; ``boxes_world`` move, and what they hold.
+        """The motion of features by views; ``boxes_world`` move, with what they carry.
 
-        A region that was seen to move does so with all that is on it.
+        All features on a moving segment move.
         """
-        regions = depth_segments(frame.depth_m, self.config)
-        samples = (self._rays * regions.depth_m[..., None]).reshape(-1, 3)
+        segments = depth_segments(frame.depth_m, self.config)
+        samples = (self._rays * segments.depth_m[..., None]).reshape(-1, 3)
         points = self.camera.backproject(features.pixels, features.depth_m)
         points_world = transform(T_world_camera, np.concatenate([points, samples]))
         told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
         point_motions = self._check.agree(told)
-        by_sample = point_motions[len(features) :].reshape(regions.labels.shape)
-        where = self._samples, regions.depth_m.ravel().astype(float)
-        moving = regions.moving(by_sample)
+        by_sample = point_motions[len(features) :].reshape(segments.labels.shape)
+        where = self._samples, segments.depth_m.ravel().astype(float)
+        moving = segments.moving(by_sample)
         taken = self.in_boxes(where, boxes_world, T_world_camera).reshape(by_sample.shape)
-        taken &= (by_sample != PointMotion.STATIC) & (regions.labels > 0)
-        taken |= regions.held(moving | taken, by_sample)
-        seen, space = regions.space(moving), regions.space(moving | taken)
+        taken &= (by_sample != PointMotion.STATIC) & (segments.labels > 0)
+        taken |= segments.held(moving | taken, by_sample)
+        seen, space = segments.space(moving), segments.space(moving | taken)
         point_motions = self._check.spread(
             features.pixels, features.depth_m, point_motions[: len(features)]
         )
@@ -102,9 +102,9 @@ class FeatureMotion:
     def in_boxes(
         self, where: tuple[Array, Array], boxes_world: Boxes, T_world_camera: Array
     ) -> Mask:
-        """Points of a frame (N,) in any of some boxes, in the image and in depth.
+        """Mask (N,) of points of a frame that lie in any of the boxes, in image and depth.
 
-        ``where`` are their pixels (N, 2) and depths (N,) m; without depth only the image counts.
+        ``where`` are their pixels (N, 2) and depths (N,) in m; without depth only the image counts.
         """
         pixels, depth_m = where
         centres_world, half_sizes_m = boxes_world

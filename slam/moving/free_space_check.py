@@ -1,7 +1,7 @@
-"""Geometry's evidence of motion: a point in space that a camera saw through cannot be there.
+"""Motion by free space: a static point cannot be where an earlier view saw through.
 
-A keypoint's point is compared with what earlier keyframes saw, a landmark with the present depth
-image; neither needs a match or a class. A point behind a surface is hidden and nothing is said.
+Keypoints are compared with the depth of earlier keyframes, landmarks with the present depth image;
+neither needs a match or a class. Points behind a surface are hidden, and their motion is unknown.
 """
 
 from __future__ import annotations
@@ -23,29 +23,28 @@ PointMotions = NDArray[np.int8]
 
 
 class PointMotion(IntEnum):
-    """What views say about a point."""
+    """The motion of a point, by depth views."""
 
     MOVING = -1
-    """It lies in space that was seen to be free."""
+    """It lies in space that a view saw to be free."""
     UNKNOWN = 0
     """It is hidden, out of view or without depth."""
     STATIC = 1
-    """There is a surface."""
+    """A view saw a surface there."""
 
 
 @dataclass(frozen=True)
 class FreeSpaceCheckConfig:
-    """When a point lies in free space, and how much is remembered.
+    """When a point lies in free space, and how many views are kept.
 
-    A view saw through a point if every depth within ``window_px`` of it is farther by
-    ``margin_m`` and ``depth_sigmas`` standard deviations of a difference of such depths; the
-    window allows for errors of the poses and for the depth image's ragged edges. There is a surface
-    if the nearest or the farthest depth in the window is as near as that. Nothing is judged beyond
-    ``max_depth_m``.
-    ``views`` keyframes are remembered, at least ``interval_s`` apart. ``neighbours`` within
-    ``neighbour_px`` decide about a keypoint that cannot be judged by itself, if their depths
-    differ by less than ``same_depth`` of it. A thing stood still if each of two or more views that
-    are at least ``still_s`` away in time found ``still_share`` of it where it is.
+    A point lies in free space of a view if every depth within ``window_px`` of it is farther by
+    ``margin_m`` plus ``depth_sigmas`` standard deviations of the difference; the window allows for
+    pose errors and for ragged edges in the depth image. It lies on a surface if the nearest or the
+    farthest depth in the window is within that distance. Points beyond ``max_depth_m`` are not
+    judged. ``views`` keyframes are kept, at least ``interval_s`` apart. The motion of a keypoint
+    that is unknown is taken from its ``neighbours`` within ``neighbour_px``, if their depths differ
+    by less than ``same_depth`` times the depth. A thing stands still if each of two or more views
+    that are at least ``still_s`` apart in time found ``still_share`` of it where it is.
     """
 
     margin_m: float = 0.1
@@ -69,11 +68,10 @@ class FreeSpaceCheckConfig:
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """What a depth image says about space, at every ``step``-th pixel in both directions.
+    """A depth image as free space and surfaces, at every ``step``-th pixel in both directions.
 
     Attributes:
-        nearest_m: (H / step, W / step) nearest depth in a window; 0 where one is missing, since
-            anything may be there.
+        nearest_m: (H / step, W / step) nearest depth in a window; 0 where one is missing.
         farthest_m: the farthest depth in it, 0 where all are missing.
     """
 
@@ -82,7 +80,7 @@ class DepthView:
     step: int
 
     def thinned(self, factor: int) -> DepthView:
-        """Every ``factor``-th of its pixels each way, in arrays of their own."""
+        """A copy of every ``factor``-th pixel in each direction."""
         near, far = (a[::factor, ::factor].copy() for a in (self.nearest_m, self.farthest_m))
         return DepthView(near, far, factor * self.step)
 
@@ -93,7 +91,7 @@ def depth_view(depth_m: Floats, window_px: int) -> DepthView:
 
 
 def thinned_view(depth_m: Floats, step: int, window_px: int) -> DepthView:
-    """The view of every ``step``-th pixel each way of a depth image; they are overwritten."""
+    """The view from every ``step``-th pixel of a depth image, which is overwritten."""
     cv2.patchNaNs(depth_m, 0.0)
     side = 2 * (window_px // step) + 1
     window = np.ones((side, side), np.uint8)
@@ -101,7 +99,7 @@ def thinned_view(depth_m: Floats, step: int, window_px: int) -> DepthView:
 
 
 class FreeSpaceCheck:
-    """Compares points with views: pure functions of a camera and its depth noise."""
+    """Compares points with depth views: pure functions of a camera and its depth noise."""
 
     def __init__(self, camera: Camera, disparity_sigma_px: float, config: FreeSpaceCheckConfig):
         self.camera = camera
@@ -110,13 +108,13 @@ class FreeSpaceCheck:
         self._sigmas_per_m2 = config.depth_sigmas * both
 
     def judge(self, points_world: Array, view: DepthView, T_world_camera: Array) -> PointMotions:
-        """What one view says about points (N, 3); nothing about those that are NaN."""
+        """The motion (N,) of points (N, 3) by one view; unknown for points that are NaN."""
         return self.judge_all(points_world, [(view, T_world_camera)])[0]
 
     def judge_all(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
     ) -> PointMotions:
-        """What views, each with T_world_camera (4, 4), say about points (N, 3): (K, N).
+        """The motion (K, N) of points (N, 3) by K views, each with T_world_camera (4, 4).
 
         The views have one size and step.
         """
@@ -132,10 +130,11 @@ class FreeSpaceCheck:
     def offsets(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
     ) -> tuple[Floats, Mask]:
-        """How far behind points (N, 3) the surface is that views, each with T_world_camera, show.
+        """Distances (K, N) in m of points (N, 3) from the surface in K views, and the visibility.
 
-        (K, N) m, 0 within the window's depths; NaN out of view, where a depth is missing in it, and
-        where the two are not one surface; and which are in view (K, N).
+        Positive where the surface is behind the point, 0 within the depths of the window; NaN out
+        of view, where a depth is missing, and where the point is not on the surface. Views come
+        with T_world_camera (4, 4); the visibility (K, N) tells which points are in view.
         """
         z, ahead, nearest, farthest = self._seen(points_world, views)
         off_m = np.clip(z, nearest, farthest) - z
@@ -143,13 +142,13 @@ class FreeSpaceCheck:
         return off_m, ahead
 
     def agree(self, point_motions: PointMotions) -> PointMotions:
-        """What several views (K, N) say together (N,): the majority of those that say anything."""
+        """The motion (N,) by several views (K, N): the majority of those that know it."""
         return np.asarray(np.sign(point_motions.sum(axis=0, dtype=np.int8)))
 
     def stood_still(self, point_motions: PointMotions, apart_s: Array, at_least: int) -> bool:
-        """Whether views (K, N) of a thing's points, taken ``apart_s`` (K,) from it, show it there.
+        """Whether a thing stands still, by views (K, N) of its points, ``apart_s`` (K,) in time.
 
-        A view that speaks of fewer than ``at_least`` points does not count.
+        A view that knows the motion of fewer than ``at_least`` points does not count.
         """
         known = np.count_nonzero(point_motions, axis=1)
         asked = (np.abs(apart_s) >= self.config.still_s) & (known >= at_least)
@@ -158,12 +157,12 @@ class FreeSpaceCheck:
         return bool(len(good) >= 2 and good.all())
 
     def spread(self, pixels: Array, depth_m: Array, point_motions: PointMotions) -> PointMotions:
-        """Verdicts (N,) with those of keypoints that have none taken from their neighbours.
+        """The motion (N,) of keypoints, with unknown ones taken from their neighbours.
 
         Args:
             pixels: (N, 2) of the keypoints.
-            depth_m: (N,) NaN where missing, and then of no matter.
-            verdicts: (N,).
+            depth_m: (N,) NaN where missing; such keypoints keep their motion.
+            point_motions: (N,).
         """
         open_, known = np.flatnonzero(point_motions == 0), np.flatnonzero(point_motions)
         if not len(open_) or not (point_motions[known] < 0).any():
@@ -184,7 +183,7 @@ class FreeSpaceCheck:
     def _seen(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
     ) -> tuple[Floats, Mask, Floats, Floats]:
-        """Of points (N, 3) in views: depth, whether in view, nearest and farthest there (K, N)."""
+        """Depth, visibility, nearest and farthest depth (K, N) of points (N, 3) in views."""
         T_camera_world = inverse(np.array([T for _, T in views])).astype(np.float32)
         to_cameras = T_camera_world[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3)
         x, y, z = (to_cameras @ points_world.T.astype(np.float32)).reshape(3, len(views), -1)
@@ -203,7 +202,7 @@ class FreeSpaceCheck:
         return z, ahead, nearest, farthest
 
     def _margin_m(self, depth_m: Floats) -> Floats:
-        """How far apart two depths as large as these may lie and still be one surface."""
+        """Largest difference of two depths of this size on one surface."""
         return np.float32(self.config.margin_m) + np.float32(self._sigmas_per_m2) * depth_m**2
 
     def _pixels(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
@@ -219,7 +218,7 @@ class FreeSpaceCheck:
 
 
 def _looked_up(views: Sequence[DepthView], place: Ints) -> tuple[Floats, Floats]:
-    """Nearest and farthest depths (K, N) of each view at its places (K, N), counted by rows."""
+    """Nearest and farthest depths (K, N) of each view at flat pixel indices (K, N)."""
     nearest = np.empty(place.shape, np.float32)
     farthest = np.empty(place.shape, np.float32)
     for view, where, near, far in zip(views, place, nearest, farthest, strict=True):

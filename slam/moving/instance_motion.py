@@ -1,4 +1,4 @@
-"""Where a keyframe's instances are in space, and whether they move."""
+"""Where the instances of a keyframe are in space, and whether they move."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bmask_slam.semantics.tracks.instance_track import Sighting, Track
 
 
 class MotionState(Enum):
-    """What views say about a thing."""
+    """The motion of an instance, by depth views."""
 
     MOVING = "moving"
     """Most of it lies in space that was seen to be free."""
@@ -28,11 +28,11 @@ class MotionState(Enum):
     STATIC = "static"
     """Most of it is where a surface was seen."""
     STILL = "still"
-    """It was there for so long that its class says nothing about it."""
+    """It stood there for so long that its class is not evidence of motion."""
 
     @property
     def is_static(self) -> bool:
-        """Whether it stands, for long or not."""
+        """Whether it is static, for long or not."""
         return self in (MotionState.STATIC, MotionState.STILL)
 
 
@@ -43,10 +43,10 @@ def motion_state(
     check: FreeSpaceCheck,
     at_least: int,
 ) -> MotionState:
-    """What views say about a thing at points (N, 3) at a time; nothing if of too few points.
+    """The motion of an instance at points (N, 3) at a time; unknown with too few points.
 
-    That it is still is asked of all that was seen, things that were believed to move included: a
-    thing with a wrong name would hide its own traces.
+    STILL is decided with the views as recorded, including what was believed to move: an instance
+    with a wrong class would otherwise remove its own evidence.
     """
     if not views:
         return MotionState.UNKNOWN
@@ -65,11 +65,11 @@ def motion_state(
 
 @dataclass(frozen=True, eq=False)
 class InstanceMotion:
-    """Tells of instances by their masks, their classes' priors and what other keyframes saw.
+    """Evidence of the motion of instances, by masks, class priors and views of other keyframes.
 
     Attributes:
-        step: by how much the log odds of an instance that was seen to move or to stand change.
-        min_judged: it is judged by at least so many of its pixels.
+        step: change of the log odds of an instance that was seen to move, or to be static.
+        min_judged: least number of pixels by which an instance is judged.
     """
 
     camera: Camera
@@ -88,8 +88,8 @@ class InstanceMotion:
     ) -> list[Sighting | None]:
         """A keyframe's instances (K,) in space; None for those without a surface.
 
-        Of those that ``stood`` that is known. Of the views the keyframe's own does not count. It
-        was taken at ``now_s``.
+        Those that ``stood`` (K,) are STILL. The keyframe was taken at ``now_s``; its own view is
+        not used.
         """
         others = [v for v in views if v.keyframe_id != masks.keyframe_id]
         found: list[Sighting | None] = []
@@ -106,7 +106,7 @@ class InstanceMotion:
         return found
 
     def shows(self, masks: KeyframeMasks, track: Track) -> bool:
-        """Whether a keyframe shows the place of a track, as predicted, or what is behind it."""
+        """Whether a keyframe sees the predicted place of a track, or what is behind it."""
         (centre,) = transform(inverse(masks.T_world_camera), track.mean[None, :3])
         if centre[2] < NEAREST_M:
             return False

@@ -1,4 +1,4 @@
-"""What a keyframe's masks tell those who ask whether things move."""
+"""The masks of a keyframe, as evidence of motion, and the surfaces that they cover."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from bmask_slam.semantics.beliefs.votes import PixelAssignment
 from bmask_slam.semantics.labels import LabelSet
 
 _SAMPLES = 400
-"""Points of an instance, at most."""
+"""Largest number of points of an instance."""
 
 
 @dataclass(frozen=True, eq=False)
 class KeyframeMasks:
-    """A keyframe's instances and what they say about its landmarks.
+    """A keyframe's instances, and the landmarks that lie on them.
 
     Attributes:
-        keyframe_id: its. names: the label set.
-        claims: who owns its pixels. depth_m: every s-th pixel of its depth, NaN where missing.
-        T_world_camera: its pose.
-        landmark_ids: (N,) that were spoken of. instances: (N,) the claims' that each is on, -1
-            for none. label_distributions: (N, C) what is known of their classes.
+        keyframe_id: of the keyframe.
+        names: the label set.
+        assignment: the instance of every pixel.
+        depth_m: (H / s, W / s) every s-th pixel of the depth image, NaN where missing.
+        T_world_camera: (4, 4).
+        landmark_ids: (N,) landmarks that the masks voted on.
+        instances: (N,) index of the instance that each landmark is on, -1 for none.
+        label_distributions: (N, C) P(class) of each landmark.
     """
 
     keyframe_id: int
@@ -39,7 +42,7 @@ class KeyframeMasks:
 
     @property
     def step(self) -> int:
-        """Every how many pixels there is a depth."""
+        """Pixels from one depth to the next."""
         return max(self.assignment.owner.shape[0] // max(self.depth_m.shape[0], 1), 1)
 
 
@@ -49,7 +52,7 @@ class Surface:
 
     Attributes:
         points: (N, 3) m, in the camera's frame.
-        complete: (N,) no depth is missing around it, as other frames ask it to be.
+        complete: (N,) whether no depth is missing in the window around it.
     """
 
     points: Array
@@ -59,7 +62,7 @@ class Surface:
 def surfaces(
     camera: Camera, masks: KeyframeMasks, window_px: int, at_least: int
 ) -> list[Surface | None]:
-    """The surface of each of a keyframe's instances; None where fewer pixels have depth."""
+    """The surface of each instance of a keyframe; None with fewer than ``at_least`` points."""
     view = thinned_view(masks.depth_m.copy(), masks.step, window_px)
     instances = range(len(masks.assignment.instances))
     return [_surface(camera, masks, k, view.nearest_m > 0, at_least) for k in instances]

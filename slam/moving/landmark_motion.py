@@ -38,7 +38,7 @@ class LandmarkMotion:
         self._map = map_editor
 
     def state(self) -> Arrays:
-        """What is known of every landmark, as named arrays."""
+        """The filters of all landmarks, as named arrays."""
         return self.movability.state()
 
     def restore(self, state: Arrays) -> None:
@@ -46,7 +46,7 @@ class LandmarkMotion:
         self.movability.restore(state)
 
     def observe_frame(self, tracked: Tracked, view: DepthView | None) -> Ints:
-        """Landmarks in view (N,) that are believed to move, with a frame's evidence counted."""
+        """Update landmarks in view by a frame's depth; returns the ids of those that move."""
         ids = tracked.visible_ids
         if view is None or not len(ids):
             return ids[self.movability.moving(ids)]
@@ -64,8 +64,10 @@ class LandmarkMotion:
     def observe_masks(
         self, masks: KeyframeMasks, sightings: Sequence[Sighting | None], standing: Sequence[bool]
     ) -> None:
-        """Landmarks on instances have their classes' priors, and move if views say so of their
-        instance; of what stood still for long the class says nothing.
+        """Set the priors of landmarks by the classes of their instances, and update them by views.
+
+        ``standing`` (K,) are instances that stood still for so long that their class is no
+        evidence.
         """
         ids, first = np.unique(masks.landmark_ids, return_index=True)
         priors = masks.label_distributions[first] @ self._priors.of(masks.names)
@@ -78,7 +80,7 @@ class LandmarkMotion:
         self.movability.update(ids[told], evidence[instances[told]] > 0)
 
     def remove_moving(self, ids: Ints) -> None:
-        """Take those of the landmarks (N,) that move out of map and graph."""
+        """Take the landmarks among these (N,) that move out of map and graph."""
         ids = self._map.world.landmarks.living(ids)
         ids = ids[self.movability.moving(ids)]
         if len(ids):
@@ -86,7 +88,7 @@ class LandmarkMotion:
             self.movability.drop(ids)
 
     def follow_map(self) -> None:
-        """What is known of fused landmarks goes to what they became; of removed ones it goes."""
+        """Move the filters of fused landmarks to their successors; drop those of removed ones."""
         landmarks, known = self._map.world.landmarks, self.movability.known()
         gone = known[~landmarks.alive[known]]
         current = landmarks.current(gone)

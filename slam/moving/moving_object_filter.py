@@ -40,13 +40,13 @@ logger = logging.getLogger(__name__)
 
 
 class MovingObjectFilter:
-    """Keeps which landmarks and instances move, and keeps what moves out of tracking and map.
+    """Finds features, landmarks and instances that move, and keeps them out of tracking and map.
 
     Attributes:
         landmarks: which of them move.
         tracks: instances that may move, over time.
         keyframe_views: depth that the last keyframes saw; recent_views: that of the last frames.
-        static_verification: what is left out for its class alone, until it is seen to stand.
+        static_verification: instances left out for their class alone, until seen to be static.
     """
 
     def __init__(
@@ -78,10 +78,10 @@ class MovingObjectFilter:
         )
 
     def filter(self, frame: Frame, features: Features) -> StaticFeatures:
-        """A frame's features (N,) without those on moving things, and others in place of these.
+        """A frame's features (N,) without those on moving things, and others in their place.
 
-        Features are judged at the predicted pose, if there is one. If most seem to move, all are
-        tracked first, and used if even they give no pose.
+        Features are judged at the predicted pose, if there is one. If most seem to move, the pose
+        is found by tracking all of them; if that fails too, all are used.
         """
         self.tracks.expire(frame.timestamp_s)
         views = self.keyframe_views.posed(self._camera_tracker.segment, self._map)
@@ -103,7 +103,7 @@ class MovingObjectFilter:
         T_world_camera: Array | None,
         views: list[PosedView],
     ) -> StaticFeatures:
-        """A frame's features without those on moving things at a pose; all of them without one."""
+        """A frame's static features at a pose (4, 4); all features without a pose."""
         geometry = self.config.geometry
         view = depth_view(frame.depth_m, self.config.check.window_px) if geometry else None
         if T_world_camera is None:
@@ -113,18 +113,18 @@ class MovingObjectFilter:
         if not moving.any():
             return StaticFeatures(features, moving, False, view, space=space)
         if np.count_nonzero(~moving) < self.config.min_static:
-            logger.info("frame %d: nearly everything moves; all is used", frame.index)
+            logger.info("frame %d: nearly all features move; all are used", frame.index)
             return StaticFeatures(features, moving, True, view)
         standing = int(np.count_nonzero(motions == PointMotion.STATIC))
         left = select(features, np.flatnonzero(~moving))
         return StaticFeatures(left, moving, False, view, standing, T_world_camera, space)
 
     def learn(self, timestamp_s: float, tracked: Tracked, static: StaticFeatures) -> bool:
-        """What a tracked frame's depth says about landmarks and about what is being verified.
+        """Update landmarks and pending instances by the depth of a tracked frame.
 
-        Landmarks that are believed to move are not tracked against from now on. Returns whether
-        observations were restored that belong to something static: the frame was tracked without
-        them, so that it cannot say how much of the map it shows.
+        Landmarks that move are not tracked against from now on. Returns whether observations were
+        restored, of something that proved static: the frame was tracked without them, so that its
+        number of tracked landmarks is no measure of how much of the map it shows.
         """
         if tracked.status is TrackingStatus.LOST:
             return False
@@ -139,9 +139,9 @@ class MovingObjectFilter:
         return restored
 
     def remember_keyframe(self, keyframe: Keyframe, static: StaticFeatures) -> None:
-        """A keyframe was made: landmarks that move leave map and graph, its depth is kept.
+        """A keyframe was made: remove landmarks that move, and keep the keyframe's depth.
 
-        Depth on what moves is not kept: the same thing would be found at that surface next.
+        Depth on moving things is not kept: the same thing would be judged by it later.
         """
         self.landmarks.follow_map()
         self.landmarks.remove_moving(self.landmarks.movability.known())
@@ -149,7 +149,7 @@ class MovingObjectFilter:
             self.keyframe_views.add(keyframe.id, keyframe.timestamp_s, static.view, static.space)
 
     def observe_masks(self, masks: KeyframeMasks) -> None:
-        """A keyframe's masks, now or late: what is on moving things leaves map and graph."""
+        """Use a keyframe's masks, now or late: observations on moving things are removed."""
         if not self.config.labels:
             return
         keyframe = self._map.world.keyframes.get(masks.keyframe_id)
@@ -222,16 +222,18 @@ class MovingObjectFilter:
     def _reinstate(
         self, time_s: float, T_world_camera: Array, view: DepthView, near: Keyframe
     ) -> bool:
-        """Restore what was left out for its class alone, and stands; whether anything was.
+        """Restore what was left out for its class alone and proved static; whether anything was.
 
-        The frame's view is kept by its pose from a keyframe near it.
+        The frame's view is kept with its pose relative to a near keyframe.
         """
         T_keyframe_camera = inverse(near.T_world_camera) @ T_world_camera
         self.recent_views.add(near.id, time_s, view, T_keyframe_camera=T_keyframe_camera)
         world = self._map.world
         standing = self.static_verification.verify(time_s, view, T_world_camera, world)
         for pending in standing:
-            logger.info("track %d stands: its class does not count", pending.track_id)
+            logger.info(
+                "track %d is static: its class is not counted as evidence", pending.track_id
+            )
             self.tracks.reinstate(pending.track_id, float(log_odds(self.priors.unknown)))
             for removed in pending.removed:
                 self.keyframe_views.restore_depth(removed.keyframe_id, removed.mask.unpacked())
@@ -275,5 +277,5 @@ class MovingObjectFilter:
 
 
 def _by_class(track: Track | None) -> bool:
-    """Whether a track moves for all that its class says, and geometry has not seen it do so."""
+    """Whether a track moves by its class alone, without evidence from geometry."""
     return track is not None and track.moving and track.evidence <= 0

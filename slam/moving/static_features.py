@@ -16,14 +16,14 @@ from bmask_slam.moving.free_space_check import DepthView
 from bmask_slam.sequences.frame import Frame
 
 LEAST_SHARE = 0.1
-"""Of the keypoints; where fewer were left out none are looked for."""
+"""If a smaller share of the keypoints was left out, no others are searched."""
 MOST_SHARE = 0.8
-"""The search is no wider than where so many were left out."""
+"""The search is limited to that for this share of left-out keypoints."""
 
 
 @dataclass(frozen=True, eq=False)
 class StaticFeatures:
-    """A frame without what moves.
+    """The features of a frame without those on moving things.
 
     Attributes:
         features: the static ones, and others in place of the rest; the frame's own where
@@ -46,12 +46,12 @@ class StaticFeatures:
 
     @property
     def ignored(self) -> int:
-        """How many features were left out."""
+        """Number of features that were left out."""
         return 0 if self.mostly_moving else int(np.count_nonzero(self.moving))
 
 
 class FeatureReplenishment:
-    """Searches a frame once more; holds a detector of its own, so that it may run in any thread."""
+    """Searches a frame for more keypoints. It holds its own detector: use one per thread."""
 
     def __init__(self, camera: Camera, config: FeatureConfig) -> None:
         self._extractor = BriskExtractor(camera, config)
@@ -63,11 +63,11 @@ class FeatureReplenishment:
         moving: Mask,
         judge: Callable[[Features], Mask],
     ) -> Features:
-        """Those of features (N,) that do not move (N,), with as many others as were left out.
+        """The static features (N,), and up to as many others as are ``moving`` (N,).
 
-        The others are what the search would have found beside the moving things: at the same
-        spread, at the threshold that gives enough of them. ``judge`` says which of them move; they
-        have no descriptors then.
+        The others are what the search would have found outside the moving things, with the same
+        spread, at a threshold that gives enough of them. ``judge`` returns which of them move; they
+        have no descriptors at that time.
         """
         left = select(features, np.flatnonzero(~moving))
         share = moving.mean()

@@ -1,7 +1,7 @@
-"""Things that are left out for their class alone, watched until they are seen to stand.
+"""Instances that are left out for their class alone, until depth shows that they are static.
 
-A mask says at once that a person moves; that what it shows is no person, or stands, is known only
-once it was watched for a while. What was taken out of the map for it meanwhile then comes back.
+A mask with the class person counts as moving at once. Whether it is wrong, or the person stands, is
+known only after some frames. What was taken out of the map for it is then restored.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 
 @dataclass(frozen=True)
 class StaticVerificationConfig:
-    """When a thing stands: what a keyframe saw of it is where it was ``stands_s`` later, or more.
+    """An instance is static if frames at least ``stands_s`` later find its points in place.
 
-    A frame says so if ``share`` of its points in view lie on a surface and the median of their
-    distances from it along the ray is below ``shift_m``; at least ``frames`` have to, and ``share``
-    of those that say anything. Someone who walks has left a third of his own place after 0.3 s. A
-    thing is watched for ``patience_s``. One that was there as long before is not left out at all:
-    so say, by the same rule, ``recent`` frames, remembered ``interval_s`` apart. With ``stands_s``
-    of 0 there is neither: only what stood for ``FreeSpaceCheckConfig.still_s`` is structure.
+    A frame finds it in place if ``share`` of its points in view lie on a surface, and the median of
+    their distances from it along the ray is below ``shift_m``. At least ``frames`` frames, and
+    ``share`` of those with enough points in view, must do so. (A walking person has left a third of
+    the place after 0.3 s.) An instance stays pending for ``patience_s``. An instance that stood as
+    long before is not left out at all; this is decided in the same way with ``recent`` frames, kept
+    ``interval_s`` apart. With ``stands_s`` of 0 the verification is off, and only
+    ``FreeSpaceCheckConfig.still_s`` decides.
     """
 
     stands_s: float = 0.4
@@ -52,19 +53,19 @@ class StaticVerificationConfig:
             raise ValueError("recent must be 1 or more, interval_s positive")
 
     def stands(self, there: int, gone: int) -> bool:
-        """Whether so many frames that found a thing where it was, and that did not, say so."""
+        """Whether an instance with these numbers of frames is static."""
         return there >= max(self.frames, self.share * (there + gone))
 
 
 @dataclass(frozen=True, eq=False)
 class Removed:
-    """What was taken out of a keyframe for a thing.
+    """What was removed from a keyframe for an instance.
 
     Attributes:
-        keyframe_id: its.
-        keypoints: (N,) that were masked.
-        patches: (N) of the landmarks that they observed.
-        mask: the thing's.
+        keyframe_id: of the keyframe.
+        keypoints: (N,) keypoints that were masked.
+        patches: (N) patches of the landmarks that they observed.
+        mask: of the instance.
     """
 
     keyframe_id: int
@@ -75,14 +76,14 @@ class Removed:
 
 @dataclass(frozen=True, eq=False)
 class PendingMovable:
-    """A thing as a keyframe saw it.
+    """An instance that was left out for its class alone.
 
     Attributes:
         track_id: of its track, which may have ended.
-        keyframe_id, time_s: where and when it was seen.
+        keyframe_id, time_s: of the keyframe that saw it first.
         points: (N, 3) on its surface, m, in the keyframe's camera frame.
-        removed: what was taken out for it, of this and later keyframes.
-        there, gone: frames, long enough after that, that found it where it was, and that did not.
+        removed: what was removed for it, from this and later keyframes.
+        there, gone: number of later frames that found it in place, and that did not.
     """
 
     track_id: int
@@ -95,10 +96,10 @@ class PendingMovable:
 
 
 class StaticVerification:
-    """All things that are watched; map and graph belong to the caller.
+    """All pending instances; map and graph belong to the caller.
 
-    ``at_least`` so many of a thing's points have to be in view. ``border_px`` are those by which
-    masks of moving things are widened.
+    A frame is used if it sees ``at_least`` points of an instance. Masks are widened by
+    ``border_px`` when their observations are removed.
     """
 
     def __init__(
@@ -116,9 +117,9 @@ class StaticVerification:
         tracks: Sequence[Track | None],
         world: WorldMap,
     ) -> None:
-        """A keyframe's instances (K,) on these tracks are about to be taken out of it.
+        """Add a keyframe's instances (K,) of these tracks, before they are removed from it.
 
-        What is seen again is watched on from the first time, unless it was found to move.
+        An instance that is pending already stays so from its first time, unless it moved.
         """
         if self.config.stands_s == 0:
             return
@@ -143,10 +144,9 @@ class StaticVerification:
         recent: Sequence[PosedView],
         now_s: float,
     ) -> list[bool]:
-        """Which of the things (K,) that a keyframe saw at ``now_s`` stood there for long enough.
+        """Which of a keyframe's instances (K,), seen at ``now_s``, stood there for long enough.
 
-        Recent frames say so by the rule for what is watched, those before it as well as those
-        after it, which there are where masks come late.
+        Decided by recent frames before the keyframe, and after it if the masks come late.
         """
         least_s = self.config.stands_s
         apart = [v for v in recent if abs(v.timestamp_s - now_s) >= least_s]
@@ -163,12 +163,12 @@ class StaticVerification:
     def verify(
         self, time_s: float, view: DepthView, T_world_camera: Array, world: WorldMap
     ) -> list[PendingMovable]:
-        """What a tracked frame's depth says; returns the things that stand, not watched further."""
+        """Update by a tracked frame's depth; returns those that are static, no longer pending."""
         oldest_s = time_s - self.config.patience_s
         recent = [s for s in self.pending if s.time_s >= oldest_s]
         kept = [s for s in recent if s.keyframe_id in world.keyframes]
         told = [
-            self._told(s, view, T_world_camera, world)
+            self._updated(s, view, T_world_camera, world)
             if time_s - s.time_s >= self.config.stands_s
             else s
             for s in kept
@@ -178,16 +178,16 @@ class StaticVerification:
         return [s for s, stands in zip(told, stand, strict=True) if stands]
 
     def not_pending(self, removed: Removed) -> Mask:
-        """Which of the keypoints (N,) that were taken out nothing else that is watched covers."""
+        """Mask (N,) of the removed keypoints that no other pending instance covers."""
         others = [r.keypoints for s in self.pending for r in s.removed if _same(r, removed)]
         return ~np.isin(removed.keypoints, np.concatenate([np.zeros(0, np.int64), *others]))
 
     def clear(self) -> None:
-        """Watch nothing: another recording."""
+        """Drop all pending instances: another recording begins."""
         self.pending = []
 
     def state(self) -> Arrays:
-        """All that is watched, as named arrays."""
+        """All pending instances, as named arrays."""
         every = self.pending
         removed = [r for s in every for r in s.removed]
         no_patches = LandmarkTable().patches_of(np.zeros(0, np.int64))
@@ -228,10 +228,10 @@ class StaticVerification:
                 PendingMovable(track_id, keyframe_id, time_s, of_one, mine, there, gone)
             )
 
-    def _told(
+    def _updated(
         self, pending: PendingMovable, view: DepthView, T_world_camera: Array, world: WorldMap
     ) -> PendingMovable:
-        """A suspect with what a frame says of it counted."""
+        """A pending instance with the evidence of a frame counted."""
         pose = world.keyframes[pending.keyframe_id].T_world_camera
         points_world = transform(pose, pending.points)
         now = [(view, T_world_camera)]
@@ -241,9 +241,9 @@ class StaticVerification:
     def _there_or_gone(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
     ) -> tuple[int, int]:
-        """How many views, each with T_world_camera, find a thing at points (N, 3), and do not.
+        """Numbers of views, each with T_world_camera, with and without a surface at points (N, 3).
 
-        A view with too few of the points in it says nothing.
+        Views that see too few of the points are not counted.
         """
         off_m, inside = self._check.offsets(points_world, views)
         in_view, found = inside.sum(axis=1), np.isfinite(off_m)
@@ -257,7 +257,7 @@ class StaticVerification:
 def _about_to_be_removed(
     mask: Mask, keyframe: Keyframe, landmarks: LandmarkTable, border_px: int
 ) -> Removed:
-    """What a mask (H, W), widened, covers of a keyframe that is not masked yet."""
+    """What a widened mask (H, W) covers in a keyframe that is not masked yet."""
     keypoints = keypoints_under(mask, keyframe.features.image_pixels, -border_px)
     free = keypoints[~keyframe.masked[keypoints]]
     patches = landmarks.patches_of(keyframe.landmark_ids[free])
