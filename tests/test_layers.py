@@ -76,7 +76,6 @@ PENDING: dict[str, set[str]] = {
         "semantics/tracks/__init__.py",
         "semantics/weights/__init__.py",
         "slam/back_end/__init__.py",
-        "slam/calibration/__init__.py",
         "slam/features/__init__.py",
         "slam/labelling/__init__.py",
         "slam/loops/__init__.py",
@@ -90,7 +89,6 @@ PENDING: dict[str, set[str]] = {
     "functions": {
         "semantics/training/loop.py train",
         "slam/api.py run",
-        "slam/calibration/views.py make_views",
         "slam/live/live_slam.py track",
         "slam/offline/runner.py track",
         "slam/tracking/pose_optimisation.py optimise_pose",

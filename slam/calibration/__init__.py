@@ -1,1 +1,1 @@
-"""TODO."""
+"""Self-calibration of the camera from a finished run."""

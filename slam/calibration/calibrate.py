@@ -1,4 +1,4 @@
-"""Self-calibration of a finished run: read it, solve, say what could be seen, write camera.yaml."""
+"""Self-calibration of a finished run: read it, solve, write camera.yaml with a report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.calibration.motion import seen_motion
+from bmask_slam.calibration.motion import landmark_motion
 from bmask_slam.calibration.report import Calibrated, format_calibration
 from bmask_slam.calibration.views import connected_views, make_views
 from bmask_slam.graph.arrays import Array, Ints
@@ -34,25 +34,25 @@ from bmask_slam.sequences import Sequence, open_sequence, write_camera
 MIN_KEYFRAMES = 5
 MIN_REFERENCE_POSES = 5
 RATE_ERROR = 0.05
-"""Measured on rendered sequences: the time offset comes out 6 to 9 % too small."""
+"""Relative error of the rates of depth; on rendered sequences time offsets are 6-9 % too small."""
 MAX_KEYFRAMES = 400
-"""The solver is dense in the poses; of a longer run those with most observations are taken."""
+"""The solver is dense in the poses; of a longer run those with most observations are used."""
 GAUGE_SIGMAS = np.full(6, 1e-4)
 FREE_SIGMAS = np.array([1.0] * 3 + [10.0] * 3)
-"""Of the first pose [rad, m], without a reference that fixes the frame and with one."""
+"""Of the first pose [rad, m]: the first without a reference, the second with one."""
 
 
 @dataclass(frozen=True)
 class CalibrationPriors:
-    """What is believed before: standard deviations around the run's own camera.
+    """Standard deviations of the parameters around the run's own camera.
 
     Attributes:
         focal_share: of the focal lengths, as a share of them.
         centre_share: of the principal point, as a share of the image's width.
-        k1, k2, p1, p2, k3: of the distortion; 0 holds a parameter fixed.
+        k1, k2, p1, p2, k3: of the distortion; 0 fixes a parameter.
         depth_share: of the depth scale, as a share of it.
         depth_offset_m, depth_time_offset_s: of the offsets.
-        rolling_shutter_s: of the time in which the rows are exposed.
+        rolling_shutter_s: of the time from the first to the last row.
     """
 
     focal_share: float = 0.05
@@ -82,18 +82,18 @@ class CalibrationPriors:
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """What to calibrate and with what.
+    """What to calibrate, and from what.
 
     Attributes:
         run: the run folder.
         out: camera.yaml to write; None: into the run folder.
-        sequence: of the run; None: the one that its config.yaml names.
+        sequence: of the run; None: the one in its config.yaml.
         reference: TUM file or sequence folder with the camera's positions in metres.
-        on_body: they are those of a body fixed to the camera, whose place is found too.
-        known_distance: two stamps in seconds and how many metres apart the camera then was.
-        anchor_sigma_m: standard deviation of these positions and of that distance.
+        on_body: the positions are those of a point fixed to the camera, whose offset is estimated.
+        known_distance: two stamps in seconds, and the distance in metres of the camera's positions.
+        anchor_sigma_m: standard deviation of the positions and of the distance.
         fixed: names of PARAMETERS that keep their values.
-        priors: of the others.
+        priors: of the other parameters.
         overwrite: replace ``out``.
     """
 
@@ -116,7 +116,7 @@ def calibrate_run(options: CalibrateOptions) -> Calibrated:
         InputError: a run, sequence or reference that is missing, broken or too small, an unknown
             parameter, or an output that is there already.
     """
-    out = refuse_early(options)
+    out = check_options(options)
     run = read_run(options.run)
     sequence = open_sequence(options.sequence or find_sequence(options.run), camera=run.camera)
     problem, _ = make_problem(options, run, sequence)
@@ -137,10 +137,10 @@ def calibrate_run(options: CalibrateOptions) -> Calibrated:
 
 
 def _with_rate_error(result: CalibrationResult) -> CalibrationResult:
-    """The result with the share by which the rates of the depth are wrong in its time offset.
+    """The result with the relative error of the rates of depth added to the time offset's variance.
 
-    The rate of change at a pixel is a measurement too: relief inside its window and noise make the
-    offset come out too small (errors in variables), which no residual shows.
+    The rate of change at a pixel is a noisy measurement too. This makes the estimated offset too
+    small (errors in variables), which no residual shows.
     """
     covariance = result.covariance.copy()
     if covariance[TIME, TIME] > 0:
@@ -148,11 +148,11 @@ def _with_rate_error(result: CalibrationResult) -> CalibrationResult:
     return dataclasses.replace(result, covariance=covariance)
 
 
-def refuse_early(options: CalibrateOptions) -> Path:
-    """The file to write; what would fail after the work is refused before it.
+def check_options(options: CalibrateOptions) -> Path:
+    """The file to write; checks what would otherwise fail after the work.
 
     Raises:
-        InputError: the file is there, its folder is not, or an option that cannot be.
+        InputError: the file exists, its folder does not, or an option is impossible.
     """
     out = options.out or options.run / "camera.yaml"
     if out.exists() and not options.overwrite:
@@ -172,18 +172,18 @@ def refuse_early(options: CalibrateOptions) -> Path:
 def make_problem(
     options: CalibrateOptions, run: SavedRun, sequence: Sequence
 ) -> tuple[CalibrationProblem, Ints]:
-    """What the solver needs, and the ids (K,) of the keyframes in it."""
+    """The problem for the solver, and the ids (K,) of its keyframes."""
     stamps_s = dict(zip(run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s, strict=True))
     frames = _frames_of(stamps_s, sequence)
-    seen = connected_views(run.tables, np.array(sorted(frames), np.int64), MAX_KEYFRAMES)
-    count = len(np.unique(seen.keyframe_ids))
+    observations = connected_views(run.tables, np.array(sorted(frames), np.int64), MAX_KEYFRAMES)
+    count = len(np.unique(observations.keyframe_ids))
     if count < MIN_KEYFRAMES:
         raise InputError(
             f"{run.path}: {count} keyframes share landmarks, too few to calibrate; use a run with "
             f"at least {MIN_KEYFRAMES}, better 20 or more"
         )
-    motion = seen_motion(seen, run)
-    views, keyframe_ids, landmark_ids = make_views(seen, frames, sequence, motion)
+    motion = landmark_motion(observations, run)
+    views, keyframe_ids, landmark_ids = make_views(observations, frames, sequence, motion)
     poses = run.tables.keyframes.get(keyframe_ids)
     points = run.tables.landmarks.get(landmark_ids)
     stamps = np.array([stamps_s[k] for k in keyframe_ids.tolist()])
@@ -207,7 +207,7 @@ def make_problem(
 
 
 def _frames_of(stamps_s: dict[int, float], sequence: Sequence) -> dict[int, int]:
-    """Index in the sequence of every keyframe whose stamp is one of its."""
+    """Index in the sequence of every keyframe whose stamp the sequence has."""
     known = {k: s for k, s in stamps_s.items() if np.isfinite(s)}
     at = nearest_indices(sequence.timestamps_s, np.array(list(known.values())))
     near = np.abs(sequence.timestamps_s[at] - np.array(list(known.values()))) < 1e-5
@@ -236,7 +236,7 @@ def _with_distance(
     stamps_s: Array,
     keyframe_ids: Ints,
 ) -> Anchors:
-    """Anchors with a distance between where the camera was at two moments of the run."""
+    """Anchors with a distance between the camera's positions at two moments of the run."""
     *moments_s, distance_m = known
     trajectory = run.trajectories["trajectory.txt"]
     at = nearest_indices(trajectory.timestamps_s, np.array(moments_s))
@@ -258,7 +258,7 @@ def _with_distance(
 
 
 def camera_from(before: Camera, calibration: Array) -> Camera:
-    """The camera (rounded to what is meaningful) that a vector (13,) of PARAMETERS says."""
+    """The camera of a vector (13,) of PARAMETERS, rounded to meaningful digits."""
     fx, fy, cx, cy = (round(float(x), 4) for x in calibration[:4])
     k1, k2, p1, p2, k3 = (round(float(x), 6) for x in calibration[4:9])
     return dataclasses.replace(

@@ -1,6 +1,8 @@
-"""How what a run's keyframes see moves in their images, for calibrating a rolling shutter."""
+"""Motion of landmarks in the images of a run's keyframes, to calibrate a rolling shutter."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,41 +18,53 @@ MAX_LATE_S, MAX_STEP_S = 1e-3, 0.2
 MIN_DEPTH_M = 0.1
 
 
-def twists_at(path: Trajectory, stamps_s: Array) -> Array:
-    """Velocities (N, 6) [rad/s, m/s] of a camera in its own frame, by the poses before and after.
+@dataclass(frozen=True, eq=False)
+class LandmarkMotion:
+    """Observed landmarks in the frames of the keyframes that observe them.
 
-    Zero where the path has no pose at a stamp (N,), or none near before or after it.
+    Attributes:
+        points: (M, 3) in metres.
+        velocities: (M, 3) in m/s, caused by the camera's motion.
+    """
+
+    points: Array
+    velocities: Array
+
+
+def twists_at(path: Trajectory, stamps_s: Array) -> Array:
+    """Velocities (N, 6) [rad/s, m/s] of a camera in its own frame, from the poses before and after.
+
+    Zero where the path has no pose at a stamp (N,), or no pose near before or after it.
     """
     at = nearest_indices(path.timestamps_s, stamps_s)
     before, after = np.maximum(at - 1, 0), np.minimum(at + 1, len(path) - 1)
     T, step_s = path.poses_world_camera, path.timestamps_s[after] - path.timestamps_s[before]
-    told = (np.abs(path.timestamps_s[at] - stamps_s) < MAX_LATE_S) & (step_s < MAX_STEP_S)
-    told &= after - before == 2
+    known = (np.abs(path.timestamps_s[at] - stamps_s) < MAX_LATE_S) & (step_s < MAX_STEP_S)
+    known &= after - before == 2
     motions = se3_log(inverse(T[before]) @ T[after])
-    return np.where(told[:, None], motions / np.where(told, step_s, 1.0)[:, None], 0.0)
+    return np.where(known[:, None], motions / np.where(known, step_s, 1.0)[:, None], 0.0)
 
 
-def seen_motion(seen: Observations, run: SavedRun) -> tuple[Array, Array]:
-    """Landmarks (M, 3) in the frames of the keyframes that see them, and their velocities (M, 3).
-
-    In metres and m/s, of still landmarks, by the run's trajectory.
-    """
-    keyframes, rows = np.unique(seen.keyframe_ids, return_inverse=True)
+def landmark_motion(observations: Observations, run: SavedRun) -> LandmarkMotion:
+    """The motion of the observed static landmarks by the run's trajectory."""
+    keyframes, rows = np.unique(observations.keyframe_ids, return_inverse=True)
     stamps_s = run.keyframe_stamps_s[np.searchsorted(run.tables.keyframes.ids, keyframes)]
     twists = twists_at(run.trajectories["trajectory.txt"], stamps_s)
     T_camera_world = inverse(run.tables.keyframes.get(keyframes))[rows]
-    points_world = run.tables.landmarks.get(seen.landmark_ids)
+    points_world = run.tables.landmarks.get(observations.landmark_ids)
     points = transform(T_camera_world, points_world[:, None])[:, 0]
-    return points, velocities(points, twists[rows])
+    return LandmarkMotion(points, velocities(points, twists[rows]))
 
 
-def as_exposed(pixels: Array, motion: tuple[Array, Array], camera: Camera) -> Array:
-    """Undistorted pixels (M, 2) as the image has them, of ones that tracking took to one moment."""
+def as_exposed(pixels: Array, motion: LandmarkMotion, camera: Camera) -> Array:
+    """Undistorted pixels (M, 2) in the image as exposed, of pixels corrected to one moment.
+
+    This undoes the rolling-shutter correction of tracking.
+    """
     if camera.rolling_shutter_s == 0:
         return pixels
-    points, velocity = motion
     later_s = exposed_after_s(pixels[:, 1], camera)[:, None]
-    in_front = points[:, 2:] > MIN_DEPTH_M
-    points = np.where(in_front, points, [0.0, 0.0, 1.0])
-    moved = camera.project(points + later_s * velocity) - camera.project(points)
+    in_front = motion.points[:, 2:] > MIN_DEPTH_M
+    points = np.where(in_front, motion.points, [0.0, 0.0, 1.0])
+    moved = camera.project(points + later_s * motion.velocities) - camera.project(points)
     return pixels + np.where(in_front, moved, 0.0)

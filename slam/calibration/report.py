@@ -1,4 +1,4 @@
-"""What a calibration found, in words: values, 95 % bounds, and what the motion made observable."""
+"""A calibration as text: values, 95 % bounds, and which parameters were observable."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bmask_slam.graph.camera import Camera
 
 NORMAL_95 = 1.96
 UNOBSERVED, WEAK = 0.8, 0.4
-"""Shares of the prior's sigma above which a posterior's says nothing new, or little."""
+"""Ratios of posterior and prior sigma above which a parameter is not, or weakly, observable."""
 UNITS = {
     "depth_offset_m": ("depth offset", "mm", 1e3),
     "time_offset_s": ("time offset", "ms", 1e3),
@@ -35,13 +35,13 @@ CURES = {
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibration and what is known about it.
+    """A calibration and its circumstances.
 
     Attributes:
-        path: the camera.yaml; camera: what it holds; before: the run's camera.
-        result: of the solver; prior_sigmas: (13,), 0 where held fixed.
-        has_anchor: whether anything metric was given.
-        keyframes, landmarks, observations: how many were used.
+        path: the camera.yaml; camera: the camera in it; before: the run's camera.
+        result: of the solver; prior_sigmas: (13,), 0 for a fixed parameter.
+        has_anchor: whether a reference or a distance was given.
+        keyframes, landmarks, observations: numbers of those used.
     """
 
     path: Path
@@ -61,7 +61,7 @@ class Calibrated:
 
 
 def format_calibration(done: Calibrated) -> str:
-    """A table of before, after and 95 % bounds, and a plain statement of what was observable."""
+    """A table of values before and after with 95 % bounds, and remarks on what was observable."""
     result = done.result
     rows: list[tuple[str, ...]] = [("", "before", "after", "95 %", "prior 95 %", "")]
     rows += [_row(done, i) for i in range(len(PARAMETERS))]
@@ -90,7 +90,7 @@ def _row(done: Calibrated, i: int) -> tuple[str, ...]:
     label, unit, factor = UNITS.get(name, (name, "", 1.0))
     shown = np.array([_of(done.before)[i], _of(done.camera)[i]]) * factor
     sigma, prior = done.sigmas[i] * factor, done.prior_sigmas[i] * factor
-    if i == FACTOR:  # shown as the depth scale, whose error has the same share
+    if i == FACTOR:  # shown as the depth scale, which has the same relative error
         label, sigma, prior = "depth scale", sigma * shown[1], prior * shown[1]
     digits = 1 if i == FACTOR else 5 if name[0] in "kp" else 2
     texts = [f"{x:.{digits}f}" for x in shown]
@@ -99,7 +99,7 @@ def _row(done: Calibrated, i: int) -> tuple[str, ...]:
 
 
 def _of(camera: Camera) -> Array:
-    """The vector of PARAMETERS as it is shown: the depth scale in place of the factor."""
+    """The vector (13,) of PARAMETERS as shown: the depth scale in place of the factor."""
     return np.array(
         [
             *(camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion),
@@ -110,7 +110,7 @@ def _of(camera: Camera) -> Array:
 
 
 def _share(done: Calibrated, i: int) -> float:
-    """The posterior's sigma over the prior's; 0 for what is held fixed."""
+    """The posterior's sigma over the prior's; 0 for a fixed parameter."""
     prior = done.prior_sigmas[i]
     return float(done.sigmas[i] / prior) if prior else 0.0
 
@@ -123,7 +123,7 @@ def _verdict(done: Calibrated, i: int) -> str:
 
 
 def _statements(done: Calibrated) -> list[str]:
-    """One line for everything that a user must know before trusting the numbers."""
+    """One line for everything that a user must know before using the numbers."""
     lines = []
     if not done.has_anchor:
         lines.append(

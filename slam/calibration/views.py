@@ -1,14 +1,15 @@
-"""What self-calibration needs of a finished run: raw pixels, raw depths and how they change."""
+"""The measurements for self-calibration: raw pixels, raw depths and their rates of change."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections import deque
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from bmask_slam.calibration.motion import as_exposed
+from bmask_slam.calibration.motion import LandmarkMotion, as_exposed
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.factors.factor_tables import FactorTables
@@ -22,39 +23,43 @@ MIN_KEYFRAME_VIEWS = 12
 VALUE_RADIUS_PX, RATE_RADIUS_PX = 6, 14
 MIN_WINDOW_SHARE = 0.6
 MAX_STEP_SIGMAS = 4.0
-"""A window holds one smooth surface where no pixel is off its plane by more sensor sigmas."""
+"""A window shows one smooth surface if all pixels are within so many sensor sigmas of its plane."""
 MAX_RATE_STEP_S = 0.2
 
 
 def connected_views(tables: FactorTables, keyframe_ids: Ints, most: int) -> Observations:
-    """Of these keyframes, the observations by which the largest connected set hangs together.
+    """The observations of the largest set of these keyframes that shared landmarks connect.
 
-    Of more than ``most`` keyframes those with most observations are taken.
-    Landmarks seen once and keyframes that see few others say nothing of the calibration. Loops and
-    other relative poses are left out too: they were measured with the calibration in question.
+    Of more than ``most`` keyframes those with most observations are used. Landmarks observed once
+    and keyframes that share few landmarks do not constrain the calibration. Relative poses, as of
+    loops, are not used: they were measured with the calibration in question.
     """
     table = tables.observations
-    seen = table.select(table.all_rows())
-    seen = seen.select(np.isin(seen.keyframe_ids, keyframe_ids))
-    ids, count = np.unique(seen.keyframe_ids, return_counts=True)
+    found = table.select(table.all_rows())
+    found = found.select(np.isin(found.keyframe_ids, keyframe_ids))
+    ids, count = np.unique(found.keyframe_ids, return_counts=True)
     if len(ids) > most:
         richest = ids[np.argsort(-count, kind="stable")[:most]]
-        seen = seen.select(np.isin(seen.keyframe_ids, richest))
+        found = found.select(np.isin(found.keyframe_ids, richest))
     while True:
-        views = np.unique(seen.landmark_ids, return_inverse=True, return_counts=True)
-        keyframes = np.unique(seen.keyframe_ids, return_inverse=True, return_counts=True)
-        keep = (views[2] >= MIN_VIEWS)[views[1]] & (keyframes[2] >= MIN_KEYFRAME_VIEWS)[
-            keyframes[1]
-        ]
+        views = _group_sizes(found.landmark_ids)
+        keep = (views >= MIN_VIEWS) & (_group_sizes(found.keyframe_ids) >= MIN_KEYFRAME_VIEWS)
         if keep.all():
             break
-        seen = seen.select(keep)
-    return seen.select(np.isin(seen.keyframe_ids, _largest_part(seen)))
+        found = found.select(keep)
+    return found.select(np.isin(found.keyframe_ids, _largest_part(found)))
 
 
-def _largest_part(seen: Observations) -> list[int]:
+def _group_sizes(ids: Ints) -> Ints:
+    """How often each of the ids (M,) occurs among them (M,)."""
+    _, rows, count = np.unique(ids, return_inverse=True, return_counts=True)
+    return np.asarray(count[rows])
+
+
+def _largest_part(observations: Observations) -> list[int]:
     """Ids of the keyframes in the largest part that shared landmarks connect."""
-    pairs = list(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))
+    keyframe_ids, landmark_ids = observations.keyframe_ids, observations.landmark_ids
+    pairs = list(zip(keyframe_ids.tolist(), landmark_ids.tolist(), strict=True))
     landmarks_of: dict[int, list[int]] = {}
     keyframes_of: dict[int, list[int]] = {}
     for k, landmark in pairs:
@@ -74,60 +79,84 @@ def _largest_part(seen: Observations) -> list[int]:
 
 
 def make_views(
-    seen: Observations,
-    frames: dict[int, int],
-    sequence: Sequence,
-    motion: tuple[Array, Array],
+    observations: Observations, frames: dict[int, int], sequence: Sequence, motion: LandmarkMotion
 ) -> tuple[CalibrationViews, Ints, Ints]:
     """The views of a run, and the ids (K,) and (L,) of keyframes and landmarks.
 
-    ``frames`` tells each keyframe's index in the sequence, whose camera must be the run's;
-    ``motion`` is that of ``seen_motion``. Pixels are distorted and rolled again as the image is;
-    depths are read anew from the raw depth images.
+    ``frames`` holds each keyframe's index in the sequence, whose camera must be the run's. Pixels
+    get back the distortion and the rolling shutter of the image; depths are read again from the
+    raw depth images.
 
     Raises:
         InputError: a keyframe's depth image is missing or broken.
     """
     camera = sequence.camera
-    keyframe_ids, keyframes = np.unique(seen.keyframe_ids, return_inverse=True)
-    landmark_ids, landmarks = np.unique(seen.landmark_ids, return_inverse=True)
-    pixels = camera.distort(as_exposed(seen.measurements[:, :2], motion, camera))
-    inverse_depth, rms, rate = np.full((3, len(seen)), np.nan)
-    lag_s = np.zeros(len(seen))
-    # The graph's disparity sigma has the roughness of the surface in it, which is fitted here.
-    nominal = float(np.nanmin(seen.sigmas_px[:, 2])) / camera.stereo_bf_px_m
+    keyframe_ids, keyframes = np.unique(observations.keyframe_ids, return_inverse=True)
+    landmark_ids, landmarks = np.unique(observations.landmark_ids, return_inverse=True)
+    pixels = camera.distort(as_exposed(observations.measurements[:, :2], motion, camera))
+    # The graph's disparity sigma includes the roughness of the surface, which is fitted here.
+    nominal = float(np.nanmin(observations.sigmas_px[:, 2])) / camera.stereo_bf_px_m
+    depths = _Depths.missing(len(observations))
     for k, keyframe in enumerate(keyframe_ids.tolist()):
         rows, index = np.flatnonzero(keyframes == k), frames[keyframe]
-        image, limit = _raw_inverse_depth(sequence, index), MAX_STEP_SIGMAS * nominal
-        planes, rms[rows] = smooth_value(image, pixels[rows], limit)
-        inverse_depth[rows] = planes[:, 0]
-        change, step_s = _change_around(sequence, index)
-        rate[rows] = mean_on_plane(change, image, pixels[rows], planes, limit) / step_s
-        lag_s[rows] = sequence.pairs.lags_s[index] - camera.depth_time_offset_s
+        depths.measure(rows, pixels[rows], sequence, index, MAX_STEP_SIGMAS * nominal)
     views = CalibrationViews(
         keyframes=keyframes,
         landmarks=landmarks,
         pixels=pixels,
-        inverse_depth=inverse_depth,
-        inverse_depth_rate=rate,
-        lag_s=lag_s,
-        sigma_px=seen.sigmas_px[:, 0],
-        sigma_inverse=np.hypot(nominal, rms),
-        shutter_velocity=share_of_rows(pixels[:, 1], camera)[:, None] * motion[1],
+        inverse_depth=depths.inverse_depth,
+        inverse_depth_rate=depths.rate,
+        lag_s=depths.lag_s,
+        sigma_px=observations.sigmas_px[:, 0],
+        sigma_inverse=np.hypot(nominal, depths.rms),
+        shutter_velocity=share_of_rows(pixels[:, 1], camera)[:, None] * motion.velocities,
     )
     return views, keyframe_ids, landmark_ids
 
 
+@dataclass(frozen=True, eq=False)
+class _Depths:
+    """Measurements of the depth images at M pixels.
+
+    Attributes:
+        inverse_depth: (M,) 1/m, of a plane fitted around the pixel; NaN where there is none.
+        rms: (M,) 1/m, distance of the pixels around from the plane.
+        rate: (M,) 1/(m s), change of the inverse depth at the pixel.
+        lag_s: (M,), how much later the depth image was taken than the colour image.
+    """
+
+    inverse_depth: Array
+    rms: Array
+    rate: Array
+    lag_s: Array
+
+    @classmethod
+    def missing(cls, count: int) -> _Depths:
+        """No measurements yet."""
+        return cls(*np.full((3, count), np.nan), np.zeros(count))
+
+    def measure(
+        self, rows: Ints, pixels: Array, sequence: Sequence, index: int, max_step: float
+    ) -> None:
+        """Measure at some pixels (m, 2) in the depth image of a frame; ``rows`` (m,) are theirs."""
+        image = _raw_inverse_depth(sequence, index)
+        planes, self.rms[rows] = smooth_value(image, pixels, max_step)
+        self.inverse_depth[rows] = planes[:, 0]
+        change, step_s = _change_around(sequence, index)
+        self.rate[rows] = mean_on_plane(change, image, pixels, planes, max_step) / step_s
+        self.lag_s[rows] = sequence.pairs.lags_s[index] - sequence.camera.depth_time_offset_s
+
+
 def _raw_inverse_depth(sequence: Sequence, index: int) -> Array:
-    """Inverse depth (H, W) of a frame without the camera's offsets, NaN where missing."""
+    """Inverse depth (H, W) of a frame without the camera's depth offset, NaN where missing."""
     camera = dataclasses.replace(sequence.camera, depth_offset_m=0.0)
     return 1.0 / read_depth(sequence.pairs.depth_files[index], camera).astype(float)
 
 
 def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:
-    """Change (H, W) of the inverse depth from the depth image before to the one after, and seconds.
+    """Change (H, W) of inverse depth from the previous to the next depth image, and the seconds.
 
-    NaN where the surface changed, and everywhere when an image is missing or too far away.
+    NaN where the surface changed, and everywhere if an image is missing or too far in time.
     """
     before, after = max(index - 1, 0), min(index + 1, len(sequence) - 1)
     taken_s = sequence.pairs.timestamps_s + sequence.pairs.lags_s
@@ -143,7 +172,7 @@ def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:
 def smooth_value(image: Array, pixels: Array, max_step: float) -> tuple[Array, Array]:
     """A plane fitted to an image around pixels (M, 2): value and slopes (M, 3), and rms (M,).
 
-    NaN where too little is valid or something in the window is off the plane by ``max_step``.
+    NaN where few pixels are valid or one in the window is off the plane by ``max_step``.
     """
     values, offsets = _windows(image, pixels, VALUE_RADIUS_PX)
     plane, error = _fit_planes(values, offsets)
@@ -155,7 +184,7 @@ def smooth_value(image: Array, pixels: Array, max_step: float) -> tuple[Array, A
 def mean_on_plane(
     change: Array, image: Array, pixels: Array, planes: Array, max_step: float
 ) -> Array:
-    """The change (M,) at pixels of an image, over wide windows as far as it is on these planes."""
+    """The change (M,) at pixels, fitted over wide windows where the image is on these planes."""
     values, offsets = _windows(change, pixels, RATE_RADIUS_PX)
     around = _windows(image, pixels, RATE_RADIUS_PX)[0]
     expected = planes[:, :1] + (offsets @ planes[:, 1:, None])[..., 0]
@@ -164,7 +193,7 @@ def mean_on_plane(
 
 
 def _windows(image: Array, pixels: Array, radius: int) -> tuple[Array, Array]:
-    """Values (M, n) of square windows around pixels (M, 2), and where (M, n, 2) from these."""
+    """Values (M, n) in square windows around pixels (M, 2), and their offsets (M, n, 2)."""
     border = cv2.BORDER_CONSTANT
     padded = cv2.copyMakeBorder(image, radius, radius, radius, radius, border, value=float("nan"))
     dv, du = (d.ravel() for d in np.indices((2 * radius + 1, 2 * radius + 1)))
@@ -175,7 +204,7 @@ def _windows(image: Array, pixels: Array, radius: int) -> tuple[Array, Array]:
 
 
 def _fit_planes(values: Array, offsets: Array) -> tuple[Array, Array]:
-    """Planes fitted to windows: value and slopes (M, 3), NaN with too little; errors (M, n)."""
+    """Planes fitted to windows: value and slopes (M, 3), NaN with few values; errors (M, n)."""
     valid = np.isfinite(values)
     A = np.concatenate([np.ones((*values.shape, 1)), offsets], axis=2) * valid[..., None]
     H = A.swapaxes(1, 2) @ A + 1e-9 * np.eye(3)

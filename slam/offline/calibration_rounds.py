@@ -14,7 +14,7 @@ from pathlib import Path
 from bmask_slam.calibration.calibrate import (
     CalibrateOptions,
     calibrate_run,
-    refuse_early,
+    check_options,
 )
 from bmask_slam.calibration.report import Calibrated, format_calibration
 from bmask_slam.config.configuration import resolve
@@ -42,7 +42,7 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
     """
     if rounds < 1:
         raise InputError(f"--rounds {rounds}: must be a whole number of at least 1")
-    out = refuse_early(options)
+    out = check_options(options)
     sequence = options.sequence or find_sequence(options.run)
     with tempfile.TemporaryDirectory(prefix=".calibrate-", dir=out.parent) as made:
         folder = Path(made)

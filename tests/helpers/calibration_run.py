@@ -122,8 +122,8 @@ def _write_run(
     write_graph(run / "graph", tables, camera)
     first = f"# bmask-slam 0.1.0, sequence {sequence}, stride 1\n"
     (run / "config.yaml").write_text(first + "{}\n")
-    rows = [f"{time_s:.6f},{k}" for k, time_s in enumerate(times_s)]
-    (run / "frames.csv").write_text("\n".join(["timestamp,keyframe", *rows]) + "\n")
+    rows = [f"{k},{time_s:.6f},OK,{k}" for k, time_s in enumerate(times_s)]
+    (run / "frames.csv").write_text("\n".join(["index,timestamp,status,keyframe", *rows]) + "\n")
     keyframes = Trajectory(np.round(times_s, 6), tables.keyframes.values)
     write_tum(run / "keyframes.txt", keyframes)
     x, y, z = tables.landmarks.values.T.astype(np.float32)

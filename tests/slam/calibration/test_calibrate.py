@@ -53,7 +53,7 @@ def test_wrong_camera_and_late_depth_are_found(made: tuple[Path, Path], tmp_path
 
 @pytest.mark.parametrize("known_s", [0.0, 0.020])
 def test_a_rolling_shutter_is_found(tmp_path: Path, known_s: float) -> None:
-    """By a run that did not know of it, and again by one that took its keypoints to one moment."""
+    """From a run without rolling-shutter correction, and from one with it."""
     truth = dataclasses.replace(TRUTH, rolling_shutter_s=0.020)
     used = dataclasses.replace(WRONG, rolling_shutter_s=known_s)
     sequence, run = make_run(tmp_path, truth, used, DELAY_S)
@@ -66,7 +66,7 @@ def test_a_rolling_shutter_is_found(tmp_path: Path, known_s: float) -> None:
     assert "rolling shutter ms" in format_calibration(done)
 
 
-def test_without_an_anchor_the_scale_stays_and_is_said_to_be_unobservable(
+def test_without_an_anchor_the_scale_stays_and_is_reported_as_unobservable(
     made: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, run = made
@@ -93,7 +93,7 @@ def test_a_known_distance_gives_the_scale(made: tuple[Path, Path], tmp_path: Pat
 
 
 def test_the_next_run_reads_what_was_written(made: tuple[Path, Path], tmp_path: Path) -> None:
-    """Scale, offset and time: the depth images become those of the colour images' moments."""
+    """Scale, offset and time: depth images become those at the stamps of the colour images."""
     sequence, _ = made
     right = dataclasses.replace(TRUTH, depth_time_offset_s=DELAY_S)
     write_camera(tmp_path / "camera.yaml", right, "a comment\nof two lines")
@@ -115,7 +115,7 @@ def test_the_next_run_reads_what_was_written(made: tuple[Path, Path], tmp_path: 
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def test_a_plane_is_read_between_pixels_and_an_edge_is_refused() -> None:
+def test_a_plane_is_fitted_between_pixels_and_an_edge_is_rejected() -> None:
     v, u = np.mgrid[:60, :80].astype(float)
     image = 0.5 + 0.002 * u - 0.001 * v
     pixels = np.array([[20.3, 30.7], [41.8, 12.2], [1.0, 1.0]])
@@ -140,7 +140,7 @@ def test_a_plane_is_read_between_pixels_and_an_edge_is_refused() -> None:
         ({"sequence": Path("/nowhere")}, "/nowhere: no such folder"),
     ],
 )
-def test_impossible_wishes(made, tmp_path, changes, words) -> None:
+def test_impossible_options_are_refused(made, tmp_path, changes, words) -> None:
     with pytest.raises(InputError, match=words):
         calibrate_run(CalibrateOptions(made[1], tmp_path / "camera.yaml", **changes))
     assert not (tmp_path / "camera.yaml").exists()
@@ -149,7 +149,7 @@ def test_impossible_wishes(made, tmp_path, changes, words) -> None:
 def test_two_rounds_run_again_with_the_camera_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """On rendered images, with focal lengths 3 % off: nothing but the camera.yaml is left over."""
+    """On rendered images, with focal lengths 3 % off; only the camera.yaml is left."""
     sequence, run = tmp_path / "office", tmp_path / "run"
     config = RenderConfig("office", 36, fps=10.0, width=320, height=240, sweeping=True)
     render_sequence(config, sequence)
