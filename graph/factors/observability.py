@@ -74,12 +74,8 @@ def loose_keyframes(
         seen[landmark[inside]] = True
         known[landmark[inside & stereo]] = True
         rest = np.flatnonzero(inside & ~known[landmark])
-        by_rays = constrained_landmarks(
-            observations.select(rest),
-            poses_world_camera[rest],
-            points_world[rest],
-            config.min_parallax_deg,
-        )
+        values = poses_world_camera[rest], points_world[rest]
+        by_rays = constrained_landmarks(observations.select(rest), *values, config.min_parallax_deg)
         known[np.searchsorted(names, by_rays)] = True
         counts = known[landmark] | (stereo & seen[landmark])
         shared = np.bincount(keyframe[counts], minlength=len(ids))
