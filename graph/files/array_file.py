@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Arrays
+from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.errors import InputError
 
 Header = dict[str, Any]
@@ -101,6 +101,16 @@ def part(arrays: Arrays, name: str) -> Arrays:
     """The arrays of one part of what ``nested`` made."""
     prefix = f"{name}."
     return {key[len(prefix) :]: a for key, a in arrays.items() if key.startswith(prefix)}
+
+
+def split_rows(array: NDArray[Any], counts: Ints) -> list[NDArray[Any]]:
+    """The consecutive parts (counts[i], ...) of an array (sum of counts, ...), one for each count.
+
+    How columns of unequal length are read back that were saved one after the other. Unlike
+    ``np.split`` it gives no part for no counts.
+    """
+    ends = np.cumsum(counts, dtype=np.int64)
+    return [array[end - count : end] for end, count in zip(ends, counts, strict=True)]
 
 
 def check_like(arrays: Arrays, example: Arrays, path: Path) -> None:

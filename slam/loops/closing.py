@@ -19,7 +19,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import mahalanobis
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.factors.graph_update import RelativePose
-from bmask_slam.graph.files.array_file import nested, part
+from bmask_slam.graph.files.array_file import nested, part, split_rows
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.pose_graph.loop_consistency import cycle_chi2
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
@@ -115,7 +115,7 @@ class LoopCloser:
             state["covariances"],
             state["inliers"].tolist(),
             state["noise_scales"].tolist(),
-            np.split(state["landmark_pairs"], np.cumsum(state["pairs"])[:-1]),
+            split_rows(state["landmark_pairs"], state["pairs"]),
         )
         a, b = state["ends"].T.tolist()
         self.waiting = list(map(LoopConstraint, a, b, *columns))

@@ -14,6 +14,7 @@ import numpy as np
 
 from bmask_slam.features.descriptor_index import DescriptorIndex, Votes
 from bmask_slam.graph.arrays import Arrays, Bits
+from bmask_slam.graph.files.array_file import split_rows
 
 Neighbours = Callable[[int], Collection[int]]  # keyframe id -> ids of the covisible ones
 
@@ -69,12 +70,10 @@ class PlaceRecogniser:
 
     def restore(self, state: Arrays) -> None:
         """Become the recogniser of a state; the index is not part of it."""
-        groups = np.split(state["members"], np.cumsum(state["sizes"])[:-1])
+        groups = split_rows(state["members"], state["sizes"])
         self._previous = [
             (frozenset(group.tolist()), queries)
-            for group, queries in zip(
-                groups[: len(state["queries"])], state["queries"].tolist(), strict=True
-            )
+            for group, queries in zip(groups, state["queries"].tolist(), strict=True)
         ]
 
     def query(

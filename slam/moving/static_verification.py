@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.graph.files.array_file import split_rows
 from bmask_slam.graph.geometry import transform
 from bmask_slam.moving.depth_view_buffer import PosedView
 from bmask_slam.moving.free_space_check import DepthView, FreeSpaceCheck
@@ -208,20 +209,20 @@ class StaticVerification:
 
     def restore(self, state: Arrays) -> None:
         """Go on from a state."""
-        points = np.split(state["points"], np.cumsum(state["points_each"])[:-1])
-        ends = np.cumsum(state["keypoints_each"])[:-1]
-        keypoints = np.split(state["keypoints"], ends)
-        images, views = np.split(state["patches"], ends), np.split(state["patch_views"], ends)
+        points = split_rows(state["points"], state["points_each"])
+        keypoints, images, views = (
+            split_rows(state[name], state["keypoints_each"])
+            for name in ("keypoints", "patches", "patch_views")
+        )
         patches = [Patches(*both) for both in zip(images, views, strict=True)]
         ids = state["keyframe_ids"].tolist()
-        bits = state["bits"].reshape(max(len(ids), 1), -1)
+        bits = state["bits"].reshape(max(len(ids), 1), -1)[: len(ids)]
         shape = self._check.camera.height, self._check.camera.width
         masks = [PackedMask(of_one, shape) for of_one in bits]
-        parts = (part[: len(ids)] for part in (keypoints, patches, masks))  # split gives at least 1
-        removed = [Removed(*row) for row in zip(ids, *parts, strict=True)]
+        removed = [Removed(*row) for row in zip(ids, keypoints, patches, masks, strict=True)]
         self.pending = []
         counts = state["counts"].tolist()
-        rows = zip(counts, state["times_s"].tolist(), points[: len(counts)], strict=True)
+        rows = zip(counts, state["times_s"].tolist(), points, strict=True)
         for (track_id, keyframe_id, there, gone, count), time_s, of_one in rows:
             mine, removed = tuple(removed[:count]), removed[count:]
             self.pending.append(

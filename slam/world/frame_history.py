@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Arrays
+from bmask_slam.graph.files.array_file import split_rows
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.world.world_map import WorldMap
@@ -62,9 +63,9 @@ class FrameHistory:
         entries = self._store[: self._size]
         ids, which = np.unique(entries["keyframe_id"], return_inverse=True)
         order = np.argsort(which, kind="stable")
-        groups = np.split(order, np.cumsum(np.bincount(which, minlength=len(ids)))[:-1])
+        groups = split_rows(order, np.bincount(which, minlength=len(ids)))
         poses, segments = np.empty((len(entries), 4, 4)), np.full(len(entries), NOBODY)
-        for keyframe_id, rows in zip(ids.tolist(), groups[: len(ids)], strict=True):
+        for keyframe_id, rows in zip(ids.tolist(), groups, strict=True):
             owner, T = self._resolve(keyframe_id, entries["T_keyframe_camera"][rows])
             if owner == NOBODY:
                 continue

@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Arrays
-from bmask_slam.graph.files.array_file import nested, part
+from bmask_slam.graph.files.array_file import nested, part, split_rows
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import CulledKeyframe, Keyframe, WorldMap
 
@@ -63,8 +63,7 @@ def world_state(world: WorldMap) -> Arrays:
 def world_of(state: Arrays) -> WorldMap:
     """The map of a ``world_state``."""
     rows, keypoints = part(state, "keyframes"), part(state, "keypoints")
-    borders = np.cumsum(rows["keypoints"])[:-1]
-    pieces = {name: np.split(array, borders) for name, array in keypoints.items()}
+    pieces = {name: split_rows(array, rows["keypoints"]) for name, array in keypoints.items()}
     keyframes = {}
     for row, keyframe_id in enumerate(rows["id"].tolist()):
         own = {name: pieces[name][row].copy() for name in pieces}
@@ -93,8 +92,7 @@ def _culled_state(culled: dict[int, CulledKeyframe]) -> Arrays:
 
 
 def _culled_of(state: Arrays) -> dict[int, CulledKeyframe]:
-    borders = np.cumsum(state["size"])[:-1]
-    pieces = (np.split(state[name], borders) for name in _CULLED)
+    pieces = (split_rows(state[name], state["size"]) for name in _CULLED)
     return dict(zip(state["id"].tolist(), map(CulledKeyframe, *pieces), strict=True))
 
 

@@ -15,6 +15,7 @@ from bmask_slam.graph.files.array_file import (
     nested,
     part,
     read_arrays,
+    split_rows,
     write_arrays,
 )
 
@@ -134,3 +135,11 @@ def test_arrays_of_another_make_are_refused(change: dict, message: str) -> None:
     found = {name: array for name, array in {**ARRAYS, **change}.items() if array is not None}
     with pytest.raises(InputError, match=f"box: .*{message}"):
         check_like(found, ARRAYS, Path("box"))
+
+
+def test_columns_of_unequal_length_are_split_again() -> None:
+    columns = [np.arange(3), np.zeros(0, int), np.arange(5, 7)]
+    counts = np.array([len(column) for column in columns])
+    for found, column in zip(split_rows(np.concatenate(columns), counts), columns, strict=True):
+        np.testing.assert_array_equal(found, column)
+    assert split_rows(np.zeros((0, 3)), np.zeros(0, np.int64)) == []
