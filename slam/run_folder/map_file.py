@@ -127,7 +127,7 @@ def _check_same_run(run: SavedRun) -> None:
         at = known[at]
         late_s = np.abs(run.keyframe_stamps_s[at] - written.timestamps_s)
         error = np.abs(run.tables.keyframes.values[at] - written.poses_world_camera)
-        if (late_s < MAX_STAMP_ERROR_S).all() and error.max(initial=0) < MAX_POSE_ERROR:
+        if (late_s < MAX_STAMP_ERROR_S).all() and error.max() < MAX_POSE_ERROR:
             return
     raise InputError(
         f"{run.path}: keyframes.txt and graph do not belong together; give the folder as the run "
