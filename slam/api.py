@@ -59,28 +59,24 @@ def run(
 ) -> Run:
     """Run the system over a sequence, as ``bmask-slam run`` does, and return its run folder.
 
-    Ctrl-C and SIGTERM end the run after the current frame; when everything is saved, the signal
-    takes its usual effect.
-
     Args:
         sequence: folder in TUM layout.
         out: the run folder; None: the first free ``runs/<sequence>[-<n>]``.
         segmenter: "light", "none", ..., or options; None: that of the configuration.
         config: a configuration, a YAML file, or the name of a shipped one, such as "paper".
-        settings: values by dotted path, such as ``{"tracking.min_inliers": 20}``; they change
-            those of the file, and cannot be given beside a ``SystemConfig``.
+        settings: values by dotted path that change ``config``, unless that is a `SystemConfig`.
         options: see `RunKeywords`; without ``quiet=False`` there is no progress bar.
 
+    SIGINT and SIGTERM end the run after the current frame, and act as usual once it is saved.
+
     Raises:
-        InputError: a broken sequence, a run folder that cannot be used, an option that is not
-            known or of the wrong type.
+        InputError: a broken sequence, a run folder that cannot be used, an unknown option, or one
+            of the wrong type.
     """
     from bmask_slam.config.configuration import from_tree  # noqa: PLC0415
     from bmask_slam.offline import runner  # noqa: PLC0415 - loads GTSAM
 
-    given = {"quiet": True, "sequence": sequence, **options}
-    if out is not None:
-        given["out"] = out
+    given = {"quiet": True, "sequence": sequence, "out": out, **options}
     resolved, name = _configuration(config, settings)
     if segmenter is not None:
         chosen = _segmenter_options(segmenter, resolved.semantics.segmenter)

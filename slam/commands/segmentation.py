@@ -37,15 +37,19 @@ def add_segment(commands: Commands) -> None:
 
 
 def _segment(arguments: argparse.Namespace) -> int:
-    from bmask_slam.offline.segment_folder import segment_folder
+    from bmask_slam.datasets.weights import find_weights
     from bmask_slam.runtime.progress import console_log, counting_bar
-    from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+    from bmask_slam.semantics.segmenters.mask_cache import CacheOptions, cache_masks
+    from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+    from bmask_slam.sequences.lists import colour_images
 
+    source: Path = arguments.source
     options = segmenter_options(arguments, SegmenterOptions(min_score=arguments.min_score))
+    settings = {**options.described(), "source": str(source.resolve())}
+    cache = CacheOptions(arguments.out, settings, not arguments.no_overlays)
     with console_log(), counting_bar(arguments.quiet) as progress:
-        result = segment_folder(
-            arguments.source, arguments.out, options, not arguments.no_overlays, progress
-        )
+        files = colour_images(source)
+        result = cache_masks(make_segmenter(options, source, find_weights), files, cache, progress)
     if arguments.quiet:
         print(result.file)
         return 0

@@ -16,6 +16,7 @@ from bmask_slam.graph.trajectory import associate_stamps, check_seconds
 
 logger = logging.getLogger(__name__)
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_DEPTH_STEP_S = 0.1
 """Largest time between two depth images for interpolation between them."""
 
@@ -59,6 +60,25 @@ def image_name(path: Path, folder: Path) -> str:
     """An image's path relative to a folder; the file name alone if it is outside."""
     inside = path.is_relative_to(folder)
     return (path.relative_to(folder) if inside else Path(path.name)).as_posix()
+
+
+def colour_images(source: Path) -> list[tuple[str, Path]]:
+    """Name relative to ``source`` and path of each colour image, ordered by stamp or name.
+
+    Raises:
+        InputError: there are no images.
+    """
+    if (source / "rgb.txt").is_file():
+        files = list(read_list(source / "rgb.txt").files)
+    elif (source / "associations.txt").is_file():
+        files = list(read_associations(source / "associations.txt")[0].files)
+    elif source.is_dir():
+        files = sorted(p for p in source.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    else:
+        raise InputError(f"{source}: no such folder; give a sequence or a folder of images")
+    if not files:
+        raise InputError(f"{source}: no image in it; give a sequence or a folder of png or jpg")
+    return [(image_name(path, source), path) for path in files]
 
 
 def read_pairs(folder: Path, max_difference_s: float, depth_time_offset_s: float) -> ImagePairs:
