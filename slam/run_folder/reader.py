@@ -14,7 +14,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.trajectory import Trajectory, read_tum
+from bmask_slam.graph.trajectory import Trajectory, nearest_indices, read_tum
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
 from bmask_slam.run_folder.folder import CHECKPOINT, FILES
 from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
@@ -108,14 +108,15 @@ class Run:
     @cached_property
     def keyframes(self) -> Keyframes:
         """The keyframes of the largest map segment."""
-        trajectory = read_tum(self._file("keyframes.txt"))
-        frames, stamps_s = self.frames, trajectory.timestamps_s
-        rows = np.searchsorted(frames.timestamps_s + _MAX_STAMP_ERROR_S, stamps_s)
-        rows = np.minimum(rows, max(len(frames) - 1, 0))
+        trajectory, frames = read_tum(self._file("keyframes.txt")), self.frames
+        stamps_s = trajectory.timestamps_s
         ids, reasons = np.full(len(stamps_s), -1), [""] * len(stamps_s)
-        for k, row in enumerate(rows.tolist() if len(frames) else ()):
-            if abs(frames.timestamps_s[row] - stamps_s[k]) <= _MAX_STAMP_ERROR_S:
-                ids[k], reasons[k] = frames.keyframe_ids[row], frames.keyframe_reasons[row]
+        made = np.flatnonzero(frames.keyframe_ids >= 0)
+        if len(made):
+            near = made[nearest_indices(frames.timestamps_s[made], stamps_s)]
+            late_s = np.abs(frames.timestamps_s[near] - stamps_s)
+            for k in np.flatnonzero(late_s <= _MAX_STAMP_ERROR_S).tolist():
+                ids[k], reasons[k] = frames.keyframe_ids[near[k]], frames.keyframe_reasons[near[k]]
         return Keyframes(ids, stamps_s, trajectory.poses_world_camera, tuple(reasons))
 
     @cached_property
