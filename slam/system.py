@@ -28,6 +28,8 @@ from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
+OLDER_ARRAYS = ("semantics.labels.counts",)
+"""Arrays in older files that are read by nothing today."""
 
 
 class SlamSystem(SystemResults):
@@ -148,6 +150,7 @@ class SlamSystem(SystemResults):
 
     def restore(self, state: Arrays, path: Path) -> None:
         """Become the system of a state that was read from a file. Raises InputError."""
+        state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
         check_like(state, self.state(), path)
         self.mapper.restore(part(state, "mapper"), path)
         self.camera_tracker.restore(part(state, "localiser"))

@@ -171,6 +171,12 @@ def _different_items(a: Any, b: Any, where: str) -> Iterator[str]:
         yield from differences(x, y, f"{where}[{i}]")
 
 
+def test_a_state_of_an_older_version_is_restored(system: SlamSystem) -> None:
+    """It holds counts of votes, which nothing reads today."""
+    older = {**system.state(), "semantics.labels.counts": np.zeros(7, np.float32)}
+    assert list(differences(system, restored(older))) == []
+
+
 def test_every_attribute_is_restored(system: SlamSystem) -> None:
     assert list(differences(system, restored(system.state()))) == []
 
