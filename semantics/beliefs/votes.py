@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints, Mask
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.instances.instances import Instance, mask_box
-from bmask_slam.semantics.instances.mask_order import painting_order
+from bmask_slam.semantics.instances.instances import Instance, mask_box, painting_order
 from bmask_slam.semantics.labels import LabelSet
 
 NO_INSTANCE = -1

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
-from bmask_slam.semantics.instances.mask_order import painting_order
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box, painting_order
 
 
 def instance(mask: np.ndarray, label: int, score: float) -> Instance:
