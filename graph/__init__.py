@@ -1,1 +1,1 @@
-"""Where things are: geometry, cameras, trajectories and the factor graph."""
+"""Geometry, cameras, trajectories and their errors, factor graphs, self-calibration."""

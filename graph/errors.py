@@ -1,10 +1,10 @@
-"""The one exception that stands for broken input; everything else is a bug or a result."""
+"""The exception for broken input from outside."""
 
 import math
 
 
 class InputError(Exception):
-    """Broken input from outside: the text names the file, the value and the cure.
+    """Broken input from outside: the message names the file, the value and the cure.
 
     The command line prints it as one line and exits with 1. Expected failures of the
     method (tracking lost, a factor refused) are results with a status, never exceptions.
@@ -12,7 +12,7 @@ class InputError(Exception):
 
 
 def finite_number(text: str, where: str) -> float:
-    """The finite number that a word is; ``where`` is its file and line, for the message."""
+    """The finite number in a word; ``where`` is its file and line, for the message."""
     try:
         number = float(text)
     except ValueError:

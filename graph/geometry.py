@@ -29,10 +29,10 @@ def inverse(T_a_b: Array) -> Array:
 
 
 def orthonormalised(T: Array) -> Array:
-    """The rigid transforms (..., 4, 4) nearest to products that have gathered rounding errors.
+    """The rigid transforms (..., 4, 4) nearest to products with accumulated rounding errors.
 
-    Prediction and update feed each other (``T <- T @ inverse(T_last) @ T``), which doubles a
-    deviation from orthonormality every frame; whoever closes such a loop must call this.
+    Where a prediction and its update depend on each other (``T <- T @ inverse(T_last) @ T``), a
+    deviation from orthonormality doubles every frame; such code must call this.
     """
     R = T[..., :3, :3]
     for _ in range(3):  # Newton's iteration for the polar factor: the error e becomes 3/4 e^2
@@ -41,10 +41,10 @@ def orthonormalised(T: Array) -> Array:
 
 
 def carried_along(T_world_a: Array, T_world_old: Array, T_world_new: Array) -> Array:
-    """Where a pose a (4, 4) is after a body that it is fixed to has moved from old to new.
+    """The pose of a (4, 4) after a body that it is fixed to has moved from old to new.
 
-    The result is made rigid again: in a chain of such steps, each starting from the last, an error
-    of the rotations would double with every step.
+    The result is orthonormalised: in a chain of such steps an error of the rotations would double
+    with every step.
     """
     return orthonormalised(T_world_new @ inverse(T_world_old) @ T_world_a)
 
@@ -133,7 +133,7 @@ def rotation_from_quaternion(q_xyzw: Array) -> Array:
 def quaternion_from_rotation(R: Array) -> Array:
     """Unit quaternions (..., 4) in TUM order x y z w with w >= 0 from rotations (..., 3, 3).
 
-    Shepperd's method, vectorised: of the four equal formulas the best conditioned is taken.
+    Shepperd's method, vectorised: of four equivalent formulas it uses the best conditioned.
     """
     R = np.asarray(R, float)
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]

@@ -1,7 +1,7 @@
-"""Where the body whose poses a reference holds sits on the camera (hand-eye calibration).
+"""Hand-eye calibration: the pose, in the camera's frame, of the body that a reference follows.
 
-Motion capture follows markers, EuRoC's reference an IMU, another program its own sensor: such a
-body is fixed to the camera, but is not it, and every turn of the camera moves it in its own way.
+Motion capture measures markers, EuRoC's reference an IMU: a body that is fixed to the camera, with
+an offset, so that rotations of the camera move it differently.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from bmask_slam.graph.trajectory import Trajectory
 
 MIN_TURN_RAD = 0.05
 ARM_M = 1.0
-"""An error of 1 rad counts as one of so many metres."""
-HELD = 1e-3
-"""Weight that keeps what no motion shows at zero."""
+"""An error of 1 rad has the weight of an error of so many metres."""
+REGULARISATION = 1e-3
+"""Weight that keeps unobservable translation at zero."""
 
 
 def hand_eye(estimate: Trajectory, reference: Trajectory) -> Array:
-    """T_camera_body (4, 4) that brings the motions of camera and body nearest to each other.
+    """T_camera_body (4, 4) that fits the motions of camera and body best.
 
     Poses of the same index belong together. Over all pairs a second apart, with the motions A of
     the camera and B of the body, ``A X = X B`` (Tsai and Lenz, T-RA 1989) is solved for X: the
-    rotation first, from the rotation vectors, which X turns (Park and Martin, T-RA 1994), then all
-    of X by least squares over ``B^-1 X^-1 A X``, the relative pose error. About one axis only, the
-    part of the offset along it shows in no motion and stays zero.
+    rotation first, from the rotation vectors, which X rotates (Park and Martin, T-RA 1994), then X
+    by least squares over ``B^-1 X^-1 A X``, the relative pose error. If all rotations are about one
+    axis, the translation along it is unobservable and stays zero.
 
     Raises:
         InputError: the camera hardly turns in any second.
@@ -53,7 +53,7 @@ def hand_eye(estimate: Trajectory, reference: Trajectory) -> Array:
         X = start @ se3_exp(xi)
         E = inverse(B) @ inverse(X) @ A @ X
         e = np.concatenate([E[:, :3, 3], ARM_M * so3_log(E[:, :3, :3])])
-        return np.concatenate([e.ravel(), HELD * xi[3:]])
+        return np.concatenate([e.ravel(), REGULARISATION * xi[3:]])
 
     return start @ se3_exp(least_squares(residuals, np.zeros(6)).x)
 

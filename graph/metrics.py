@@ -19,7 +19,7 @@ RELATIVE_DELTA_TOLERANCE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class ErrorStatistics:
-    """Errors (N,), never negative, at least one, and what is usually said of them."""
+    """Errors (N,), at least one, none negative, and their usual statistics."""
 
     errors: Array
 
@@ -60,7 +60,7 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class AbsoluteError:
-    """Absolute trajectory error: what is left after the best alignment.
+    """Absolute trajectory error: what remains after the best alignment.
 
     Attributes:
         alignment: of the estimate to the reference.
@@ -133,7 +133,7 @@ def relative_error(
 ) -> RelativeError | None:
     """Relative pose error over index pairs (i, j); None when there is no pair.
 
-    It depends on neither world frame, so that nothing is aligned.
+    It does not depend on the world frames, so no alignment is needed.
     """
     i, j = pairs
     if not len(i):
@@ -153,8 +153,8 @@ def time_pairs(timestamps_s: Array, delta_s: float = 1.0) -> tuple[Ints, Ints]:
     """For each i the j whose stamp is nearest to ``t_i + delta_s``, as TUM's script pairs them.
 
     A pair whose time difference is off by more than a tenth of ``delta_s`` is left out, so that
-    gaps and the end of the trajectory count for nothing. evo knows no such delta; on evenly
-    sampled poses this is its delta of ``delta_s * fps`` frames with all pairs.
+    gaps and the end of the trajectory do not count. evo has no such delta; on evenly sampled poses
+    this is its delta of ``delta_s * fps`` frames with all pairs.
     """
     if not len(timestamps_s):
         return frame_pairs(0)

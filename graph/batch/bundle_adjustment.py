@@ -1,12 +1,12 @@
-"""Full bundle adjustment of a saved graph: robustly, then the loops by GNC, then without outliers.
+"""Full bundle adjustment of a saved graph: robust, then loops by GNC, then without outliers.
 
-Three stages, each from where the one before ended:
+Three stages, each from the result of the one before:
 
-1. **robust**: Levenberg-Marquardt on everything, with the kernels of the run.
+1. **robust**: Levenberg-Marquardt on all factors, with the kernels of the run.
 2. **loops**: graduated non-convexity decides which loop edges are right. Observations and all other
-   relative poses are known inliers (the former keep their kernel). Wrong loops leave the graph.
-3. **inliers**: observations whose chi-square without a kernel is beyond the bound leave, with the
-   landmarks that nothing holds then; the rest is optimised again.
+   relative poses are known inliers (the former keep their kernel). Wrong loops are removed.
+3. **inliers**: observations whose chi-square without a kernel is beyond the bound are removed, with
+   the landmarks that are then underconstrained; the rest is optimised again.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class AdjustmentConfig:
 
     Attributes:
         loop_probability, observation_probability: the share of right ones that the chi-square
-            tests keep. Observations meet the bounds of tracking, 7.815 with depth and 5.991
-            without: there are many of them. Of loops there are few.
+            tests keep. Observations have the bounds of tracking, 7.815 with depth and 5.991
+            without, since there are many; there are few loops.
         gnc_step, gnc_inner_iterations: growth of mu, and solver steps at each.
         drop_observations: whether there is a third stage.
     """
@@ -54,7 +54,7 @@ class AdjustmentConfig:
 
 @dataclass(frozen=True)
 class Stage:
-    """One optimisation of it all: its factors, its cost before and after, its solver steps."""
+    """One optimisation: number of factors, cost before and after, solver steps."""
 
     name: str
     factors: int
@@ -69,11 +69,11 @@ class Adjustment:
 
     Attributes:
         stages: in their order; costs are half the sum of squared whitened errors, with kernels.
-        loops: number of loop edges there were.
-        wrong_loops: (N, 2) keyframe ids of the loop edges that were taken out.
-        observations: number of observations there were.
-        wrong_observations: (N, 2) keyframe id, landmark id of those that were taken out.
-        dropped_landmarks: (N,) ids of the landmarks that this left without a hold.
+        loops: number of loop edges before.
+        wrong_loops: (N, 2) keyframe ids of the loop edges that were removed.
+        observations: number of observations before.
+        wrong_observations: (N, 2) keyframe id, landmark id of those that were removed.
+        dropped_landmarks: (N,) ids of the landmarks that were then underconstrained.
         duration_ms: wall time.
     """
 
@@ -87,12 +87,12 @@ class Adjustment:
 
     @property
     def initial_cost(self) -> float:
-        """Where the first stage began."""
+        """The cost before the first stage."""
         return self.stages[0].cost_before
 
     @property
     def final_cost(self) -> float:
-        """Where the last stage ended, without what was taken out."""
+        """The cost after the last stage, without what was removed."""
         return self.stages[-1].cost_after
 
     @property
@@ -108,7 +108,7 @@ def adjust(
     config: AdjustmentConfig | None = None,
     progress: Progress = lambda iteration, cost: None,
 ) -> Adjustment:
-    """Adjust a graph in place: its values move, its outliers leave.
+    """Adjust a graph in place: its values are optimised, its outliers removed.
 
     Raises:
         InputError: the graph is empty or cannot be solved, with GTSAM's reason.
@@ -150,7 +150,7 @@ def loop_numbers(tables: FactorTables) -> list[int]:
 
 
 class _Adjuster:
-    """A shadow, the factors made of it, and the stages so far."""
+    """Factor tables, the GTSAM factors made of them, and the stages so far."""
 
     def __init__(
         self,
@@ -168,7 +168,7 @@ class _Adjuster:
         self.stages: list[Stage] = []
 
     def optimise(self, name: str) -> None:
-        """A stage: every factor that is in the shadow, to convergence."""
+        """A stage: optimise with all factors, to convergence."""
         graph = self._graph(sorted(self._tables.pose_factors))
         before = float(graph.error(self._values()))
         done = self._done
@@ -176,10 +176,9 @@ class _Adjuster:
         self.stages.append(Stage(name, graph.size(), before, after, self._done - done))
 
     def drop_wrong_loops(self) -> Ints:
-        """Decide on the loop edges by GNC; keyframes (N, 2) of those that left.
+        """Decide on the loop edges by GNC; keyframes (N, 2) of those that were removed.
 
-        The right ones stay without a kernel until the end of this stage, so that the solution
-        follows them whole.
+        The right ones have no kernel until the end of this stage, so that they take full effect.
         """
         numbers = loop_numbers(self._tables)
         loops = [self._loop(number) for number in numbers]
@@ -216,7 +215,7 @@ class _Adjuster:
         return edges.reshape(-1, 2)
 
     def drop_wrong_observations(self) -> tuple[Ints, Ints]:
-        """Pairs (N, 2) of the observations that left, and the landmarks (N,) with them."""
+        """Pairs (N, 2) of the observations that were removed, and the landmarks (N,) with them."""
         probability = self._config.observation_probability
         pairs = wrong_observations(self._tables, self._camera, probability)
         if not (len(pairs) and self._config.drop_observations):
@@ -244,7 +243,7 @@ class _Adjuster:
         return make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
 
     def _run(self, graph: gtsam.NonlinearFactorGraph, max_iterations: int) -> float:
-        """Iterate, write the values into the shadow; the cost that was reached."""
+        """Iterate, write the values into the factor tables; returns the final cost."""
         parameters = gtsam.LevenbergMarquardtParams()
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, self._values(), parameters)
         done = self._done

@@ -13,7 +13,7 @@ def iterate(
 ) -> tuple[float, int]:
     """Iterate until the cost falls by less than a share of itself; the cost and the steps taken.
 
-    ``progress`` is told each step, counted from 1.
+    ``progress`` is called after each step, counted from 1.
     """
     cost, steps = float(optimiser.error()), 0
     for steps in range(1, max_iterations + 1):

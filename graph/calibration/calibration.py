@@ -1,9 +1,9 @@
 """Self-calibration: bundle adjustment of poses, landmarks and the camera's calibration.
 
 Landmarks are eliminated (Schur complement), poses and calibration solved together by
-Levenberg-Marquardt. Cauchy's kernel keeps wrong matches out; the noise of pixels and depths is
-estimated along with the rest, since the sigmas that a run works with are only nominal, and the
-covariance is stated in that estimated noise.
+Levenberg-Marquardt. Cauchy's kernel suppresses wrong matches; the noise of pixels and depths is
+estimated too, since the sigmas of a run are only nominal, and the covariance refers to the
+estimated noise.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MIN_LEFT = 0.1
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """How the solver goes about it: rounds of noise estimation, steps a round, and when to end."""
+    """Rounds of noise estimation, steps a round, and when the solver ends."""
 
     rounds: int = 10
     steps: int = 15
@@ -49,15 +49,14 @@ class CalibrationConfig:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Where the solver ended.
+    """The result of the solver.
 
     Attributes:
         calibration: (13,), and its covariance (13, 13), zero in fixed parameters.
         poses_world_camera: (K, 4, 4); points_world: (L, 3).
-        noise_scales: (2,) how many times the nominal sigmas of pixels and of depths the
-            residuals are.
-        body_arm_m: (3,) where in the camera's frame the body of the anchors' positions sits.
-        anchor_rms_m: RMS of what anchors and result differ by, NaN without any.
+        noise_scales: (2,) ratio of the residuals to the nominal sigmas of pixels and of depths.
+        body_arm_m: (3,) position in the camera's frame of the body that the anchors refer to.
+        anchor_rms_m: RMS difference of anchors and result, NaN without anchors.
         inlier_share: of the views' measurements within 3 of those sigmas.
         converged: whether the last step was negligible.
     """
@@ -107,7 +106,7 @@ def calibrate(
 def _descend(
     problem: CalibrationProblem, state: CalibrationState, scales: Array, config: CalibrationConfig
 ) -> CalibrationState:
-    """Levenberg-Marquardt at this noise; steps that raise the cost are taken back."""
+    """Levenberg-Marquardt with this noise; steps that increase the cost are rejected."""
     damping, cost = 1e-6, _cost(problem, state, scales)
     for _ in range(config.steps):
         step = _step(problem, state, scales, damping)
@@ -157,10 +156,10 @@ def _cost(problem: CalibrationProblem, state: CalibrationState, scales: Array) -
 
 
 def _noise_scales(problem: CalibrationProblem, state: CalibrationState, scales: Array) -> Array:
-    """How many times the nominal sigmas of pixels and depths the noise is, (2,).
+    """Ratio (2,) of the noise to the nominal sigmas of pixels and depths.
 
-    From medians, which wrong matches do not move, of residuals over the root of what the landmark
-    left of them: 1 - h, with h the diagonal of its hat matrix J (J^T J)^-1 J^T.
+    From medians, which wrong matches do not affect, of squared residuals over 1 - h, with h the
+    diagonal of the landmark's hat matrix J (J^T J)^-1 J^T: the share that its estimation leaves.
     """
     views = problem.views
     lin = linearise(views, *state.values)

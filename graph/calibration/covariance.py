@@ -1,4 +1,4 @@
-"""How sure a self-calibration is, whose errors depend on each other."""
+"""Covariance of a self-calibration whose measurement errors are correlated."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def covariance_of(problem: CalibrationProblem, state: CalibrationState, scales: 
     """Covariance (13, 13) of the calibration, zero in what is held fixed.
 
     The inverse of the normal equations is right if errors are independent. They are not: a
-    landmark's patch looks different, in the same way, from neighbouring views, and a stretch of the
-    path shares its light, blur and depth relief. So sandwiches are made with all errors of a
-    landmark, of a stretch of keyframes, and of the landmarks that a stretch made in one cluster
-    each (Cameron and Miller, J. Human Resources 2015). The correlations are those of the normal
-    equations, the standard deviations the largest, in terms of 95 % bounds.
+    landmark's patch errs alike in neighbouring views, and a stretch of the path shares light, blur
+    and depth relief. So sandwich estimates are made with clusters of all errors of a landmark, of a
+    stretch of keyframes, and of the landmarks first seen in a stretch (Cameron and Miller, J. Human
+    Resources 2015). The correlations are those of the normal equations, the standard deviations the
+    largest of all, in terms of 95 % bounds.
     """
     views = problem.views
     reduced = normal_equations(problem, state, scales, 0.0)
@@ -53,7 +53,7 @@ def covariance_of(problem: CalibrationProblem, state: CalibrationState, scales: 
 
 
 def _clusters(views: CalibrationViews) -> tuple[Ints, Ints, Ints]:
-    """Three ways to say (M,) which views may err together: see ``covariance_of``."""
+    """Three clusterings (M,) of views whose errors may be correlated: see ``covariance_of``."""
     keyframes = int(views.keyframes.max()) + 1
     stretch = np.arange(keyframes) * min(STRETCHES, keyframes) // keyframes
     first = np.full(int(views.landmarks.max()) + 1, keyframes)
@@ -62,10 +62,10 @@ def _clusters(views: CalibrationViews) -> tuple[Ints, Ints, Ints]:
 
 
 def _clustered_variance(scores: Array, clusters: Ints) -> Array:
-    """Variances (13,) from scores (M, 13) whose errors depend on each other within clusters (M,).
+    """Variances (13,) from scores (M, 13) whose errors are correlated within clusters (M,).
 
-    Few clusters tell their spread badly: the variance is raised so that 1.96 of its roots are the
-    bound of Student's t with as many degrees of freedom.
+    Few clusters estimate their spread badly: the variance is increased so that 1.96 standard
+    deviations are the bound of Student's t with as many degrees of freedom.
     """
     sums = np.zeros((int(clusters.max()) + 1, N))
     np.add.at(sums, clusters, scores)

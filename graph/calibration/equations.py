@@ -16,7 +16,7 @@ CAUCHY = 2.385  # 95 % efficiency on Gaussian noise
 
 @dataclass(frozen=True)
 class Reduced:
-    """Normal equations of poses and calibration, with what is needed to find the points again."""
+    """Normal equations of poses and calibration, with what is needed to recover the points."""
 
     S: Array
     b: Array
@@ -86,7 +86,7 @@ def _product(views: CalibrationViews, left: Array, right: Array, K: int, L: int)
 
 
 def with_points(views: CalibrationViews, reduced: Reduced, x: Array) -> tuple[Array, Array, Array]:
-    """Columns (6K + 13, n) of poses and calibration with what they make of the points.
+    """Columns (6K + 13, n) of poses and calibration, and the points that follow from them.
 
     Returns (K, 6, n), (L, 3, n) and (13, n).
     """

@@ -1,24 +1,23 @@
 """What an RGB-D camera measures of a point, as a function of its calibration, with derivatives.
 
-A landmark is measured by the raw (distorted) pixel where the colour image shows it, and by the
-inverse of the raw depth that the depth image holds at that pixel:
+The measurements of a landmark are its raw (distorted) pixel in the colour image, and the inverse of
+the raw depth at that pixel of the depth image:
 
     pixel          (u, v) = (fx, fy) * distort_normalised(x / z, y / z) + (cx, cy)
     metric depth   z = factor * raw + offset
 
-The depth image may have been taken tau = lag + time_offset later than the colour image; by then
-another point of the surface is seen at the pixel. To first order
+The depth image may have been taken tau = lag + time_offset later than the colour image, when
+another point of the surface is at the pixel. To first order
 
     1 / raw = factor / (z - offset) + tau * rate
 
-with the rate of change of 1 / raw at the fixed pixel, which is measured: the depth images before
-and after differ by it. (The alternative, rate = -(z' + slope . flow) / z^2 from the camera's
-velocity and the surface's slope, needs that slope from one noisy image, whose error biases tau
-toward zero.)
+with the rate of change of 1 / raw at the fixed pixel, which is measured from the depth images
+before and after. (The alternative, rate = -(z' + slope . flow) / z^2 from the camera's velocity and
+the surface's slope, needs the slope from one noisy image, whose error biases tau toward zero.)
 
 The rows of a rolling shutter are exposed one after the other: a point with the velocity p' in the
-camera's frame is seen at p + (row / rows - 1/2) rolling_shutter p'. The depth image is taken to
-roll along.
+camera's frame is observed at p + (row / rows - 1/2) rolling_shutter p'. The depth image is assumed
+to have the same rolling shutter.
 """
 
 from __future__ import annotations
@@ -47,11 +46,11 @@ class CalibrationViews:
     """M views of L landmarks in K keyframes, as columns.
 
     Attributes:
-        keyframes, landmarks: (M,) positions in the tables of poses and points, from 0.
+        keyframes, landmarks: (M,) rows in the tables of poses and points, from 0.
         pixels: (M, 2) raw pixels, distorted as the image is.
         inverse_depth: (M,) of the raw depth, NaN without one.
         inverse_depth_rate: (M,) its rate of change at that pixel, in 1/s; NaN where unknown.
-        lag_s: (M,) what the depth image's stamp says it was taken later than the colour image.
+        lag_s: (M,) stamp of the depth image less that of the colour image.
         sigma_px: (M,) standard deviation of u and of v.
         sigma_inverse: (M,) standard deviation of ``inverse_depth``.
         shutter_velocity: (M, 3) the point's velocity in the camera's frame in m/s, times the share

@@ -1,4 +1,4 @@
-"""What self-calibration is given, and what priors and anchors add to its equations."""
+"""The inputs of self-calibration, and the equations of its priors and anchors."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ N = len(PARAMETERS)
 
 @dataclass(frozen=True)
 class Anchors:
-    """What is known of the camera's positions in metres from outside.
+    """External measurements of the camera's positions in metres.
 
     Attributes:
         positions_world: (K, 3) of the keyframes, NaN where unknown.
         position_sigma_m: their standard deviation.
-        on_body: they are not the camera's, but those of a body fixed to it, such as markers, whose
-            place in the camera's frame is to be found.
+        on_body: they are those of a body fixed to the camera, such as markers, whose position in
+            the camera's frame is estimated too.
         ends: (D, 2) pairs of keyframes between which a distance was measured,
         arms_m: (D, 2, 3) the points in those keyframes' frames at which it was,
         distances_m: (D,) the distances, and
@@ -39,14 +39,14 @@ class Anchors:
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Everything that is measured, where to start, and what is believed before.
+    """Measurements, initial values and priors.
 
     Attributes:
         views: the measurements.
         poses_world_camera: (K, 4, 4); points_world: (L, 3); calibration: (13,), see PARAMETERS.
         prior_sigmas: (13,) around ``calibration``; 0 holds a parameter fixed.
         pose_sigmas: (6,) of the prior on the first pose ``[rad, m]``, which fixes the frame.
-        anchors: None, and nothing but the prior tells the scale.
+        anchors: if None, only the prior determines the scale.
     """
 
     views: CalibrationViews
@@ -60,7 +60,7 @@ class CalibrationProblem:
 
 @dataclass(frozen=True)
 class CalibrationState:
-    """Where the solver is: poses (K, 4, 4), points (L, 3) and the vector (13,) of PARAMETERS."""
+    """Current values: poses (K, 4, 4), points (L, 3) and the vector (13,) of PARAMETERS."""
 
     poses: Array
     points: Array
@@ -132,8 +132,8 @@ def anchor_terms(problem: CalibrationProblem, state: CalibrationState) -> tuple[
 def _position_terms(anchors: Anchors, poses: Array) -> tuple[Array, Array]:
     """Whitened residuals (A,) of the positions and their derivatives (A, 6K).
 
-    A body's place is eliminated: residuals and derivatives are those at its best place, without
-    the part that another place would take (variable projection, Kaufman, BIT 1975).
+    A body's position is eliminated: residuals and derivatives are those at its best position,
+    without the part that a change of it would absorb (variable projection, Kaufman, BIT 1975).
     """
     known = np.flatnonzero(np.isfinite(anchors.positions_world).all(axis=1))
     R, sigma = poses[known, :3, :3], anchors.position_sigma_m
@@ -150,7 +150,7 @@ def _position_terms(anchors: Anchors, poses: Array) -> tuple[Array, Array]:
 
 
 def body_arm(anchors: Anchors, poses: Array) -> Array:
-    """Where (3,) in the camera's frame the body whose positions are known sits; 0 for its own."""
+    """Position (3,) in the camera's frame of the body that the anchors refer to; else 0."""
     if not anchors.on_body:
         return np.zeros(3)
     known = np.isfinite(anchors.positions_world).all(axis=1)

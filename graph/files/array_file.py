@@ -1,8 +1,8 @@
 """Named numpy arrays and a JSON header in one file: how graphs, maps and checkpoints are saved.
 
 The file is a zip of .npy arrays (``numpy.load`` opens it), the same bytes for the same contents.
-It is written under a temporary name and renamed, so that a killed run leaves the old file or the
-new one, never half of one; the zip's checksums find damage, and nothing in it is executed.
+It is written under a temporary name and renamed, so that an interrupted run leaves either the old
+file or the new one; the zip's checksums detect damage, and nothing in it is executed.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _UNREADABLE = (  # RuntimeError: a damaged byte may ask for encryption or anothe
 class FileKind:
     """What a file holds: ``noun`` is the word for it, such as "graph".
 
-    ``version`` grows with every change of the arrays that the file must hold. A compressed file
-    (zlib, without loss) takes about half the place and many times the time.
+    ``version`` increases with every change of the arrays that the file must contain. A compressed
+    file (zlib, lossless) takes about half the space and many times the time.
     """
 
     noun: str

@@ -1,6 +1,6 @@
-"""The g2o text format of graphs with landmarks: keyframe poses, points and what was seen of them.
+"""The g2o text format of graphs with landmarks: keyframe poses, points and observations.
 
-All in g2o's own types, of its library slam3d:
+The types are those of g2o's library slam3d:
 
 ==========================  ===================================================================
 PARAMS_CAMERACALIB 0        pose of the camera in its vertex (none: the two are the same), then
@@ -13,18 +13,18 @@ EDGE_PROJECT_DISPARITY      keyframe, point, 0; u v in pixels and 1/z in 1/m; up
                             the information of these three
 EDGE_SE3:QUAT               keyframe a, keyframe b; T_a_b; information
 EDGE_SE3_PRIOR              keyframe, 2; T_world_camera; information
-FIX                         keyframes that stand still (read, never written)
+FIX                         fixed keyframes (read, never written)
 ==========================  ===================================================================
 
-**Exact:** a view with depth. g2o's disparity is normalised, 1/z = d / bf, so sigma_d becomes
-sigma_d / bf; u, v and d err independently here as there. A view without depth is the same edge
-with no information on 1/z, which g2o adds like any other: the two equations of a monocular view
-remain. (Its monocular edges belong to its library sba, with another pose vertex and one focal
-length for both axes.) Poses and information: as ``graph.g2o.lines`` says.
+**Exact:** an observation with depth. g2o's disparity is normalised, 1/z = d / bf, so sigma_d
+becomes sigma_d / bf; the errors of u, v and d are independent in both. An observation without depth
+is the same edge without information on 1/z: the two equations of a monocular observation remain.
+(g2o's monocular edges belong to its library sba, with another pose vertex and one focal length for
+both axes.) Poses and information: as in ``graph.g2o.lines``.
 
-**In comments**, since g2o has no words for it: image size, bf and distortion; which ids are
+**In comments**, since g2o has no tags for it: image size, bf and distortion; which ids are
 landmarks' (g2o's vertices share one range); kind and kernel of the next relative pose. Kernels of
-views are left to whoever optimises.
+observations are not written.
 """
 
 from __future__ import annotations

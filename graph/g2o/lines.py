@@ -1,9 +1,9 @@
-"""Lines of g2o files: tags, ids and numbers, and the columns that poses and information take.
+"""Lines of g2o files: tags, ids and numbers, and the columns of poses and information.
 
-Orders at the file boundary, and nowhere else: quaternions x y z w; the upper triangle of the
-information matrix row by row, in 3-D of [translation, rotation], where arrays here have
-[rotation, translation]. Rotational information is taken per radian, as GTSAM and most who write
-such files do; g2o's own 3-D edge measures half angles (the quaternion's vector part).
+The file's orders are converted here and nowhere else: quaternions x y z w; the upper triangle of
+the information matrix row by row, in 3-D of [translation, rotation], where arrays have [rotation,
+translation]. Rotational information is per radian, as in GTSAM and most such files; g2o's own 3-D
+edge measures half angles (the quaternion's vector part).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # its own inverse
 
 
 class Tag(NamedTuple):
-    """How many ids and numbers follow a tag; where a quaternion starts among the numbers."""
+    """How many ids and numbers follow a tag; the position of a quaternion among the numbers."""
 
     ids: int
     numbers: int

@@ -39,7 +39,7 @@ _TAGS = {
 
 
 def read_g2o(path: Path) -> PoseGraph:
-    """Read a 2-D or 3-D pose graph; of one that is not connected, the largest part.
+    """Read a 2-D or 3-D pose graph; if it is not connected, its largest component.
 
     Lines with other tags are left out, with one warning a tag. A file of edges alone gives a graph
     with ``has_poses`` false.

@@ -11,7 +11,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_coordinates, planar_poses
 
-_IN_PLANE = np.array([3, 4, 2])  # where x, y and angle stand in a tangent of SE(3)
+_IN_PLANE = np.array([3, 4, 2])  # positions of x, y and angle in a tangent of SE(3)
 
 
 def pose_graph_cost(graph: PoseGraph) -> float:
@@ -22,7 +22,7 @@ def pose_graph_cost(graph: PoseGraph) -> float:
 def chordal_poses(graph: PoseGraph) -> Array:
     """Poses (N, 4, 4) by chordal relaxation: rotations first, then all in one linear step.
 
-    Carlone et al., ICRA 2015, as GTSAM has it. A 2-D graph is solved as 3-D in the plane. The
+    Carlone et al., ICRA 2015, by GTSAM. A 2-D graph is solved as 3-D in the plane. The
     first vertex that is fixed (or the first) keeps its pose.
     """
     anchor = int(np.argmax(graph.fixed))
@@ -53,13 +53,13 @@ def make_factors(graph: PoseGraph, information: Array | None = None) -> gtsam.No
 
 
 def make_gauge(graph: PoseGraph) -> gtsam.NonlinearFactorGraph:
-    """What holds the fixed vertices; a single one is held exactly by any prior."""
+    """Priors on the fixed vertices; any prior fixes a single one exactly."""
     prior = gtsam.PriorFactorPose2 if graph.is_planar else gtsam.PriorFactorPose3
-    held = np.flatnonzero(graph.fixed) if graph.fixed.any() else np.array([0])
-    sigma = 1.0 if len(held) == 1 else 1e-5
+    fixed = np.flatnonzero(graph.fixed) if graph.fixed.any() else np.array([0])
+    sigma = 1.0 if len(fixed) == 1 else 1e-5
     noise = gtsam.noiseModel.Isotropic.Sigma(graph.information.shape[-1], sigma)
     factors = gtsam.NonlinearFactorGraph()
-    for k, pose in zip(held.tolist(), _gtsam_poses(graph, graph.poses[held]), strict=True):
+    for k, pose in zip(fixed.tolist(), _gtsam_poses(graph, graph.poses[fixed]), strict=True):
         factors.add(prior(k, pose, noise))
     return factors
 

@@ -1,4 +1,4 @@
-"""How well edges of a pose graph fit a solution that was made without them."""
+"""How well edges of a pose graph fit a solution without them, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ SEED = 0
 
 
 def predicted_chi2(graph: PoseGraph, used: Mask, asked: Ints) -> Array:
-    """Chi-squares (A,) of edges against the solution of others, its own uncertainty counted.
+    """Chi-squares (A,) of edges against the solution of others, including its uncertainty.
 
     ``r^T (Sigma + J P J^T)^-1 r`` with r and J the residual and the Jacobian of an edge of
     ``asked`` (A,), and P the covariance of the graph's poses, which are the optimum of the ``used``
-    edges (M,). To first order it is twice what the optimum's cost rises by if that edge alone is
+    edges (M,). To first order it is twice the increase of the optimal cost when that edge alone is
     added: a right edge stays below its quantile however far the solution has drifted.
 
     Raises:
-        RuntimeError: the used edges do not hold the graph.
+        RuntimeError: the used edges do not determine all poses.
     """
     d = graph.information.shape[-1]
     A, b = _linearised(graph)
@@ -38,7 +38,7 @@ def pose_draws(graph: PoseGraph, used: Mask) -> Array:
     """Tangents (SAMPLES, N, d) drawn from the posterior of all poses, given ``used`` edges (M,).
 
     In GTSAM's order: [rotation, translation], in a 2-D graph [x, y, angle]. Draws given different
-    edges come from the same errors of the edges, so that their spreads compare well.
+    edge sets use the same errors of the edges, so that their spreads are comparable.
     """
     d = graph.information.shape[-1]
     return _draws(_linearised(graph)[0], used, d).T.reshape(SAMPLES, -1, d)
@@ -48,8 +48,8 @@ def _draws(A: csr_array, used: Mask, d: int) -> Array:
     """Draws (N d, SAMPLES) of all tangents: normal equations with random right-hand sides.
 
     ``x = H^-1 A^T e`` with ``H = A^T A`` and white e has the covariance ``H^-1``: a factorisation
-    and one solve a draw, where covariances would need one for each pair of poses asked. The gauge
-    does not err, so that the world stays where it is.
+    and one solve a draw, where covariances would need one for each pair of poses. The gauge has no
+    error, so that the world is fixed.
     """
     with_gauge = np.append(used, np.ones(A.shape[0] // d - len(used), bool))
     rows = np.repeat(with_gauge, d)

@@ -1,4 +1,4 @@
-"""Pose graphs as plain arrays: vertices, relative poses between them, and what connects."""
+"""Pose graphs as plain arrays: vertices, relative poses between them, connected components."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class PoseGraph:
     """N poses and M relative poses. A 2-D graph is the same in the plane z = 0.
 
     Attributes:
-        ids: (N,) int64, strictly increasing: the names that a file gives the vertices.
+        ids: (N,) int64, strictly increasing: the ids of the vertices in a file.
         poses: (N, 4, 4) T_world_vertex, metres.
         edges: (M, 2) int64, rows (i, j) into ``ids``.
-        measurements: (M, 4, 4) T_i_j: ``T_world_j = T_world_i @ T_i_j`` but for the noise.
+        measurements: (M, 4, 4) T_i_j: ``T_world_j = T_world_i @ T_i_j`` without noise.
         information: (M, 6, 6) inverse covariances of the tangent [rotation rad, translation m] of
             each measurement; in a 2-D graph (M, 3, 3) of [x m, y m, angle rad], as Pose2 has it.
         fixed: (N,) bool, the vertices that must not move.
-        has_poses: whether ``poses`` were given; if not they are identities, and no guess.
+        has_poses: whether ``poses`` were given; if not they are identities, no initial values.
 
     Raises:
         ValueError: shapes that do not fit, or ids that do not increase.
@@ -107,7 +107,7 @@ def planar_coordinates(T: Array) -> Array:
 
 
 def component_labels(graph: PoseGraph) -> Ints:
-    """(N,) number of the connected part that each vertex belongs to."""
+    """(N,) number of the connected component of each vertex."""
     return connected_components(_adjacency(graph), directed=False)[1]
 
 
@@ -119,7 +119,7 @@ def is_connected(graph: PoseGraph) -> bool:
 def spanning_tree_poses(graph: PoseGraph) -> Array:
     """Poses (N, 4, 4) of a connected graph by chaining measurements along a tree.
 
-    Odometry edges are taken first, so that a graph of consecutive ids gets its odometry path. The
+    Only odometry edges are used if they connect the graph, which gives the odometry path. The
     first fixed vertex (or the first) keeps its pose.
     """
     odometry = graph.with_edges(graph.is_odometry)

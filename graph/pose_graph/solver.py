@@ -1,4 +1,4 @@
-"""GTSAM's optimisers on a pose graph: where they stand, weights of edges, steps taken."""
+"""GTSAM's optimisers on a pose graph: current values, weights of edges, steps taken."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Method = Literal["lm", "dogleg", "gnc"]
 
 @dataclass(frozen=True)
 class PoseGraphConfig:
-    """How long to iterate, and what GNC takes for an outlier."""
+    """Limits of the iterations, and the parameters of GNC."""
 
     method: Method = "lm"
     max_iterations: int = 200
@@ -29,7 +29,7 @@ class PoseGraphConfig:
 
 
 class PoseGraphSolver:
-    """A graph in GTSAM's terms, its current values, and the steps taken so far."""
+    """GTSAM factors of a graph, their weights, current values, and the steps taken so far."""
 
     def __init__(self, graph: PoseGraph, config: PoseGraphConfig, progress: Progress) -> None:
         self._graph, self._config, self._progress = graph, config, progress
@@ -42,11 +42,11 @@ class PoseGraphSolver:
 
     @property
     def poses(self) -> Array:
-        """(N, 4, 4) where the solver stands."""
+        """Current poses (N, 4, 4)."""
         return poses_of(self._graph, self._values)
 
     def start_from(self, poses: Array) -> None:
-        """Go to poses (N, 4, 4)."""
+        """Set the current poses (N, 4, 4)."""
         self._values = make_values(self._graph, poses)
 
     def cost(self, poses: Array) -> float:
