@@ -133,7 +133,8 @@ class _Depths:
     @classmethod
     def missing(cls, count: int) -> _Depths:
         """No measurements yet."""
-        return cls(*np.full((3, count), np.nan), np.zeros(count))
+        inverse_depth, rms, rate = np.full((3, count), np.nan)
+        return cls(inverse_depth, rms, rate, np.zeros(count))
 
     def measure(
         self, rows: Ints, pixels: Array, sequence: Sequence, index: int, max_step: float

@@ -35,7 +35,7 @@ def all_of(mapper: DenseMapper, given: list[DenseKeyframe]) -> list[FusedKeyfram
     return [r for k in given for r in mapper.add(k)] + mapper.flush()
 
 
-def test_a_keyframe_comes_back_once_six_more_came() -> None:
+def test_a_keyframe_is_returned_after_six_more() -> None:
     mapper, given = DenseMapper(CAMERA), keyframes(16)
     ids = [[r.keyframe.id for r in mapper.add(k)] for k in given]
     assert ids == [[]] * WINDOW + [[k] for k in range(16 - WINDOW)]
@@ -43,7 +43,7 @@ def test_a_keyframe_comes_back_once_six_more_came() -> None:
     assert [r.keyframe.id for r in mapper.flush()] == list(range(10, 16))
 
 
-def test_what_is_not_wanted_serves_its_neighbours_only() -> None:
+def test_an_unwanted_keyframe_is_only_a_neighbour() -> None:
     given = keyframes(9)
     expected = {r.keyframe.id: r for r in all_of(DenseMapper(CAMERA), given)}
     mapper = DenseMapper(CAMERA)
@@ -62,7 +62,7 @@ def moved_by(T: Array, keyframe: DenseKeyframe) -> DenseKeyframe:
     return replace(keyframe, T_world_camera=T @ keyframe.T_world_camera)
 
 
-def test_poses_that_are_optimised_meanwhile_are_followed() -> None:
+def test_the_current_poses_are_used_for_the_fusion() -> None:
     """The first keyframes stand in another world until they are moved, like before a loop."""
     given = keyframes(8)
     expected = all_of(DenseMapper(CAMERA), given)
@@ -77,7 +77,7 @@ def test_poses_that_are_optimised_meanwhile_are_followed() -> None:
         np.testing.assert_array_equal(mine.keyframe.T_world_camera, theirs.keyframe.T_world_camera)
 
 
-def test_after_a_flush_it_begins_anew() -> None:
+def test_a_flush_starts_a_new_stream() -> None:
     mapper, given = DenseMapper(CAMERA), keyframes(6)
     first = all_of(mapper, given[:3])
     again = all_of(mapper, given[3:])
@@ -87,7 +87,7 @@ def test_after_a_flush_it_begins_anew() -> None:
         np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
 
 
-def test_one_that_comes_late_finds_its_place() -> None:
+def test_a_late_keyframe_is_used_by_its_neighbours() -> None:
     given = keyframes(9)
     expected = {r.keyframe.id: r for r in all_of(DenseMapper(CAMERA), given)}
     found = all_of(DenseMapper(CAMERA), [given[k] for k in (0, 2, 4, 1, 3, 5, 6, 8, 7)])
@@ -98,7 +98,7 @@ def test_one_that_comes_late_finds_its_place() -> None:
             np.testing.assert_array_equal(result.map.rho.numpy(), expected_rho)
 
 
-def test_what_is_forgotten_is_as_if_it_had_not_come() -> None:
+def test_removed_keyframes_have_no_effect() -> None:
     given = keyframes(8)
     expected = all_of(DenseMapper(CAMERA), [k for k in given if k.id not in (2, 5)])
     mapper = DenseMapper(CAMERA)
@@ -110,7 +110,7 @@ def test_what_is_forgotten_is_as_if_it_had_not_come() -> None:
         np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
 
 
-def test_labels_that_come_late_are_as_if_in_time() -> None:
+def test_late_labels_have_the_effect_of_early_ones() -> None:
     given = keyframes(8)
     moves, numbers = np.zeros((30, 40), bool), np.ones((30, 40), np.uint16)
     moves[5:15, 8:20] = True

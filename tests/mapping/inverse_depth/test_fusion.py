@@ -55,7 +55,7 @@ def read(given: InverseDepthMap, u: float, v: float, inner: bool):
     return (np.nan, np.nan) if inner else (rho[near], variance[near])
 
 
-def say(seed: float, u: int, v: int, view: View, inner: bool):
+def neighbour_estimate(seed: float, u: int, v: int, view: View, inner: bool):
     """One neighbour's hypothesis about the point at ``seed`` on the ray of pixel (u, v)."""
     point = CAMERA.backproject(np.array([u, v], float), np.array(1 / seed))
     there = transform(inverse(view.T_own_neighbour), point[None])[0]
@@ -87,7 +87,7 @@ def reference(own: InverseDepthMap, views: list[View], seeds):
         seed = rho0[v, u] if known else seeds[v, u]
         if not np.isfinite(seed):
             continue
-        said = [say(seed, u, v, view, not known) for view in views]
+        said = [neighbour_estimate(seed, u, v, view, not known) for view in views]
         r, s = [rho0[v, u], *(m for m, _ in said)], [variance0[v, u], *(x for _, x in said)]
         chosen = largest_set(r, s)
         if not chosen and known and not any(m < seed for m, _ in said):
@@ -118,7 +118,7 @@ def test_it_follows_the_formulas(count: int) -> None:
         assert (np.isfinite(rho) & ~own.known.numpy()).sum() > 5
 
 
-def test_a_neighbour_sees_the_same_plane() -> None:
+def test_a_neighbour_gives_the_inverse_depth_of_the_same_plane() -> None:
     T_a, T_b = poses(np.random.default_rng(0), 2, 0.05, 0.15)
     truth = plane_rho(T_a)
     view = View(as_map(plane_rho(T_b), 0.01), relative(T_a, T_b))
@@ -129,7 +129,7 @@ def test_a_neighbour_sees_the_same_plane() -> None:
     assert (variance.numpy()[seen] > 0).all()
 
 
-def test_what_is_behind_the_other_camera_is_nowhere_in_its_image() -> None:
+def test_points_behind_the_other_camera_have_no_projection() -> None:
     away = make_pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
     u, v, ratio = project(torch.full((30, 40), 0.5), away, CAMERA)
     assert not (torch.isfinite(u) | torch.isfinite(v)).any()
@@ -162,7 +162,7 @@ def test_independent_views_add_up() -> None:
     np.testing.assert_allclose(result.map.variance.numpy(), 0.01**2 / 4, rtol=2e-2)
 
 
-def test_what_a_neighbour_sees_through_is_not_there() -> None:
+def test_an_estimate_that_a_neighbour_sees_through_is_removed() -> None:
     own = as_map(np.full((30, 40), 0.505), 0.001)
     behind = View(as_map(np.full((30, 40), 0.5), 0.001), np.eye(4))
     before = View(as_map(np.full((30, 40), 0.51), 0.001), np.eye(4))
@@ -203,7 +203,7 @@ def test_the_rim_of_a_seeded_surface_is_not_seeded_from_behind() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
-def test_the_factor_finds_what_variances_lack(scale: float) -> None:
+def test_the_factor_corrects_wrong_variances(scale: float) -> None:
     rng = np.random.default_rng(1)
     maps = [as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004 / scale) for _ in range(4)]
     said = [(m.rho, m.variance) for m in maps[1:]]
@@ -219,7 +219,7 @@ def unchanged(given: InverseDepthMap, factor: float) -> Fused:
     return Fused(given, given.known.to(torch.uint8), factor)
 
 
-def test_the_stated_variance_grows_with_the_slope() -> None:
+def test_the_calibrated_variance_grows_with_the_slope() -> None:
     rho = np.tile(np.linspace(0.4, 0.8, 40), (30, 1))
     given = as_map(rho, 0.002)
     slope = squared_gradient(given.rho).numpy()[:, 1:-1]
@@ -229,7 +229,7 @@ def test_the_stated_variance_grows_with_the_slope() -> None:
     np.testing.assert_allclose(extra, BLUR_PX**2 * slope, rtol=1e-3)
 
 
-def test_the_stated_variance_shrinks_by_what_was_smoothed_away() -> None:
+def test_the_calibrated_variance_shrinks_by_what_was_smoothed_away() -> None:
     rng = np.random.default_rng(4)
     given = as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004)
     final = regularise(given)

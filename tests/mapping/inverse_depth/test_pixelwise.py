@@ -19,7 +19,7 @@ from bmask_slam.mapping.inverse_depth.pixelwise import (
 )
 
 
-def test_a_gate_lets_through_what_is_not_negative() -> None:
+def test_negative_margins_become_nan() -> None:
     margin = torch.tensor([2.0, 0.0, -0.0, -1e-6, torch.nan, -torch.inf])
     np.testing.assert_array_equal(nan_where_negative(margin).numpy(), [0, 0, 0, *[np.nan] * 3])
 

@@ -65,7 +65,7 @@ def test_a_step_stays_sharp() -> None:
     np.testing.assert_allclose(result, truth, rtol=1e-6)
 
 
-def test_a_lonely_pixel_goes_and_a_hole_is_filled() -> None:
+def test_an_isolated_pixel_is_removed_and_a_hole_is_filled() -> None:
     rho = np.full((9, 9), 0.5)
     rho[2, 2], rho[6, 6] = 0.9, np.nan
     result = regularise(as_map(rho, 0.005)).rho.numpy()
@@ -73,7 +73,7 @@ def test_a_lonely_pixel_goes_and_a_hole_is_filled() -> None:
     assert result[6, 6] == pytest.approx(0.5)
 
 
-def test_nothing_known_stays_nothing() -> None:
+def test_an_empty_map_stays_empty() -> None:
     empty = torch.full((6, 7), torch.nan)
     assert not regularise(InverseDepthMap(empty, empty)).known.any()
 

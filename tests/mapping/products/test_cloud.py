@@ -77,7 +77,7 @@ def test_it_is_that_of_a_loop_over_voxels(tmp_path: Path) -> None:
 
 
 def test_labels_are_those_of_a_loop_over_voxels_and_submaps() -> None:
-    """Each submap speaks once; one without a point in the voxel, by its points in the cell."""
+    """Each submap counts once; one without a point in the voxel, by its points in the cell."""
     told, points, voxels = table([3, 2, 4], 5), 300, 60
     voxel = np.r_[np.arange(voxels), RNG.integers(0, voxels, points - voxels)]
     cell = np.arange(voxels) // 7
@@ -100,8 +100,8 @@ def test_labels_are_those_of_a_loop_over_voxels_and_submaps() -> None:
         assert abs(probabilities[v] - share.max()) < 1e-4
 
 
-def test_a_thing_that_some_views_missed_is_still_there_and_one_seen_once_is_not() -> None:
-    """As in the label store: what was missed once is missed again."""
+def test_an_object_that_some_views_missed_is_kept_and_one_seen_once_is_not() -> None:
+    """As in the label store: misses of an object are not independent."""
     store, classes = LabelStoreConfig(), 40
     seen = np.zeros(classes, np.float32)
     seen[2] = 0.6
@@ -174,7 +174,7 @@ def test_where_masks_overlap_the_better_wins() -> None:
     np.testing.assert_array_equal(labels.numbers[:, 0], [1, 1, 2, 2, 2, 0])
 
 
-def test_a_trusted_mask_says_more() -> None:
+def test_a_better_mask_has_more_weight() -> None:
     found = [instance(slice(0, 3), 1, 0.9, 0.9), instance(slice(3, 5), 1, 0.9, 0.3)]
     told = keyframe_labels(found, (6, 8), 4, LabelStoreConfig()).log_likelihoods
     np.testing.assert_allclose(np.exp(told) @ LabelStoreConfig().prior(4), 1, rtol=1e-5)

@@ -50,7 +50,7 @@ def test_landmarks_are_the_prior_of_an_instances_class() -> None:
     np.testing.assert_array_equal(found[others], given.log_likelihoods[others])
 
 
-def test_landmarks_of_a_thing_on_an_instance_do_not_overrule_its_mask() -> None:
+def test_landmarks_of_an_object_on_an_instance_do_not_overrule_its_mask() -> None:
     """A table whose mask covers a box with more landmarks than its own top."""
     table = np.array([0.4, 0.588, 0.006, 0.006])
     p = np.zeros((30, 4))
@@ -63,7 +63,7 @@ def test_landmarks_of_a_thing_on_an_instance_do_not_overrule_its_mask() -> None:
     assert given.with_landmarks(p, all_known, PRIOR)[0].argmax() == 2
 
 
-def test_dilate_reaches_as_far_as_it_says() -> None:
+def test_dilate_grows_by_the_margin() -> None:
     shown = np.zeros((20, 30), bool)
     shown[10, 12] = True
     rows, columns = np.nonzero(dilate(shown, 3))

@@ -52,7 +52,7 @@ def mapped(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-def test_it_leaves_what_it_promises(mapped: Path) -> None:
+def test_the_products_are_written(mapped: Path) -> None:
     names = {p.name for p in (mapped / "dense").iterdir()}
     expected = {"cloud.ply", "cloud.pcd", "semantic.ply", "mesh.ply", "plan.png", "legend.json"}
     assert expected | {"dense.json", "view_first.png", "view_overview_semantic.png"} <= names
@@ -104,7 +104,7 @@ def test_labels_are_those_of_the_truth(mapped: Path, room: Path) -> None:
     assert same[visible].mean() > 0.93
 
 
-def test_again_nothing_is_fused_and_the_bytes_are_the_same(
+def test_a_second_call_fuses_nothing_and_writes_the_same_bytes(
     mapped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (mapped / "dense" / "cloud.ply").read_bytes()
@@ -117,7 +117,7 @@ def test_again_nothing_is_fused_and_the_bytes_are_the_same(
     assert (mapped / "dense" / "cloud.ply").read_bytes() == before
 
 
-def test_a_map_that_was_stopped_goes_on_to_the_same_bytes(mapped: Path, tmp_path: Path) -> None:
+def test_a_stopped_map_is_completed_with_the_same_bytes(mapped: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(mapped, run)
     for name in ("000003", "000004", "000009"):
@@ -153,7 +153,7 @@ def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_
     assert [p.stat().st_mtime_ns for p in sorted((run / "dense" / "submaps").iterdir())] == stamps
 
 
-def test_what_moves_is_left_out_or_kept_in_a_cloud_of_its_own(mapped: Path, tmp_path: Path) -> None:
+def test_excluded_classes_are_missing_or_in_another_cloud(mapped: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(mapped, run)
     names = CocoSegmenter(truth_file(open_run(run))).labels
@@ -166,7 +166,7 @@ def test_what_moves_is_left_out_or_kept_in_a_cloud_of_its_own(mapped: Path, tmp_
     assert len(moving["x"]) > 100
 
 
-def test_keyframes_that_cannot_be_used_are_left_out(
+def test_keyframes_that_cannot_be_used_are_skipped(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     broken = {1: "no landmarks", 2: "nan pose", 5: "other image"}
@@ -178,7 +178,7 @@ def test_keyframes_that_cannot_be_used_are_left_out(
         assert text in err
 
 
-def test_without_depth_a_keyframe_is_left_out(room: Path, tmp_path: Path) -> None:
+def test_a_keyframe_without_depth_is_refused(room: Path, tmp_path: Path) -> None:
     sequence = open_sequence(room)
     run = make_run(tmp_path / "run", sequence)
     moved = tmp_path / "office"
@@ -190,7 +190,7 @@ def test_without_depth_a_keyframe_is_left_out(room: Path, tmp_path: Path) -> Non
         load_keyframe(opened, opened.keyframes[3])
 
 
-def test_a_full_disk_stops_with_what_was_written(
+def test_a_full_disk_keeps_the_keyframes_written_before(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = make_run(tmp_path / "run", open_sequence(room))
@@ -230,7 +230,7 @@ def test_a_run_can_fuse_its_keyframes_on_the_way(
     assert f"0 fused, {total} were finished" in capsys.readouterr().out
 
 
-def test_what_an_overwritten_run_left_is_not_used(
+def test_the_dense_map_of_an_overwritten_run_is_not_used(
     room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = make_run(tmp_path / "run", open_sequence(room))

@@ -104,7 +104,7 @@ def write_depth(folder: Path, stamp: str, depth_m: Array) -> None:
     write_png(folder / "depth" / f"{stamp}.png", stored_depth(depth_m, 5000))
 
 
-def test_the_map_of_pairs_is_that_of_the_true_surfaces_whatever_the_sensor_says(
+def test_the_map_of_pairs_is_right_whatever_the_sensor_measures(
     sequence: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = run_of(sequence)
@@ -132,7 +132,7 @@ def test_the_baseline_is_that_of_the_sequences_camera_file(
     assert "2 fused, 0 were finished" in capsys.readouterr().out
 
 
-def test_where_the_sensor_has_nothing_both_takes_the_pair(sequence: Path) -> None:
+def test_both_uses_the_pair_where_the_sensor_has_no_depth(sequence: Path) -> None:
     """The first keyframe has none before it that a sweep could match it with."""
     run = run_of(sequence, (2,))
     true_m = open_sequence(sequence).load(2).depth_m
@@ -143,7 +143,7 @@ def test_where_the_sensor_has_nothing_both_takes_the_pair(sequence: Path) -> Non
     np.testing.assert_allclose(np.nanmedian(relative[..., 142:]), 0.02, atol=0.003)
 
 
-def test_broken_right_images_leave_a_keyframe_out_or_to_the_sensor(
+def test_keyframes_with_broken_right_images_are_skipped_or_use_the_sensor(
     sequence: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, right = run_of(sequence), sequence / "right"
@@ -185,7 +185,7 @@ def negative_bf(folder: Path) -> None:
         (negative_bf, ["camera.yaml: stereo_bf is -25", "positive"]),
     ],
 )
-def test_what_pairs_need_is_told_in_one_line(
+def test_missing_inputs_of_pairs_are_one_line(
     sequence: Path,
     spoil: Callable[[Path], object],
     texts: list[str],
@@ -216,7 +216,7 @@ class PersonInTheMiddle:
         return [Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 1.0)]
 
 
-def test_what_moves_is_left_out_of_the_pairs_too(sequence: Path) -> None:
+def test_excluded_classes_get_no_depth_from_pairs_either(sequence: Path) -> None:
     opened = open_run(run_of(sequence, (0,)))
     options = MapOptions(opened.path, excluded=("person",), source="stereo")
     assert RunFusion(opened, PersonInTheMiddle(), options).fuse_all().fused == 1
