@@ -28,7 +28,7 @@ from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
-OLDER_ARRAYS = ("semantics.labels.counts",)
+OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
 """Arrays in older files that are read by nothing today."""
 
 
