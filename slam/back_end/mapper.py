@@ -223,8 +223,8 @@ class Mapper:
     def _apply(self, estimate: GraphEstimate, timed: bool = True) -> None:
         if timed:
             self.update_ms.append(estimate.update_ms)
-        if estimate.rebuilt:
-            logger.warning("graph rebuilt after a failure at %s", estimate.failed_variable)
+        for note in estimate.notes():
+            logger.log(logging.WARNING if estimate.rebuilt else logging.INFO, "graph: %s", note)
         read_back(self.world, estimate)
 
     def _change_graph(self, **changes: Any) -> None:

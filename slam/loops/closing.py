@@ -231,7 +231,7 @@ class LoopCloser:
     def _within_drift(self, loop: LoopConstraint, world: WorldMap) -> bool:
         """Whether the drift that a loop implies is possible."""
         a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
-        ids, travelled_m = _travelled(world)
+        ids, travelled_m = world.path_lengths_m()
         row_a, row_b = np.searchsorted(ids, loop.ends)
         S = loop.covariance + self._map_covariances(travelled_m[row_b] - travelled_m[row_a])
         r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
@@ -245,7 +245,7 @@ class LoopCloser:
         first, second = np.triu_indices(len(loops), 1)
         a, b = (np.array([getattr(k, f"keyframe_{end}") for k in loops]) for end in "ab")
         poses = np.array([k.T_world_camera for k in world.keyframes.values()])
-        ids, travelled_m = _travelled(world)
+        ids, travelled_m = world.path_lengths_m()
         row_a, row_b = np.searchsorted(ids, a), np.searchsorted(ids, b)
         lengths = np.stack(
             [np.abs(travelled_m[k[first]] - travelled_m[k[second]]) for k in (row_a, row_b)]
@@ -277,14 +277,6 @@ class LoopCloser:
             axis=-1,
         )
         return np.repeat(sigmas**2, 3, axis=-1)[..., None] * np.eye(6)
-
-
-def _travelled(world: WorldMap) -> tuple[Ints, Array]:
-    """Ids (K,) of all keyframes, ascending, and metres (K,) of path up to each."""
-    ids = np.fromiter(world.keyframes, np.int64)
-    centres = np.array([k.T_world_camera[:3, 3] for k in world.keyframes.values()])
-    steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
-    return ids, np.cumsum(steps)
 
 
 def _largest_clique(agree: Mask) -> Ints:

@@ -92,6 +92,13 @@ class WorldMap:
         segments = [self.keyframes[h].segment for h in hosts if h in self.keyframes]
         return int(np.bincount(segments).argmax())
 
+    def path_lengths_m(self) -> tuple[Ints, Array]:
+        """Ids (K,) of all keyframes, ascending, and the metres (K,) of path up to each."""
+        ids = np.fromiter(self.keyframes, np.int64)
+        centres = np.array([k.T_world_camera[:3, 3] for k in self.keyframes.values()])
+        steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
+        return ids, np.cumsum(steps)
+
     def observed(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
         """Keypoint indices and ids of the landmarks in the map that a keyframe observes."""
         keypoints = np.flatnonzero(keyframe.landmark_ids >= 0)
