@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
+    from bmask_slam.evaluation import Row
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
     from bmask_slam.system_config import SystemConfig
     from bmask_slam.viewer.scene import ViewOptions
@@ -15,6 +16,11 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # no public name
 
 WEB_PORT = 9090
+DETAILS = (
+    *("rpe_trans_rmse_frame", "rpe_rot_rmse_frame", "ate_rot_rmse", "tracking_ms_p95"),
+    *("isam2_update_ms_median", "isam2_update_ms_p95", "latency_ms_p95"),
+)
+"""Figures of metrics.json that are not printed."""
 SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth or none"
 
 
@@ -112,3 +118,10 @@ def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
 
     elsewhere = arguments.record is not None or arguments.serve > 0
     return ViewOptions(arguments.record, arguments.serve, window and not elsewhere)
+
+
+def format_summary(rows: list[Row]) -> str:
+    """The main figures of a run as a table; metrics.json holds all of them."""
+    from bmask_slam.evaluation import format_table
+
+    return format_table([row for row in rows if row["name"] not in DETAILS])

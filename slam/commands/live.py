@@ -13,6 +13,7 @@ from bmask_slam.commands.arguments import (
     add_segmenter_arguments,
     add_view_arguments,
     chosen_config,
+    format_summary,
     view_options,
 )
 
@@ -129,9 +130,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
 
 
 def _print_summary(slam: LiveSlam, source: Source) -> None:
-    from bmask_slam.evaluation import format_table
-
-    print(f"{format_table(slam.rows)}\n\nRun folder  {slam.options.out}")
+    print(f"{format_summary(slam.rows)}\n\nRun folder  {slam.options.out}")
     if slam.dense is not None:
         print(f"Dense map   {slam.options.out}/dense, {slam.dense.points} points")
     if left_out := source.counts.line():

@@ -12,6 +12,7 @@ from bmask_slam.commands.arguments import (
     add_config_arguments,
     add_segmenter_arguments,
     chosen_config,
+    format_summary,
 )
 from bmask_slam.graph.errors import InputError
 
@@ -122,12 +123,10 @@ def _run_or_resume(arguments: argparse.Namespace, chosen: ChosenConfig) -> RunSu
 
 
 def _print_summary(summary: RunSummary, quiet: bool) -> None:
-    from bmask_slam.evaluation import format_table
-
     if quiet:
         print(summary.folder)
         return
-    print(format_table(summary.rows))
+    print(format_summary(summary.rows))
     if summary.skipped:
         print(f"\n{summary.skipped} broken frames were skipped, see log.txt")
     if summary.stopped_by:

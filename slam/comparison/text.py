@@ -7,14 +7,21 @@ from collections.abc import Iterator, Sequence
 from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.comparison.experiment.result import CellStatus, Comparison
 from bmask_slam.comparison.report.table import TableRow, cell_name, metric_table
-from bmask_slam.comparison.statistics import Verdict, verdicts
+from bmask_slam.comparison.statistics import TOO_FEW, Verdict, verdicts
 
 MAIN_METRIC = "ate_rmse"
 
 
 def format_comparison(comparison: Comparison) -> str:
-    """The table of the main metric, the verdicts, and every cell without figures."""
-    parts = [format_table(comparison, MAIN_METRIC), format_verdicts(verdicts(comparison))]
+    """The table of the main metric, the verdicts, and every cell without figures.
+
+    Where all verdicts have too few pairs to be any, one line says so; the report holds them.
+    """
+    found = verdicts(comparison)
+    judged = format_verdicts(found)
+    if found and all(TOO_FEW in verdict.note for verdict in found):
+        judged = f"Verdicts: {TOO_FEW}; more seeds or sequences give more pairs"
+    parts = [format_table(comparison, MAIN_METRIC), judged]
     return "\n\n".join(filter(None, [*parts, format_problems(comparison)]))
 
 
