@@ -114,12 +114,10 @@ def optimise_pose(
         measurements: (N, 3) u, v, disparity in undistorted pixels; disparity NaN: monocular.
         sigmas_px: (N, 3) their standard deviations.
 
-    Inliers are chosen by the chi-square gate of 95 % for 3 or 2 degrees of freedom, taken without
-    the robust kernel, and with the pixel sigmas scaled to the residuals of the frame, since a
-    blurred or rolling-shutter image has more noise.
+    Inliers pass the chi-square gate (95 %, 3 or 2 degrees of freedom) without the kernel, with pixel
+    sigmas scaled to the residuals of the frame: blurred images have more noise.
     """
-    config = config or PoseOptimisationConfig()
-    stereo = np.isfinite(measurements[:, 2])
+    config, stereo = config or PoseOptimisationConfig(), np.isfinite(measurements[:, 2])
     measured = np.where(np.isfinite(measurements), measurements, 0.0)
     weight = np.where(np.isfinite(measurements), 1.0 / sigmas_px**2, 0.0)
     gate = np.where(stereo, CHI2_3DOF, CHI2_2DOF)
