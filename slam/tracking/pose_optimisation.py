@@ -114,7 +114,7 @@ def optimise_pose(
         measurements: (N, 3) u, v, disparity in undistorted pixels; disparity NaN: monocular.
         sigmas_px: (N, 3) their standard deviations.
 
-    Inliers pass the chi-square gate (95 %, 3 or 2 degrees of freedom) without the kernel, with pixel
+    Inliers pass the chi-square gate (95 %, 3 or 2 degrees of freedom) without the kernel, with
     sigmas scaled to the residuals of the frame: blurred images have more noise.
     """
     config, stereo = config or PoseOptimisationConfig(), np.isfinite(measurements[:, 2])
