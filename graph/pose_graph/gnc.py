@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.stats import chi2
 
 from bmask_slam.graph.arrays import Array, Mask
+from bmask_slam.graph.factors.checks import chi2_quantile
 from bmask_slam.graph.factors.gnc import first_mu, gnc_weights
 from bmask_slam.graph.pose_graph.loop_consistency import LoopConsistency
 from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
@@ -71,7 +71,7 @@ class _Search:
     ) -> None:
         self._graph, self._solver, self._config = graph, solver, config
         degrees = graph.information.shape[-1]
-        self.limit = noise_scale * float(chi2.ppf(config.inlier_probability, degrees))
+        self.limit = noise_scale * float(chi2_quantile(config.inlier_probability, degrees))
         self.known = graph.is_odometry
 
     def solve(self, right: Mask) -> float:

@@ -11,12 +11,11 @@ import logging
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import chi2
 
 from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.checks import mahalanobis
+from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.array_file import nested, part, split_rows
@@ -71,7 +70,7 @@ class LoopClosingConfig:
     @property
     def gate(self) -> float:
         """Chi-square with 6 degrees of freedom at ``probability``."""
-        return float(chi2.ppf(self.probability, 6))
+        return float(chi2_quantile(self.probability, 6))
 
 
 class LoopCloser:
