@@ -14,6 +14,7 @@ plots/...             status, inliers, milliseconds of each stage, queues
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,11 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
+logger = logging.getLogger(__name__)
+
 TIMELINE = "time"
+FLUSH_S = 10.0
+"""The longest wait for a viewer at the end."""
 IMAGE_STEP = 2
 JPEG_QUALITY = 70
 STATUS = {TrackingStatus.OK: 2, TrackingStatus.WEAK: 1, TrackingStatus.LOST: 0}
@@ -161,8 +166,14 @@ class Scene:
         self._stream.set_time(TIMELINE, duration=timestamp_s)
 
     def close(self) -> None:
-        """Write buffered data and end the recording."""
-        self._stream.flush()
+        """Write buffered data and end the recording.
+
+        A viewer that does not take the data within FLUSH_S loses the rest of it.
+        """
+        try:
+            self._stream.flush(timeout_sec=FLUSH_S)
+        except RuntimeError as error:
+            logger.warning("the viewer did not take all data: %s", error)
         self._stream.disconnect()
 
     def _pose(self, T: Array) -> Any:

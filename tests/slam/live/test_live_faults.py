@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -177,12 +178,15 @@ def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:
     from bmask_slam.viewer.scene import ViewOptions
 
     viewers: list[subprocess.Popen[bytes]] = []
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
 
     def spawn(stream: rerun.RecordingStream) -> None:
         """A viewer without a window in place of one with, since tests have no display."""
-        command = [sys.executable, "-m", "rerun", "--serve-grpc", "--port", "19876"]
+        command = [sys.executable, "-m", "rerun", "--serve-grpc", "--port", str(port)]
         viewers.append(subprocess.Popen(command, stdout=-3, stderr=-3))
-        stream.connect_grpc("rerun+http://127.0.0.1:19876/proxy")
+        stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
 
     monkeypatch.setattr(rerun.RecordingStream, "spawn", spawn)
     options = LiveOptions(tmp_path / "run", view=ViewOptions(window=True))
