@@ -183,6 +183,11 @@ class Smoother:
         self._tables = factor_tables_of(state, path)
         self.restart()
 
+    @property
+    def tables(self) -> FactorTables:
+        """The whole graph and its values, to be read and not changed."""
+        return self._tables
+
     def save(self, path: Path) -> None:
         """Write the graph, its values and ids into one file, atomically."""
         write_graph(path, self._tables, self._camera)

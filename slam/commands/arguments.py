@@ -24,6 +24,12 @@ DETAILS = (
 SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth or none"
 
 
+def add_camera_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --camera."""
+    text = "camera.yaml in place of its own, or a model such as kinect-v1 for what that leaves out"
+    parser.add_argument("--camera", type=Path, metavar="F", help=text)
+
+
 def add_segmenter_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     """Add --segmenter and what the segmenters need; ``default`` is for the help alone."""
     parser.add_argument("--segmenter", metavar="NAME", help=f"{SEGMENTERS} (default: {default})")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from bmask_slam.commands.arguments import (
     Commands,
+    add_camera_argument,
     add_config_arguments,
     add_segmenter_arguments,
     add_view_arguments,
@@ -46,7 +47,7 @@ def add_live(commands: Commands) -> None:
     )
     _add_source_arguments(parser)
     add_config_arguments(parser)
-    parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
+    add_camera_argument(parser)
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--map", action="store_true", help="also a dense map, as by bmask-slam map")
     add_segmenter_arguments(parser, "light")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from bmask_slam.commands.arguments import (
     ChosenConfig,
     Commands,
+    add_camera_argument,
     add_config_arguments,
     add_segmenter_arguments,
     chosen_config,
@@ -56,7 +57,7 @@ def add_run(commands: Commands) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --out holds")
     add_config_arguments(parser)
     parser.add_argument("--print-config", action="store_true", help="print it resolved, and end")
-    parser.add_argument("--camera", type=Path, metavar="F", help="camera.yaml in place of its own")
+    add_camera_argument(parser)
     parser.add_argument("--reference", type=Path, metavar="F", help="trajectory to compare to")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--stride", type=int, metavar="N", help="take every N-th frame")

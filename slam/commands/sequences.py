@@ -6,7 +6,7 @@ import argparse
 from dataclasses import fields
 from pathlib import Path
 
-from bmask_slam.commands.arguments import Commands
+from bmask_slam.commands.arguments import Commands, add_camera_argument
 
 DOWNLOAD = "fetch published recordings (TUM, Bonn, ICL-NUIM) from where they were published"
 DOWNLOAD_MORE = """\
@@ -66,6 +66,7 @@ def add_info(commands: Commands) -> None:
     parser = commands.add_parser("info", help=text, description=text)
     parser.set_defaults(handler=_info)
     parser.add_argument("sequence", type=Path, help="folder in TUM layout, or ROS bag")
+    add_camera_argument(parser)
 
 
 def _info(arguments: argparse.Namespace) -> int:
@@ -78,7 +79,7 @@ def _info(arguments: argparse.Namespace) -> int:
             print(format_topics(bag))
         return 0
     with console_log():
-        info = sequence_info(open_sequence(arguments.sequence))
+        info = sequence_info(open_sequence(arguments.sequence, camera=arguments.camera))
     print(format_info(info))
     return 0
 

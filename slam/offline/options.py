@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.system_config import SystemConfig
 
 _PATHS = ("sequence", "camera", "reference", "map")
@@ -26,7 +27,7 @@ class RunOptions:
         config_name: part of the run folder's name where ``out`` is None.
         out: the run folder; None: the first free ``runs/<sequence>[-<config_name>][-<n>]``.
         overwrite: replace the run that ``out`` holds.
-        camera: a camera.yaml to use in place of the sequence's own.
+        camera: a camera.yaml to use in place of the sequence's own, or the name of a camera preset.
         reference: TUM file or sequence folder to compare with; None: the sequence's own, if any.
         max_frames: stop after so many frames.
         stride: take every n-th frame.
@@ -70,7 +71,7 @@ class RunOptions:
     def recorded(self) -> dict[str, Any]:
         """The options that a checkpoint keeps, as JSON values; paths are absolute."""
         found = {name: getattr(self, name) for name in _RECORDED}
-        return found | {name: str(found[name].absolute()) for name in _PATHS if found[name]}
+        return found | {name: str(_absolute(found[name])) for name in _PATHS if found[name]}
 
     @classmethod
     def from_recorded(
@@ -92,12 +93,17 @@ class RunOptions:
         free = ("sequence", "quiet")
         for option in (name for name in given if name not in free):
             value, own = given[option], getattr(self, option)
-            if own != (value.absolute() if isinstance(value, Path) else value):
+            if own != (_absolute(value) if isinstance(value, Path) else value):
                 was = "another configuration" if option == "config" else own
                 raise InputError(
                     f"{_flag(option)}: the run was started with {was}; omit it, or start a new run"
                 )
         return replace(self, **{name: given[name] for name in free if name in given})
+
+
+def _absolute(path: Path) -> Path:
+    """The path from the root; the name of a camera preset as it is."""
+    return path if is_preset(path) else path.absolute()
 
 
 def _flag(option: str) -> str:

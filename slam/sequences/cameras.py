@@ -1,16 +1,24 @@
-"""The camera of a sequence: camera.yaml, or one of TUM's three known cameras."""
+"""The camera of a sequence: camera.yaml, one of TUM's three known cameras, or a preset."""
 
 from __future__ import annotations
 
 import logging
 import math
 import re
+from collections.abc import Container
 from pathlib import Path
 
 from bmask_slam.config.yaml import format_yaml, parse_yaml
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.sequences.camera_presets import (
+    PRESETS,
+    completed,
+    is_preset,
+    nominal_camera,
+    preset_of_folder,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -50,31 +58,52 @@ LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0, "rolling_shutter": 1.0}
 def find_camera(folder: Path, given: Path | None = None) -> tuple[Camera, str]:
     """The camera of a sequence and a description of its source.
 
-    The file ``given`` has precedence over the folder's camera.yaml, and that over its name.
+    The file ``given`` has precedence over the folder's camera.yaml, and that over its name. What
+    none of them says is filled in from the preset ``given``, or else from that of the recording.
 
     Raises:
-        InputError: a broken camera.yaml, or none and a folder name that is not TUM's.
+        InputError: a broken camera.yaml, or none, no preset and a folder name that is not TUM's.
     """
-    path = given or folder / "camera.yaml"
+    preset = str(given) if is_preset(given) else preset_of_folder(folder)
+    path = folder / "camera.yaml" if given is None or is_preset(given) else given
     match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", folder.resolve().name.lower())
-    if given or path.is_file():
-        camera, source = read_camera(path), str(path)
+    said: Container[str] = ()
+    if path == given or path.is_file():
+        camera, said = _read(path)
+        source = str(path)
     elif match:
         name = f"freiburg{match.group(1)}"
         camera = TUM_CAMERAS[name]
         source = f"built-in {name} (folder name {folder.resolve().name!r}, no camera.yaml)"
+    elif is_preset(given):
+        camera, source = nominal_camera(str(given)), f"preset {given}, not of this very device"
+        logger.warning("%s: intrinsics by the %s; a camera.yaml is more accurate", folder, source)
     else:
         raise InputError(
             f"{path}: no such file, and the folder name {folder.resolve().name!r} is not one of "
-            f"TUM's (freiburg1, 2, 3); write a camera.yaml such as {CAMERA_EXAMPLE}"
+            f"TUM's (freiburg1, 2, 3); write a camera.yaml such as {CAMERA_EXAMPLE}, or give "
+            "--camera NAME"
         )
+    camera, added = completed(camera, said, preset)
+    source = ", ".join(filter(None, (source, added)))
     logger.info(
-        "camera: %s; fx %.3f fy %.3f cx %.3f cy %.3f, "
-        "depth scale %g to the metre, offsets %g m and %g s",
-        source, camera.fx, camera.fy, camera.cx, camera.cy,
-        camera.depth_scale, camera.depth_offset_m, camera.depth_time_offset_s,
+        "camera: %s; fx %.3f fy %.3f cx %.3f cy %.3f, depth scale %g to the metre, offsets %g m "
+        "and %g s, rolling shutter %g s",
+        source, camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale,
+        camera.depth_offset_m, camera.depth_time_offset_s, camera.rolling_shutter_s,
     )  # fmt: skip
     return camera, source
+
+
+def given_camera(given: Path, own: Camera | None = None) -> Camera:
+    """The camera of a device: the file ``given``, or its ``own`` with what a preset adds.
+
+    Raises:
+        InputError: a broken file, or a preset that has no intrinsics where there are no own ones.
+    """
+    if not is_preset(given):
+        return read_camera(given)
+    return completed(own or nominal_camera(str(given)), (), str(given))[0]
 
 
 def read_camera(path: Path) -> Camera:
@@ -83,11 +112,33 @@ def read_camera(path: Path) -> Camera:
     Raises:
         InputError: naming the key, its value and the cure.
     """
+    return _read(path)[0]
+
+
+def _read(path: Path) -> tuple[Camera, set[str]]:
+    """The camera of a file, and the keys that the file has."""
+    values = _values(path)
+    numbers = {k: _number(path, k, v) for k, v in values.items() if k != "distortion"}
+    _check_range(path, numbers)
+    optional = {name: numbers[key] for key, name in OPTIONAL.items() if key in numbers}
+    camera = Camera(
+        width=int(numbers["width"]),
+        height=int(numbers["height"]),
+        **{key: numbers[key] for key in ("fx", "fy", "cx", "cy", "depth_scale")},
+        distortion=_distortion(path, values.get("distortion", [0, 0, 0, 0, 0])),
+        **optional,
+    )
+    return camera, set(values)
+
+
+def _values(path: Path) -> dict[str, object]:
+    """The values of a camera.yaml by key, none unknown and none missing. Raises InputError."""
     try:
         values = parse_yaml(path.read_text(encoding="utf-8"), path.name)
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give a camera.yaml"
+            f"{path}: cannot be read ({error.strerror}); give a camera.yaml, or one of "
+            f"{', '.join(PRESETS)}"
         ) from error
     except (InputError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not YAML ({error}); write e.g. {CAMERA_EXAMPLE}") from error
@@ -100,16 +151,7 @@ def read_camera(path: Path) -> Camera:
     for key in REQUIRED:
         if key not in values:
             raise InputError(f"{path}: {key} is missing; write e.g. {CAMERA_EXAMPLE}")
-    numbers = {k: _number(path, k, v) for k, v in values.items() if k != "distortion"}
-    _check_range(path, numbers)
-    optional = {name: numbers[key] for key, name in OPTIONAL.items() if key in numbers}
-    return Camera(
-        width=int(numbers["width"]),
-        height=int(numbers["height"]),
-        **{key: numbers[key] for key in ("fx", "fy", "cx", "cy", "depth_scale")},
-        distortion=_distortion(path, values.get("distortion", [0, 0, 0, 0, 0])),
-        **optional,
-    )
+    return values
 
 
 def write_camera(path: Path, camera: Camera, comment: str = "") -> None:

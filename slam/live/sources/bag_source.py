@@ -24,6 +24,8 @@ from bmask_slam.live.sources.ros_images import (
 )
 from bmask_slam.live.sources.source import SourceCounts, paced
 from bmask_slam.sequences import read_camera
+from bmask_slam.sequences.camera_presets import is_preset
+from bmask_slam.sequences.cameras import given_camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.sequences.images import depth_in_metres
 
@@ -143,13 +145,14 @@ def _find_camera(bag: Bag, topics: BagTopics, given: Path | None) -> Camera:
     first = {name: _first(bag, name) for name in (topics.rgb, topics.depth)}
     rgb, depth = first[topics.rgb], first[topics.depth]
     scale = DEPTH_SCALES[depth_encoding(depth, topics.depth)]
-    if given is not None:
+    if given is not None and not is_preset(given):
         camera = read_camera(given)
         check_depth_scale(camera, scale, str(given), f"{bag.path}'s depth")
     else:
         rectified = "_rect" in topics.rgb.removesuffix("/compressed").rpartition("/")[2]
         where = f"{bag.path}: {topics.camera_info}"
         camera = camera_of(_camera_info(bag, topics.camera_info), scale, rectified, where)
+        camera = camera if given is None else given_camera(given, camera)
     if rgb.header.frame_id != depth.header.frame_id:
         logger.warning(
             "%s: colour is in the frame %r, depth in %r; depth must be registered to colour",

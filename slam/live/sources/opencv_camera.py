@@ -11,7 +11,7 @@ import numpy as np
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
 from bmask_slam.live.sources.checks import check_depth_scale, check_sizes
-from bmask_slam.sequences import read_camera
+from bmask_slam.sequences.cameras import given_camera
 from bmask_slam.sequences.images import depth_in_metres
 
 DEPTH_SCALE = 1000.0
@@ -31,7 +31,7 @@ class OpenCvSource(CameraSource):
         super().__init__(f"opencv-{device}", silence_s)
         if camera is None:
             raise InputError(f"{self.name}: OpenCV does not know the intrinsics; give --camera F")
-        self.camera = read_camera(camera)
+        self.camera = given_camera(camera)
         check_depth_scale(self.camera, DEPTH_SCALE, str(camera), f"{self.name}'s depth")
         self._capture = cv2.VideoCapture(device, cv2.CAP_OPENNI2)
         registration = cv2.CAP_OPENNI_DEPTH_GENERATOR_REGISTRATION

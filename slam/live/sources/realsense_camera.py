@@ -14,6 +14,8 @@ from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
 from bmask_slam.live.sources.checks import check_depth_scale, import_optional
 from bmask_slam.live.sources.pairing import MAX_DIFFERENCE_S
 from bmask_slam.sequences import read_camera
+from bmask_slam.sequences.camera_presets import is_preset
+from bmask_slam.sequences.cameras import given_camera
 from bmask_slam.sequences.images import depth_in_metres
 
 SIZE = (640, 480)
@@ -72,10 +74,15 @@ class RealSenseSource(CameraSource):
     def _find_camera(self, profile: Any, given: Path | None) -> Camera:
         """The given camera, or the device's own calibration."""
         scale = 1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale())
-        if given is not None:
+        if given is not None and not is_preset(given):
             camera = read_camera(given)
             check_depth_scale(camera, scale, str(given), "realsense's depth")
             return camera
+        own = self._own_camera(profile, scale)
+        return own if given is None else given_camera(given, own)
+
+    def _own_camera(self, profile: Any, scale: float) -> Camera:
+        """The device's calibration, whose depth is ``scale`` to the metre."""
         stream = profile.get_stream(self._rs.stream.color).as_video_stream_profile()
         i = stream.get_intrinsics()
         plain = Camera(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy, depth_scale=scale, fps=FPS)

@@ -1,12 +1,14 @@
 """camera.yaml and the cameras that are built in."""
 
 import logging
+from pathlib import Path
 
 import pytest
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.sequences.cameras import CAMERA_EXAMPLE, find_camera, read_camera
+from bmask_slam.sequences.camera_presets import FOLDERS, PRESETS
+from bmask_slam.sequences.cameras import CAMERA_EXAMPLE, find_camera, given_camera, read_camera
 
 LINES = {
     "width": "640",
@@ -114,7 +116,7 @@ def test_camera_file_wins(tmp_path):
     write_camera(folder)
     camera, source = find_camera(folder)
     assert camera.depth_scale == 5000
-    assert source.endswith("camera.yaml")
+    assert source.partition(",")[0].endswith("camera.yaml")
 
 
 @pytest.mark.parametrize("name", ["kitchen", "freiburg4_new", "fr12", "frame1", "afr1"])
@@ -123,3 +125,75 @@ def test_no_camera(tmp_path, name):
     with pytest.raises(InputError, match=r"write a camera\.yaml such as") as caught:
         find_camera(tmp_path / name)
     assert name in str(caught.value)
+
+
+# --- presets ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "readout_s"),
+    [
+        ("rgbd_dataset_freiburg1_rpy", 0.026),
+        ("tum_fr2_desk", 0.026),
+        ("rgbd_dataset_freiburg3_walking_xyz", 0.0248),
+        ("rgbd_bonn_crowd", 0.0248),
+        ("bonn_moving", 0.0248),
+        ("bonnet", 0.0),
+        ("kitchen", 0.0),
+    ],
+)
+def test_a_published_recording_has_the_readout_time_of_its_camera(tmp_path, name, readout_s):
+    folder = tmp_path / name
+    folder.mkdir()
+    write_camera(folder)
+    camera, source = find_camera(folder)
+    assert camera.rolling_shutter_s == readout_s
+    assert camera.fx == 527.27  # the file's
+    assert ("rolling_shutter" in source) == (readout_s > 0)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.011])
+def test_a_key_in_the_file_wins_over_preset_and_name(tmp_path, value):
+    folder = tmp_path / "rgbd_bonn_crowd"
+    folder.mkdir()
+    write_camera(folder, rolling_shutter=value)
+    assert find_camera(folder)[0].rolling_shutter_s == value
+    assert find_camera(folder, Path("kinect-v1"))[0].rolling_shutter_s == value
+
+
+def test_the_preset_given_wins_over_the_name_and_leaves_intrinsics(tmp_path):
+    folder = tmp_path / "rgbd_bonn_crowd"
+    folder.mkdir()
+    write_camera(folder, distortion="[0.1, 0.2, 0.3, 0.4]")
+    camera, source = find_camera(folder, Path("realsense-d455"))
+    assert (camera.rolling_shutter_s, camera.fx, camera.width) == (0.0, 527.27, 640)
+    assert "realsense-d455" in source
+
+
+def test_a_preset_alone_is_a_camera_where_intrinsics_are_published(tmp_path, caplog):
+    camera, _ = find_camera(tmp_path, Path("kinect-v1"))
+    assert (camera.width, camera.fx, camera.depth_scale) == (640, 525.0, 1000.0)
+    assert camera.rolling_shutter_s == pytest.approx(480 * 54.21e-6, abs=1e-4)
+    assert "a camera.yaml is more accurate" in caplog.text
+    with pytest.raises(InputError, match="--camera azure-kinect: every Microsoft Azure Kinect DK"):
+        find_camera(tmp_path, Path("azure-kinect"))
+    with pytest.raises(InputError, match=r"kinectv1: cannot be read .* one of kinect-v1, xtion"):
+        find_camera(tmp_path, Path("kinectv1"))
+
+
+def test_a_device_keeps_its_own_calibration():
+    own = Camera(640, 480, 611.0, 612.0, 320.0, 240.0)
+    camera = given_camera(Path("xtion"), own)
+    assert (camera.fx, camera.rolling_shutter_s) == (611.0, 0.0248)
+
+
+def test_the_table_of_presets_is_possible():
+    assert {name for _, name in FOLDERS} <= set(PRESETS)
+    for name, preset in PRESETS.items():
+        if preset.nominal is not None:
+            assert 0.4 < preset.nominal.fx / preset.nominal.width < 1.0, name
+        if preset.rolling_shutter_s is not None:
+            assert 0 <= preset.rolling_shutter_s < 1 / 30, name
+        if preset.depth_noise is not None:  # between a tenth of a millimetre and 5 cm at 2 m
+            a, b, c = preset.depth_noise
+            assert 1e-4 < a + 2 * b + 4 * c < 0.05, name

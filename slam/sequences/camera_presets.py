@@ -1,0 +1,142 @@
+"""Cameras by name: what is published about each model, and the recordings that it made.
+
+Nothing is guessed: what is not published is None. The sources are beside the values, and in the
+table of docs/data.md.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+
+
+@dataclass(frozen=True)
+class CameraPreset:
+    """What is published about one model of RGB-D camera.
+
+    Attributes:
+        title: maker and model.
+        nominal: colour camera at its native size by the driver's defaults or the published field
+            of view; a device of its own differs by some per cent. None: every device tells its own.
+        rolling_shutter_s: from the first to the last row of the colour image; 0: global shutter.
+        depth_time_offset_s: from the depth image's stamp to when it was taken, in the colour
+            image's clock.
+        depth_range_m: recommended, from and to.
+        depth_noise: (a, b, c) of the standard deviation a + b z + c z^2 in metres at z metres.
+        depth_unit: stored depth values to the metre, as the driver gives them.
+    """
+
+    title: str
+    nominal: Camera | None
+    rolling_shutter_s: float | None = None
+    depth_time_offset_s: float | None = None
+    depth_range_m: tuple[float, float] | None = None
+    depth_noise: tuple[float, float, float] | None = None
+    depth_unit: float = 1000.0
+
+
+def _pinhole(width: int, height: int, focal_px: float, depth_scale: float = 1000.0) -> Camera:
+    centre = (width - 1) / 2, (height - 1) / 2
+    return Camera(width, height, focal_px, focal_px, *centre, depth_scale=depth_scale)
+
+
+NGUYEN = (0.001504, -0.00152, 0.0019)
+"""0.0012 + 0.0019 (z - 0.4)^2: Nguyen, Izadi, Lovell, 3DIMPVT 2012, axial noise below 60 deg."""
+
+PRESETS = {
+    # OpenNI's default focal length; rows 54.21 us apart at 30 Hz, 480 of them (measured on the
+    # MT9M112 by exposure, libfreenect pull request 670); range: Kinect for Windows SDK 1.8.
+    "kinect-v1": CameraPreset(
+        "Microsoft Kinect for Xbox 360", _pinhole(640, 480, 525.0), 0.0260,
+        depth_range_m=(0.8, 4.0), depth_noise=NGUYEN,
+    ),
+    # The same reference design. Readout: nothing published; 24.8 +- 3.3 ms by this project's
+    # calibrate on Bonn's rgbd_bonn_crowd; range: ASUS.
+    "xtion": CameraPreset(
+        "ASUS Xtion Pro Live", _pinhole(640, 480, 525.0), 0.0248,
+        depth_range_m=(0.8, 3.5), depth_noise=NGUYEN,
+    ),
+    # Colour camera: libfreenect2's defaults; range: Microsoft.
+    "kinect-v2": CameraPreset(
+        "Microsoft Kinect for Xbox One", _pinhole(1920, 1080, 1081.37), depth_range_m=(0.5, 4.5)
+    ),
+    # Range and random error (<= 17 mm) of NFOV unbinned: Azure Kinect DK hardware specification.
+    # Both stamps are of the middle of the exposure (Azure-Kinect-Sensor-SDK issue 868), with no
+    # delay unless depth_delay_off_color_usec is set; no readout time is published (issue 1062).
+    "azure-kinect": CameraPreset(
+        "Microsoft Azure Kinect DK", None, depth_time_offset_s=0.0,
+        depth_range_m=(0.5, 3.86), depth_noise=(0.017, 0.0, 0.0),
+    ),
+    # Field of view 69.4 deg, rolling colour shutter of unpublished time: D400 datasheet. Noise:
+    # subpixel error 0.08 px, focal length 645 px at 1280 columns, baseline 50 mm (Intel, tuning).
+    "realsense-d435": CameraPreset(
+        "Intel RealSense D435", _pinhole(1920, 1080, 1386.0),
+        depth_range_m=(0.3, 3.0), depth_noise=(0.0, 0.0, 0.08 / (645 * 0.050)),
+    ),
+    # Field of view 90 deg, global shutter, baseline 95 mm: D400 datasheet; noise as above.
+    "realsense-d455": CameraPreset(
+        "Intel RealSense D455", _pinhole(1280, 800, 640.0), 0.0,
+        depth_range_m=(0.6, 6.0), depth_noise=(0.0, 0.0, 0.08 / (640 * 0.095)),
+    ),
+    # IMX378, field of view 66 deg, rolling shutter of unpublished time: docs.luxonis.com.
+    "oak-d": CameraPreset(
+        "Luxonis OAK-D", _pinhole(1920, 1080, 1478.0), depth_range_m=(0.7, 12.0)
+    ),
+    # Colour is the tablet's. Precision 0.5 mm at 0.4 m and 30 mm at 3 m, range: Occipital.
+    "structure": CameraPreset(
+        "Occipital Structure Sensor", None,
+        depth_range_m=(0.4, 3.5), depth_noise=(0.0, 0.0, 0.03 / 9),
+    ),
+    # ARKit gives the intrinsics of every frame; range: Apple.
+    "iphone-lidar": CameraPreset("Apple iPhone, iPad with LiDAR", None, depth_range_m=(0.3, 5.0)),
+}  # fmt: skip
+
+FOLDERS = (
+    (re.compile(r"(?<![a-z])(?:freiburg|fr)[12](?![0-9])"), "kinect-v1"),
+    (re.compile(r"(?<![a-z])(?:freiburg|fr)3(?![0-9])"), "xtion"),
+    (re.compile(r"(?<![a-z])bonn(?![a-z])"), "xtion"),
+)
+"""Names of published recordings, and what took them: the TUM RGB-D benchmark (the third room by
+an Xtion, all others by a Kinect) and Bonn's dynamic dataset."""
+
+
+def is_preset(given: Path | None) -> bool:
+    """Whether what was given as a camera is the name of a preset, and no file of that name."""
+    return given is not None and str(given) in PRESETS and not given.is_file()
+
+
+def preset_of_folder(folder: Path) -> str | None:
+    """The preset of a published recording, by the name of its folder."""
+    name = folder.resolve().name.lower()
+    return next((preset for pattern, preset in FOLDERS if pattern.search(name)), None)
+
+
+def nominal_camera(name: str) -> Camera:
+    """The camera of a preset alone. Raises InputError where no intrinsics are published."""
+    preset = PRESETS[name]
+    if preset.nominal is None:
+        raise InputError(
+            f"--camera {name}: every {preset.title} has intrinsics of its own, which it tells; "
+            "write them into the sequence's camera.yaml, the rest is known"
+        )
+    return replace(preset.nominal, depth_scale=preset.depth_unit)
+
+
+def completed(camera: Camera, said: Container[str], name: str | None) -> tuple[Camera, str]:
+    """The camera with what a preset knows and nothing else said, and that as text.
+
+    ``said`` are the keys of camera.yaml that are known already; a value there, also 0, stays.
+    """
+    preset = PRESETS.get(name or "")
+    known = {
+        "rolling_shutter": ("rolling_shutter_s", preset and preset.rolling_shutter_s),
+        "depth_time_offset": ("depth_time_offset_s", preset and preset.depth_time_offset_s),
+    }
+    added = {field: v for key, (field, v) in known.items() if v is not None and key not in said}
+    text = ", ".join(f"{field.removesuffix('_s')} {1e3 * v:g} ms" for field, v in added.items())
+    return replace(camera, **added), f"{text} of {name}" if text else ""
