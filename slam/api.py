@@ -32,6 +32,7 @@ class RunKeywords(TypedDict, total=False):
     checkpoint_every: int
     map: AnyPath
     localise: AnyPath
+    calibrate: str
     dense: bool
     quiet: bool
 

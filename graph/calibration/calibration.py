@@ -17,6 +17,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.covariance import covariance_of
 from bmask_slam.graph.calibration.equations import (
     CAUCHY,
+    inverse_information,
     normal_equations,
     squared,
     with_points,
@@ -164,9 +165,9 @@ def _noise_scales(problem: CalibrationProblem, state: CalibrationState, scales: 
     views = problem.views
     lin = linearise(views, *state.values)
     J = lin.point / scales[[0, 0, 1], None]
-    H = np.zeros((len(state.points), 3, 3)) + 1e-9 * np.eye(3)
+    H = np.zeros((len(state.points), 3, 3))
     np.add.at(H, views.landmarks, J.swapaxes(1, 2) @ J)
-    left = 1 - np.einsum("mri,mij,mrj->mr", J, np.linalg.inv(H)[views.landmarks], J)
+    left = 1 - np.einsum("mri,mij,mrj->mr", J, inverse_information(H)[views.landmarks], J)
     chi2 = lin.residuals**2 / np.maximum(left, MIN_LEFT)
     told = lin.valid & (left > MIN_LEFT)
     pixel, depth = told[:, 0] & told[:, 1], told[:, 2]

@@ -39,8 +39,7 @@ def normal_equations(
     H_ll, g_l = np.zeros((L, 3, 3)), np.zeros((L, 3))
     np.add.at(H_ll, views.landmarks, J_l.swapaxes(1, 2) @ J_l)
     np.add.at(g_l, views.landmarks, np.einsum("mri,mr->mi", J_l, r))
-    H_ll = _damped(H_ll, damping) + 1e-9 * np.eye(3)
-    inverse_ll: Array = np.linalg.inv(H_ll).astype(float)
+    inverse_ll = inverse_information(_damped(H_ll, damping))
     cross_c, cross_k = J_c.swapaxes(1, 2) @ J_l, np.zeros((L, N, 3))
     np.add.at(cross_k, views.landmarks, J_k.swapaxes(1, 2) @ J_l)
 
@@ -63,6 +62,16 @@ def normal_equations(
     b = np.concatenate([b_c.ravel(), b_k])
     add_priors(problem, state, S, b)
     return Reduced(S, b, inverse_ll, g_l, cross_c, cross_k)
+
+
+def inverse_information(H: Array) -> Array:
+    """Inverses of the information (L, 3, 3) of landmarks, of which some are hardly determined.
+
+    A landmark without depth that is always seen in the same direction has none along it.
+    """
+    scale = np.trace(H, axis1=1, axis2=2)[:, None, None]
+    inverse: Array = np.linalg.inv(H + (1e-9 + 1e-13 * scale) * np.eye(3)).astype(float)
+    return inverse
 
 
 def _damped(H: Array, damping: float) -> Array:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.calibration.motion import landmark_motion
-from bmask_slam.calibration.report import Calibrated, format_calibration
+from bmask_slam.calibration.report import Calibrated, format_calibration, parameter_named
 from bmask_slam.calibration.views import connected_views, make_views
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
@@ -26,10 +26,11 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.metrics import align
+from bmask_slam.graph.smoother.storage import read_graph
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, nearest_indices, read_tum
 from bmask_slam.run_folder.map_file import SavedRun, read_run
 from bmask_slam.run_folder.origin import find_sequence
-from bmask_slam.sequences import Sequence, open_sequence, write_camera
+from bmask_slam.sequences import Sequence, open_sequence, read_camera, write_camera
 
 MIN_KEYFRAMES = 5
 MIN_REFERENCE_POSES = 5
@@ -92,7 +93,7 @@ class CalibrateOptions:
         on_body: the positions are those of a point fixed to the camera, whose offset is estimated.
         known_distance: two stamps in seconds, and the distance in metres of the camera's positions.
         anchor_sigma_m: standard deviation of the positions and of the distance.
-        fixed: names of PARAMETERS that keep their values.
+        fixed: parameters that keep their values, by their names here, in the table or the file.
         priors: of the other parameters.
         overwrite: replace ``out``.
     """
@@ -120,7 +121,8 @@ def calibrate_run(options: CalibrateOptions) -> Calibrated:
     run = read_run(options.run)
     sequence = open_sequence(options.sequence or find_sequence(options.run), camera=run.camera)
     problem, _ = make_problem(options, run, sequence)
-    result = _with_rate_error(calibrate(problem))
+    result = with_rate_error(calibrate(problem))
+    before = calibrate(dataclasses.replace(problem, prior_sigmas=np.zeros(len(PARAMETERS))))
     done = Calibrated(
         path=out,
         camera=camera_from(run.camera, result.calibration),
@@ -131,12 +133,14 @@ def calibrate_run(options: CalibrateOptions) -> Calibrated:
         keyframes=len(problem.poses_world_camera),
         landmarks=len(problem.points_world),
         observations=len(problem.views.pixels),
+        noise_before=before.noise_scales,
+        sigma_px=float(np.median(problem.views.sigma_px)),
     )
     write_camera(out, done.camera, format_calibration(done))
     return done
 
 
-def _with_rate_error(result: CalibrationResult) -> CalibrationResult:
+def with_rate_error(result: CalibrationResult) -> CalibrationResult:
     """The result with the relative error of the rates of depth added to the time offset's variance.
 
     The rate of change at a pixel is a noisy measurement too. This makes the estimated offset too
@@ -155,18 +159,25 @@ def check_options(options: CalibrateOptions) -> Path:
         InputError: the file exists, its folder does not, or an option is impossible.
     """
     out = options.out or options.run / "camera.yaml"
-    if out.exists() and not options.overwrite:
+    if out.exists() and not (options.overwrite or _is_of_run(out, options)):
         raise InputError(f"{out}: is there already; choose another --out or add --overwrite")
     if not out.parent.is_dir():
         raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
     for name in options.fixed:
-        if name not in PARAMETERS:
+        if parameter_named(name) is None:
             raise InputError(f"--fix {name}: is no parameter; they are {', '.join(PARAMETERS)}")
     if options.on_body and options.reference is None:
         raise InputError("--hand-eye: finds where the reference sits; give it as --reference")
     if not options.anchor_sigma_m > 0:
         raise InputError(f"--anchor-sigma {options.anchor_sigma_m}: must be positive metres")
     return out
+
+
+def _is_of_run(out: Path, options: CalibrateOptions) -> bool:
+    """Whether a file is the camera that the run itself found, which the run's graph holds too."""
+    if options.out is not None or not (options.run / "graph").is_file():
+        return False
+    return read_camera(out) == read_graph(options.run / "graph")[1]
 
 
 def make_problem(
@@ -197,8 +208,10 @@ def make_problem(
     if options.known_distance is not None:
         anchors = _with_distance(anchors, options.known_distance, run, stamps, keyframe_ids)
     sigmas = options.priors.sigmas(run.camera)
-    sigmas[[PARAMETERS.index(name) for name in options.fixed]] = 0.0
     has_anchor = options.reference is not None or options.known_distance is not None
+    if not has_anchor:  # a scale that nothing fixes and an offset take each other's part
+        sigmas[OFFSET] = 0.0
+    sigmas[[PARAMETERS.index(parameter_named(name) or name) for name in options.fixed]] = 0.0
     start = parameters_of(run.camera, run.camera.depth_scale)
     problem = CalibrationProblem(
         views, poses, points, start, sigmas, gauge, anchors if has_anchor else None

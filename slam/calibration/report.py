@@ -33,6 +33,31 @@ CURES = {
 }
 
 
+ALSO = {
+    "depth_factor": ("depth scale",),
+    "time_offset_s": ("depth time offset", "colour-depth delay"),
+}
+"""Further names, of the table and of camera.yaml."""
+
+
+def parameter_named(name: str) -> str | None:
+    """The parameter of PARAMETERS that a name of the table or of camera.yaml stands for.
+
+    Units, and whether words are joined by spaces, hyphens or underscores, do not matter.
+    """
+    wanted = _plain(name)
+    for parameter in PARAMETERS:
+        label, unit, _ = UNITS.get(parameter, (parameter, "", 1.0))
+        names = (parameter, label, f"{label} {unit}", *ALSO.get(parameter, ()))
+        if wanted in map(_plain, names):
+            return parameter
+    return None
+
+
+def _plain(name: str) -> str:
+    return " ".join(name.lower().replace("-", " ").replace("_", " ").split())
+
+
 @dataclass(frozen=True)
 class Calibrated:
     """A calibration and its circumstances.
@@ -42,6 +67,9 @@ class Calibrated:
         result: of the solver; prior_sigmas: (13,), 0 for a fixed parameter.
         has_anchor: whether a reference or a distance was given.
         keyframes, landmarks, observations: numbers of those used.
+        noise_before: (2,) ratio of residuals to nominal sigmas, of pixels and of depths, when poses
+            and points are fitted with the run's camera.
+        sigma_px: the nominal sigma of a pixel, the median of those used.
     """
 
     path: Path
@@ -53,6 +81,20 @@ class Calibrated:
     keyframes: int
     landmarks: int
     observations: int
+    noise_before: Array
+    sigma_px: float
+
+    def agrees_with(self, earlier: Calibrated) -> bool:
+        """Whether no parameter differs from an earlier calibration by more than 95 % bounds.
+
+        Both are of the same frames, in runs with different cameras.
+        """
+        start = self.before.depth_scale / earlier.before.depth_scale
+        found = earlier.result.calibration * np.where(
+            np.arange(len(PARAMETERS)) == FACTOR, start, 1
+        )
+        bounds = NORMAL_95 * np.hypot(self.sigmas, earlier.sigmas)
+        return bool((np.abs(self.result.calibration - found) <= bounds).all())
 
     @property
     def sigmas(self) -> Array:
@@ -70,6 +112,7 @@ def format_calibration(done: Calibrated) -> str:
     noise_px, noise_depth = result.noise_scales
     lines = [
         f"{done.keyframes} keyframes, {done.landmarks} landmarks, {done.observations} observations",
+        _residual(done),
         f"noise: pixels {noise_px:.2f} and depths {noise_depth:.2f} times their nominal sigmas; "
         f"{100 * result.inlier_share:.1f} % within 3 sigma",
         "",
@@ -78,6 +121,16 @@ def format_calibration(done: Calibrated) -> str:
         *_statements(done),
     ]
     return "\n".join(lines)
+
+
+def _residual(done: Calibrated) -> str:
+    """What the new camera does to the residuals, poses and points being fitted with each."""
+    (before, depth_before), (after, depth_after) = done.noise_before, done.result.noise_scales
+    change = 100 * (depth_after / depth_before - 1)
+    return (
+        f"reprojection error: {done.sigma_px * before:.3f} px with the camera before, "
+        f"{done.sigma_px * after:.3f} px with this one; depth residuals {change:+.0f} %"
+    )
 
 
 def _pad(row: tuple[str, ...], widths: list[int]) -> list[str]:
@@ -128,7 +181,8 @@ def _statements(done: Calibrated) -> list[str]:
     if not done.has_anchor:
         lines.append(
             "The depth scale is not observable: images and depths fit a world of any size equally "
-            "well. It keeps its value; with --reference or --known-distance it is estimated."
+            "well. It and the depth offset keep their values; with --reference or --known-distance "
+            "they are estimated."
         )
     if done.result.body_arm_m.any():
         x, y, z = 1e3 * done.result.body_arm_m

@@ -31,11 +31,19 @@ def add_calibrate(commands: Commands) -> None:
     )
     _add_metric_arguments(parser)
     parser.add_argument(
-        "--fix", action="append", default=[], metavar="NAME", help="keep a parameter, such as k1"
+        "--fix",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="keep a parameter, such as k1 or depth-offset",
     )
     parser.add_argument("--k3", action="store_true", help="estimate k3 too")
     parser.add_argument(
-        "--rounds", type=int, default=1, metavar="N", help="calibrate N times (default: 1)"
+        "--rounds",
+        type=int,
+        default=1,
+        metavar="N",
+        help="calibrate up to N times, until nothing changes by more than its sigma (default: 1)",
     )
     parser.add_argument("--quiet", action="store_true", help="print only the file's path")
 

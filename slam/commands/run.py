@@ -37,6 +37,7 @@ OPTIONS = (
     "checkpoint_every",
     "map",
     "localise",
+    "calibrate",
     "dense",
 )
 
@@ -58,6 +59,8 @@ def add_run(commands: Commands) -> None:
     add_config_arguments(parser)
     parser.add_argument("--print-config", action="store_true", help="print it resolved, and end")
     add_camera_argument(parser)
+    text = "find readout time and depth delay by the first frames, and use them (auto: default)"
+    parser.add_argument("--calibrate", metavar="auto|off|report", help=text)
     parser.add_argument("--reference", type=Path, metavar="F", help="trajectory to compare to")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--stride", type=int, metavar="N", help="take every N-th frame")
@@ -128,6 +131,8 @@ def _print_summary(summary: RunSummary, quiet: bool) -> None:
         print(summary.folder)
         return
     print(format_summary(summary.rows))
+    if summary.calibration:
+        print(f"\nCamera      {summary.calibration}")
     if summary.skipped:
         print(f"\n{summary.skipped} broken frames were skipped, see log.txt")
     if summary.stopped_by:

@@ -31,6 +31,8 @@ logger = logging.getLogger(__name__)
 def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = False) -> Calibrated:
     """Calibrate a run, then ``rounds - 1`` times a new run made with the estimated camera.
 
+    It ends earlier when a round agrees with the one before within the bounds of both.
+
     The new runs have the configuration of the first and are not kept. The camera file is written at
     the end.
 
@@ -54,7 +56,13 @@ def calibrate_in_rounds(options: CalibrateOptions, rounds: int, quiet: bool = Fa
             again = folder / f"run-{k}"
             run(_again(options.run, sequence, done.path, again, quiet))
             camera = folder / f"camera-{k}.yaml"
-            done = calibrate_run(dataclasses.replace(options_1, run=again, out=camera))
+            earlier, done = (
+                done,
+                calibrate_run(dataclasses.replace(options_1, run=again, out=camera)),
+            )
+            if done.agrees_with(earlier):
+                logger.info("calibrated %d times: nothing changes any more", k)
+                break
     done = dataclasses.replace(done, path=out, before=before)
     write_camera(out, done.camera, format_calibration(done))
     return done
@@ -71,5 +79,6 @@ def _again(before: Path, sequence: Path, camera: Path, out: Path, quiet: bool) -
         camera=camera,
         max_frames=None if frames is None else len(frames),
         stride=read_origin(before).stride,
+        calibrate="off",
         quiet=quiet,
     )

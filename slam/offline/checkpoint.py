@@ -12,6 +12,7 @@ import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, nested, part, read_arrays, write_arrays
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.offline.options import RunOptions
+from bmask_slam.offline.self_calibration import SelfCalibration
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.sequences import Sequence
@@ -31,7 +33,7 @@ from bmask_slam.system_interface import System
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_FILE = FileKind("checkpoint", 6)
+CHECKPOINT_FILE = FileKind("checkpoint", 7)
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Checkpoint:
 
     Attributes:
         options: of the run.
-        camera: of the sequence.
+        camera: of the sequence, as the run uses it.
+        calibration: what was found of the camera, whose ``given`` was the sequence's.
         stamps: digest of all timestamps of the sequence.
         skipped: index and reason of the broken frames so far.
         frames_bytes: size of frames.csv.
@@ -50,6 +53,7 @@ class Checkpoint:
 
     options: RunOptions
     camera: Camera
+    calibration: SelfCalibration
     stamps: str
     skipped: list[tuple[int, str]]
     frames_bytes: int
@@ -77,10 +81,17 @@ def digest(sequence: Sequence) -> str:
 class Checkpoints:
     """Writes the checkpoints of one run; none without ``checkpoint_every``."""
 
-    def __init__(self, folder: RunFolder, options: RunOptions, sequence: Sequence) -> None:
+    def __init__(
+        self,
+        folder: RunFolder,
+        options: RunOptions,
+        sequence: Sequence,
+        calibration: SelfCalibration,
+    ) -> None:
         self._folder = folder
         self._options = options
         self._sequence = sequence
+        self._calibration = calibration
         self._every = options.checkpoint_every
         self._frames = -1  # number of frames at the last checkpoint
 
@@ -103,6 +114,7 @@ class Checkpoints:
         checkpoint = Checkpoint(
             self._options,
             self._sequence.camera,
+            self._calibration,
             digest(self._sequence),
             skipped,
             self._folder.synced_bytes(),
@@ -123,6 +135,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "options": checkpoint.options.recorded(),
         "config": dump(checkpoint.options.config),
         "camera": dataclasses.asdict(checkpoint.camera),
+        "calibration": dataclasses.asdict(checkpoint.calibration),
         "stamps": checkpoint.stamps,
         "skipped": checkpoint.skipped,
         "frames_bytes": checkpoint.frames_bytes,
@@ -160,6 +173,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         return Checkpoint(
             RunOptions.from_recorded(header["options"], config, folder),
             read_camera(header, path),
+            _calibration(header["calibration"], path),
             header["stamps"],
             [(int(i), str(reason)) for i, reason in header["skipped"]],
             int(header["frames_bytes"]),
@@ -170,3 +184,9 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise InputError(
             f"{path}: its header cannot be read ({error}); start the run again"
         ) from error
+
+
+def _calibration(header: dict[str, Any], path: Path) -> SelfCalibration:
+    """What a checkpoint says of the calibration. Raises InputError, KeyError or TypeError."""
+    cameras = {name: read_camera({"camera": header[name]}, path) for name in ("camera", "given")}
+    return SelfCalibration(**{**header, **cameras})

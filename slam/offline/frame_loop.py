@@ -15,6 +15,7 @@ from bmask_slam.evaluation import Row
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.offline.checkpoint import Checkpoints
 from bmask_slam.offline.options import RunOptions
+from bmask_slam.offline.self_calibration import SelfCalibration
 from bmask_slam.run_folder.folder import RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, measure, save
 from bmask_slam.runtime.progress import Progress
@@ -42,6 +43,7 @@ class ActiveRun:
         system: what processes the frames.
         folder: where results are written.
         stop: says when a signal asked to end the run.
+        calibration: what was found of the camera; ``sequence`` has the camera that is used.
         counters: of the frames processed so far.
     """
 
@@ -51,21 +53,27 @@ class ActiveRun:
     system: System
     folder: RunFolder
     stop: StopRequest
+    calibration: SelfCalibration
     counters: RunCounters = field(default_factory=RunCounters)
 
     @property
     def indices(self) -> range:
         """Indices in the sequence of all frames of the run."""
-        end, stride = len(self.sequence), self.options.stride
-        if self.options.max_frames is not None:
-            end = min(end, self.options.max_frames * stride)
-        return range(0, end, stride)
+        return run_indices(self.sequence, self.options)
 
     @property
     def remaining(self) -> range:
         """The indices that are still to be processed."""
         done = -(-self.counters.next_index // self.options.stride)
         return self.indices[done:]
+
+
+def run_indices(sequence: Sequence, options: RunOptions) -> range:
+    """Indices in a sequence of all frames that a run processes."""
+    end, stride = len(sequence), options.stride
+    if options.max_frames is not None:
+        end = min(end, options.max_frames * stride)
+    return range(0, end, stride)
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,7 @@ class RunSummary:
         frames: frames given to the system.
         skipped: frames that were broken, not counted in ``frames``.
         stopped_by: the signal that ended the run early, or None.
+        calibration: what was found of the camera, in one line; "" if nothing was tried.
         resumable: the run can be resumed from its last checkpoint, since it was stopped.
     """
 
@@ -87,6 +96,7 @@ class RunSummary:
     skipped: int
     stopped_by: signal.Signals | None = None
     resumable: bool = False
+    calibration: str = ""
 
 
 def process_frames(run: ActiveRun) -> None:
@@ -95,7 +105,7 @@ def process_frames(run: ActiveRun) -> None:
     frames = run.sequence.frames(
         remaining.start, remaining.stop, remaining.step, prepare=_timed(system.prepare)
     )
-    checkpoints = Checkpoints(run.folder, run.options, run.sequence)
+    checkpoints = Checkpoints(run.folder, run.options, run.sequence, run.calibration)
     fuse = _dense_follower(run) if run.options.dense else None
     start_s = time.perf_counter() - counters.wall_s
     done = len(run.indices) - len(remaining)
@@ -141,7 +151,8 @@ def finish_run(run: ActiveRun) -> RunSummary:
         run.folder.complete()
     skipped = sum(index < counters.next_index for index, _ in run.sequence.skipped)
     resumable = stopped_by is not None and options.checkpoint_every is not None
-    return RunSummary(run.folder.path, rows, counters.frames, skipped, stopped_by, resumable)
+    told = run.calibration.text
+    return RunSummary(run.folder.path, rows, counters.frames, skipped, stopped_by, resumable, told)
 
 
 def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:

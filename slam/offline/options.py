@@ -12,7 +12,11 @@ from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.system_config import SystemConfig
 
 _PATHS = ("sequence", "camera", "reference", "map")
-_RECORDED = (*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense")
+_RECORDED = (
+    *(*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense"),
+    "calibrate",
+)
+CALIBRATE = ("auto", "report", "off")
 _FLAGS = {"map": "--continue", "dense": "--map"}
 """Flags that differ from the name of their field."""
 
@@ -35,6 +39,8 @@ class RunOptions:
         map: map file, or run folder with one, that the run continues.
         localise: map file, or run folder with one, in which the frames are located; it is not
             changed.
+        calibrate: whether the camera's readout time and delay are found from the first frames:
+            "auto", and used where that is sure; "report", and only said; "off".
         dense: also make a dense map, fusing keyframes while the run goes on.
         quiet: no progress bar.
     """
@@ -51,6 +57,7 @@ class RunOptions:
     checkpoint_every: int | None = None
     map: Path | None = None
     localise: Path | None = None
+    calibrate: str = "auto"
     dense: bool = False
     quiet: bool = False
 
@@ -59,6 +66,8 @@ class RunOptions:
             value = getattr(self, option)
             if value is not None and value < 1:
                 raise InputError(f"{_flag(option)} {value}: must be a whole number of at least 1")
+        if self.calibrate not in CALIBRATE:
+            raise InputError(f"--calibrate {self.calibrate}: is not one of {', '.join(CALIBRATE)}")
         if self.localise is None:
             return
         for option in ("map", "checkpoint_every", "dense"):

@@ -7,6 +7,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -18,17 +19,24 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.graph.trajectory_formats import read_trajectory
-from bmask_slam.offline.checkpoint import read_checkpoint
-from bmask_slam.offline.frame_loop import ActiveRun, RunSummary, finish_run, process_frames
+from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
+from bmask_slam.offline.frame_loop import (
+    ActiveRun,
+    RunSummary,
+    finish_run,
+    process_frames,
+    run_indices,
+)
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder, free_run_path
+from bmask_slam.offline.self_calibration import SelfCalibration, SelfCalibrator
+from bmask_slam.run_folder.folder import CAMERA, CHECKPOINT, RunFolder, free_run_path
 from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
-from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences import Sequence, open_sequence, write_camera
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_interface import System
@@ -60,8 +68,13 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
         StopRequest() as stop,
     ):
         describe_run(folder, options, sequence)
-        system = start_system(options, sequence, make_system or _with_segmenter(options, sequence))
-        active = ActiveRun(options, sequence, reference, system, folder, stop)
+        make = make_system or _with_segmenter(options, sequence)
+        calibration = find_calibration(options, sequence, make, stop)
+        if calibration.adopted:
+            sequence = open_sequence(options.sequence, camera=calibration.camera)
+            write_camera(folder.path / CAMERA, calibration.camera, calibration.text)
+        system = start_system(options, sequence, make)
+        active = ActiveRun(options, sequence, reference, system, folder, stop, calibration)
         process_frames(active)
         return finish_run(active)
 
@@ -82,7 +95,7 @@ def resume(
         return None
     checkpoint = read_checkpoint(path)
     options = checkpoint.options.with_given(given or {})
-    sequence = open_sequence(options.sequence, camera=options.camera)
+    sequence, calibration = _reopened(options, checkpoint), checkpoint.calibration
     checkpoint.check_sequence(sequence)
     reference = find_reference(options.reference, sequence)
     make = make_system or _with_segmenter(options, sequence)
@@ -94,9 +107,53 @@ def resume(
             logger.warning("%s: no checkpoint was reached; starting from the beginning", path)
         for index, reason in checkpoint.skipped:
             sequence.skip(index, reason)
-        active = ActiveRun(options, sequence, reference, system, folder, stop, counters)
+        active = ActiveRun(
+            options, sequence, reference, system, folder, stop, calibration, counters
+        )
         process_frames(active)
         return finish_run(active)
+
+
+def _reopened(options: RunOptions, checkpoint: Checkpoint) -> Sequence:
+    """The sequence of a run, with the camera that the run has found; else with its own."""
+    sequence = open_sequence(options.sequence, camera=options.camera)
+    calibration = checkpoint.calibration
+    if calibration.adopted and sequence.camera == calibration.given:
+        return open_sequence(options.sequence, camera=calibration.camera)
+    return sequence
+
+
+def find_calibration(
+    options: RunOptions, sequence: Sequence, make_system: MakeSystem, stop: StopRequest
+) -> SelfCalibration:
+    """The camera to run with: what the first frames say of it, or that of the map to go on with."""
+    given, source = sequence.camera, options.map or options.localise
+    if options.calibrate == "off":
+        return SelfCalibration(given, given)
+    if source is not None:
+        return _calibration_of_map(options, source, given)
+    calibrator = SelfCalibrator(
+        sequence,
+        lambda camera: open_sequence(options.sequence, camera=camera),
+        run_indices(sequence, options),
+        lambda camera: make_system(camera, options.config),
+    )
+    found = calibrator.calibrate(stop, options.quiet)
+    if found.text:
+        logger.info("calibration: %s", found.text)
+    if options.calibrate == "report":
+        text = found.text.replace("found and applied", "found, not applied")
+        return SelfCalibration(given, given, text)
+    return found
+
+
+def _calibration_of_map(options: RunOptions, source: Path, given: Camera) -> SelfCalibration:
+    """The camera that the run of a map has found, if it is the given one but for its times."""
+    camera = read_map(source)[1]
+    times = {name: getattr(camera, name) for name in ("rolling_shutter_s", "depth_time_offset_s")}
+    if options.camera is not None or replace(given, **times) != camera or camera == given:
+        return SelfCalibration(given, given)
+    return SelfCalibration(given, camera, f"readout time and depth delay of {source}")
 
 
 def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:

@@ -18,6 +18,8 @@ covariances.txt       with ``--covariances``: of every keyframe's pose, see
 metrics.json          a list of {"name", "value", "unit"}
 trajectory.png        top view, and errors against the reference
 log.txt               the log
+camera.yaml           the camera of the run, where readout time or delay were found and adopted;
+                      or what ``bmask-slam calibrate`` found
 health.json           of a live run: rates, delays, queues, what was dropped, every second
 checkpoint            while a run with ``--checkpoint-every`` is not finished: the state from
                       which ``run --resume`` goes on; removed when the run is complete
@@ -61,9 +63,10 @@ FILES = (
     "trajectory.png",
     "log.txt",
 )
+CAMERA = "camera.yaml"
 CHECKPOINT = "checkpoint"
 HEALTH = "health.json"
-SOMETIMES = (CHECKPOINT, COVARIANCES, HEALTH, *SEMANTIC_FILES)
+SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, *SEMANTIC_FILES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)
 

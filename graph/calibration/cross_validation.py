@@ -1,0 +1,118 @@
+"""Whether a calibration fits observations that it was not estimated from, and agrees in halves.
+
+The keyframes are split in two in the order of time. Each half estimates the calibration alone; then
+poses and points of the other half are fitted with this calibration and, for comparison, with the
+one that was there before. Nothing of a half is in the calibration that it judges.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.graph.arrays import Array, Ints, Mask
+from bmask_slam.graph.calibration.calibration import (
+    CalibrationConfig,
+    CalibrationResult,
+    calibrate,
+)
+from bmask_slam.graph.calibration.equations import CAUCHY, squared
+from bmask_slam.graph.calibration.model import CalibrationViews, linearise
+from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState
+
+MIN_KEYFRAMES = 5
+ESTIMATE = CalibrationConfig(rounds=4, steps=8)
+JUDGE = CalibrationConfig(rounds=2, steps=8)
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Two calibrations from half the keyframes each, judged by the other half.
+
+    Attributes:
+        calibrations, sigmas: (2, 13) of the halves.
+        gains: (K,) of every judged keyframe, the drop of its robust cost, in units of the
+            estimated noise, from the calibration before to that of the half it is not in.
+    """
+
+    calibrations: Array
+    sigmas: Array
+    gains: Array
+
+    @property
+    def gain_sigmas(self) -> float:
+        """The mean gain over its standard error; above 2 the calibrations are really better."""
+        error = self.gains.std(ddof=1) / np.sqrt(len(self.gains))
+        return float(self.gains.mean() / max(error, 1e-12))
+
+
+def cross_validate(problem: CalibrationProblem) -> CrossValidation | None:
+    """Calibrate from each half of the keyframes, and judge by the other; None: too few views."""
+    count = len(problem.poses_world_camera)
+    late = np.arange(count) >= count // 2
+    halves = [_part(problem, ~late), _part(problem, late)]
+    if any(half is None for half in halves):
+        return None
+    first, second = (half for half in halves if half is not None)
+    found = [calibrate(half, ESTIMATE) for half in (first, second)]
+    gains = [
+        _gains(judge, result.calibration)
+        for judge, result in zip((second, first), found, strict=True)
+    ]
+    return CrossValidation(
+        np.array([result.calibration for result in found]),
+        np.array([np.sqrt(np.diag(result.covariance)) for result in found]),
+        np.concatenate(gains),
+    )
+
+
+def _part(problem: CalibrationProblem, keyframes: Mask) -> CalibrationProblem | None:
+    """The problem of some keyframes (K,), with landmarks that two of them see."""
+    views = problem.views
+    keep = keyframes[views.keyframes]
+    seen = np.bincount(views.landmarks[keep], minlength=len(problem.points_world))
+    keep &= seen[views.landmarks] >= 2
+    kept_keyframes, rows = np.unique(views.keyframes[keep], return_inverse=True)
+    kept_landmarks, points = np.unique(views.landmarks[keep], return_inverse=True)
+    if len(kept_keyframes) < MIN_KEYFRAMES:
+        return None
+    return dataclasses.replace(
+        problem,
+        views=_select(views, keep, rows, points),
+        poses_world_camera=problem.poses_world_camera[kept_keyframes],
+        points_world=problem.points_world[kept_landmarks],
+        anchors=None,
+    )
+
+
+def _select(
+    views: CalibrationViews, keep: Mask, keyframes: Ints, landmarks: Ints
+) -> CalibrationViews:
+    columns = {f.name: getattr(views, f.name)[keep] for f in dataclasses.fields(views)}
+    return CalibrationViews(**{**columns, "keyframes": keyframes, "landmarks": landmarks})
+
+
+def _gains(problem: CalibrationProblem, calibration: Array) -> Array:
+    """Of each keyframe (K,), the drop of its cost from the problem's calibration to another."""
+    before = _fitted(problem, problem.calibration)
+    after = _fitted(problem, calibration)
+    costs = [_costs(problem, result, before.noise_scales) for result in (before, after)]
+    drop = np.zeros(len(problem.poses_world_camera))
+    np.add.at(drop, problem.views.keyframes, costs[0] - costs[1])
+    return drop
+
+
+def _fitted(problem: CalibrationProblem, calibration: Array) -> CalibrationResult:
+    """Poses and points with a calibration that is held fixed."""
+    fixed = dataclasses.replace(problem, calibration=calibration, prior_sigmas=np.zeros(13))
+    return calibrate(fixed, JUDGE)
+
+
+def _costs(problem: CalibrationProblem, result: CalibrationResult, scales: Array) -> Array:
+    """The robust cost (M,) of every view."""
+    state = CalibrationState(result.poses_world_camera, result.points_world, result.calibration)
+    e2 = squared(linearise(problem.views, *state.values).residuals, scales)
+    cost: Array = (0.5 * CAUCHY**2 * np.log1p(e2 / CAUCHY**2)).sum(axis=1)
+    return cost

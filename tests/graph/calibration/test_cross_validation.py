@@ -1,0 +1,40 @@
+"""Calibrations from half the views, judged by the other half."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from calibration_scene import PRIORS, TRUTH, make_problem
+
+from bmask_slam.graph.calibration.cross_validation import cross_validate
+from bmask_slam.graph.calibration.model import OFFSET, SHUTTER, TIME
+
+TIMES_ONLY = np.where(np.isin(np.arange(13), (TIME, SHUTTER)), PRIORS, 0.0)
+ROLLING = np.where(np.arange(13) == SHUTTER, 0.020, TRUTH)
+
+
+def _problem(truth, start, keyframes=20):
+    problem, _, _ = make_problem(truth=truth, start=start, noise=1.0, keyframes=keyframes)
+    return dataclasses.replace(problem, prior_sigmas=TIMES_ONLY)
+
+
+def test_both_halves_find_a_rolling_shutter_that_the_other_half_confirms() -> None:
+    found = cross_validate(_problem(ROLLING, np.where(np.arange(13) == SHUTTER, 0.0, ROLLING)))
+    assert found is not None
+    error = found.calibrations - ROLLING
+    assert (np.abs(error)[:, SHUTTER] < 4 * found.sigmas[:, SHUTTER]).all()
+    assert (found.calibrations[:, SHUTTER] > 0.018).all()  # and not -0.020
+    assert (found.calibrations[:, OFFSET] == ROLLING[OFFSET]).all()
+    assert len(found.gains) == 20 and found.gain_sigmas > 4
+
+
+def test_a_right_camera_is_not_improved() -> None:
+    found = cross_validate(_problem(ROLLING, ROLLING))
+    assert found is not None
+    assert found.gain_sigmas < 2
+    assert np.abs(found.calibrations - ROLLING)[:, SHUTTER].max() < 0.001
+
+
+def test_too_few_keyframes_say_nothing() -> None:
+    assert cross_validate(make_problem(keyframes=8)[0]) is None
