@@ -21,7 +21,7 @@ from bmask_slam.run_folder.covariance_file import (
     find_covariances,
     write_covariances,
 )
-from bmask_slam.run_folder.map_file import MAP, write_map
+from bmask_slam.run_folder.map_file import MAP, SavedRun, write_map
 from bmask_slam.run_folder.semantic_files import semantic_writers
 from bmask_slam.system_config import SystemConfig
 
@@ -97,6 +97,21 @@ class SystemResults(ABC):
         if self.config.covariances:
             found[COVARIANCES] = lambda path: write_covariances(path, self.keyframe_covariances())
         return found
+
+    def as_run(self) -> SavedRun:
+        """The run so far as one that was saved and read again, without its folder."""
+        tables = self.mapper.smoother.tables
+        stamps_s = {k.id: k.timestamp_s for k in self.map.world.keyframes.values()}
+        return SavedRun(
+            Path(),
+            tables,
+            self.camera,
+            self.config.graph,
+            np.array([stamps_s.get(i, np.nan) for i in tables.keyframes.ids.tolist()]),
+            {"trajectory.txt": self.trajectory()},
+            self.keyframe_trajectory(),
+            {},
+        )
 
     def save_map(self, path: Path) -> None:
         """Write the state without times, so that the same run gives the same bytes."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +48,7 @@ logger = logging.getLogger(__name__)
 FREE = (SHUTTER, TIME)
 """The parameters that are estimated, by their places in PARAMETERS."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
+MIN_STEP_S, MAX_SHARE = 0.002, 0.6
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,11 @@ class _Estimate:
             and abs(self.found[i]) < config.max_s
         )
 
+    def settled(self, chosen: list[int]) -> bool:
+        """Whether the run found what its camera had, within 95 % bounds of two rounds."""
+        bounds = 1.96 * np.sqrt(2) * self.sigmas[chosen]
+        return bool((np.abs(self.found - self.before)[chosen] <= bounds).all())
+
     def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
         """Whether both halves alone find a parameter, as far as they show it."""
         bounds = config.min_change_sigmas * np.hypot(halves.sigmas[:, i], self.sigmas[i])
@@ -165,31 +171,29 @@ class SelfCalibrator:
         self, estimate: _Estimate, stretch: range, stop: StopRequest, quiet: bool
     ) -> SelfCalibration:
         """Track a stretch again with what was found, until that changes no more."""
-        before, config = self._sequence.camera, self._config
-        sure = self._sure(estimate)
-        if not sure:
-            return SelfCalibration(before, before, _told(estimate, FREE, "nothing adopted"))
-        camera = _with(before, estimate, sure)
-        for _ in range(config.rounds - 1):
+        given, config = self._sequence.camera, self._config
+        sure, rounds = self._sure(estimate, ()), [estimate]
+        for _ in range(config.rounds - 1 if sure else 0):
+            camera = _with(given, _next(rounds), sure)
             again = self._estimate(camera, stretch, stop, quiet)
             if again is None or stop.signal is not None:
-                return SelfCalibration(before, before)
-            moved = np.abs(again.found - estimate.found)[sure]
-            bounds = 1.96 * np.hypot(again.sigmas, estimate.sigmas)[sure]
-            estimate, camera = again, _with(camera, again, sure)
-            if (moved <= bounds).all():
+                return SelfCalibration(given, given)
+            rounds.append(again)
+            more = self._sure(again, sure)
+            if not more and again.settled(sure):
                 break
-        given = parameters_of(before, before.depth_scale)
-        told = dataclasses.replace(estimate, before=given)
-        kept = [i for i in sure if told.differs(i, config)]
-        camera = _with(before, told, kept)
+            sure += more
+        start = parameters_of(given, given.depth_scale)
+        final = dataclasses.replace(rounds[-1], before=start)
+        kept = [i for i in sure if final.differs(i, config)]
         if not kept:
-            return SelfCalibration(before, before, _told(estimate, FREE, "nothing adopted"))
-        return SelfCalibration(before, camera, _told(estimate, kept, "found and applied"))
+            return SelfCalibration(given, given, _told(final, FREE, "nothing adopted"))
+        camera = _with(given, final.found, kept)
+        return SelfCalibration(given, camera, _told(final, kept, "found and applied"))
 
-    def _sure(self, estimate: _Estimate) -> list[int]:
-        """The parameters that are to be adopted."""
-        sure = [i for i in FREE if estimate.differs(i, self._config)]
+    def _sure(self, estimate: _Estimate, known: Iterable[int]) -> list[int]:
+        """The parameters that are to be adopted beside those that already are."""
+        sure = [i for i in FREE if i not in known and estimate.differs(i, self._config)]
         halves = cross_validate(estimate.problem) if sure else None
         if halves is None:
             return []
@@ -240,24 +244,27 @@ class SelfCalibrator:
                 bar.update(result.status, keyframes, lost)
                 if stop.signal is not None:
                     return None
-        tables = system.mapper.smoother.tables
-        stamps_s = {k.id: k.timestamp_s for k in system.map.world.keyframes.values()}
-        return SavedRun(
-            Path(),
-            tables,
-            sequence.camera,
-            system.config.graph,
-            np.array([stamps_s.get(i, np.nan) for i in tables.keyframes.ids.tolist()]),
-            {"trajectory.txt": system.trajectory()},
-            system.keyframe_trajectory(),
-            {},
-        )
+        return system.as_run()
 
 
-def _with(camera: Camera, estimate: _Estimate, chosen: list[int]) -> Camera:
-    """The camera with some of the estimated parameters."""
-    calibration = estimate.before.copy()
-    calibration[chosen] = estimate.found[chosen]
+def _next(rounds: list[_Estimate]) -> Array:
+    """The vector (13,) to track with after some rounds.
+
+    A run with a camera that is off by d finds one that is off by a share r of d, which two rounds
+    show; what it tends to is x + (found - x) / (1 - r) (Aitken's extrapolation).
+    """
+    last = rounds[-1]
+    if len(rounds) == 1:
+        return last.found
+    moved, changed = last.before - rounds[-2].before, last.found - rounds[-2].found
+    share = np.divide(changed, moved, out=np.zeros(len(moved)), where=np.abs(moved) > MIN_STEP_S)
+    return last.before + (last.found - last.before) / (1 - np.clip(share, 0.0, MAX_SHARE))
+
+
+def _with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
+    """The camera with some of the parameters of a vector (13,)."""
+    calibration = parameters_of(camera, camera.depth_scale)
+    calibration[chosen] = values[chosen]
     found = camera_from(camera, calibration)
     return dataclasses.replace(
         camera,

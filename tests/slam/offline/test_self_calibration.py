@@ -126,3 +126,21 @@ def test_a_found_camera_is_adopted() -> None:
     assert not SelfCalibration(camera, camera).adopted
     other = dataclasses.replace(camera, rolling_shutter_s=0.02)
     assert SelfCalibration(camera, other).adopted
+
+
+def test_two_rounds_show_what_a_run_tends_to() -> None:
+    """A run that is off by d finds a camera that is off by a share of d."""
+    truth, share = 0.026, 0.4
+
+    def estimate(start: float) -> self_calibration._Estimate:
+        before, found = np.zeros(13), np.zeros(13)
+        before[SHUTTER], found[SHUTTER] = start, truth + share * (start - truth)
+        return self_calibration._Estimate(before, found, np.full(13, 1e-4), None)  # type: ignore[arg-type]
+
+    first = estimate(0.0)
+    second = estimate(self_calibration._next([first])[SHUTTER])
+    assert second.before[SHUTTER] == first.found[SHUTTER]
+    third = self_calibration._next([first, second])
+    assert third[SHUTTER] == pytest.approx(truth, abs=1e-9)
+    assert third[TIME] == 0.0
+    assert estimate(third[SHUTTER]).settled([SHUTTER]) and not second.settled([SHUTTER])
