@@ -114,7 +114,13 @@ def repeated(sequence: Path, out: Path, camera: str, keypoints: int) -> Path:
     path = out / f"{camera}-{keypoints}"
     run(
         RunOptions(
-            sequence, config, camera=out / f"{camera}.yaml", out=path, overwrite=True, quiet=True
+            sequence,
+            config,
+            camera=out / f"{camera}.yaml",
+            out=path,
+            calibrate="off",
+            overwrite=True,
+            quiet=True,
         )
     )
     return path
@@ -136,7 +142,12 @@ def spoiled(truth: Camera) -> Camera:
 def errors_of(sequence: Path, out: Path, name: str) -> dict[str, float]:
     """ERRORS of a run with the camera ``name``.yaml."""
     options = RunOptions(
-        sequence, camera=out / f"{name}.yaml", out=out / name, overwrite=True, quiet=True
+        sequence,
+        camera=out / f"{name}.yaml",
+        out=out / name,
+        calibrate="off",
+        overwrite=True,
+        quiet=True,
     )
     run(options)
     rows = evaluate(out / name, sequence).rows

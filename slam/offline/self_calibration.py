@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -236,7 +236,7 @@ class SelfCalibrator:
             return None
         frames = sequence.frames(stretch.start, stretch.stop, stretch.step, prepare=system.prepare)
         keyframes = lost = 0
-        with Progress(len(stretch), quiet) as bar:
+        with closing(frames), Progress(len(stretch), quiet) as bar:  # type: ignore[type-var]
             for frame, features in frames:
                 result = system.process(frame, features)
                 keyframes += result.keyframe_id is not None
