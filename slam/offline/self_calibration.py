@@ -187,9 +187,14 @@ class SelfCalibrator:
         final = dataclasses.replace(rounds[-1], before=start)
         kept = [i for i in sure if final.differs(i, config)]
         if not kept:
-            return SelfCalibration(given, given, _told(final, FREE, "nothing adopted"))
+            return SelfCalibration(given, given, _told(final, FREE, self._refused(final)))
         camera = _with(given, final.found, kept)
         return SelfCalibration(given, camera, _told(final, kept, "found and applied"))
+
+    def _refused(self, estimate: _Estimate) -> str:
+        """Why nothing is adopted."""
+        differs = any(estimate.differs(i, self._config) for i in FREE)
+        return "not sure enough to be applied" if differs else "the camera keeps its values"
 
     def _sure(self, estimate: _Estimate, known: Iterable[int]) -> list[int]:
         """The parameters that are to be adopted beside those that already are."""
