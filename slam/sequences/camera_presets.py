@@ -132,11 +132,13 @@ def completed(camera: Camera, said: Container[str], name: str | None) -> tuple[C
 
     ``said`` are the keys of camera.yaml that are known already; a value there, also 0, stays.
     """
-    preset = PRESETS.get(name or "")
-    known = {
-        "rolling_shutter": ("rolling_shutter_s", preset and preset.rolling_shutter_s),
-        "depth_time_offset": ("depth_time_offset_s", preset and preset.depth_time_offset_s),
-    }
-    added = {field: v for key, (field, v) in known.items() if v is not None and key not in said}
-    text = ", ".join(f"{field.removesuffix('_s')} {1e3 * v:g} ms" for field, v in added.items())
-    return replace(camera, **added), f"{text} of {name}" if text else ""
+    if name is None:
+        return camera, ""
+    preset, values, parts = PRESETS[name], camera, []
+    if preset.rolling_shutter_s is not None and "rolling_shutter" not in said:
+        values = replace(values, rolling_shutter_s=preset.rolling_shutter_s)
+        parts.append(f"rolling_shutter {1e3 * preset.rolling_shutter_s:g} ms")
+    if preset.depth_time_offset_s is not None and "depth_time_offset" not in said:
+        values = replace(values, depth_time_offset_s=preset.depth_time_offset_s)
+        parts.append(f"depth_time_offset {1e3 * preset.depth_time_offset_s:g} ms")
+    return values, f"{', '.join(parts)} of {name}" if parts else ""
