@@ -57,7 +57,7 @@ class RunOptions:
     checkpoint_every: int | None = None
     map: Path | None = None
     localise: Path | None = None
-    calibrate: str = "auto"
+    calibrate: str = "off"
     dense: bool = False
     quiet: bool = False
 
