@@ -1,0 +1,130 @@
+"""Hard inputs made of recorded and rendered sequences: faster, blurred, rows exposed in turn.
+
+A folder in TUM layout is written where the caller says. Nothing of it belongs into the repository.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bmask_slam.graph.arrays import Array, Floats, Image
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.trajectory import Trajectory, associate_stamps, write_tum
+from bmask_slam.rendering.engine.sensor import blur, optical_flow
+from bmask_slam.rendering.writer import new_folder, stored_depth, write_png
+from bmask_slam.sequences import Sequence, open_sequence, write_camera
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.rolling_shutter import share_of_rows
+
+BURST, PAUSE = 12, 18
+"""Frames blurred in one go by a box, and frames between that are not."""
+
+
+@dataclass(frozen=True)
+class Hardship:
+    """What is done to a sequence.
+
+    Attributes:
+        stride: every n-th frame is kept.
+        max_frames: of those that are kept.
+        shutter: blur along the image motion, as a share of the motion to the next kept frame.
+        box_px: side of a box that blurs BURST frames in every BURST + PAUSE.
+        readout_s: rolling shutter, of a rendered sequence only; the new camera.yaml says so.
+        restamp: the kept frames follow each other as fast as all did: the camera moves faster.
+    """
+
+    stride: int = 1
+    max_frames: int | None = None
+    shutter: float = 0.0
+    box_px: int = 0
+    readout_s: float = 0.0
+    restamp: bool = False
+
+
+def make_hard(source: Path, hardship: Hardship, out: Path) -> Path:
+    """Write a hard version of a sequence to a folder, unless it is there; returns it."""
+    if out.is_dir():
+        return out
+    sequence = open_sequence(source)
+    kept = list(range(0, len(sequence), hardship.stride))[: hardship.max_frames]
+    stamps_s = sequence.timestamps_s[kept]
+    if hardship.restamp:
+        stamps_s = stamps_s[0] + np.arange(len(kept)) / sequence.camera.fps
+    camera = sequence.camera
+    if hardship.readout_s:
+        camera = replace(camera, rolling_shutter_s=hardship.readout_s)
+    names = [f"{stamp:.6f}.png" for stamp in stamps_s]
+    with new_folder(out) as folder:
+        for name, frame in zip(names, _disturbed(sequence, kept, hardship), strict=True):
+            write_png(folder / "rgb" / name, frame.rgb)
+            depth = stored_depth(frame.depth_m, camera.depth_scale)
+            write_png(folder / "depth" / name, depth)
+        for kind in ("rgb", "depth"):
+            lines = [f"{name.removesuffix('.png')} {kind}/{name}\n" for name in names]
+            (folder / f"{kind}.txt").write_text("".join(lines), encoding="utf-8")
+        write_camera(folder / "camera.yaml", camera)
+        truth = sequence.groundtruth
+        if truth is not None:
+            there, here = associate_stamps(sequence.timestamps_s[kept], truth.timestamps_s)
+            poses = truth.poses_world_camera[here]
+            write_tum(folder / "groundtruth.txt", Trajectory(stamps_s[there], poses))
+    return out
+
+
+def _disturbed(sequence: Sequence, kept: list[int], hardship: Hardship) -> Iterator[Frame]:
+    """The kept frames with blur, and with rows exposed one after the other."""
+    for k, index in enumerate(kept):
+        frame = sequence.load(index)
+        if hardship.box_px and k % (BURST + PAUSE) >= PAUSE:
+            side = (hardship.box_px, hardship.box_px)
+            frame = replace(frame, rgb=cv2.blur(frame.rgb, side))
+        if hardship.shutter or hardship.readout_s:
+            other = kept[k + 1] if k + 1 < len(kept) else kept[k - 1]
+            flow = _flow(sequence, frame, other) * np.float32(1 if other > index else -1)
+            frame = _moved(frame, flow, hardship, sequence.camera)
+        yield frame
+
+
+def _moved(frame: Frame, flow: Floats, hardship: Hardship, camera: Camera) -> Frame:
+    """A frame blurred along a flow (H, W, 2) px an interval, each row seen at its own time."""
+    rgb, depth_m = frame.rgb, frame.depth_m
+    if hardship.readout_s:
+        height, width = depth_m.shape
+        v, u = np.mgrid[:height, :width].astype(np.float32)
+        intervals = hardship.readout_s * camera.fps * share_of_rows(v, camera)
+        u, v = u - intervals * flow[..., 0], v - intervals * flow[..., 1]
+        u, v = u.astype(np.float32), v.astype(np.float32)
+        rgb = cv2.remap(rgb, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        depth_m = cv2.remap(depth_m, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_REPLICATE)
+    if hardship.shutter:
+        rgb = np.rint(blur(rgb.astype(np.float32), hardship.shutter * flow)).astype(np.uint8)
+    return replace(frame, rgb=rgb, depth_m=depth_m)
+
+
+def _flow(sequence: Sequence, frame: Frame, other: int) -> Floats:
+    """The motion (H, W, 2) in px of what a frame shows to another frame.
+
+    By depth and true poses of a rendered sequence, else by dense optical flow (DIS, OpenCV).
+    """
+    if (sequence.folder / "annotations.json").is_file() and sequence.groundtruth is not None:
+        poses = _poses(sequence, [frame.index, other])
+        return optical_flow(frame.depth_m, sequence.camera, inverse(poses[1]) @ poses[0])
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    return dis.calc(_gray(frame.rgb), _gray(sequence.load(other).rgb), None)
+
+
+def _poses(sequence: Sequence, indices: list[int]) -> Array:
+    truth = sequence.groundtruth
+    assert truth is not None
+    _, rows = associate_stamps(sequence.timestamps_s[sorted(indices)], truth.timestamps_s)
+    return truth.poses_world_camera[rows][np.argsort(np.argsort(indices))]
+
+
+def _gray(rgb: Image) -> Image:
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)

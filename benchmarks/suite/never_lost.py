@@ -1,0 +1,179 @@
+"""How much of a hard recording is tracked, and how well: fast, blurred, in a crowd.
+
+    python -m benchmarks.suite.never_lost [NAME ...] [--repeats N] [--set A.B=C]
+
+Inputs are made of those under ../shared/data, and of a rendered office, in a folder for such
+things (``--into``). Cameras are the published ones and the readout time of their sensor. A row is
+the median of runs that differ by the grid on which keypoints are spread (see
+benchmarks/moving/no_harm.py): frames with a pose, frames of which the pose is WEAK, the longest
+loss in frames, errors against the truth (the red kitchen's is of the depth camera: by hand-eye),
+and the time of features and tracking.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from benchmarks.moving.no_harm import other_keypoints
+from benchmarks.pages import table
+from benchmarks.paths import SHARED
+from benchmarks.suite.hard_sequences import Hardship, make_hard
+from bmask_slam.config.configuration import resolve
+from bmask_slam.evaluation import evaluate
+from bmask_slam.graph.errors import InputError
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.sequences import write_camera
+from bmask_slam.sequences.cameras import read_camera
+from bmask_slam.system_config import SystemConfig
+
+KINECT_V1 = {"rolling_shutter_s": 0.022, "depth_time_offset_s": -0.0145}
+XTION = {"rolling_shutter_s": 0.0248}
+
+
+@dataclass(frozen=True)
+class Input:
+    """A recording of ``SHARED`` or a rendered scene, what is done to it, and its camera's timing.
+
+    ``stride`` is that of the run; ``hand_eye``: the truth is of another body.
+    """
+
+    source: str
+    hardship: Hardship | None = None
+    stride: int = 1
+    timing: dict[str, float] | None = None
+    hand_eye: bool = False
+
+
+INPUTS = {
+    "rpy": Input("tum_fr1_rpy", timing=KINECT_V1),
+    "rpy-x2": Input("tum_fr1_rpy", stride=2, timing=KINECT_V1),
+    "rpy-x3": Input("tum_fr1_rpy", stride=3, timing=KINECT_V1),
+    "bonn": Input("bonn_crowd", timing=XTION),
+    "kitchen-x3": Input("redkitchen", stride=3, hand_eye=True),
+    "kitchen-x3-blur": Input("redkitchen", Hardship(stride=3, shutter=0.6), hand_eye=True),
+    "kitchen-box": Input("redkitchen", Hardship(max_frames=200, box_px=11), hand_eye=True),
+    "office-x2": Input("office-300", Hardship(stride=2, shutter=0.5, readout_s=0.02, restamp=True)),
+    "office-x3": Input("office-300", Hardship(stride=3, shutter=0.5, readout_s=0.02, restamp=True)),
+    "kitchen": Input("redkitchen", hand_eye=True),
+    "office": Input("office-300"),
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one run: shares of frames, the longest loss in frames, errors in mm, time in ms."""
+
+    tracked: float
+    weak: float
+    longest_loss: float
+    ate_mm: float
+    rpe_mm: float
+    tracking_ms: float
+
+
+def sequence_of(wanted: Input, into: Path) -> Path:
+    """The folder of an input, made if it is not there."""
+    source = SHARED / wanted.source
+    if not source.is_dir():
+        source = into / wanted.source
+        if not source.is_dir():
+            render_sequence(RenderConfig("office", frames=300), source)
+    if wanted.hardship is None:
+        return source
+    done = wanted.hardship
+    name = (
+        f"{wanted.source}-{done.stride}-{done.max_frames}-{done.shutter}-{done.box_px}"
+        f"-{done.readout_s}-{done.restamp}"
+    )
+    return make_hard(source, done, into / name)
+
+
+def outcome(wanted: Input, into: Path, settings: list[str]) -> Outcome:
+    """Run an input."""
+    sequence = sequence_of(wanted, into)
+    config = resolve(SystemConfig, None, settings)
+    with TemporaryDirectory() as folder:
+        out, camera = Path(folder) / "run", None
+        if wanted.timing:
+            camera = Path(folder) / "camera.yaml"
+            write_camera(camera, replace(read_camera(sequence / "camera.yaml"), **wanted.timing))
+        run(RunOptions(sequence, config, out=out, camera=camera, stride=wanted.stride, quiet=True))
+        return _read(out, sequence, wanted.hand_eye)
+
+
+def _read(out: Path, sequence: Path, hand_eye: bool) -> Outcome:
+    with (out / "frames.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    status = [row["status"] for row in rows]
+    runs = [len(list(group)) for lost, group in groupby(status, "LOST".__eq__) if lost]
+    times = [float(row["features_ms"]) + float(row["tracking_ms"]) for row in rows]
+    try:
+        errors = evaluate(out, sequence, with_body=hand_eye)
+        ate_m, rpe_m = errors.value("ate_rmse"), errors.value("rpe_trans_rmse_second")
+    except (InputError, KeyError):
+        ate_m = rpe_m = np.nan
+    return Outcome(
+        tracked=_posed(out) / len(rows),
+        weak=status.count("WEAK") / len(rows),
+        longest_loss=max(runs, default=0),
+        ate_mm=1e3 * ate_m,
+        rpe_mm=1e3 * rpe_m,
+        tracking_ms=float(np.median(times)),
+    )
+
+
+def _posed(out: Path) -> int:
+    """Poses of the main trajectory."""
+    lines = (out / "trajectory.txt").read_text(encoding="utf-8").splitlines()
+    return sum(not line.startswith("#") for line in lines)
+
+
+def row(name: str, outcomes: list[Outcome]) -> tuple[str, ...]:
+    """The medians of some runs as cells, of the ATE also the range."""
+    columns = np.array([[getattr(o, f) for f in Outcome.__dataclass_fields__] for o in outcomes])
+    tracked, weak, loss, ate, rpe, ms = np.median(columns, axis=0)
+    span = f" ({columns[:, 3].min():.1f}-{columns[:, 3].max():.1f})" if len(outcomes) > 1 else ""
+    return (
+        name, f"{100 * tracked:.1f}", f"{100 * weak:.1f}", f"{loss:.0f}",
+        f"{ate:.1f}{span}", f"{rpe:.1f}", f"{ms:.1f}",
+    )  # fmt: skip
+
+
+HEADER = ("input", "tracked %", "weak %", "longest loss", "ATE mm", "RPE/s mm", "ms a frame")
+
+
+def main() -> None:
+    """Print the table, a row as soon as it is measured."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("names", nargs="*", choices=[*INPUTS, []], metavar="NAME")
+    parser.add_argument("--into", type=Path, default=Path("runs/hard"), help="where inputs lie")
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--masks", type=Path, help="cached masks of the sequences, by their name")
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="A.B=C")
+    given = parser.parse_args()
+    first = True
+    for name in given.names or INPUTS:
+        wanted, settings = INPUTS[name], list(given.settings)
+        kind = ["semantics.segmenter.name=none"]
+        if given.masks and (given.masks / wanted.source).is_dir():
+            file = given.masks / wanted.source / "annotations.json"
+            kind = ["semantics.segmenter.name=precomputed", f"semantics.segmenter.masks={file}"]
+        outcomes = [
+            outcome(wanted, given.into, [*kind, *settings, other_keypoints(k)])
+            for k in range(given.repeats)
+        ]
+        lines = table(HEADER, [row(name, outcomes)]).splitlines()
+        print("\n".join(lines if first else lines[2:]), flush=True)
+        first = False
+
+
+if __name__ == "__main__":
+    main()
