@@ -60,9 +60,6 @@ class LoopConfig:
     first_ratio: float = 0.85
 
 
-Search = tuple[float, Camera, LoopConfig]  # radius in px
-
-
 class NoLoopReason(Enum):
     """Why a candidate was rejected."""
 
@@ -128,11 +125,11 @@ def verify_loop(
     matches = _descriptor_matches(views, config)
     if len(matches) < config.min_matches:
         return NoLoop(NoLoopReason.FEW_MATCHES, len(matches), config.min_matches)
-    T_a_b, agreeing = _consensus(views, matches, (config.ransac_px, camera, config))
+    T_a_b, agreeing = _consensus(views, matches, camera, config)
     if agreeing < config.min_consensus:
         return NoLoop(NoLoopReason.NO_CONSENSUS, agreeing, config.min_consensus)
     for radius_px in config.radii_px:
-        a, b, expected = _guided_pairs(views, T_a_b, (radius_px, camera, config))
+        a, b, expected = _guided_pairs(views, T_a_b, camera, radius_px)
         if (found := len(a)) >= config.min_inliers:
             T_a_b, covariance, inliers, scale = refine_relative_pose(views, (a, b), T_a_b, camera)
             found = int(inliers.sum())
@@ -174,9 +171,11 @@ def _descriptor_matches(views: Views, config: LoopConfig) -> Matches:
     return consistent_rotation(matches, turn_rad, config.max_turn_rad)
 
 
-def _consensus(views: Views, matches: Matches, search: Search) -> tuple[Array, int]:
+def _consensus(
+    views: Views, matches: Matches, camera: Camera, config: LoopConfig
+) -> tuple[Array, int]:
     """The T_a_b that most matches agree with, fitted to these, and their number."""
-    (limit_px, camera, config), rows = search, (matches.query, matches.train)
+    limit_px, rows = config.ransac_px, (matches.query, matches.train)
     points_a, points_b = (v.points_camera[k] for v, k in zip(views, rows, strict=True))
     pixels = tuple(v.features.pixels[k] for v, k in zip(views, rows, strict=True))
     triples = np.random.default_rng(config.seed).integers(0, len(points_a), (config.samples, 3))
@@ -202,10 +201,12 @@ def _near(T_x_y: Array, points_y: Array, pixels_x: Array, camera: Camera, px: fl
     return front & (np.linalg.norm(camera.project(points_x) - pixels_x, axis=-1) < px)
 
 
-def _guided_pairs(views: Views, T_a_b: Array, search: Search) -> tuple[Ints, Ints, int]:
+def _guided_pairs(
+    views: Views, T_a_b: Array, camera: Camera, radius_px: float
+) -> tuple[Ints, Ints, int]:
     """Keypoints (a, b) that match at the pose in both directions, and how many are in view."""
-    query_a, train_b, seen_in_b = _guided(views, inverse(T_a_b), search)
-    query_b, train_a, seen_in_a = _guided(views[::-1], T_a_b, search)
+    query_a, train_b, seen_in_b = _guided(views, inverse(T_a_b), camera, radius_px)
+    query_b, train_a, seen_in_a = _guided(views[::-1], T_a_b, camera, radius_px)
     pairs = np.unique(np.c_[np.r_[query_a, train_a], np.r_[train_b, query_b]], axis=0)
     once_a = np.bincount(pairs[:, 0], minlength=1)[pairs[:, 0]] == 1
     once_b = np.bincount(pairs[:, 1], minlength=1)[pairs[:, 1]] == 1
@@ -213,9 +214,11 @@ def _guided_pairs(views: Views, T_a_b: Array, search: Search) -> tuple[Ints, Int
     return a, b, max(min(seen_in_a, seen_in_b), 1)
 
 
-def _guided(views: Views, T_target_source: Array, search: Search) -> tuple[Ints, Ints, int]:
+def _guided(
+    views: Views, T_target_source: Array, camera: Camera, radius_px: float
+) -> tuple[Ints, Ints, int]:
     """Keypoints (source, target) that match within a radius, and how many points are in view."""
-    (source, target), (radius_px, camera, _) = views, search
+    source, target = views
     rows = np.flatnonzero(np.isfinite(source.points_camera[:, 2]))
     points = transform(T_target_source, source.points_camera[rows])
     rows, points = rows[points[:, 2] > NEAREST_M], points[points[:, 2] > NEAREST_M]
