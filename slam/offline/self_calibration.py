@@ -289,7 +289,7 @@ def _told(estimate: _Estimate, parameters: tuple[int, ...] | list[int], verdict:
 
 @contextmanager
 def _quiet_log() -> Iterator[None]:
-    """Only warnings are logged: what is tracked here is tracked again."""
+    """Only errors are logged: what is tracked here is tracked again."""
     root = logging.getLogger("bmask_slam")
     level = root.level
     root.setLevel(logging.ERROR)
