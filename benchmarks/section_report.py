@@ -25,20 +25,26 @@ from bmask_slam.runtime.machine import processor
 
 @dataclass(frozen=True)
 class Report:
-    """A page of sections by name: each has a title, a benchmark and its arguments, pictures."""
+    """A page of sections by name: each has a title, a benchmark and its arguments, pictures.
+
+    Attributes:
+        sections: title and command by name; a section without command is written by hand.
+        pictures: of a section, captions by their names in docs/images.
+        markdown: sections of which the output is Markdown, and not put into a block of code.
+    """
 
     path: Path
     title: str
     sections: dict[str, tuple[str, str]]
     pictures: dict[str, dict[str, str]] = field(default_factory=dict)
-    """Of a section: captions by their names in docs/images."""
+    markdown: frozenset[str] = frozenset()
 
     @property
     def head(self) -> str:
         """How the page begins."""
         return (
             f"# {self.title}\n\nWritten by `python -m benchmarks.section_report {self.path.stem}`; "
-            "each section is what its command printed.\n"
+            "a section with a command is what that printed.\n"
         )
 
 
@@ -151,6 +157,13 @@ REPORTS = {
             "dense_office.jpg": "A rendered office: cloud and labels",
         },
     }),
+    "real-cameras": Report(RESULTS / "real-cameras.md", "Results: real cameras", {
+        "table": ("Real sequences", "suite.real_cameras --work {sequences}"),
+        "reading": ("What the figures say", ""),
+        "hard": ("Hard inputs: never lost", ""),
+        "loops": ("Loop closures", ""),
+        "wrong": ("Wrong cameras", ""),
+    }, markdown=frozenset({"table", "hard", "loops", "wrong"})),
 }  # fmt: skip
 
 
@@ -169,7 +182,9 @@ def make_section(report: Report, name: str, sequences: Path) -> str:
         raise SystemExit(f"{typed} failed:\n{done.stderr[-2000:]}")
     wall_s = time.perf_counter() - begin_s
     stamp = f"{processor()}; commit {commit}; {now()}; {wall_s:.0f} s."
-    printed = f"```\n{done.stdout.rstrip()}\n```"
+    printed = done.stdout.rstrip()
+    if name not in report.markdown:
+        printed = f"```\n{printed}\n```"
     captions = report.pictures.get(name, {})
     pictures = "".join(
         f"\n![{text}](../images/{file})\n{text}.\n" for file, text in captions.items()
@@ -198,7 +213,8 @@ def main() -> None:
     parser.add_argument("--sequences", type=Path, default=Path("runs/bench"))
     arguments = parser.parse_args()
     report = REPORTS[arguments.report]
-    for name in arguments.only.split(",") if arguments.only else report.sections:
+    commands = [name for name, (_, command) in report.sections.items() if command]
+    for name in arguments.only.split(",") if arguments.only else commands:
         replace_section(report, make_section(report, name, arguments.sequences))
 
 
