@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from bmask_slam import __version__
+from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.config.configuration import dump, from_text, resolve
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
@@ -24,7 +25,6 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, nested, part, read_arrays, write_arrays
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.offline.self_calibration import SelfCalibration
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.sequences import Sequence

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.offline.checkpoint import Checkpoints
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.offline.self_calibration import SelfCalibration
 from bmask_slam.run_folder.folder import RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, measure, save
 from bmask_slam.runtime.progress import Progress

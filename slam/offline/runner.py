@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.config.configuration import dump
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.camera import Camera
@@ -29,7 +30,7 @@ from bmask_slam.offline.frame_loop import (
 )
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.offline.self_calibration import SelfCalibration, SelfCalibrator
+from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.folder import CAMERA, CHECKPOINT, RunFolder, free_run_path
 from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.origin import Origin

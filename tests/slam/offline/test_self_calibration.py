@@ -8,14 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bmask_slam.calibration.adoption import (
+    Estimate,
+    SelfCalibration,
+    SelfCalibrationConfig,
+    next_start,
+)
 from bmask_slam.calibration.report import parameter_named
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.offline import runner, self_calibration
+from bmask_slam.offline import runner
 from bmask_slam.offline.runner import RunOptions, resume, run
-from bmask_slam.offline.self_calibration import SelfCalibration, SelfCalibrator
+from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.run_folder.map_file import read_run
 from bmask_slam.sequences import read_camera
@@ -82,13 +88,13 @@ def test_report_and_off_change_nothing(late_depth: Path, tmp_path: Path) -> None
 )
 def test_only_what_is_sure_differs(change_ms: float, sigma_ms: float, differs: bool) -> None:
     found = np.where(np.arange(13) == TIME, 1e-3 * change_ms, 0.0)
-    estimate = self_calibration._Estimate(
+    estimate = Estimate(
         np.zeros(13),
         found,
         np.full(13, 1e-3 * sigma_ms),
         None,  # type: ignore[arg-type]
     )
-    config = self_calibration.SelfCalibrationConfig()
+    config = SelfCalibrationConfig()
     assert estimate.differs(TIME, config) is differs
     assert not estimate.differs(SHUTTER, config)
 
@@ -132,15 +138,15 @@ def test_two_rounds_show_what_a_run_tends_to() -> None:
     """A run that is off by d finds a camera that is off by a share of d."""
     truth, share = 0.026, 0.4
 
-    def estimate(start: float) -> self_calibration._Estimate:
+    def estimate(start: float) -> Estimate:
         before, found = np.zeros(13), np.zeros(13)
         before[SHUTTER], found[SHUTTER] = start, truth + share * (start - truth)
-        return self_calibration._Estimate(before, found, np.full(13, 1e-4), None)  # type: ignore[arg-type]
+        return Estimate(before, found, np.full(13, 1e-4), None)  # type: ignore[arg-type]
 
     first = estimate(0.0)
-    second = estimate(self_calibration._next([first])[SHUTTER])
+    second = estimate(next_start([first])[SHUTTER])
     assert second.before[SHUTTER] == first.found[SHUTTER]
-    third = self_calibration._next([first, second])
+    third = next_start([first, second])
     assert third[SHUTTER] == pytest.approx(truth, abs=1e-9)
     assert third[TIME] == 0.0
     assert estimate(third[SHUTTER]).settled([SHUTTER]) and not second.settled([SHUTTER])

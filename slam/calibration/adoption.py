@@ -1,0 +1,206 @@
+"""Whether a run should use what was found of its camera's times: by one estimate and the next.
+
+What was found is adopted if it is observable, differs from what the camera has, fits observations
+that it was not estimated from better (`graph.calibration.cross_validation`), and is found in both
+halves of the observations. A run with a wrong camera has matched what fits that camera, which draws
+the estimate towards it, so it is estimated in rounds, each from frames tracked with what the round
+before found, until that changes no more.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.calibration.calibrate import camera_from, with_rate_error
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.calibration.calibration import calibrate
+from bmask_slam.graph.calibration.cross_validation import CrossValidation, cross_validate
+from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, TIME, parameters_of
+from bmask_slam.graph.calibration.problem import CalibrationProblem
+from bmask_slam.graph.camera import Camera
+
+logger = logging.getLogger(__name__)
+
+FREE = (SHUTTER, TIME)
+"""The parameters that are estimated, by their places in PARAMETERS."""
+FIXED = tuple(name for i, name in enumerate(PARAMETERS) if i not in FREE)
+NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
+MIN_STEP_S, MAX_SHARE = 0.002, 0.6
+
+
+@dataclass(frozen=True)
+class SelfCalibrationConfig:
+    """How much is tracked, and when something is adopted.
+
+    Attributes:
+        frames: of a stretch.
+        min_frames: of a sequence; a shorter one is not calibrated.
+        stretches: how many are tried until one shows the parameters.
+        rounds: how often a stretch is tracked at most.
+        max_sigma_s: largest standard deviation of a parameter that counts as observable.
+        min_change_sigmas: what is adopted differs by so many standard deviations.
+        min_gain_sigmas: so many standard errors is the gain on observations kept out of the fit.
+        max_s: a larger time is no readout within a frame's interval, but an error.
+    """
+
+    frames: int = 210
+    min_frames: int = 90
+    stretches: int = 3
+    rounds: int = 4
+    max_sigma_s: float = 0.004
+    min_change_sigmas: float = 3.0
+    min_gain_sigmas: float = 2.0
+    max_s: float = 0.035
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """What was found of a camera, and whether a run should use it.
+
+    Attributes:
+        given: the camera before.
+        camera: to run with, that one if nothing is adopted.
+        text: one line for the summary and the log; "" if nothing could be said.
+    """
+
+    given: Camera
+    camera: Camera
+    text: str = ""
+
+    @property
+    def adopted(self) -> bool:
+        """Whether the camera is another one."""
+        return self.camera != self.given
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Of one stretch: the vector (13,) before and after, standard deviations, and the problem."""
+
+    before: Array
+    found: Array
+    sigmas: Array
+    problem: CalibrationProblem
+
+    def differs(self, i: int, config: SelfCalibrationConfig) -> bool:
+        """Whether a parameter is observable, possible, and not what the camera has."""
+        change_s = abs(self.found[i] - self.before[i])
+        return bool(
+            self.sigmas[i] < config.max_sigma_s
+            and change_s > config.min_change_sigmas * self.sigmas[i]
+            and abs(self.found[i]) < config.max_s
+        )
+
+    def settled(self, chosen: list[int]) -> bool:
+        """Whether the run found what its camera had, within 95 % bounds of two rounds."""
+        bounds = 1.96 * np.sqrt(2) * self.sigmas[chosen]
+        return bool((np.abs(self.found - self.before)[chosen] <= bounds).all())
+
+    def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
+        """Whether both halves alone find a parameter, as far as they show it."""
+        bounds = config.min_change_sigmas * np.hypot(halves.sigmas[:, i], self.sigmas[i])
+        return bool((np.abs(halves.calibrations[:, i] - self.found[i]) <= bounds).all())
+
+
+def estimate_times(problem: CalibrationProblem) -> Estimate:
+    """What the observations of a problem say of a camera's times."""
+    result = with_rate_error(calibrate(problem))
+    sigmas = np.sqrt(np.diag(result.covariance))
+    return Estimate(problem.calibration, result.calibration, sigmas, problem)
+
+
+class CalibrationRounds:
+    """Takes one estimate a round; says which camera to track with next, and what is adopted.
+
+    Args:
+        given: the camera of the first round.
+    """
+
+    def __init__(self, given: Camera, config: SelfCalibrationConfig | None = None) -> None:
+        self._given, self._config = given, config or SelfCalibrationConfig()
+        self._sure: list[int] = []
+        self._rounds: list[Estimate] = []
+
+    def shows(self, estimate: Estimate) -> bool:
+        """Whether the motion of a stretch shows any of the parameters."""
+        return bool(min(estimate.sigmas[i] for i in FREE) < self._config.max_sigma_s)
+
+    def add(self, estimate: Estimate) -> Camera | None:
+        """Add the estimate of a round; the camera to track the next one with, None at the end."""
+        more = self._newly_sure(estimate, self._sure)
+        settled = bool(self._rounds) and not more and estimate.settled(self._sure)
+        self._rounds.append(estimate)
+        self._sure += more
+        if not self._sure or settled or len(self._rounds) == self._config.rounds:
+            return None
+        return _with(self._given, next_start(self._rounds), self._sure)
+
+    def result(self) -> SelfCalibration:
+        """What the rounds together say of the given camera."""
+        given, config = self._given, self._config
+        start = parameters_of(given, given.depth_scale)
+        final = dataclasses.replace(self._rounds[-1], before=start)
+        kept = [i for i in self._sure if final.differs(i, config)]
+        if not kept:
+            return SelfCalibration(given, given, format_times(final, FREE, self._refused(final)))
+        camera = _with(given, final.found, kept)
+        return SelfCalibration(given, camera, format_times(final, kept, "found and applied"))
+
+    def _refused(self, estimate: Estimate) -> str:
+        """Why nothing is adopted."""
+        differs = any(estimate.differs(i, self._config) for i in FREE)
+        return "not sure enough to be applied" if differs else "the camera keeps its values"
+
+    def _newly_sure(self, estimate: Estimate, known: Iterable[int]) -> list[int]:
+        """The parameters that are to be adopted beside those that already are."""
+        sure = [i for i in FREE if i not in known and estimate.differs(i, self._config)]
+        halves = cross_validate(estimate.problem) if sure else None
+        if halves is None:
+            return []
+        logger.info(
+            "calibration: better on observations kept out of the fit by %.1f standard errors",
+            halves.gain_sigmas,
+        )
+        if halves.gain_sigmas < self._config.min_gain_sigmas:
+            return []
+        return [i for i in sure if estimate.agrees(i, halves, self._config)]
+
+
+def next_start(rounds: list[Estimate]) -> Array:
+    """The vector (13,) to track with after some rounds.
+
+    A run with a camera that is off by d finds one that is off by a share r of d, which two rounds
+    show; what it tends to is x + (found - x) / (1 - r) (Aitken's extrapolation).
+    """
+    last = rounds[-1]
+    if len(rounds) == 1:
+        return last.found
+    moved, changed = last.before - rounds[-2].before, last.found - rounds[-2].found
+    share = np.divide(changed, moved, out=np.zeros(len(moved)), where=np.abs(moved) > MIN_STEP_S)
+    return last.before + (last.found - last.before) / (1 - np.clip(share, 0.0, MAX_SHARE))
+
+
+def _with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
+    """The camera with some of the parameters of a vector (13,)."""
+    calibration = parameters_of(camera, camera.depth_scale)
+    calibration[chosen] = values[chosen]
+    found = camera_from(camera, calibration)
+    return dataclasses.replace(
+        camera,
+        rolling_shutter_s=found.rolling_shutter_s,
+        depth_time_offset_s=found.depth_time_offset_s,
+    )
+
+
+def format_times(estimate: Estimate, parameters: tuple[int, ...] | list[int], verdict: str) -> str:
+    """Parameters in milliseconds with 95 % bounds, and what became of them."""
+    parts = [
+        f"{NAMES[i]} {1e3 * estimate.found[i]:.1f} ± {1.96e3 * estimate.sigmas[i]:.1f} ms"
+        for i in parameters
+    ]
+    return f"{', '.join(parts)}: {verdict}"
