@@ -1,22 +1,63 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all.
+
+A temporary one is made beside the target, under a name that cannot be guessed and with O_EXCL, so
+that a link that lies in the folder is never followed; it is renamed to the target in the end.
+"""
 
 from __future__ import annotations
 
 import os
+import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+PREFIX = ".part-"
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path``, of the same suffix, to write the file under.
+    """An empty temporary file beside ``path``, of the same suffix, to write the content to.
 
-    It takes the place of ``path`` when the block ends well, and is removed when it does not.
+    It takes the place of ``path``, of the link itself if that is one, when the block ends well,
+    and is removed when it does not.
     """
-    temporary = path.with_name(f".part-{path.name}")
+    temporary = _temporary(path)
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield temporary
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """An empty temporary folder beside ``path``; else as ``whole_file``."""
+    temporary = _temporary(path)
+    temporary.mkdir()
+    try:
+        yield temporary
+        remove(path)
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a folder with all that is in it, or a link, but nothing that it leads to."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove the temporary files and folders that a killed process left in a folder."""
+    for path in folder.glob(f"{PREFIX}*"):
+        remove(path)
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f"{PREFIX}{secrets.token_hex(8)}{path.suffix}")

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import whole_file
 
 Header = dict[str, Any]
 _HEADER = "header"
@@ -52,17 +53,14 @@ def write_arrays(path: Path, kind: FileKind, header: Header, arrays: Arrays) -> 
     """Save arrays and a header of JSON values, atomically. Raises InputError if it cannot."""
     names = list(arrays)  # the zip's own directory has no checksum
     header = {**header, "format": kind.format, "version": kind.version, "arrays": names}
-    temporary = path.with_name(path.name + ".tmp")
     try:
-        with temporary.open("wb") as file:
+        with whole_file(path) as temporary, temporary.open("wb") as file:
             named = {_HEADER: np.array(json.dumps(header, sort_keys=True)), **arrays}
             save = np.savez_compressed if kind.compressed else np.savez
             save(file, allow_pickle=False, **named)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise InputError(
             f"{path}: the {kind.noun} cannot be written ({error.strerror}); free some space or "
             "choose another folder"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -39,12 +40,8 @@ class CloudWriter:
         self._palette = palette
         self._body: IO[bytes] | None = None
 
-    @property
-    def _temporary(self) -> Path:
-        return self.stem.with_name(f".{self.stem.name}.part")
-
     def __enter__(self) -> CloudWriter:
-        self._body = self._temporary.open("wb")
+        self._body = tempfile.TemporaryFile(dir=self.stem.parent)
         return self
 
     def write(self, cloud: Cloud) -> None:
@@ -60,21 +57,16 @@ class CloudWriter:
         traceback: TracebackType | None,
     ) -> None:
         assert self._body is not None
-        self._body.close()
-        try:
+        with self._body as body:
             if error is None:
-                self._finish(".ply", _ply_header(self.count))
-                self._finish(".pcd", _pcd_header(self.count))
-        finally:
-            self._temporary.unlink(missing_ok=True)
+                self._finish(body, ".ply", _ply_header(self.count))
+                self._finish(body, ".pcd", _pcd_header(self.count))
 
-    def _finish(self, suffix: str, header: str) -> None:
-        with (
-            whole_file(self.stem.with_suffix(suffix)) as temporary,
-            temporary.open("wb") as out,
-            self._temporary.open("rb") as body,
-        ):
+    def _finish(self, body: IO[bytes], suffix: str, header: str) -> None:
+        path = self.stem.with_suffix(suffix)
+        with whole_file(path) as temporary, temporary.open("wb") as out:
             out.write(header.encode("ascii"))
+            body.seek(0)
             shutil.copyfileobj(body, out)
 
 

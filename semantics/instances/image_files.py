@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import io
+import os
+import struct
+import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 
+MAX_MEGAPIXELS = 100
+LIMIT = "BMASK_SLAM_MAX_MEGAPIXELS"
+"""The environment variable that sets another limit."""
+FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")
 _TAIL_BYTES = 4096
+warnings.filterwarnings("ignore", module=r"PIL\.")  # said here in one line
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
@@ -48,8 +58,27 @@ def decode_bytes(data: bytes, flags: int, where: str) -> NDArray:
     truncated = (data.startswith(b"\xff\xd8") and b"\xff\xd9" not in tail) or (
         data.startswith(b"\x89PNG") and b"IEND" not in tail
     )
-    image = None if truncated else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    image = None
+    if not truncated and _has_possible_size(data, where):
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         reason = "truncated" if truncated else "not a readable image"
         raise InputError(f"{where}: {reason} ({len(data)} bytes); restore it or leave it out")
     return image
+
+
+def _has_possible_size(data: bytes, where: str) -> bool:
+    """Whether the file's header can be read. Raises InputError if the image would be too large."""
+    try:
+        width, height = PIL.Image.open(io.BytesIO(data), formats=FORMATS).size
+    except PIL.Image.DecompressionBombError:
+        width = height = 1 << 20
+    except (OSError, ValueError, SyntaxError, OverflowError, struct.error):
+        return False
+    limit = float(os.environ.get(LIMIT, MAX_MEGAPIXELS))
+    if width * height > limit * 1e6:
+        raise InputError(
+            f"{where}: {width} x {height} pixels, more than {limit:g} megapixels; scale it "
+            f"down, or set {LIMIT}"
+        )
+    return True

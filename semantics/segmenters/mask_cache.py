@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+from pydantic import BaseModel
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import target_below
+from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.instances.instances import as_annotation
@@ -23,6 +26,16 @@ logger = logging.getLogger(__name__)
 
 ANNOTATIONS = "annotations.json"
 SETTINGS = "settings.json"
+
+
+class _Entry(BaseModel):
+    """The file of one image."""
+
+    model_config = STRICT
+    file_name: str
+    height: int
+    width: int
+    annotations: list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -73,9 +86,9 @@ def cache_masks(
     entries: list[dict[str, Any]] = []
     reused = broken = 0
     for k, (name, path) in enumerate(files):
-        cached = (options.out / "images" / name).with_suffix(".json")
+        cached = target_below(options.out / "images", name).with_suffix(".json")
         if cached.is_file():
-            entries.append(json.loads(cached.read_text()))
+            entries.append(read_json(cached, _Entry, "remove it").model_dump())
             reused += 1
         else:
             try:
@@ -96,7 +109,7 @@ def cache_masks(
 def _check_settings(options: CacheOptions) -> None:
     path = options.out / SETTINGS
     if path.is_file():
-        before = json.loads(path.read_text())
+        before = read_json(path, dict[str, str], "choose another --out or remove it")
         different = [k for k, v in options.settings.items() if before.get(k) != v]
         if different:
             key = different[0]
@@ -118,9 +131,9 @@ def _segmented(
     instances = segmenter.segment(image, name)
     if options.overlays:
         picture = draw(image, instances, segmenter.labels)
-        target = (options.out / "overlays" / name).with_suffix(".jpg")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(target), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        target = target_below(options.out / "overlays", name).with_suffix(".jpg")
+        with whole_file(target) as temporary:
+            cv2.imwrite(str(temporary), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     height, width = image.shape[:2]
     annotations = [as_annotation(i) for i in instances]
     return {"file_name": name, "height": height, "width": width, "annotations": annotations}

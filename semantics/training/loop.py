@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.training.dataset import (
     AugmentConfig,
     Dataset,
@@ -235,9 +235,8 @@ def _save(
         "step": step,
         "config": _comparable(config),
     }
-    temporary = out / f"{STATE}.tmp"
-    torch.save(content, temporary)
-    os.replace(temporary, out / STATE)
+    with whole_file(out / STATE) as temporary:
+        torch.save(content, temporary)
 
 
 def _resume(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -16,6 +15,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.labels import LabelSet, label_set, read_label_set
 from bmask_slam.semantics.network.config import (
     RESNET50,
@@ -108,9 +108,8 @@ def save_network(network: TrainedNetwork, path: Path, half: bool = True) -> None
         "network": json.dumps(asdict(network.model.config), sort_keys=True),
         "labels": json.dumps(network.labels.names),
     }
-    temporary = path.with_name(path.name + ".tmp")
-    save_file(state, temporary, metadata)
-    os.replace(temporary, path)
+    with whole_file(path) as temporary:
+        save_file(state, temporary, metadata)
 
 
 def read_state(path: Path) -> tuple[State, dict[str, str]]:

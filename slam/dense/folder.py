@@ -34,6 +34,7 @@ from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
+from bmask_slam.graph.files.json_file import read_json
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.inverse_depth.depth_map import (
     InverseDepthMap,
@@ -74,6 +75,10 @@ def folder_settings(
     return settings if options.source == "sensor" else settings | {"stereo_bf": stereo_bf_px_m}
 
 
+def _read_settings(path: Path) -> dict[str, Any]:
+    return read_json(path, dict[str, Any], "remove it to start the dense map again")
+
+
 def _first_log_line(run: Path) -> str:
     """The first line of a run's log, with the time when it began.
 
@@ -96,6 +101,9 @@ class DenseFolder:
             InputError: it cannot be written.
         """
         self.path = run / "dense"
+        for path in (self.path, *(self.path / name for name in PARTS)):
+            if path.is_symlink():
+                raise InputError(f"{path}: is a link; nothing is written through it, remove it")
         try:
             self.path.mkdir(exist_ok=True)
             self._clear_unless(settings)
@@ -113,12 +121,12 @@ class DenseFolder:
         path = run / "dense" / "settings.json"
         if not path.is_file():
             raise InputError(f"{path}: no dense map here; make it with bmask-slam map {run}")
-        return cls(run, json.loads(path.read_text(encoding="utf-8")))
+        return cls(run, _read_settings(path))
 
     def _clear_unless(self, settings: dict[str, Any]) -> None:
         """Remove the keyframes unless they were made with these settings."""
         path = self.path / "settings.json"
-        before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        before = _read_settings(path) if path.is_file() else None
         if before == json.loads(json.dumps(settings)):
             return
         if before is not None:

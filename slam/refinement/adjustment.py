@@ -22,6 +22,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import write_ply
 from bmask_slam.graph.smoother.storage import write_graph
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.refinement.adjustment_plot import GraphSnapshot, check_picture, draw_adjustment
 from bmask_slam.refinement.carried_along import adjusted_map, move_frames, move_landmarks
 from bmask_slam.run_folder.folder import RunFolder
@@ -125,16 +126,16 @@ def _write_run(
         folder.write_trajectory(trajectory, name)
     for name in ("frames.csv", "config.yaml"):
         if (run.path / name).is_file():
-            with folder.replacing(name) as temporary:
+            with whole_file(folder.path / name) as temporary:
                 shutil.copyfile(run.path / name, temporary)
     columns = move_landmarks(run.landmarks, before, run.tables, adjustment)
     write_ply(folder.path / "landmarks.ply", columns, LANDMARKS_COMMENT)
-    with folder.replacing("graph") as graph:
+    with whole_file(folder.path / "graph") as graph:
         write_graph(graph, run.tables, run.camera)
     if (run.path / MAP).is_file():
         state, camera = read_map(run.path)
         state = adjusted_map(state, run.tables, adjustment, camera, run.path / MAP)
-        with folder.replacing(MAP) as file:
+        with whole_file(folder.path / MAP) as file:
             write_map(file, state, camera)
     return moved["trajectory.txt"]
 

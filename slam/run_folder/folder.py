@@ -36,16 +36,16 @@ import errno
 import itertools
 import logging
 import os
-import shutil
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory, write_tum
+from bmask_slam.graph.whole_file import remove, remove_partial, whole_file
 from bmask_slam.run_folder.covariance_file import COVARIANCES
 from bmask_slam.run_folder.frame_file import COLUMNS, frame_row
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
@@ -110,12 +110,14 @@ class RunFolder:
             _clear(path, overwrite)
         else:
             _check_frames(path / "frames.csv", resume_bytes)
+            _check_no_links(path)
         try:
             mode = "a" if self._keep else "x"
             self._frames = (path / "frames.csv").open(mode, encoding="utf-8", newline="")
             _lock(self._frames, path)
             self._log = _LogFile(path / "log.txt", mode=mode, encoding="utf-8")
             self._frames.truncate(resume_bytes or 0)
+            remove_partial(path)
         except OSError as error:
             _remove_empty(self._made)
             raise _unwritable(path, error) from error
@@ -188,21 +190,8 @@ class RunFolder:
 
     def write_text(self, name: str, text: str) -> None:
         """Replace a text file."""
-        with self.replacing(name) as temporary:
+        with whole_file(self.path / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
-
-    @contextmanager
-    def replacing(self, name: str) -> Iterator[Path]:
-        """A temporary path, for a file or a folder, that replaces ``name`` when the block ends."""
-        path = self.path / name
-        temporary = path.with_name(f".partial-{name}")
-        try:
-            yield temporary
-            if path.is_dir():
-                shutil.rmtree(path)
-            os.replace(temporary, path)
-        finally:
-            _remove(self.path, [temporary.name])
 
 
 def _clear(path: Path, overwrite: bool) -> None:
@@ -249,6 +238,16 @@ def _check_frames(frames: Path, size: int) -> None:
         )
 
 
+def _check_no_links(folder: Path) -> None:
+    """Raise InputError if a file that a resumed run goes on with is a link."""
+    for name in ("frames.csv", "log.txt"):
+        if (folder / name).is_symlink():
+            raise InputError(
+                f"{folder / name}: is a link; nothing is written through it, start the run again "
+                "with --overwrite"
+            )
+
+
 def _make_folder(path: Path) -> list[Path]:
     """Make a folder and its parents; returns those that were made, the innermost first."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
@@ -276,8 +275,4 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 def _remove(folder: Path, names: Iterable[str]) -> None:
     """Remove the files and folders that exist."""
     for name in names:
-        path = folder / name
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        remove(folder / name)

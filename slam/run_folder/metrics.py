@@ -11,6 +11,7 @@ from bmask_slam.evaluation import Row, evaluate_trajectory, format_json
 from bmask_slam.evaluation.plot import plot_trajectory
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.run_folder.folder import RunFolder
 from bmask_slam.run_folder.landmark_file import write_landmarks
 from bmask_slam.runtime.memory import peak_rss_mb
@@ -110,7 +111,7 @@ def save(
     write_landmarks(folder.path / "landmarks.ply", system.landmarks())
     files = system.files()
     for name, write in files.items():
-        with folder.replacing(name) as temporary:
+        with whole_file(folder.path / name) as temporary:
             write(temporary)
     folder.write_text("metrics.json", format_json(rows))
     plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title)

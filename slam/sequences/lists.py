@@ -12,6 +12,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import check_name
 from bmask_slam.graph.trajectory import associate_stamps, check_seconds
 
 logger = logging.getLogger(__name__)
@@ -202,4 +203,6 @@ def _image_list(path: Path, rows: list[tuple[int, float, str]]) -> ImageList:
             )
     stamps_s = np.array([row[1] for row in rows])
     check_seconds(stamps_s, path)
+    for line, _, name in rows:
+        check_name(name, f"{path}:{line}")
     return ImageList(stamps_s, tuple(path.parent / row[2] for row in rows))

@@ -1,28 +1,54 @@
-"""A file that is written appears whole, or the old one stays."""
+"""Files that appear whole or not at all; links that lie in the folder are not followed."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.whole_file import whole_file, whole_folder
 
 
-def test_the_file_appears_at_the_end_of_the_block(tmp_path):
-    path = tmp_path / "map.ply"
-    path.write_text("old")
+def test_a_link_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
+    victim, path = tmp_path / "victim", tmp_path / "trajectory.txt"
+    victim.write_text("precious")
+    for name in (path.name, f"{path.name}.tmp", f".part-{path.name}"):
+        (tmp_path / name).symlink_to(victim)
     with whole_file(path) as temporary:
-        temporary.write_text("new")
-        assert path.read_text() == "old"
-        assert temporary.suffix == ".ply"
-    assert path.read_text() == "new"
-    assert list(tmp_path.iterdir()) == [path]
+        temporary.write_text("poses")
+    assert victim.read_text() == "precious"
+    assert not path.is_symlink()
+    assert path.read_text() == "poses"
 
 
-def test_the_old_file_stays_when_the_block_fails(tmp_path):
-    path = tmp_path / "map.ply"
-    path.write_text("old")
-    with pytest.raises(OSError, match="full"), whole_file(path) as temporary:
-        temporary.write_text("ne")
-        raise OSError("disk full")
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
+def test_a_linked_folder_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
+    victim, path = tmp_path / "victim", tmp_path / "dense"
+    victim.mkdir()
+    (victim / "a").write_text("precious")
+    path.symlink_to(victim)
+    with whole_folder(path) as temporary:
+        (temporary / "b").write_text("")
+    assert (victim / "a").read_text() == "precious"
+    assert [p.name for p in path.iterdir()] == ["b"]
+
+
+def test_after_an_error_the_old_content_is_there(tmp_path: Path) -> None:
+    file, folder = tmp_path / "a.txt", tmp_path / "b"
+    file.write_text("old")
+    folder.mkdir()
+    (folder / "old").write_text("")
+    with pytest.raises(ZeroDivisionError), whole_file(file) as temporary:
+        temporary.write_text("half")
+        raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError), whole_folder(folder) as temporary:
+        raise ZeroDivisionError
+    assert file.read_text() == "old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "b"]
+    assert (folder / "old").exists()
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
+    (tmp_path / "plain").write_text("")
+    with whole_file(tmp_path / "whole") as temporary:
+        temporary.write_text("")
+    assert (tmp_path / "whole").stat().st_mode == (tmp_path / "plain").stat().st_mode

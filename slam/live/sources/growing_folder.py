@@ -16,6 +16,7 @@ import numpy as np
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import is_inside
 from bmask_slam.graph.trajectory import Trajectory, check_seconds
 from bmask_slam.live.sources.pairing import DEPTH, RGB, Pairer
 from bmask_slam.live.sources.source import SourceCounts
@@ -188,11 +189,12 @@ class GrowingFolder:
             stamps_s = [float(text) for text in columns[::2]]
         except ValueError:
             stamps_s = [np.nan]
-        if len(columns) != (4 if kind is None else 2) or not np.isfinite(stamps_s).all():
+        files = columns[1::2]
+        whole = len(columns) == (4 if kind is None else 2) and np.isfinite(stamps_s).all()
+        if not whole or not all(map(is_inside, files)):
             self.counts.broken += 1
             logger.warning("%s: skipped the line %r", listed.path, line[:60])
             return []
-        files = columns[1::2]
         streams: tuple[int, ...] = (RGB, DEPTH)
         if kind is not None:
             streams = (kind,)

@@ -8,10 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pycocotools import mask as coco_mask
 from repository import SHARED
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.semantics.instances.coco_files import read_coco
+from bmask_slam.semantics.instances.coco_files import decoded_lengths, read_coco
 
 SQUARE = [2.0, 3.0, 6.0, 3.0, 6.0, 9.0, 2.0, 9.0]
 
@@ -59,6 +62,17 @@ def test_polygons_and_both_kinds_of_run_lengths(tmp_path: Path) -> None:
         ({"segmentation": None}, "no segmentation"),
         ({"segmentation": {"size": [9, 9], "counts": [81]}}, "size"),
         ({"segmentation": {"size": [12, 10], "counts": [5, 6]}}, "do not add up to 120"),
+        ({"segmentation": {"size": [12, 10], "counts": "1" * 1000 + "o"}}, "no compressed numbers"),
+        ({"segmentation": {"size": [12, 10], "counts": "1" * 1000}}, "do not add up to 120"),
+        ({"segmentation": {"size": [12, 10], "counts": "o"}}, "no compressed numbers"),
+        ({"segmentation": {"size": [12, 10], "counts": "\u20ac"}}, "no compressed numbers"),
+        ({"segmentation": {"size": [12, 10], "counts": [2**62, 2**62]}}, "counts"),
+        ({"segmentation": [[0, 0, 1e9, 0, 1e9, 1e9]]}, "no valid polygon"),
+        ({"segmentation": [[0.0, 0.0, 1e6, 1e6] * 6000]}, "no valid polygon"),
+        ({"segmentation": [["0", 0, 5, 0, 5, 5]]}, "no valid polygon"),
+        ({"image_id": [7]}, "image_id: input should be a valid integer"),
+        ({"score": float("inf")}, "score"),
+        ({"distribution": ["a"]}, "distribution.0"),
         ({"image_id": 99}, "image_id 99"),
         ({"category_id": 1}, "category_id 1"),
     ],
@@ -92,6 +106,36 @@ def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
         read_coco(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_coco(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"height": 0}, "images.0.height"),
+        ({"height": 60_000, "width": 60_000}, "megapixels"),
+        ({"width": 70_000}, "images.0.width"),
+        ({"id": [1]}, "images.0.id"),
+        ({"file_name": "../../victim/x.png"}, "image 7: '../../victim/x.png' leads out"),
+        ({"file_name": 5}, "images.0.file_name"),
+    ],
+)
+def test_impossible_images_are_refused(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    path = write(tmp_path / "c.json", [annotation()])
+    content = json.loads(path.read_text())
+    content["images"][0].update(change)
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"c\.json: ") as caught:
+        read_coco(path)
+    assert words in str(caught.value)
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 70_000), max_size=40))
+def test_compressed_run_lengths_are_decoded(lengths: list[int]) -> None:
+    height, width = 1, max(sum(lengths), 1)
+    plain = {"size": [height, width], "counts": lengths or [1]}
+    text = coco_mask.frPyObjects(plain, height, width)["counts"].decode()
+    assert decoded_lengths(text).tolist() == (lengths or [1])
 
 
 def test_the_real_excerpt() -> None:

@@ -69,16 +69,29 @@ def test_an_unknown_stage_is_a_bug(tmp_path: Path) -> None:
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     with RunFolder(tmp_path) as folder:
         folder.write_text("metrics.json", "old")
-        with pytest.raises(ZeroDivisionError), folder.replacing("metrics.json") as temporary:
-            temporary.write_text("half")
-            raise ZeroDivisionError
+        with pytest.raises(TypeError):
+            folder.write_text("metrics.json", None)  # type: ignore[arg-type]
         assert (tmp_path / "metrics.json").read_text() == "old"
-        for content in ("a", "b"):
-            with folder.replacing("graph") as temporary:
-                temporary.mkdir()
-                (temporary / content).write_text("")
-        assert [p.name for p in (tmp_path / "graph").iterdir()] == ["b"]
     assert [p.name for p in tmp_path.glob(".*")] == []
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    (tmp_path / ".part-0123.ply").write_text("half")
+    with RunFolder(tmp_path):
+        assert not list(tmp_path.glob(".part-*"))
+
+
+@pytest.mark.parametrize("name", ["frames.csv", "log.txt"])
+def test_a_resumed_run_writes_through_no_link(tmp_path: Path, name: str) -> None:
+    run, victim = tmp_path / "run", tmp_path / "victim"
+    with RunFolder(run) as folder:
+        size = folder.synced_bytes()
+    (run / name).rename(victim)
+    before = victim.read_bytes()
+    (run / name).symlink_to(victim)
+    with pytest.raises(InputError, match=rf"{name}: is a link"):
+        RunFolder(run, resume_bytes=size)
+    assert victim.read_bytes() == before
 
 
 def test_an_input_error_after_frames_keeps_them(tmp_path: Path) -> None:

@@ -1,0 +1,60 @@
+"""Names of files that stand in files: they may not lead out of their folder."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+from bmask_slam.graph.errors import InputError
+
+MAX_NAME_BYTES = 255
+MAX_PATH_BYTES = 1024
+
+
+def is_inside(name: str) -> bool:
+    """Whether ``check_name`` accepts a name."""
+    return not _fault(name)
+
+
+def check_name(name: str, where: str) -> str:
+    """A path relative to the folder of the file that names it, as it was given.
+
+    What a recording is made of may be links to elsewhere, which the user made; a name in a list
+    comes from a stranger.
+
+    Raises:
+        InputError: the name is empty, absolute, too long, has ``..`` or a NUL in it; ``where``
+            says where it stands.
+    """
+    fault = _fault(name)
+    if fault:
+        raise InputError(f"{where}: {name[:60]!r} {fault}; name it relative to the file's folder")
+    return name
+
+
+def _fault(name: str) -> str:
+    """What is wrong with a name; "" for a good one."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    parts = [part.encode(errors="surrogatepass") for part in path.parts]
+    if not parts or "\0" in name:
+        return "is no file name"
+    if path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
+        return "leads out of the folder"
+    if max(map(len, parts)) > MAX_NAME_BYTES or sum(map(len, parts)) > MAX_PATH_BYTES:
+        return "is too long for a file name"
+    return ""
+
+
+def target_below(root: Path, name: str) -> Path:
+    """A path below ``root`` to write a file to; folders are made, links are not followed.
+
+    Raises:
+        InputError: the name leads out of ``root``, or a folder on the way is a link.
+    """
+    path = root / check_name(name, str(root))
+    for folder in reversed(path.relative_to(root).parents):
+        if (root / folder).is_symlink() and folder.parts:
+            raise InputError(
+                f"{root / folder}: is a link; nothing is written through it, remove it"
+            )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path

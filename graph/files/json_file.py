@@ -1,0 +1,53 @@
+"""JSON files from elsewhere: parsed and checked against a schema before anything uses them."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import ConfigDict, StringConstraints, TypeAdapter, ValidationError
+
+from bmask_slam.graph.errors import InputError
+
+MAX_BYTES = 1 << 30
+Name = Annotated[str, StringConstraints(min_length=1, max_length=200)]
+"""A name of a class or the like."""
+STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="ignore", frozen=True)
+"""Of models: numbers are finite, and nothing is converted from another type but whole to float."""
+Content = TypeVar("Content")
+
+
+def read_json(path: Path, schema: type[Content], cure: str) -> Content:
+    """The content of a file, checked against ``schema``: any type that pydantic knows.
+
+    Raises:
+        InputError: a missing or very large file, no JSON, or not what the schema asks for; the line
+            names the file, the field, the value and the ``cure``.
+    """
+    try:
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= MAX_BYTES else b""
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {cure}") from error
+    if size > MAX_BYTES:
+        raise InputError(f"{path}: {size / 1e9:.1f} GB, more than {MAX_BYTES >> 30} GiB; {cure}")
+    try:
+        return _adapter(schema).validate_json(data, strict=True)
+    except ValidationError as error:
+        raise InputError(f"{path}: {first_problem(error)}; {cure}") from error
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first problem in the reader's words: where it is, what is wrong, what was found."""
+    found = error.errors(include_url=False)[0]
+    if found["type"] == "json_invalid":
+        return f"not JSON ({found['msg'].removeprefix('Invalid JSON: ')})"
+    where = ".".join(str(part) for part in found["loc"])[:100]
+    value = "" if found["type"] == "missing" else f", found {repr(found['input'])[:60]}"
+    return f"{where or 'content'}: {found['msg'][0].lower()}{found['msg'][1:200]}{value}"
+
+
+@cache
+def _adapter(schema: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(schema)

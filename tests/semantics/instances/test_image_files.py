@@ -1,0 +1,54 @@
+"""Images of strangers: their size is known before they are decoded."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.image_files import LIMIT, decode_bytes, read_colour
+
+
+def png_header(width: int, height: int) -> bytes:
+    """A PNG file of 69 bytes that claims a size, and has no pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        body = kind + data
+        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0\0\0\0")), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+@pytest.mark.parametrize(("width", "height"), [(40_000, 40_000), (2**31 - 1, 2**31 - 1)])
+def test_a_huge_size_is_refused_before_decoding(tmp_path: Path, width: int, height: int) -> None:
+    path = tmp_path / "bomb.png"
+    path.write_bytes(png_header(width, height))
+    with pytest.raises(InputError, match=r"bomb\.png: .* more than 100 megapixels"):
+        read_colour(path)
+
+
+def test_another_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = cv2.imencode(".png", np.zeros((300, 400, 3), np.uint8))[1].tobytes()
+    assert decode_bytes(data, cv2.IMREAD_COLOR, "a").shape == (300, 400, 3)
+    monkeypatch.setenv(LIMIT, "0.1")
+    with pytest.raises(InputError, match=r"400 x 300 pixels, more than 0\.1 megapixels"):
+        decode_bytes(data, cv2.IMREAD_COLOR, "a")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".webp", ".ppm"])
+def test_the_usual_formats(suffix: str) -> None:
+    data = cv2.imencode(suffix, np.full((30, 40, 3), 90, np.uint8))[1].tobytes()
+    assert abs(int(decode_bytes(data, cv2.IMREAD_COLOR, "a").mean()) - 90) <= 1
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89PNG", b"\xff\xd8\xff\xd9", b"II*\0" + b"\xff" * 40])
+def test_what_is_no_image_is_one_line(data: bytes) -> None:
+    with pytest.raises(InputError, match=r"a: .*; restore it or leave it out"):
+        decode_bytes(data, cv2.IMREAD_COLOR, "a")
