@@ -6,7 +6,6 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import IO
 
 import numpy as np
@@ -50,12 +49,7 @@ class CloudWriter:
         self._body.write(_rows(cloud, self._palette).tobytes())
         self.count += len(cloud)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
         assert self._body is not None
         with self._body as body:
             if error is None:

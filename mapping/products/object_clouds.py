@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
+from typing import Self
 
 import numpy as np
 
@@ -47,17 +47,17 @@ def assign_regions(cloud: Cloud, regions: Sequence[ObjectRegion]) -> Ints:
     return found
 
 
-class ObjectClouds:
+class ObjectClouds(ExitStack):
     """Writes FOLDER/NAME.ply and .pcd for every region with points; a context manager."""
 
     def __init__(self, folder: Path, regions: Sequence[ObjectRegion]) -> None:
+        super().__init__()
         self.folder, self.regions = folder, regions
-        self._stack = ExitStack()
         self._writers: dict[int, CloudWriter] = {}
 
-    def __enter__(self) -> ObjectClouds:
+    def __enter__(self) -> Self:
         shutil.rmtree(self.folder, ignore_errors=True)
-        return self
+        return super().__enter__()
 
     def write(self, cloud: Cloud) -> None:
         """Append a block of the map's cloud."""
@@ -66,18 +66,10 @@ class ObjectClouds:
             if k not in self._writers:
                 self.folder.mkdir(exist_ok=True)
                 writer = CloudWriter(self.folder / self.regions[k].name)
-                self._writers[k] = self._stack.enter_context(writer)
+                self._writers[k] = self.enter_context(writer)
             self._writers[k].write(cloud.select(found == k))
 
     @property
     def files(self) -> list[Path]:
         """The PLY files, in the order of the regions."""
         return [self._writers[k].stem.with_suffix(".ply") for k in sorted(self._writers)]
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._stack.__exit__(kind, error, traceback)

@@ -1,4 +1,4 @@
-"""Carrying out an experiment: render, run, evaluate, and keep what is done."""
+"""Running an experiment: render, run, evaluate, and keep the results."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 from bmask_slam.comparison.experiment.experiment import Configuration, Experiment
 from bmask_slam.comparison.experiment.experiment_file import read_experiment
-from bmask_slam.comparison.experiment.options import CompareOptions, chosen
+from bmask_slam.comparison.experiment.options import CompareOptions, select_part
 from bmask_slam.comparison.experiment.provenance import provenance
 from bmask_slam.comparison.experiment.result import (
     RESULTS,
@@ -25,7 +25,7 @@ from bmask_slam.comparison.experiment.result import (
     write_results,
 )
 from bmask_slam.comparison.jobs.bar import JobBar
-from bmask_slam.comparison.jobs.cells import Key
+from bmask_slam.comparison.jobs.cells import CellKey
 from bmask_slam.comparison.jobs.errors import Rules, run_figures, trajectory_errors
 from bmask_slam.comparison.jobs.external import other_methods, published_cells, trajectory_cells
 from bmask_slam.comparison.jobs.job import Job, Outcome, finished
@@ -36,26 +36,25 @@ from bmask_slam.graph.errors import InputError
 
 logger = logging.getLogger(__name__)
 
-Cells = dict[Key, Cell]
+Cells = dict[CellKey, Cell]
 
 
 def compare(
     experiment: str | Path | Experiment, out: str | Path, options: CompareOptions | None = None
 ) -> Comparison:
-    """Carry out an experiment, a file's or the shipped one of a name, in the folder ``out``.
+    """Run an experiment, from a file or a shipped one by name, in the folder ``out``.
 
-    Cells that are done there, with the same code, configuration and images, are not run again.
+    Cells that are done in ``out`` with the same code, configuration and images are not run again.
     ``out`` then holds ``results.json``, ``sequences/`` (rendered), ``cells/`` with a run folder and
-    a log each, and the report. A cell that fails is FAILED and does not end the others.
+    a log each, and the report. A cell that fails is FAILED and does not stop the others.
 
     Raises:
-        InputError: an experiment or an option that cannot be, or another comparison is at work in
-            ``out``.
+        InputError: an impossible experiment or option, or another comparison runs in ``out``.
     """
     options = options or CompareOptions()
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment)
-    experiment = chosen(experiment, options)
+    experiment = select_part(experiment, options)
     with _locked(Path(out).absolute()) as folder, _pool(options) as pool:
         plan = make_plan(experiment, folder, options)
         origin = provenance(experiment, pool.workers)
@@ -68,8 +67,8 @@ def compare(
             return comparison
 
         save()
-        _carry_out(plan, pool, cells, save, options.quiet)
-        others = tuple(_other_cells(plan))  # the truth of what is rendered is there only then
+        _run_missing(plan, pool, cells, save, options.quiet)
+        others = tuple(_other_cells(plan))  # again, since rendered sequences now have their truth
         comparison = save()
         write_report(comparison, folder)
         return comparison
@@ -79,32 +78,34 @@ def _pool(options: CompareOptions) -> LocalPool | RayPool:
     return RayPool(options.ray) if options.ray else LocalPool(options.workers)
 
 
-def _carry_out(
+def _run_missing(
     plan: Plan, pool: Pool, cells: Cells, save: Callable[[], object], quiet: bool
 ) -> None:
-    """Render what is missing, then run what is missing; each cell is saved when it ends."""
+    """Render missing sequences, then run missing cells; each cell is saved when it ends."""
     before = {key: finished(job) for key, job in plan.jobs.items()}
     cells |= {key: _run_cell(plan, key, outcome) for key, outcome in before.items() if outcome}
     save()
-    left = {plan.jobs[key].record: key for key, outcome in before.items() if outcome is None}
-    undrawn = [p.render for p in plan.places if p.render and not finished(p.render)]
-    with JobBar([*undrawn, *(plan.jobs[key] for key in left.values())], pool.workers, quiet) as bar:
-        failed = _draw(pool, undrawn, bar)
-        for record, key in list(left.items()):
-            render = plan.place(key[0], key[2]).render
+    remaining = {plan.jobs[key].record: key for key, outcome in before.items() if outcome is None}
+    to_render = [s.render for s in plan.sequences if s.render and not finished(s.render)]
+    with JobBar(
+        [*to_render, *(plan.jobs[key] for key in remaining.values())], pool.workers, quiet
+    ) as bar:
+        failed = _render(pool, to_render, bar)
+        for record, key in list(remaining.items()):
+            render = plan.sequence(key.sequence, key.seed).render
             if render is not None and render.record in failed:
-                cells[key] = _not_drawn(plan, cells[key], render, failed[render.record])
-                bar.drop(plan.jobs[left.pop(record)])
-        with closing(pool.run([plan.jobs[key] for key in left.values()])) as ended:
+                cells[key] = _not_rendered(plan, cells[key], render, failed[render.record])
+                bar.drop(plan.jobs[remaining.pop(record)])
+        with closing(pool.run([plan.jobs[key] for key in remaining.values()])) as ended:
             for job, outcome in ended:
-                key = left[job.record]
+                key = remaining[job.record]
                 cells[key] = _run_cell(plan, key, outcome)
                 bar.update(job, outcome)
                 save()
 
 
-def _draw(pool: Pool, jobs: list[Job], bar: JobBar) -> dict[str, Outcome]:
-    """Render sequences; those that failed, by their records."""
+def _render(pool: Pool, jobs: list[Job], bar: JobBar) -> dict[str, Outcome]:
+    """Render sequences; returns the outcomes of those that failed, by record."""
     failed = {}
     with closing(pool.run(jobs)) as ended:
         for job, outcome in ended:
@@ -117,35 +118,37 @@ def _draw(pool: Pool, jobs: list[Job], bar: JobBar) -> dict[str, Outcome]:
 # --- Cells ---------------------------------------------------------------------------------------
 
 
-def _pending(plan: Plan, key: Key) -> Cell:
-    """A cell before it is run, with the reason where it cannot be."""
-    sequence, method, seed = key
-    problem = plan.place(sequence, seed).problem
-    return Cell(sequence, method, seed, CellStatus.PENDING, error=problem)
+def _cell(key: CellKey, status: CellStatus, **values: str) -> Cell:
+    return Cell(key.sequence, key.configuration, key.seed, status, **values)
 
 
-def _not_drawn(plan: Plan, cell: Cell, render: Job, outcome: Outcome) -> Cell:
+def _pending(plan: Plan, key: CellKey) -> Cell:
+    """A cell before it is run, with the reason if it cannot be run."""
+    return _cell(key, CellStatus.PENDING, error=plan.sequence(key.sequence, key.seed).problem)
+
+
+def _not_rendered(plan: Plan, cell: Cell, render: Job, outcome: Outcome) -> Cell:
     """A cell whose sequence could not be rendered."""
-    error, log = f"rendering failed: {outcome.error}", _shown(plan, render.log)
+    error, log = f"rendering failed: {outcome.error}", _relative(plan, render.log)
     return replace(cell, status=CellStatus.FAILED, error=error, log=log)
 
 
-def _run_cell(plan: Plan, key: Key, outcome: Outcome) -> Cell:
-    """What a run that has ended gives."""
-    job, (sequence, method, seed) = plan.jobs[key], key
-    cell = Cell(sequence, method, seed, outcome.status, log=_shown(plan, job.log))
+def _run_cell(plan: Plan, key: CellKey, outcome: Outcome) -> Cell:
+    """The cell of a run that has ended."""
+    job = plan.jobs[key]
+    cell = _cell(key, outcome.status, log=_relative(plan, job.log))
     if outcome.status is not CellStatus.DONE:
         return replace(cell, error=outcome.error)
     run = Path(job.run)
     metrics = run_figures(run) | outcome.figures
-    cell = replace(cell, folder=_shown(plan, job.run))
-    trajectory, reference = run / "trajectory.txt", plan.place(sequence, seed).reference
+    cell = replace(cell, folder=_relative(plan, job.run))
+    trajectory, reference = run / "trajectory.txt", plan.sequence(key.sequence, key.seed).reference
     if reference is None:
-        return replace(cell, metrics=metrics, trajectory=_shown(plan, str(trajectory)))
+        return replace(cell, metrics=metrics, trajectory=_relative(plan, str(trajectory)))
     experiment = plan.experiment
     rules = Rules(experiment.max_time_difference_s, experiment.with_scale)
     cell = replace(
-        cell, trajectory=_shown(plan, str(trajectory)), reference=_shown(plan, str(reference))
+        cell, trajectory=_relative(plan, str(trajectory)), reference=_relative(plan, str(reference))
     )
     try:
         errors = trajectory_errors(trajectory, reference, rules)
@@ -178,12 +181,12 @@ def _comparison(plan: Plan, cells: Iterable[Cell], origin: dict[str, Any]) -> Co
 
 
 def _note(configuration: Configuration) -> str:
-    """What a configuration is for, and the options that make it."""
+    """A configuration's purpose, and its options."""
     words = " ".join(configuration.arguments())
     return "; ".join(filter(None, (configuration.note, words)))
 
 
-def _shown(plan: Plan, path: str) -> str:
+def _relative(plan: Plan, path: str) -> str:
     """A path relative to the comparison's folder; absolute outside it."""
     inside = Path(path).is_relative_to(plan.folder)
     return str(Path(path).relative_to(plan.folder)) if inside else str(Path(path).absolute())
@@ -191,7 +194,7 @@ def _shown(plan: Plan, path: str) -> str:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[Path]:
-    """The folder, made if need be, for this process alone. Raises InputError."""
+    """Make the folder if needed and lock it for this process. Raises InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = (folder / ".lock").open("w")
@@ -207,7 +210,7 @@ def _locked(folder: Path) -> Iterator[Path]:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise InputError(
-                    f"{folder}: another bmask-slam compare is at work there; wait for it"
+                    f"{folder}: another bmask-slam compare runs there; wait for it"
                 ) from error
         file.write(str(os.getpid()))
         yield folder

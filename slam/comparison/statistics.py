@@ -1,8 +1,8 @@
-"""What a comparison lets one say: summaries over seeds, and which of two methods is better.
+"""Statistics of a comparison: summaries over seeds, and tests whether a method is better.
 
-Two methods are compared in pairs: the same images, once by each. Of a rendered sequence every seed
-draws other images and gives a pair; the seeds of a recorded one share their images and give one
-pair, the medians. What is found is said of these sequences.
+Two methods are compared in pairs, on the same images. Each seed of a rendered sequence has other
+images and gives a pair; the seeds of a recorded one share their images and give one pair, of the
+medians. Verdicts hold for these sequences only.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from bmask_slam.graph.arrays import Array
 LEVEL = 0.05
 RESAMPLES = 10_000
 FEWER_TRACKED = 0.01
-BETTER, WORSE, NOTHING = "better", "worse", "no difference shown"
+BETTER, WORSE, NO_DIFFERENCE = "better", "worse", "no difference shown"
 TRACKED = "tracked_share"
 TOO_FEW = "too few pairs for a verdict"
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Median and range of a metric over the cells that are done, and how many those are."""
+    """Median, range and number of values of a metric over the cells that are done."""
 
     median: float
     low: float
@@ -39,19 +39,19 @@ class Summary:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A method against the first one in a metric.
+    """A method compared with the baseline in a metric.
 
     Attributes:
         metric, method, baseline: names.
         judgement: BETTER or WORSE than the baseline, if the interval excludes 0 and the sign test
-            agrees, else NOTHING.
+            agrees, else NO_DIFFERENCE.
         difference: mean of method minus baseline over the pairs, in the unit of metrics.json;
             NaN without a pair.
         low, high: 95 % bootstrap interval of it.
         pairs: compared; wins: those in which the method is better; losses: worse.
-        left_out: pairs that one of the two has no figure for, as when its run failed.
+        incomplete: pairs in which one method has no value, as when its run failed.
         p_value: of the exact two-sided sign test, after Holm's correction for all that is judged.
-        note: what must be known beside it.
+        note: a remark to print with it.
     """
 
     metric: str
@@ -64,7 +64,7 @@ class Verdict:
     pairs: int
     wins: int
     losses: int
-    left_out: int
+    incomplete: int
     p_value: float
     note: str = ""
 
@@ -76,10 +76,10 @@ def summarise(cells: Iterable[Cell], metric: str) -> Summary | None:
 
 
 def verdicts(comparison: Comparison, metrics: Sequence[str] | None = None) -> tuple[Verdict, ...]:
-    """Every other method that was evaluated here against the first configuration.
+    """Compare every other method that was evaluated here with the first configuration.
 
-    ``metrics`` None: those that the experiment names. Methods aligned otherwise (Sim(3)) are left
-    out, as are metrics that the two do not share.
+    ``metrics`` None: those that the experiment names. Methods with another alignment (Sim(3)) are
+    excluded, as are metrics that the two methods do not share.
     """
     if metrics is None:
         stated = comparison.provenance.get("experiment", {}).get("verdicts", VERDICT_METRICS)
@@ -95,7 +95,7 @@ def verdicts(comparison: Comparison, metrics: Sequence[str] | None = None) -> tu
 def pairs(
     comparison: Comparison, methods: tuple[str, str], metric: str
 ) -> tuple[Array, Array, int]:
-    """Values (N,) of two methods on the same images, and how many pairs lack one of the two."""
+    """Values (N,) of two methods on the same images, and the number of incomplete pairs."""
     values: list[tuple[float, float]] = []
     for sequence in comparison.sequences:
         cells = [list(comparison.of(sequence, method)) for method in methods]
@@ -105,11 +105,11 @@ def pairs(
             by_seed = [{c.seed: value_of(c, metric) for c in own} for own in cells]
             values += [(by_seed[0][s], by_seed[1][s]) for s in by_seed[0] if s in by_seed[1]]
         else:
-            middle = [summarise(own, metric) for own in cells]
-            values.append(tuple(s.median if s else nan for s in middle))  # type: ignore[arg-type]
+            medians = [summarise(own, metric) for own in cells]
+            values.append(tuple(s.median if s else nan for s in medians))  # type: ignore[arg-type]
     table = np.array(values, float).reshape(-1, 2)
-    whole = np.isfinite(table).all(axis=1)
-    return table[whole, 0], table[whole, 1], int((~whole).sum())
+    complete = np.isfinite(table).all(axis=1)
+    return table[complete, 0], table[complete, 1], int((~complete).sum())
 
 
 def value_of(cell: Cell, metric: str) -> float:
@@ -132,14 +132,14 @@ def bootstrap_interval(differences: Array, level: float = LEVEL) -> tuple[float,
 
 
 def sign_test(wins: int, losses: int) -> float:
-    """Two-sided p-value of so many signs either way, if both were equally likely; ties left out."""
+    """Two-sided p-value of the exact sign test for numbers of wins and losses, without ties."""
     count = wins + losses
     tail = sum(comb(count, k) for k in range(min(wins, losses) + 1))
     return float(min(1.0, 2 * tail / 2**count))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Corrected p-values (Holm 1979), in their order: one false one at all is as rare as told."""
+    """Corrected p-values (Holm 1979), in their order; they bound the family-wise error rate."""
     order = sorted(range(len(p_values)), key=lambda k: p_values[k])
     corrected, highest = [0.0] * len(p_values), 0.0
     for rank, k in enumerate(order):
@@ -149,56 +149,56 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def _verdict(comparison: Comparison, base: Method, method: Method, metric: str) -> Verdict:
-    """With the p-value as it is, and no judgement."""
-    theirs, own, left_out = pairs(comparison, (base.name, method.name), metric)
-    difference = own - theirs
-    good = -1 if BY_NAME[metric].lower_is_better else 1
-    wins, losses = int((good * difference > 0).sum()), int((good * difference < 0).sum())
+    """A verdict with the uncorrected p-value, without a judgement."""
+    base_values, values, incomplete = pairs(comparison, (base.name, method.name), metric)
+    difference = values - base_values
+    sign = -1 if BY_NAME[metric].lower_is_better else 1
+    wins, losses = int((sign * difference > 0).sum()), int((sign * difference < 0).sum())
     low, high = bootstrap_interval(difference)
     return Verdict(
         metric,
         method.name,
         base.name,
-        NOTHING,
+        NO_DIFFERENCE,
         float(difference.mean()) if len(difference) else nan,
         low,
         high,
         len(difference),
         wins,
         losses,
-        left_out,
+        incomplete,
         sign_test(wins, losses),
         _note(comparison, base, method),
     )
 
 
 def _corrected(found: list[Verdict]) -> tuple[Verdict, ...]:
-    """Judged, after the correction for their number."""
+    """The verdicts with corrected p-values and judgements."""
     corrected = holm([v.p_value for v in found])
     judged = (replace(v, p_value=p) for v, p in zip(found, corrected, strict=True))
-    return tuple(replace(v, judgement=_judgement(v), note=_with_number(v)) for v in judged)
+    return tuple(replace(v, judgement=_judgement(v), note=_note_with_count(v)) for v in judged)
 
 
-def _with_number(verdict: Verdict) -> str:
-    """The note, which also says where no outcome of so few pairs could be a verdict."""
+def _note_with_count(verdict: Verdict) -> str:
+    """The note; it also states if no outcome of so few pairs could be significant."""
     few = sign_test(verdict.pairs, 0) > LEVEL
     return "; ".join(filter(None, [TOO_FEW if few else "", verdict.note]))
 
 
 def _judgement(verdict: Verdict) -> str:
-    """Interval and sign test must both say so, and in the same direction."""
-    good = -1 if BY_NAME[verdict.metric].lower_is_better else 1
+    """BETTER or WORSE if interval and sign test are significant in the same direction."""
+    sign = -1 if BY_NAME[verdict.metric].lower_is_better else 1
     if verdict.p_value > LEVEL or isnan(verdict.low) or verdict.low <= 0 <= verdict.high:
-        return NOTHING
-    by_mean, by_signs = good * verdict.low > 0, verdict.wins > verdict.losses
+        return NO_DIFFERENCE
+    by_mean, by_signs = sign * verdict.low > 0, verdict.wins > verdict.losses
     if by_mean != by_signs:
-        return NOTHING
+        return NO_DIFFERENCE
     return BETTER if by_mean else WORSE
 
 
 def _note(comparison: Comparison, base: Method, method: Method) -> str:
-    """A method that tracks less of a sequence may leave out its hard parts."""
-    theirs, own, _ = pairs(comparison, (base.name, method.name), TRACKED)
-    if not len(own) or abs(fmean(own) - fmean(theirs)) < FEWER_TRACKED:
+    """A remark if a method tracks less of a sequence, which may exclude its hard parts."""
+    base_shares, shares, _ = pairs(comparison, (base.name, method.name), TRACKED)
+    if not len(shares) or abs(fmean(shares) - fmean(base_shares)) < FEWER_TRACKED:
         return ""
-    return f"tracks {100 * fmean(own):.0f} % against {100 * fmean(theirs):.0f} %"
+    return f"tracks {100 * fmean(shares):.0f} % against {100 * fmean(base_shares):.0f} %"

@@ -15,7 +15,7 @@ MAIN_METRIC = "ate_rmse"
 def format_comparison(comparison: Comparison) -> str:
     """The table of the main metric, the verdicts, and every cell without figures.
 
-    Where all verdicts have too few pairs to be any, one line says so; the report holds them.
+    If all verdicts have too few pairs, one line states it; the report lists them.
     """
     found = verdicts(comparison)
     judged = format_verdicts(found)
@@ -35,7 +35,7 @@ def format_table(comparison: Comparison, metric: str) -> str:
 
 
 def format_verdicts(found: tuple[Verdict, ...]) -> str:
-    """A line for each, the metrics under each other; "" without any."""
+    """A line for each verdict, in columns; "" without any."""
     if not found:
         return ""
     lines = [_verdict(v, v.metric != before) for before, v in _with_previous(found)]
@@ -58,7 +58,7 @@ def _verdict(v: Verdict, first: bool) -> tuple[str, ...]:
     """The columns of a verdict; its metric is named in the first line of each."""
     metric = BY_NAME[v.metric]
     shown = [f"{metric.scale * x:+.{metric.digits + 1}f}" for x in (v.difference, v.low, v.high)]
-    notes = [f"{v.left_out} pairs without figures"] * bool(v.left_out) + [v.note] * bool(v.note)
+    notes = [f"{v.incomplete} pairs without figures"] * bool(v.incomplete) + [v.note] * bool(v.note)
     return (
         f"{metric.title} ({metric.unit})" if first else "",
         v.method,
@@ -77,7 +77,7 @@ def _aligned(lines: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 def format_problems(comparison: Comparison) -> str:
-    """What failed or is not there, a line for each reason with all cells that it holds for."""
+    """Failed and pending cells, a line for each reason."""
     found: dict[tuple[str, ...], list[str]] = {}
     for cell in comparison.cells:
         if cell.status is not CellStatus.DONE:

@@ -9,7 +9,6 @@ import time
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
@@ -99,12 +98,7 @@ class LiveSlam:
     def __enter__(self) -> LiveSlam:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _open_recorder(self, stack: ExitStack) -> Recorder | None:

@@ -1,1 +1,1 @@
-"""What is compared: experiment files, where their data is, and what a comparison holds."""
+"""Experiments: files, options, data folders, results and their provenance."""

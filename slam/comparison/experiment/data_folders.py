@@ -1,4 +1,4 @@
-"""Finding recordings, ground truth and trajectories in the folders where a user keeps them."""
+"""Finding recordings, ground truth and trajectories in the user's data folders."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ PREFIXES = ("", "rgbd_dataset_", "rgbd_bonn_")  # of the folders in the archives
 
 
 @dataclass(frozen=True)
-class Site:
+class SequenceLocation:
     """Where a sequence was found.
 
     Attributes:
-        folder: with images; None without.
-        reference: its ground truth; None without.
-        problem: why there are no images and what to do; "" where there are.
+        folder: of the images; None if they were not found.
+        reference: its ground truth; None if it was not found.
+        problem: why there are no images, and the cure; "" if there are.
     """
 
     folder: Path | None
@@ -37,37 +37,37 @@ def data_folders(given: Iterable[Path] = ()) -> tuple[Path, ...]:
     return tuple(dict.fromkeys([*given, *(Path(name) for name in named if name), DEFAULT]))
 
 
-def find_site(
+def locate_sequence(
     source: SequenceSource,
     experiment: Experiment,
     folders: Iterable[Path],
     trajectories: list[Path],
-) -> Site:
+) -> SequenceLocation:
     """Look for a sequence that is not rendered, and for its ground truth.
 
     The truth is the source's own, the folder's, or ``NAME-groundtruth.txt`` in a data folder or
     beside one of the ``trajectories``.
     """
     roots = [experiment.file.parent, *folders]
-    found = [p for root in roots for p in _places(root, source.folder) if p.is_dir()]
+    found = [p for root in roots for p in _candidate_folders(root, source.folder) if p.is_dir()]
     with_images = (p for p in found if (p / "rgb.txt").is_file() or _associated(p))
     folder = next(with_images, None)
-    beside = [path.parent for path in trajectories]
-    truths = [source.reference] if source.reference else list(_truths(source, found, roots, beside))
+    near = [path.parent for path in trajectories]
+    truths = [source.reference] if source.reference else list(_truths(source, found, roots, near))
     reference = next((p for p in truths if p.is_file()), None)
     if folder is not None:
-        return Site(folder, reference)
-    return Site(None, reference, _problem(source, found))
+        return SequenceLocation(folder, reference)
+    return SequenceLocation(None, reference, _problem(source, found))
 
 
 def find_file(name: str, experiment: Experiment, folders: Iterable[Path]) -> Path | None:
-    """A file by its path from the experiment's file or a data folder on."""
+    """A file by its path relative to the experiment's file or a data folder."""
     candidates = (root / name for root in (experiment.file.parent, *folders))
     return next((path for path in candidates if path.is_file()), None)
 
 
-def _places(root: Path, name: str) -> Iterator[Path]:
-    """``tum/freiburg1_xyz`` as such, by its last part, and as the archives call it."""
+def _candidate_folders(root: Path, name: str) -> Iterator[Path]:
+    """Paths for ``tum/freiburg1_xyz``: as given, by its last part, and with archives' prefixes."""
     path = Path(name)
     for prefix in PREFIXES:
         yield root / path.with_name(prefix + path.name)
@@ -79,19 +79,19 @@ def _associated(folder: Path) -> bool:
 
 
 def _truths(
-    source: SequenceSource, found: list[Path], roots: list[Path], beside: list[Path]
+    source: SequenceSource, found: list[Path], roots: list[Path], near: list[Path]
 ) -> Iterator[Path]:
     yield from (folder / TRUTH for folder in found)
     last = Path(source.folder).name
     names = dict.fromkeys([source.name, last, last.replace("freiburg", "fr")])
-    for root in (*roots, *beside):
+    for root in (*roots, *near):
         yield from (root / f"{name}{mark}{TRUTH}" for name in names for mark in "-_")
-    yield from (folder / TRUTH for folder in beside)
+    yield from (folder / TRUTH for folder in near)
 
 
 def _problem(source: SequenceSource, found: list[Path]) -> str:
     if found:
-        return f"{found[0]}: holds no rgb.txt; restore it, or give the folder of the images"
+        return f"{found[0]}: holds no rgb.txt; restore it or give the folder of the images"
     cure = f"{source.folder}: not found; give DIR by --data, where DIR/{source.folder} lies"
     if source.folder in read_catalogue():
         cure += f", or bmask-slam download {source.folder} --to DIR"

@@ -11,7 +11,7 @@ from bmask_slam.rendering.sequence import RenderConfig
 VERDICT_METRICS = ("ate_rmse", "rpe_trans_rmse_second", "rpe_rot_rmse_second")
 """Not times: cells that run side by side disturb each other's."""
 OPTIONS = ("segmenter", "weights", "max_frames", "stride", "dense")
-"""What a configuration can say beside its parameters."""
+"""Options of a configuration besides its parameters."""
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class SequenceSource:
 
     Attributes:
         name: as printed, unique.
-        folder: a path, from the experiment's file on, or what a data folder holds, such as
-            ``tum/freiburg1_xyz``; "" where it is rendered.
-        render: what to draw, the seed being each cell's; None for a folder.
-        reference: file that takes the place of the folder's own ground truth.
-        camera: camera.yaml that takes the place of the folder's own.
+        folder: a path relative to the experiment's file or a data folder, such as
+            ``tum/freiburg1_xyz``; "" if it is rendered.
+        render: what to render, with the seed of each cell; None for a folder.
+        reference: file that replaces the folder's ground truth.
+        camera: camera.yaml that replaces the folder's.
     """
 
     name: str
@@ -36,10 +36,10 @@ class SequenceSource:
 
 @dataclass(frozen=True)
 class Configuration:
-    """This system with some of its parameters changed: what ``bmask-slam run`` is called with.
+    """This system with some of its parameters changed: the options of ``bmask-slam run``.
 
     Attributes:
-        note: what it is for, printed with the tables.
+        note: its purpose, printed with the tables.
         config: YAML file or the name of a shipped one.
         set: ``a.b=c`` each.
         segmenter, weights: as ``--segmenter`` and ``--weights``.
@@ -57,7 +57,7 @@ class Configuration:
     dense: bool = False
 
     def arguments(self) -> list[str]:
-        """For the command line of ``bmask-slam run``."""
+        """The options of the command line ``bmask-slam run``."""
         named = ("config", "segmenter", "weights", "max_frames", "stride")
         given = {name: value for name in named if (value := getattr(self, name))}
         words = [w for name, v in given.items() for w in (f"--{name.replace('_', '-')}", str(v))]
@@ -72,8 +72,8 @@ class OtherSystem:
     Attributes:
         note: what it is.
         with_scale: align its trajectories by Sim(3).
-        trajectories: file by sequence, or by ``SEQUENCE@SEED`` of a rendered one; looked for from
-            the experiment's file on and in the data folders.
+        trajectories: file by sequence, or by ``SEQUENCE@SEED`` of a rendered one; relative
+            to the experiment's file or a data folder.
     """
 
     note: str = ""
@@ -93,18 +93,18 @@ class Quotation:
 
 @dataclass(frozen=True)
 class Experiment:
-    """All that an experiment's file says.
+    """The contents of an experiment's file.
 
     Attributes:
-        name, title, description: of it.
-        file: where it was read; relative paths begin there.
+        name, title, description: texts for the report.
+        file: its path; other paths are relative to its folder.
         sequences: in the order of the columns.
-        configurations: by name, in the order of the rows; the first is what others are held to.
-        seeds: of a rendered sequence the seed draws the images; of all it is the system's own.
+        configurations: by name, in the order of the rows; the first is the baseline.
+        seeds: of the system, and of the images of rendered sequences.
         systems: other systems by name.
-        published: what others wrote.
+        published: figures from the literature.
         with_scale: align all runs by Sim(3).
-        max_time_difference_s: largest difference of the stamps of poses that belong together.
+        max_time_difference_s: largest difference of the stamps of associated poses.
         verdicts: metrics by which configurations are judged.
         networks: folders of trained networks by name, whose curves the report draws.
     """

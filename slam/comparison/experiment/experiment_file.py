@@ -30,8 +30,8 @@ GROUPS = ("sequences", "configurations", "systems", "published", "networks")
 
 
 @dataclass(frozen=True)
-class _Plain:
-    """The keys of an experiment whose values are plain."""
+class _Settings:
+    """The keys of an experiment whose values are settings."""
 
     name: str = ""
     title: str = ""
@@ -77,11 +77,11 @@ def read_experiment(name: str | Path) -> Experiment:
     """
     file = find_experiment(name)
     tree = _mapping(read_yaml(file), str(file), "the whole")
-    known = [*(f.name for f in fields(_Plain)), *GROUPS]
+    known = [*(f.name for f in fields(_Settings)), *GROUPS]
     for key in tree:
         if key not in known:
             raise InputError(f"{file}: unknown key {key}; there are: {', '.join(known)}")
-    plain = from_tree(_Plain, {k: v for k, v in tree.items() if k not in GROUPS}, str(file))
+    settings = from_tree(_Settings, {k: v for k, v in tree.items() if k not in GROUPS}, str(file))
     sequences = tuple(_sequences(file, tree.get("sequences")))
     configurations = dict(_configurations(file, tree.get("configurations")))
     systems = dict(_systems(file, tree.get("systems")))
@@ -89,24 +89,24 @@ def read_experiment(name: str | Path) -> Experiment:
     _check_names(file, sequences, (configurations, systems, {q.method: q for q in published}))
     _check_sequences(file, {s.name for s in sequences}, systems, published)
     return Experiment(
-        plain.name or file.stem,
-        plain.title or plain.name or file.stem,
+        settings.name or file.stem,
+        settings.title or settings.name or file.stem,
         file,
         sequences,
-        plain.description.strip(),
+        settings.description.strip(),
         configurations,
-        plain.seeds,
+        settings.seeds,
         systems,
         published,
-        plain.with_scale,
-        plain.max_time_difference_s,
-        plain.verdicts,
+        settings.with_scale,
+        settings.max_time_difference_s,
+        settings.verdicts,
         dict(_networks(file, tree.get("networks"))),
     )
 
 
 def _sequences(file: Path, tree: Any) -> Iterator[SequenceSource]:
-    """A sequence is a text, its folder, or keys; ``render`` has those of RenderConfig."""
+    """A sequence is a text (its folder) or keys; ``render`` has the keys of RenderConfig."""
     if not tree:
         raise InputError(f"{file}: sequences is missing; give at least one, as NAME: FOLDER")
     for name, given in _mapping(tree, str(file), "sequences").items():
@@ -116,9 +116,9 @@ def _sequences(file: Path, tree: Any) -> Iterator[SequenceSource]:
         rest = from_tree(_Folder, keys, where)
         if bool(rest.folder) == (render is not None):
             raise InputError(f"{where}: give either folder or render")
-        beside = {key: _beside(file, getattr(rest, key)) for key in ("reference", "camera")}
-        drawn = None if render is None else _render(render, f"{where}.render")
-        yield SequenceSource(name, rest.folder, drawn, **beside)
+        files = {key: _relative_to(file, getattr(rest, key)) for key in ("reference", "camera")}
+        config = None if render is None else _render(render, f"{where}.render")
+        yield SequenceSource(name, rest.folder, config, **files)
 
 
 def _render(tree: Any, where: str) -> RenderConfig:
@@ -127,19 +127,19 @@ def _render(tree: Any, where: str) -> RenderConfig:
         raise InputError(f"{where}: seed = {keys['seed']!r} is each cell's own; write it in seeds")
     if keys.get("name") not in SCENES:
         raise InputError(
-            f"{where}: name = {keys.get('name')!r} is no scene; there are: {', '.join(SCENES)}"
+            f"{where}: name = {keys.get('name')!r} is not a scene; there are: {', '.join(SCENES)}"
         )
     return from_tree(RenderConfig, keys, where)
 
 
 def _configurations(file: Path, tree: Any) -> Iterator[tuple[str, Configuration]]:
-    """Each is resolved once, so that a wrong key is found before anything is run."""
+    """The configurations; each is resolved once, so that a wrong key is found before any run."""
     for name, given in _mapping(tree or {}, str(file), "configurations").items():
         where = f"{file}: configurations.{name}"
         found = from_tree(Configuration, given or {}, where)
         if found.config and not re.fullmatch(r"[\w-]+", found.config):
-            beside = str(_beside(file, Path(found.config)))
-            found = from_tree(Configuration, {**(given or {}), "config": beside}, where)
+            path = str(_relative_to(file, Path(found.config)))
+            found = from_tree(Configuration, {**(given or {}), "config": path}, where)
         for key in ("max_frames", "stride"):
             value = getattr(found, key)
             if value is not None and value < 1:
@@ -159,12 +159,12 @@ def _systems(file: Path, tree: Any) -> Iterator[tuple[str, OtherSystem]]:
         for sequence, path in files.items():
             if not isinstance(path, str):
                 raise InputError(f"{where}.trajectories.{sequence} = {path!r}: give a file's path")
-        plain = from_tree(OtherSystem, keys, where)
-        yield name, OtherSystem(plain.note, plain.with_scale, files)
+        settings = from_tree(OtherSystem, keys, where)
+        yield name, OtherSystem(settings.note, settings.with_scale, files)
 
 
 def _networks(file: Path, tree: Any) -> Iterator[tuple[str, Path]]:
-    """A folder each, as a path from the experiment's file on."""
+    """A folder each, relative to the experiment's file."""
     for name, path in _mapping(tree or {}, str(file), "networks").items():
         if not isinstance(path, str) or not (file.parent / path).is_dir():
             raise InputError(
@@ -210,7 +210,7 @@ def _numbers(where: str, metric: str, tree: Any) -> Iterator[tuple[str, float]]:
 def _check_names(
     file: Path, sequences: Iterable[SequenceSource], groups: tuple[dict[str, Any], ...]
 ) -> None:
-    """Names are printed and become folders; a method's name stands for one thing only."""
+    """Check that names can be folders and are unique."""
     methods = [name for group in groups for name in group]
     for kind, names in (("sequence", [s.name for s in sequences]), ("method", methods)):
         slugs: dict[str, str] = {}
@@ -218,7 +218,7 @@ def _check_names(
             if not NAME.fullmatch(name) or not slug(name).strip("-."):
                 raise InputError(f"{file}: {kind} {name!r}: use letters and digits, not / \\ @ = :")
             if slug(name) in slugs:
-                raise InputError(f"{file}: {kind}s {slugs[slug(name)]!r} and {name!r}: too alike")
+                raise InputError(f"{file}: {kind}s {slugs[slug(name)]!r} and {name!r}: too similar")
             slugs[slug(name)] = name
 
 
@@ -237,20 +237,20 @@ def _check_sequences(
 
 
 def slug(name: str) -> str:
-    """The name as a folder's."""
+    """The name of a folder for a name."""
     return re.sub(r"[^\w.-]+", "-", name)
 
 
 def _mapping(tree: Any, source: str, path: str = "") -> dict[str, Any]:
-    """The mapping itself, with its keys as texts, or InputError."""
+    """The mapping with its keys as texts. Raises InputError."""
     if not isinstance(tree, dict):
         shown = f"{path} = {tree!r}" if path else repr(tree)
         raise InputError(f"{source}: {shown}: give a group of keys")
     return {str(key): value for key, value in tree.items()}
 
 
-def _beside(file: Path, path: Path | None) -> Path | None:
-    """A path that begins at the experiment's file."""
+def _relative_to(file: Path, path: Path | None) -> Path | None:
+    """A path relative to the experiment's file."""
     return None if path is None else file.parent / path
 
 

@@ -1,4 +1,4 @@
-"""The metrics of a comparison: what each is called, its unit, and which way is better."""
+"""The metrics of a comparison: name, unit and direction of each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Metric:
         unit: of the printed number.
         scale: printed = stored x scale.
         digits: after the point.
-        lower_is_better: None where neither way is.
+        lower_is_better: None if neither direction is better.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""How an experiment is carried out, and which part of it."""
+"""Options of a comparison, and the part of an experiment that they select."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ Files = dict[tuple[str, str], Path]
 
 @dataclass(frozen=True)
 class CompareOptions:
-    """How an experiment is carried out.
+    """Options of a comparison.
 
     Attributes:
         data: folders in which recordings and trajectories are looked for, before those of the
             environment variable BMASK_SLAM_DATA and ``data``.
-        references: ground truth by sequence, in place of its own.
+        references: ground truth by sequence, instead of its own.
         trajectories: of other systems, by method and sequence.
-        seeds, sequences, configurations: only these of the experiment's; None for all.
+        seeds, sequences, configurations: those to use; None for all.
         workers: jobs at a time; None: as many as there are cores.
         ray: address of a Ray cluster to use instead of this machine.
-        with_scale: align all runs by Sim(3), whatever the experiment says.
+        with_scale: align all runs by Sim(3), also if the experiment does not.
         quiet: no progress bar.
     """
 
@@ -58,21 +58,21 @@ def parse_trajectory(text: str) -> tuple[tuple[str, str], Path]:
     return (method, sequence), Path(file)
 
 
-def with_files(experiment: Experiment, files: Files) -> Experiment:
-    """The experiment with the given files in place of its own, and their systems if it lacks them.
+def with_trajectories(experiment: Experiment, files: Files) -> Experiment:
+    """The experiment with the given trajectories, which replace its own or add a system.
 
     Raises:
-        InputError: a file that does not exist, or a sequence or method that cannot be.
+        InputError: a file that does not exist, an unknown sequence, or a method's name in use.
     """
     systems = dict(experiment.systems)
     for (method, sequence), file in files.items():
-        there = [s.name for s in experiment.sequences]
-        if sequence.partition("@")[0] not in there:
+        known = [s.name for s in experiment.sequences]
+        if sequence.partition("@")[0] not in known:
             raise InputError(
-                f"--trajectory {method}:{sequence}: no such sequence; there are: {', '.join(there)}"
+                f"--trajectory {method}:{sequence}: no such sequence; there are: {', '.join(known)}"
             )
-        taken = [*experiment.configurations, *(q.method for q in experiment.published)]
-        if method in taken:
+        used = [*experiment.configurations, *(q.method for q in experiment.published)]
+        if method in used:
             raise InputError(f"--trajectory {method}:{sequence}: {method!r} is another row's name")
         if not file.is_file():
             raise InputError(f"{file}: no such file; give a trajectory in TUM format")
@@ -82,8 +82,8 @@ def with_files(experiment: Experiment, files: Files) -> Experiment:
     return replace(experiment, systems=systems)
 
 
-def chosen(experiment: Experiment, options: CompareOptions) -> Experiment:
-    """The part of an experiment that is asked for, with the files that are given.
+def select_part(experiment: Experiment, options: CompareOptions) -> Experiment:
+    """The part of an experiment that the options select, with their files.
 
     Raises:
         InputError: a name that the experiment does not have, or a file that does not exist.
@@ -95,16 +95,16 @@ def chosen(experiment: Experiment, options: CompareOptions) -> Experiment:
     for path in options.references.values():
         if not path.is_file():
             raise InputError(f"--reference {path}: no such file; give a trajectory in TUM format")
-    experiment = with_files(experiment, options.trajectories)
-    kept = set(names if options.sequences is None else options.sequences)
+    experiment = with_trajectories(experiment, options.trajectories)
+    selected = set(names if options.sequences is None else options.sequences)
     rows = options.configurations
     sequences = tuple(
         replace(s, reference=options.references.get(s.name, s.reference))
         for s in experiment.sequences
-        if s.name in kept
+        if s.name in selected
     )
     return replace(
-        _without_others(experiment, kept),
+        _without_others(experiment, selected),
         sequences=sequences,
         configurations={
             k: v for k, v in experiment.configurations.items() if rows is None or k in rows
@@ -114,11 +114,11 @@ def chosen(experiment: Experiment, options: CompareOptions) -> Experiment:
     )
 
 
-def _without_others(experiment: Experiment, kept: set[str]) -> Experiment:
+def _without_others(experiment: Experiment, selected: set[str]) -> Experiment:
     """Without the trajectories and published figures of other sequences."""
 
     def only(values: Mapping[str, Value]) -> dict[str, Value]:
-        return {key: value for key, value in values.items() if key.partition("@")[0] in kept}
+        return {key: value for key, value in values.items() if key.partition("@")[0] in selected}
 
     systems = {
         name: replace(system, trajectories=only(system.trajectories))
@@ -136,9 +136,9 @@ def _without_others(experiment: Experiment, kept: set[str]) -> Experiment:
 
 
 def _check(
-    flag: str, asked: Iterable[str] | None, there: Iterable[str], experiment: Experiment
+    flag: str, names: Iterable[str] | None, known: Iterable[str], experiment: Experiment
 ) -> None:
-    unknown = [name for name in asked or () if name not in there]
+    unknown = [name for name in names or () if name not in known]
     if unknown:
-        known = ", ".join(there)
-        raise InputError(f"{flag} {unknown[0]}: not in {experiment.file}; there are: {known}")
+        listed = ", ".join(known)
+        raise InputError(f"{flag} {unknown[0]}: not in {experiment.file}; there are: {listed}")

@@ -1,6 +1,6 @@
-"""Where figures come from, and hashes of what they depend on.
+"""Provenance of figures, and hashes of what they depend on.
 
-Equal hashes mean that nothing has changed, so that a result can be kept.
+A result is kept if the hashes are equal.
 """
 
 from __future__ import annotations
@@ -28,23 +28,14 @@ from bmask_slam.system_config import SystemConfig
 PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "open3d", "scipy", "torch", "faiss-cpu")
 SYSTEM = Path(__file__).parents[2]
 LAYERS = (*tuple(Path(layer.__path__[0]) for layer in (graph, semantics, mapping)), SYSTEM)
-ELSEWHERE = (
-    "comparison",
-    "viewer",
-    "live",
-    "rendering",
-    "datasets",
-)
-"""Folders of slam that no run uses."""
+NOT_HASHED = ("comparison", "viewer", "live", "rendering", "datasets")
+"""Folders of slam that do not affect a run."""
 LIBRARIES = ("gtsam", "numpy", "opencv-python-headless", "torch", "scipy", "faiss-cpu")
 CONTENTS = ("rgb.txt", "depth.txt", "associations.txt", "camera.yaml", "annotations.json")
 
 
 def provenance(experiment: Experiment, workers: int) -> dict[str, Any]:
-    """By name: plain values that can be written as JSON.
-
-    ``workers`` jobs ran beside each other, which tells what their times are worth.
-    """
+    """Plain values by name, for JSON; ``workers``: jobs that ran at a time."""
     head, changed = commit()
     return {
         "version": __version__,
@@ -56,24 +47,24 @@ def provenance(experiment: Experiment, workers: int) -> dict[str, Any]:
         "machine": describe_machine(),
         "packages": versions(PACKAGES),
         "configurations": {k: _changed(v) for k, v in experiment.configurations.items()},
-        "experiment": _plain(asdict(experiment)),
+        "experiment": _paths_as_text(asdict(experiment)),
     }
 
 
 def _changed(configuration: Configuration) -> dict[str, Any]:
-    """What differs from the defaults of the code, parameters by dotted path, and the options."""
+    """Parameters by dotted path that differ from the defaults, and options."""
     file = find_config(configuration.config) if configuration.config else None
     found = differences(resolve(SystemConfig, file, configuration.set), SystemConfig())
     options = {name: getattr(configuration, name) for name in OPTIONS}
     return found | {name: value for name, value in options.items() if value}
 
 
-def _plain(value: Any) -> Any:
-    """Paths as text, all the way down."""
+def _paths_as_text(value: Any) -> Any:
+    """The value with every path in it as text."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _paths_as_text(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [_paths_as_text(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
 
@@ -86,7 +77,7 @@ def code_hash() -> str:
     versions = ",".join(f"{name} {version(name)}" for name in LIBRARIES)
     parts = [versions]
     for folder in LAYERS:
-        used = (p for p in folder.rglob("*.py") if p.relative_to(folder).parts[0] not in ELSEWHERE)
+        used = (p for p in folder.rglob("*.py") if p.relative_to(folder).parts[0] not in NOT_HASHED)
         parts += _contents(used, folder)
     weights = data_path("weights")
     return _digest([*parts, *_contents(weights.glob("*.safetensors"), weights)])
@@ -129,7 +120,7 @@ def _contents(files: Iterable[Path], root: Path) -> Iterator[str]:
 
 
 def _digest(texts: Iterable[str]) -> str:
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     for text in texts:
-        whole.update(text.encode() + b"\0")
-    return whole.hexdigest()[:16]
+        digest.update(text.encode() + b"\0")
+    return digest.hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""What a comparison holds when it is done, or half done: plain values that can be saved as JSON."""
+"""Results of a comparison, complete or not: plain values that are saved as JSON."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Kind(Enum):
 
 
 class CellStatus(Enum):
-    """Whether a cell has figures; one without never enters a mean."""
+    """Whether a cell has figures; only DONE cells enter a mean."""
 
     DONE = "done"
     FAILED = "failed"
@@ -44,7 +44,7 @@ class Method:
         name: as printed, unique.
         kind: where its figures come from.
         note: a configuration's differences, or the source of a published figure.
-        with_scale: aligned by Sim(3), which is marked wherever the row is printed.
+        with_scale: aligned by Sim(3).
     """
 
     name: str
@@ -61,11 +61,11 @@ class Cell:
         sequence, method: their names.
         seed: of a run; None where there is none.
         status: DONE, FAILED or PENDING.
-        metrics: value by metric name (`comparison.experiment.metric_table`), only those that exist.
+        metrics: value by metric name (`comparison.experiment.metric_table`), those that exist.
         folder: the run folder, relative to the comparison's; "" without one.
         trajectory, reference: TUM files that were compared, relative to the comparison's folder or
             absolute; "" without.
-        log: file with what the run had to say; "" without one.
+        log: file with the run's output; "" without one.
         error: why it failed, one line.
         source: of a published figure.
     """
@@ -85,16 +85,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All cells of an experiment and where they come from.
+    """All cells of an experiment and their provenance.
 
     Attributes:
         name, title, description: of the experiment.
         sequences: names in the order of the columns.
         methods: in the order of the rows.
-        cells: one for each sequence, method and seed that was asked for.
+        cells: one for each sequence, method and seed.
         provenance: commit, machine, versions, command, date, the resolved experiment; by name.
-        drawn: sequences whose images the seed draws, so that each seed is a sequence of its own;
-            of the others the seed is the system's alone.
+        drawn: rendered sequences, whose images depend on the seed; for the others the seed is the
+            system's only.
     """
 
     name: str
@@ -171,7 +171,7 @@ def _cell(plain: dict[str, Any]) -> Cell:
 
 
 def _finite(value: object) -> object:
-    """The same with None for what JSON does not know: NaN and infinity."""
+    """The same with None for NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""From an experiment to jobs: what is rendered first, and a run for each cell."""
+"""The jobs of an experiment: a rendering for each rendered sequence, and a run for each cell."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from bmask_slam.comparison.experiment.data_folders import Site
+from bmask_slam.comparison.experiment.data_folders import SequenceLocation
 from bmask_slam.comparison.experiment.experiment import Configuration, Experiment, SequenceSource
 from bmask_slam.comparison.experiment.experiment_file import slug
 from bmask_slam.comparison.experiment.provenance import (
@@ -20,20 +20,29 @@ from bmask_slam.rendering.sequence import RenderConfig
 
 SEQUENCES, CELLS = "sequences", "cells"
 SEED_SETTING = "loops.verification.seed={}"
-Key = tuple[str, str, int]
-"""A cell of this system: sequence, configuration, seed."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """A sequence as it lies on disk, or will when it is rendered.
+class CellKey:
+    """A cell of this system: names of sequence and configuration, and the seed."""
+
+    sequence: str
+    configuration: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class SequenceData:
+    """A sequence on disk, or one that will be rendered.
 
     Attributes:
-        source, seed: of it; the seed is None where it does not draw the images.
-        folder, reference: None without.
+        source: its entry in the experiment.
+        seed: of a rendered sequence; None for a recorded one.
+        folder: of the images; None if there are none.
+        reference: its ground truth; None if there is none.
         problem: why there are no images.
-        contents: what its images depend on, as a short text.
-        render: the job that draws it.
+        contents: hash of what its images depend on.
+        render: the job that renders it; None for a recorded one.
     """
 
     source: SequenceSource
@@ -45,33 +54,37 @@ class Place:
     render: Job | None = None
 
 
-def recorded_place(source: SequenceSource, site: Site) -> Place:
+def recorded_sequence(source: SequenceSource, location: SequenceLocation) -> SequenceData:
     """A recorded sequence, the same for every seed."""
-    contents = "" if site.folder is None else folder_hash(site.folder, source.camera)
-    return Place(source, None, site.folder, site.reference, site.problem, contents)
+    contents = "" if location.folder is None else folder_hash(location.folder, source.camera)
+    return SequenceData(
+        source, None, location.folder, location.reference, location.problem, contents
+    )
 
 
-def drawn_place(source: SequenceSource, config: RenderConfig, seed: int, out: Path) -> Place:
+def rendered_sequence(
+    source: SequenceSource, config: RenderConfig, seed: int, out: Path
+) -> SequenceData:
     """A rendered sequence with its job; ``config`` without the seed."""
-    drawn = replace(config, seed=seed, true_depth=True)
+    seeded = replace(config, seed=seed, true_depth=True)
     folder = out / SEQUENCES / f"{slug(source.name)}-{seed}"
-    contents = rendered_hash(drawn)
-    beside = str(folder)
+    contents = rendered_hash(seeded)
+    path = str(folder)
     job = Job(
         f"rendering {source.name}, seed {seed}",
         f"rendering {source.name}",
-        ("render", config.name, *_render_arguments(drawn), "--out", beside, "--quiet"),
+        ("render", config.name, *_render_arguments(seeded), "--out", path, "--quiet"),
         product=str(folder / "groundtruth.txt"),
-        record=f"{beside}.record/record.json",
-        log=f"{beside}.record/log.txt",
+        record=f"{path}.record/record.json",
+        log=f"{path}.record/log.txt",
         depends={"sequence": contents},
-        fresh=beside,
+        clear=path,
     )
-    return Place(source, seed, folder, folder / "groundtruth.txt", "", contents, job)
+    return SequenceData(source, seed, folder, folder / "groundtruth.txt", "", contents, job)
 
 
 def _render_arguments(config: RenderConfig) -> Iterator[str]:
-    """The command line that gives this configuration."""
+    """The command-line options of this configuration."""
     yield from ("--seed", str(config.seed))
     for name in (f.name for f in fields(config) if f.name not in ("name", "seed", "noise")):
         flag, value = f"--{name.replace('_', '-')}", getattr(config, name)
@@ -83,28 +96,30 @@ def _render_arguments(config: RenderConfig) -> Iterator[str]:
         yield "--no-noise"
 
 
-def run_jobs(experiment: Experiment, places: Iterable[Place], out: Path) -> dict[Key, Job]:
-    """The runs by sequence, configuration and seed; none for a sequence without images."""
-    jobs: dict[Key, Job] = {}
-    for place in (p for p in places if p.folder is not None):
-        seeds = experiment.seeds if place.seed is None else (place.seed,)
+def run_jobs(
+    experiment: Experiment, sequences: Iterable[SequenceData], out: Path
+) -> dict[CellKey, Job]:
+    """The run of each cell; none for a sequence without images."""
+    jobs: dict[CellKey, Job] = {}
+    for data in (s for s in sequences if s.folder is not None):
+        seeds = experiment.seeds if data.seed is None else (data.seed,)
         for name, configuration in experiment.configurations.items():
             for seed in seeds:
-                key = (place.source.name, name, seed)
-                jobs[key] = _run_job(place, (name, configuration), seed, out)
+                key = CellKey(data.source.name, name, seed)
+                jobs[key] = _run_job(data, key, configuration, out)
     return jobs
 
 
-def _run_job(place: Place, named: tuple[str, Configuration], seed: int, out: Path) -> Job:
-    (name, configuration), source = named, place.source
+def _run_job(data: SequenceData, key: CellKey, configuration: Configuration, out: Path) -> Job:
+    source, name, seed = data.source, key.configuration, key.seed
     folder = out / CELLS / slug(source.name) / slug(name) / str(seed)
     run = folder / "run"
     setting = SEED_SETTING.format(seed)
-    words = ["run", str(place.folder), "--out", str(run), "--quiet", "--overwrite"]
+    words = ["run", str(data.folder), "--out", str(run), "--quiet", "--overwrite"]
     words += [*configuration.arguments(), "--set", setting]
     if source.camera is not None:
         words += ["--camera", str(source.camera.absolute())]
-    judged = place.seed is not None and (configuration.segmenter != "none" or configuration.dense)
+    has_truth = data.seed is not None and (configuration.segmenter != "none" or configuration.dense)
     return Job(
         f"{source.name}, {name}, seed {seed}",
         f"{source.name}, {name}",
@@ -114,9 +129,9 @@ def _run_job(place: Place, named: tuple[str, Configuration], seed: int, out: Pat
         log=str(folder / "log.txt"),
         depends={
             "code": code_hash(),
-            "sequence": place.contents,
+            "sequence": data.contents,
             "configuration": configuration_hash(configuration, (setting,)),
         },
-        sequence=str(place.folder) if judged else "",
+        sequence=str(data.folder) if has_truth else "",
         run=str(run),
     )

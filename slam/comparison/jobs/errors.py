@@ -1,4 +1,4 @@
-"""The errors of a trajectory file as metrics of a cell."""
+"""Errors of a trajectory file, and measurements of a run, as metrics of a cell."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.evaluation import evaluate_trajectory, read_reference
 from bmask_slam.graph.trajectory_formats import read_trajectory
 
-NAMES = {"estimate_share": "evaluated_share"}
-"""What a row of the evaluation is called in a comparison, where the names differ."""
+COMPARISON_NAMES = {"estimate_share": "evaluated_share"}
+"""Names of evaluation rows that have another name in a comparison."""
 
 
 @dataclass(frozen=True)
@@ -28,20 +28,20 @@ def trajectory_errors(
     """ATE, RPE and the share that could be evaluated, by metric; with ``frames`` the share tracked.
 
     Raises:
-        InputError: a file that is missing or broken, or two that share no time.
+        InputError: a file that is missing or broken, or two without common times.
     """
     estimate, truth = read_trajectory(trajectory), read_reference(reference)
     result = evaluate_trajectory(
         estimate, truth, frames, rules.with_scale, rules.max_time_difference_s
     )
-    rows = {NAMES.get(row["name"], row["name"]): row["value"] for row in result.rows}
+    rows = {COMPARISON_NAMES.get(row["name"], row["name"]): row["value"] for row in result.rows}
     if "tracked_share" in rows:
         rows["tracked_share"] = min(rows["tracked_share"], 1.0)
     return {name: value for name, value in rows.items() if name in BY_NAME}
 
 
 def run_figures(run: Path) -> dict[str, float]:
-    """What a run measured of itself: times, memory, shares, without errors."""
+    """The measurements of a run without errors: times, memory, shares."""
     rows = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    ours = (row for row in rows if not row["name"].startswith(("ate_", "rpe_")))
-    return {row["name"]: float(row["value"]) for row in ours if row["name"] in BY_NAME}
+    kept = (row for row in rows if not row["name"].startswith(("ate_", "rpe_")))
+    return {row["name"]: float(row["value"]) for row in kept if row["name"] in BY_NAME}

@@ -1,4 +1,4 @@
-"""Cells of other systems: their trajectory files, and what others published."""
+"""Cells of other systems: from their trajectory files, and from published figures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bmask_slam.comparison.experiment.experiment import Experiment
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Kind, Method
-from bmask_slam.comparison.jobs.cells import Place
+from bmask_slam.comparison.jobs.cells import SequenceData
 from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.lists import read_pairs
@@ -17,40 +17,40 @@ from bmask_slam.sequences.sequence import SequenceConfig
 
 def trajectory_cells(
     experiment: Experiment,
-    find_place: Callable[[str, int | None], Place],
+    find_data: Callable[[str, int | None], SequenceData],
     files: Mapping[tuple[str, str], Path | None],
 ) -> Iterator[Cell]:
     """A cell for each file; one that cannot be evaluated is FAILED, a missing one PENDING."""
     for (method, key), file in files.items():
         name, _, seed = key.partition("@")
-        place = find_place(name, int(seed) if seed.isdigit() else None)
+        data = find_data(name, int(seed) if seed.isdigit() else None)
         rules = Rules(experiment.max_time_difference_s, experiment.systems[method].with_scale)
-        cell = Cell(name, method, place.seed, CellStatus.PENDING)
+        cell = Cell(name, method, data.seed, CellStatus.PENDING)
         if file is None:
             wanted = experiment.systems[method].trajectories[key]
             cure = f"give it by --trajectory '{method}:{key}=FILE', or its folder by --data"
             yield replace(cell, error=f"{wanted}: not found; {cure}")
         else:
-            yield _evaluated(cell, file, place, rules)
+            yield _evaluated_cell(cell, file, data, rules)
 
 
-def _evaluated(cell: Cell, file: Path, place: Place, rules: Rules) -> Cell:
+def _evaluated_cell(cell: Cell, file: Path, data: SequenceData, rules: Rules) -> Cell:
     cell = replace(cell, status=CellStatus.FAILED, trajectory=str(file.absolute()))
-    if place.reference is None or not place.reference.is_file():
+    if data.reference is None or not data.reference.is_file():
         return replace(
             cell,
             error=f"{cell.sequence}: no ground truth; give it by --reference {cell.sequence}=FILE",
         )
-    cell = replace(cell, reference=str(place.reference.absolute()))
+    cell = replace(cell, reference=str(data.reference.absolute()))
     try:
-        metrics = trajectory_errors(file, place.reference, rules, _frame_count(place.folder))
+        metrics = trajectory_errors(file, data.reference, rules, _frame_count(data.folder))
     except InputError as error:
         return replace(cell, error=str(error))
     return replace(cell, status=CellStatus.DONE, metrics=metrics)
 
 
 def _frame_count(folder: Path | None) -> int | None:
-    """Frames of a sequence, None where its images are not there."""
+    """Number of frames of a sequence; None without its images."""
     if folder is None:
         return None
     limit_s = SequenceConfig().max_time_difference_s

@@ -18,7 +18,7 @@ from bmask_slam.graph.whole_file import whole_file
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PROCESS = "bmask_slam.job_process"
-"""Module that a job's process runs; named, since it is above this one in the order of imports."""
+"""Module that a job's process runs, given by name since this package must not import it."""
 LAST_LINES = 30
 LINE_LIMIT = 300
 
@@ -28,16 +28,16 @@ class Job:
     """What to run. Files are absolute, so that a job can be sent to another process.
 
     Attributes:
-        name: for the progress.
+        name: shown in the progress bar.
         group: jobs of one group take about as long as each other.
         arguments: of ``bmask-slam``.
-        product: file that is there when it has succeeded.
-        record: file that says how it ended; it is written last.
-        log: what the command printed.
-        depends: what its result depends on: a text by name.
+        product: file that exists if it has succeeded.
+        record: file with its outcome, written last.
+        log: file with what the command printed.
+        depends: hashes of what its result depends on, by name.
         sequence: folder whose truth is compared with the finished run ``run``; "" for none.
         run: the run folder, if it makes one.
-        fresh: folder that is removed first, "" for none.
+        clear: folder that is removed first, "" for none.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Job:
     depends: dict[str, str] = field(default_factory=dict)
     sequence: str = ""
     run: str = ""
-    fresh: str = ""
+    clear: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ def finished(job: Job) -> Outcome | None:
 def run_job(job: Job, threads: int = 1, started: Start = lambda process: None) -> Outcome:
     """Run a job to its end and record it; ``started`` is given the process.
 
-    The process ends itself when this one is no longer there, however that came about.
+    The process ends when this one has ended for whatever reason.
     """
     record, log = Path(job.record), Path(job.log)
     record.parent.mkdir(parents=True, exist_ok=True)
     log.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
-    if job.fresh:
-        shutil.rmtree(job.fresh, ignore_errors=True)
+    if job.clear:
+        shutil.rmtree(job.clear, ignore_errors=True)
     begin_s = time.monotonic()
     with log.open("wb") as output:
         process = subprocess.Popen(
@@ -112,12 +112,12 @@ def run_job(job: Job, threads: int = 1, started: Start = lambda process: None) -
 
 
 def environment(threads: int) -> dict[str, str]:
-    """This process's, with the threads of the numerical libraries limited."""
+    """This process's environment, with the threads of the numerical libraries limited."""
     return {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
 
 
 def figures_file(job: Job) -> Path:
-    """Where the process leaves its figures."""
+    """The file in which the process writes its figures."""
     return Path(job.record).with_name("figures.json")
 
 
@@ -142,13 +142,13 @@ def _outcome(job: Job, code: int, wall_s: float) -> Outcome:
         file = figures_file(job)
         figures = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
         return Outcome(CellStatus.DONE, "", wall_s, figures, job.depends)
-    error = _last_words(Path(job.log)) or f"ended with status {code} and said nothing"
+    error = _last_error(Path(job.log)) or f"ended with status {code} without a message"
     if code < 0:
         error = f"killed by signal {-code}"
     return Outcome(CellStatus.FAILED, error, wall_s, {}, job.depends)
 
 
-def _last_words(log: Path) -> str:
+def _last_error(log: Path) -> str:
     """The last error message in a log, else its last line."""
     text = log.read_text(encoding="utf-8", errors="replace").replace("\r", "\n")
     lines = [line.strip() for line in text.splitlines() if line.strip()][-LAST_LINES:]

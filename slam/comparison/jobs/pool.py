@@ -1,4 +1,4 @@
-"""Where jobs run: beside each other on this machine, or on a Ray cluster."""
+"""Where jobs run: in parallel on this machine, or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import threading
 from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from types import TracebackType
 from typing import Any, Protocol
 
 from bmask_slam.comparison.jobs.job import Job, Outcome, run_job
 from bmask_slam.runtime.machine import available_cores
 from bmask_slam.semantics.segmenters.ray_connection import connect
 
-Done = tuple[Job, Outcome]
+JobOutcome = tuple[Job, Outcome]
 
 
 class Pool(Protocol):
@@ -23,8 +22,8 @@ class Pool(Protocol):
     @property
     def workers(self) -> int: ...
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
-        """Yield each job with its outcome as it ends; when closed early, the others are ended."""
+    def run(self, jobs: Sequence[Job]) -> Generator[JobOutcome, None, None]:
+        """Yield each job with its outcome as it ends; closing the generator kills the others."""
         ...
 
 
@@ -44,19 +43,14 @@ class LocalPool:
     def __enter__(self) -> LocalPool:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop()
 
     @property
     def workers(self) -> int:
         return self._workers
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
+    def run(self, jobs: Sequence[Job]) -> Generator[JobOutcome, None, None]:
         """See `Pool.run`."""
         self._stopping = False
         with ThreadPoolExecutor(self._workers) as executor:
@@ -78,7 +72,7 @@ class LocalPool:
             process.kill()
 
     def _stop(self) -> None:
-        """End what still runs."""
+        """Kill the jobs that still run."""
         with self._lock:
             self._stopping = True
             for process in self._running:
@@ -91,7 +85,7 @@ class RayPool:
     """Ray tasks of one CPU each (`pip install 'bmask-slam[ray]'`); all machines see the same files.
 
     ``address`` is a cluster's, "auto" for the one that this machine belongs to, or "local" for one
-    that is started here and ended with this process.
+    that is started here and stopped with this process.
 
     Raises:
         InputError: Ray is not installed, or there is no cluster at the address.
@@ -104,12 +98,7 @@ class RayPool:
     def __enter__(self) -> RayPool:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ray.shutdown()
 
     @property
@@ -117,7 +106,7 @@ class RayPool:
         """CPUs of the cluster."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
-    def run(self, jobs: Sequence[Job]) -> Generator[Done, None, None]:
+    def run(self, jobs: Sequence[Job]) -> Generator[JobOutcome, None, None]:
         """See `Pool.run`."""
         waiting = {self._remote.remote(job): job for job in jobs}
         try:

@@ -1,4 +1,4 @@
-"""What a run on a rendered sequence says of things and surfaces, against what was drawn."""
+"""Accuracy of labels and dense depth of a run on a rendered sequence."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.system_config import SystemConfig
 
 MIN_DEPTH_M, OUTLIER_M = 0.1, 0.05
-NEAR_M = (0.02, 0.01)  # at 0 m, and what the square of the depth adds
+NEAR_M = (0.02, 0.01)  # a + b z^2
 
 
 def truth_figures(run: Path, folder: Path) -> dict[str, float]:
-    """Figures by metric; none where the run has none to compare or the sequence no truth."""
+    """Figures by metric; those that the run or the truth allow."""
     sequence = open_sequence(folder)
     found = {"label_accuracy": label_accuracy(run, sequence)}
     found["depth_rmse_ratio"] = depth_ratio(run, sequence)
@@ -37,9 +37,9 @@ def truth_figures(run: Path, folder: Path) -> dict[str, float]:
 
 
 def label_accuracy(run: Path, sequence: Sequence) -> float | None:
-    """Of landmarks on an object of a class that the segmenter knows, the share with its label.
+    """The share of landmarks with the right label, of those on objects of the segmenter's classes.
 
-    A landmark lies where most keyframes that can see it show it.
+    A landmark's true class is that of most keyframes in which it is visible.
     """
     folder = sequence.folder
     if not (run / LABELS).is_file() or not (folder / "annotations.json").is_file():
@@ -62,17 +62,17 @@ def label_accuracy(run: Path, sequence: Sequence) -> float | None:
         points_camera = transform(inverse(T_truth_camera), points_truth)
         rows, pixels = visible(points_camera, true_depth(sequence, index), sequence.camera)
         counts[rows, classes[instances[pixels[:, 1], pixels[:, 0]]]] += 1
-    true = counts.argmax(axis=1)  # the background, 0, for those that no keyframe sees
+    true = counts.argmax(axis=1)  # 0, the background, for landmarks visible in no keyframe
     found = np.array([names.number(name) for name in labels.labels])
     on_objects = true > 0
     return float((found[on_objects] == true[on_objects]).mean()) if on_objects.any() else None
 
 
 def depth_ratio(run: Path, sequence: Sequence) -> float | None:
-    """RMSE of the dense map's depth over that of the sensor's, at the same pixels.
+    """RMSE of the dense map's depth divided by that of the sensor's, at the same pixels.
 
-    These are the pixels of keyframes where both and the truth are known and neither is off by more
-    than 5 cm, which are outliers of another kind.
+    Pixels of keyframes count where both depths and the truth are known and both errors are below
+    5 cm, so that outliers do not dominate.
     """
     exact, finished = sequence.folder / "depth_true", run / "dense" / "dense.json"
     if not exact.is_dir() or not finished.is_file():
@@ -97,7 +97,7 @@ def keyframe_frames(run: Path) -> list[tuple[int, int]]:
 
 
 def truth_from_world(keyframes: Trajectory, truth: Trajectory) -> Array:
-    """T_truth_world (4, 4), the mean over poses that belong together."""
+    """T_truth_world (4, 4), the mean over associated poses."""
     T = truth.poses_world_camera @ inverse(keyframes.poses_world_camera)
     return np.asarray(T[0] @ se3_exp(se3_log(inverse(T[0]) @ T).mean(axis=0)))
 
@@ -113,7 +113,7 @@ def true_classes(folder: Path, names: LabelSet) -> Ints:
 
 
 def visible(points_camera: Array, depth_m: Array, camera: Camera) -> tuple[Ints, Ints]:
-    """Which points (N, 3) an image shows: their rows (M,), and pixels (M, 2) as (u, v)."""
+    """Visible points of (N, 3): their rows (M,), and pixels (M, 2) as (u, v)."""
     ahead = np.flatnonzero(points_camera[:, 2] > MIN_DEPTH_M)
     pixels = np.rint(camera.project(points_camera[ahead])).astype(np.int64)
     inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
@@ -124,7 +124,7 @@ def visible(points_camera: Array, depth_m: Array, camera: Camera) -> tuple[Ints,
 
 
 def true_depth(sequence: Sequence, index: int) -> Array:
-    """Depth (H, W) in metres, NaN where nothing is; the sensor's if the exact one was not kept."""
+    """Depth (H, W) in metres, NaN where missing; the sensor's if there is no exact one."""
     kept = (sequence.folder / "depth_true").is_dir()
     depth = _image(sequence, "depth_true" if kept else "depth", index)
     return np.where(depth > 0, depth / sequence.camera.depth_scale, np.nan)

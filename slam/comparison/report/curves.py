@@ -28,13 +28,12 @@ logger = logging.getLogger(__name__)
 def network_pictures(comparison: Comparison, folder: Path) -> list[Picture]:
     """Losses and precision-recall curves of the networks that the experiment names.
 
-    Each name has a folder: that of ``bmask-slam train``, in which ``evaluate-segmentation
-    --curves`` has put its file.
+    The folder of each is written by ``bmask-slam train`` and ``evaluate-segmentation --curves``.
     """
     named = (comparison.provenance.get("experiment") or {}).get("networks") or {}
     folders = {str(name): folder / str(path) for name, path in named.items()}
-    losses = _of_all(folders, LOSSES, read_losses, TOTAL)
-    precision = _of_all(folders, CURVES, read_precision, MASKS)
+    losses = _read_all(folders, LOSSES, read_losses, TOTAL)
+    precision = _read_all(folders, CURVES, read_precision, MASKS)
     pictures = []
     if losses:
         text = f"Training loss, mean over {SMOOTHING_STEPS} steps."
@@ -62,7 +61,7 @@ def curve_picture(title: str, caption: str, curves: Curves, names: tuple[str, st
 
 
 def read_losses(path: Path) -> Curves:
-    """Of a losses.csv each loss, and their sum as "total", against the step, smoothed."""
+    """Each loss of a losses.csv, and their sum as "total", against the step, smoothed."""
     parts: dict[str, dict[int, float]] = defaultdict(dict)
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -74,7 +73,7 @@ def read_losses(path: Path) -> Curves:
 
 
 def read_precision(path: Path) -> Curves:
-    """Of a precision_recall.csv each curve, named by what it is of and what ranks it."""
+    """Each curve of a precision_recall.csv, named by kind and ranking score."""
     points = defaultdict(list)
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -84,10 +83,10 @@ def read_precision(path: Path) -> Curves:
     return {name: np.array(values) for name, values in points.items()}
 
 
-def _of_all(
+def _read_all(
     folders: dict[str, Path], file: str, read: Callable[[Path], Curves], preferred: str
 ) -> Curves:
-    """All curves of a single network, or of each of several the preferred one."""
+    """All curves of a single network, or the preferred curve of each of several."""
     found: dict[str, Curves] = {}
     for name, folder in folders.items():
         try:
@@ -95,7 +94,7 @@ def _of_all(
         except FileNotFoundError:
             continue
         except (KeyError, ValueError, OSError) as error:
-            logger.warning("%s: no curves in it (%s); left out", folder / file, error)
+            logger.warning("%s: no curves in it (%s); skipped", folder / file, error)
     if len(found) == 1:
         return next(iter(found.values()))
     first = {name: next(iter(curves.values()), None) for name, curves in found.items()}

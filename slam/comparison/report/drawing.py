@@ -14,7 +14,7 @@ from bmask_slam.comparison.report.section import Picture
 
 SVG = "image/svg+xml"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-"""Okabe and Ito's, which differ for the colour-blind too."""
+"""Colours of Okabe and Ito, which colour-blind readers can distinguish."""
 DASHES = ("-", "--", "-.", ":")
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none", "svg.hashsalt": "bmask-slam", "pdf.fonttype": 42, "font.size": 9.0,
@@ -26,7 +26,7 @@ STYLE: dict[Any, Any] = {
 
 @contextmanager
 def figure(width_in: float, height_in: float) -> Iterator[Figure]:
-    """An empty figure; what is drawn within looks alike."""
+    """An empty figure in the style of the report, within a context manager."""
     with matplotlib.rc_context(STYLE):
         yield Figure(figsize=(width_in, height_in), layout="constrained")
 
@@ -36,7 +36,7 @@ def as_picture(drawn: Figure, title: str, caption: str) -> Picture:
     svg, pdf = io.BytesIO(), io.BytesIO()
     with matplotlib.rc_context(STYLE):
         drawn.savefig(svg, format="svg", metadata={"Date": None}, transparent=True)
-        drawn.set_layout_engine("none")  # what has been found holds for both
+        drawn.set_layout_engine("none")  # use the layout of the SVG in the PDF too
         drawn.savefig(pdf, format="pdf", metadata={"CreationDate": None})
     width_in, height_in = drawn.get_size_inches()
     size_px = (96 * width_in, 96 * height_in)

@@ -34,15 +34,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """The errors of one cell's trajectory, with what they are drawn from.
+    """The errors of one cell's trajectory, and the trajectories for the drawing.
 
     Attributes:
-        cell: whose trajectory.
+        cell: of the trajectory.
         aligned: the whole estimate in the reference's world frame.
         reference: the truth.
-        absolute: of the poses that belong together.
-        truth: the reference's poses that belong to those of ``absolute``.
-        per_second: relative error over a second, None where no poses are that far apart.
+        absolute: of the associated poses.
+        truth: the reference's poses that are associated with those of ``absolute``.
+        per_second: relative error over a second; None if no poses are that far apart.
     """
 
     cell: Cell
@@ -55,11 +55,11 @@ class Errors:
 
 @dataclass(frozen=True)
 class Scales:
-    """What the figures of a sequence share, so that they can be compared.
+    """Common scales of the figures of a sequence.
 
     Attributes:
         top_cm: end of the axes of relative errors.
-        enlarged: differences between the paths are drawn so many times longer.
+        enlarged: factor by which differences between the paths are enlarged.
     """
 
     top_cm: float
@@ -69,20 +69,20 @@ class Scales:
 def error_pictures(comparison: Comparison, sequence: str, folder: Path) -> list[Picture]:
     """A picture for each method that has a trajectory of the sequence, all in the same scales.
 
-    Of several seeds the one in the middle by ATE is drawn.
+    The seed with the median ATE is drawn.
     """
     found = [
         (method, errors)
         for method in comparison.methods
-        if (errors := _middle_errors(comparison, sequence, method, folder)) is not None
+        if (errors := _median_errors(comparison, sequence, method, folder)) is not None
     ]
     scales = common_scales([errors for _, errors in found])
     return [error_picture(method, errors, scales) for method, errors in found]
 
 
 def common_scales(found: list[Errors]) -> Scales:
-    """Axes that hold all errors, and differences enlarged until the largest RMSE can be seen."""
-    tops = [100 * e.per_second.translation_m.max for e in found if e.per_second is not None]
+    """Axes for all errors, and the factor that makes the largest RMSE visible."""
+    maxima_cm = [100 * e.per_second.translation_m.max for e in found if e.per_second is not None]
     ratios = [
         VISIBLE_SHARE
         * np.ptp(e.truth.positions_world, axis=0).max()
@@ -91,7 +91,7 @@ def common_scales(found: list[Errors]) -> Scales:
         if e.absolute.translation_m.rmse > 0
     ]
     fitting = [factor for factor in ENLARGED if factor <= min(ratios, default=1)]
-    top_cm = max(tops, default=0.0) or 1.0  # an axis needs a length, also without any error
+    top_cm = max(maxima_cm, default=0.0) or 1.0  # an axis of length 0 cannot be drawn
     return Scales(LEGEND_ROOM * top_cm, max(fitting, default=1))
 
 
@@ -114,7 +114,7 @@ def error_picture(method: Method, errors: Errors, scales: Scales) -> Picture:
 
 
 def draw_path(axes: Axes, errors: Errors, enlarged: int) -> int:
-    """Draw estimate, reference and at most 300 differences; one of how many is drawn."""
+    """Draw estimate, reference and at most 300 differences; returns the step between those."""
     step = -(-len(errors.truth) // MAX_DIFFERENCES)
     every = np.arange(0, len(errors.truth), step)
     truth, estimate = errors.truth.select(every), errors.absolute.aligned.select(every)
@@ -145,7 +145,7 @@ def draw_relative(axes: Axes, errors: Errors, top_cm: float) -> None:
 
 
 def read_errors(cell: Cell, folder: Path, rules: Rules) -> Errors | None:
-    """The errors of a cell's trajectory; None, with a warning, where they cannot be made."""
+    """The errors of a cell's trajectory; None, with a warning, if there are none."""
     if cell.status is not CellStatus.DONE or not cell.trajectory or not cell.reference:
         return None
     largest_s = rules.max_time_difference_s
@@ -168,10 +168,10 @@ def stated_rules(comparison: Comparison, method: Method) -> Rules:
     return Rules(float(largest_s), method.with_scale)
 
 
-def _middle_errors(
+def _median_errors(
     comparison: Comparison, sequence: str, method: Method, folder: Path
 ) -> Errors | None:
-    """Of the cells of a method the one whose ATE is in the middle, if it can be drawn."""
+    """The errors of a method's cell with the median ATE; None if it cannot be drawn."""
     cells = sorted(_measured(comparison, sequence, method), key=lambda c: values([c], ATE))
     rules = stated_rules(comparison, method)
     return read_errors(cells[(len(cells) - 1) // 2], folder, rules) if cells else None

@@ -23,7 +23,7 @@ TEMPLATES = Path(__file__).parent
 def write_report(comparison: Comparison, folder: Path) -> list[Path]:
     """Write report.html, tables.csv, .md, .tex and figures/*.pdf to the comparison's folder.
 
-    Returns the paths. Files of cells that are missing or broken leave their figure out, with a
+    Returns the paths. The figure of a cell with missing or broken files is skipped, with a
     warning. The same comparison and files give the same bytes.
     """
     sections, sentences = make_sections(comparison, folder), summary(comparison)
@@ -42,7 +42,7 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
 
 
 def _write_figures(folder: Path, sections: list[Section]) -> list[Path]:
-    """Every drawing as a PDF of its own, to be included in a paper; those of before are removed."""
+    """Write every drawing as a PDF for a paper, and remove earlier ones."""
     folder.mkdir(exist_ok=True)
     drawn = [p for section in sections for p in section.pictures if p.pdf is not None]
     files = {}
@@ -69,7 +69,7 @@ def _html_text(title: str, description: str, sentences: list[str], sections: lis
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    style = Markup((TEMPLATES / "page.css").read_text(encoding="utf-8"))  # our own file
+    style = Markup((TEMPLATES / "page.css").read_text(encoding="utf-8"))
     page = environment.get_template("page.html.j2")
     return page.render(
         title=title, description=description, summary=sentences, sections=sections, style=style

@@ -1,4 +1,4 @@
-"""What run folders add to a report: times of the stages, pictures of the maps."""
+"""Times of the stages and pictures of the maps, from run folders."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def stage_table(comparison: Comparison, folder: Path) -> Table | None:
 
 
 def read_stage_times(cell: Cell, folder: Path, times: Times) -> None:
-    """Append the times of a finished run's frames, of some stages those of its keyframes only."""
+    """Append the times of a run's frames; of keyframe stages, those of keyframes only."""
     path = folder / cell.folder / "frames.csv"
     if cell.status is not CellStatus.DONE or not cell.folder or not path.is_file():
         return
@@ -61,7 +61,7 @@ def read_stage_times(cell: Cell, folder: Path, times: Times) -> None:
 
 
 def map_pictures(comparison: Comparison, sequence: str, folder: Path) -> list[Picture]:
-    """The maps of a sequence, of the first run that made any (the paper's Figs. 7, 13)."""
+    """The maps of a sequence from the first run that has any (the paper's Figs. 7, 13)."""
     for method in comparison.methods:
         for cell in comparison.of(sequence, method.name):
             if cell.folder and cell.status is CellStatus.DONE:
@@ -80,12 +80,12 @@ def _times_entry(times_ms: list[float]) -> Entry:
 
 
 def _map_picture(path: Path, cell: Cell, shows: str) -> Picture | None:
-    """A picture file made smaller; None where there is none that can be read."""
+    """A picture file, reduced in size; None if it cannot be read."""
     if not path.is_file():
         return None
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        logger.warning("%s: not a picture; left out of the report", path)
+        logger.warning("%s: not a picture; skipped in the report", path)
         return None
     height, width = image.shape[:2]
     if width > PICTURE_WIDTH_PX:

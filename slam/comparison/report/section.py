@@ -1,4 +1,4 @@
-"""What a report is made of, whatever its format: sections of text, tables, pictures, listings."""
+"""The parts of a report: sections of text, tables, pictures and listings."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class Picture:
     """A picture as the bytes of a file.
 
     Attributes:
-        title: what it shows; its alternative text.
+        title: also its alternative text.
         caption: how to read it.
         data, mime: the file and its type.
         size_px: width and height, at 96 px an inch.
-        pdf: the same as a page of PDF where it is a drawing.
+        pdf: the same as a page of PDF if it is a drawing.
     """
 
     title: str
@@ -30,7 +30,7 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """The file as an address that needs no other."""
+        """The file as a data URI."""
         return f"data:{self.mime};base64,{base64.b64encode(self.data).decode('ascii')}"
 
     @property
@@ -44,7 +44,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Listing:
-    """Text to be printed as it is, such as a log."""
+    """Preformatted text, such as a log."""
 
     title: str
     text: str
@@ -52,7 +52,7 @@ class Listing:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the report under one heading; what is empty is left out."""
+    """A part of the report under one heading."""
 
     title: str
     text: tuple[str, ...] = ()
@@ -62,7 +62,7 @@ class Section:
 
     @property
     def anchor(self) -> str:
-        """The heading as a name for links."""
+        """The name of the heading for links."""
         return slug(self.title)
 
     @property

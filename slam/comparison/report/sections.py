@@ -34,7 +34,7 @@ EMPTY: tuple[Any, ...] = (None, "", [], {})
 
 
 def make_sections(comparison: Comparison, folder: Path) -> list[Section]:
-    """All sections that have something to say; files are looked for in ``folder``."""
+    """All sections that are not empty; ``folder`` holds the files of the cells."""
     sections = [
         _absolute_errors(comparison),
         _differences(comparison),
@@ -51,7 +51,7 @@ def make_sections(comparison: Comparison, folder: Path) -> list[Section]:
 
 
 def summary(comparison: Comparison) -> list[str]:
-    """What was compared, in sentences."""
+    """A summary of the comparison in sentences."""
     states = Counter(cell.status for cell in comparison.cells)
     counts = f"{_count(comparison.sequences, 'sequence')}, {_count(comparison.methods, 'method')}, "
     counts += f"{_count(comparison.cells, 'cell')}"
@@ -72,7 +72,7 @@ def summary(comparison: Comparison) -> list[str]:
 
 
 def log_tail(cell: Cell, folder: Path) -> str:
-    """The last lines of a cell's log, or a sentence saying that there is none."""
+    """The last lines of a cell's log, or a sentence if there are none."""
     path = folder / cell.log
     if not cell.log or not path.is_file():
         return "(no log)"
@@ -85,7 +85,7 @@ def _absolute_errors(comparison: Comparison) -> Section:
     text = (
         "Best figures measured here are bold; published figures are quoted from their sources and "
         "were not measured here. Alignment is SE(3) unless a row is marked Sim(3). A sequence with "
-        "a failed run is marked, and takes no part in what is best.",
+        "a failed run is marked, and is not compared for the best.",
     )
     return Section("Absolute trajectory error", text, (table,)) if table else Section("")
 
@@ -122,7 +122,7 @@ def _other_metrics(comparison: Comparison) -> Section:
 
 
 def _without_notes(table: Table) -> Table:
-    """A table whose rows' notes stand beside the main one."""
+    """A table without the notes of its rows, which the main table has."""
     return replace(table, rows=tuple(replace(row, note="") for row in table.rows))
 
 
@@ -139,10 +139,10 @@ def _maps(comparison: Comparison, folder: Path) -> list[Section]:
 
 
 def _provenance(comparison: Comparison) -> Section:
-    """What is short on one listing, each of the others on its own."""
-    given = {name: _without_empty(value) for name, value in comparison.provenance.items()}
-    long = {name: value for name, value in given.items() if isinstance(value, (dict, list))}
-    short = {name: value for name, value in given.items() if name not in long and value != ""}
+    """Short values in one listing, and a listing for each long one."""
+    values = {name: _without_empty(value) for name, value in comparison.provenance.items()}
+    long = {name: value for name, value in values.items() if isinstance(value, (dict, list))}
+    short = {name: value for name, value in values.items() if name not in long and value != ""}
     listings = [Listing("Run", _as_text(short))] if short else []
     listings += [
         Listing(name.capitalize(), _as_text(value)) for name, value in long.items() if value
@@ -151,7 +151,7 @@ def _provenance(comparison: Comparison) -> Section:
 
 
 def _without_empty(value: Any) -> Any:
-    """The same without what says nothing: None, empty texts, empty collections."""
+    """The same without None, empty texts and empty collections."""
     if isinstance(value, dict):
         kept = {key: _without_empty(item) for key, item in value.items()}
         return {key: item for key, item in kept.items() if item not in EMPTY}

@@ -1,4 +1,4 @@
-"""Tables of a comparison, as text and marks that every format prints in its own way."""
+"""Tables of a comparison, independent of the format in which they are printed."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Entry:
     """One cell of a table.
 
     Attributes:
-        text: the figure, or a word where there is none.
-        spread: range over seeds, "" with one.
-        note: what must be known to read the figure, such as "1 of 3 failed".
-        best: the best of its column among what was measured here.
-        failed: a run of it failed.
+        text: the figure, or a word without one.
+        spread: range over seeds; "" with one seed.
+        note: a remark on the figure, such as "1 of 3 failed".
+        best: whether it is the best measured here in its column.
+        failed: whether a run of it failed.
     """
 
     text: str
@@ -38,14 +38,14 @@ class Entry:
 
     @property
     def plain(self) -> str:
-        """All of it without marks."""
+        """Text, spread and note."""
         spread = f" ({self.spread})" if self.spread else ""
         return f"{self.text}{spread}{f' {self.note}' if self.note else ''}"
 
 
 @dataclass(frozen=True)
 class TableRow:
-    """A line: its name, marks beside it, where its figures come from, and its entries."""
+    """A row: its name, entries, tags after the name, and the source of its figures."""
 
     label: str
     entries: tuple[Entry, ...]
@@ -66,13 +66,13 @@ class Table:
 
 
 def metric_tables(comparison: Comparison) -> list[Table]:
-    """A table of methods by sequences for each metric that some cell holds."""
+    """A table of methods by sequences for each metric that a cell has."""
     tables = (metric_table(comparison, metric) for metric in METRICS)
     return [table for table in tables if table is not None]
 
 
 def metric_table(comparison: Comparison, metric: Metric) -> Table | None:
-    """Methods by sequences: the median over seeds, and the range; None where no cell has it."""
+    """Methods by sequences: median over seeds and range; None if no cell has the metric."""
     if not any(metric.name in cell.metrics for cell in comparison.cells):
         return None
     columns = [_column(comparison, sequence, metric) for sequence in comparison.sequences]
@@ -89,9 +89,9 @@ def metric_table(comparison: Comparison, metric: Metric) -> Table | None:
 
 
 def cell_tables(comparison: Comparison) -> list[Table]:
-    """For each sequence every cell with each of its figures, at most nine columns a table."""
-    held = {name for cell in comparison.cells for name in cell.metrics}
-    metrics = [metric for metric in METRICS if metric.name in held]
+    """All figures of every cell, by sequence, with at most nine columns a table."""
+    names = {name for cell in comparison.cells for name in cell.metrics}
+    metrics = [metric for metric in METRICS if metric.name in names]
     groups = [metrics[k : k + MAX_COLUMNS] for k in range(0, len(metrics), MAX_COLUMNS)]
     return [_cell_table(comparison, s, group) for s in comparison.sequences for group in groups]
 
@@ -117,7 +117,7 @@ def number(value: float, metric: Metric) -> str:
 
 
 def method_tags(method: Method) -> tuple[str, ...]:
-    """What marks a method's row: not run here, quoted, aligned with scale."""
+    """Tags of a method's row: not run here, published, aligned with scale."""
     kind = {Kind.RUN: (), Kind.TRAJECTORY: ("trajectory file",), Kind.PUBLISHED: ("published",)}
     return (*kind[method.kind], *(("Sim(3)",) if method.with_scale else ()))
 
@@ -129,7 +129,7 @@ def method_note(comparison: Comparison, method: Method) -> str:
 
 
 def _column(comparison: Comparison, sequence: str, metric: Metric) -> list[Entry]:
-    """The entries of a sequence, one for each method, the best marked."""
+    """The entries of a sequence, one for each method, with the best marked."""
     groups = [list(comparison.of(sequence, method.name)) for method in comparison.methods]
     entries = [_entry(cells, metric) for cells in groups]
     middle = {
@@ -169,7 +169,7 @@ def _entry(cells: list[Cell], metric: Metric) -> Entry:
 
 
 def _share(cells: list[Cell]) -> list[str]:
-    """How much of the sequence was evaluated, where it was not all."""
+    """The share of the sequence that was evaluated, if not all of it."""
     shares = [c.metrics["evaluated_share"] for c in cells if "evaluated_share" in c.metrics]
     return [f"over {100 * min(shares):.0f} %"] if shares and min(shares) < 0.995 else []
 

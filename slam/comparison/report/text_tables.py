@@ -26,7 +26,7 @@ LATEX = {
 
 
 def csv_text(comparison: Comparison) -> str:
-    """A line for each cell and metric, values as stored (SI); a cell without has one empty line."""
+    """A line for each cell and metric, values as stored (SI); an empty line for a cell without."""
     methods = {method.name: method for method in comparison.methods}
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -52,7 +52,7 @@ def latex_text(tables: list[Table]) -> str:
 
 
 def latex(text: str) -> str:
-    """Text with every character that LaTeX would read as its own escaped."""
+    """Text with LaTeX's special characters escaped."""
     return "".join(LATEX.get(character, character) for character in text)
 
 
@@ -82,7 +82,7 @@ def _markdown_entry(entry: Entry) -> str:
 
 
 def _latex_table(table: Table) -> str:
-    """Small and close, heads broken at their underscores; ranges only in narrow tables."""
+    """A small table with wrapped headings; ranges only in narrow tables."""
     narrow = len(table.columns) <= NARROW
     heads = [latex(table.corner), *map(_latex_head, table.columns)]
     rows = [
@@ -106,7 +106,7 @@ def _latex_rows(rows: list[list[str]]) -> list[str]:
 
 
 def _latex_head(text: str) -> str:
-    """A name in lines of at most about twelve letters, broken after _ or at spaces."""
+    """A heading in lines of about twelve letters, broken after _ or at spaces."""
     lines = [""]
     for piece in re.findall(r"[^_ ]+[_ ]?", text):
         if lines[-1] and len(lines[-1]) + len(piece) > HEAD_LETTERS + 1:

@@ -1,4 +1,4 @@
-"""Which differences from the first configuration are more than chance, and how large they are."""
+"""Tables of the differences from the first configuration and of their significance."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from bmask_slam.comparison.report.table import ATE, EMPTY, Entry, Table, TableRo
 from bmask_slam.comparison.statistics import (
     BETTER,
     LEVEL,
-    NOTHING,
+    NO_DIFFERENCE,
     RESAMPLES,
     WORSE,
     Verdict,
@@ -19,31 +19,31 @@ from bmask_slam.comparison.statistics import (
 COLUMNS = ("judgement", "difference", "95 % interval", "better / worse of pairs", "p")
 RULE = (
     f"A method is called better or worse only where the bootstrap interval of the mean difference "
-    f"over paired images ({RESAMPLES} resamples) leaves out 0 and the sign test agrees, "
-    f"p < {LEVEL:g} after Holm's correction for all that is judged here. "
-    f'"{NOTHING.capitalize()}" does not mean equal. All of it is said of these sequences.'
+    f"over paired images ({RESAMPLES} resamples) excludes 0 and the sign test agrees, "
+    f"p < {LEVEL:g} after Holm's correction for all verdicts of this report. "
+    f'"{NO_DIFFERENCE.capitalize()}" does not mean equal. Verdicts hold for these sequences only.'
 )
 
 
 def verdict_tables(comparison: Comparison) -> list[Table]:
-    """A table for each metric that is judged: methods against the first configuration."""
+    """A table for each judged metric: methods against the first configuration."""
     found = verdicts(comparison)
     metrics = dict.fromkeys(verdict.metric for verdict in found)
     return [_table(BY_NAME[name], [v for v in found if v.metric == name]) for name in metrics]
 
 
 def verdict_sentences(comparison: Comparison) -> list[str]:
-    """What is shown of the main metric, in words; one sentence where nothing is."""
+    """Significant differences in the main metric as sentences; one sentence if there are none."""
     found = [v for v in verdicts(comparison) if v.metric == ATE.name]
-    shown = [
+    sentences = [
         f"{ATE.title}: {v.method} is {v.judgement} than {v.baseline} by "
         f"{ATE.scale * abs(v.difference):.{ATE.digits}f} {ATE.unit} on the mean of {v.pairs} pairs."
         for v in found
-        if v.judgement != NOTHING
+        if v.judgement != NO_DIFFERENCE
     ]
-    if found and not shown:
+    if found and not sentences:
         return [f"{ATE.title}: no difference from {found[0].baseline} is shown."]
-    return shown
+    return sentences
 
 
 def ablation_table(comparison: Comparison) -> Table | None:
@@ -62,7 +62,7 @@ def ablation_table(comparison: Comparison) -> Table | None:
     if all(entry.text == EMPTY for row in rows for entry in row.entries):
         return None
     caption = (
-        f"Median ATE against that of {runs[0].name} (%): above 0, it is worse without. "
+        f"Median ATE against that of {runs[0].name} (%): positive: larger error. "
         "Empty where a run of either failed."
     )
     return Table("ablation", f"ATE against {runs[0].name} (%)", caption, comparison.sequences, rows)
@@ -92,11 +92,11 @@ def _entries(metric: Metric, verdict: Verdict) -> tuple[Entry, ...]:
     def shown(value: float) -> str:
         return f"{metric.scale * value:+.{metric.digits + 1}f}"
 
-    left_out = f"{verdict.left_out} left out" if verdict.left_out else ""
+    incomplete = f"{verdict.incomplete} incomplete" if verdict.incomplete else ""
     return (
         Entry(verdict.judgement, best=verdict.judgement in (BETTER, WORSE)),
         Entry(shown(verdict.difference)),
         Entry(f"{shown(verdict.low)} to {shown(verdict.high)}"),
-        Entry(f"{verdict.wins} / {verdict.losses} of {verdict.pairs}", note=left_out),
+        Entry(f"{verdict.wins} / {verdict.losses} of {verdict.pairs}", note=incomplete),
         Entry(f"{verdict.p_value:.2g}"),
     )

@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind, Method
 from bmask_slam.comparison.statistics import (
     BETTER,
-    NOTHING,
+    NO_DIFFERENCE,
     WORSE,
     bootstrap_interval,
     holm,
@@ -82,7 +82,7 @@ def test_holm_by_hand():
 
 def test_nothing_is_said_of_noise():
     """Two methods of the same distribution: a verdict is false, and rarer than the level."""
-    false = [verdicts(comparison(noise(seed)))[0].judgement != NOTHING for seed in range(300)]
+    false = [verdicts(comparison(noise(seed)))[0].judgement != NO_DIFFERENCE for seed in range(300)]
     assert np.mean(false) <= 0.05
 
 
@@ -101,7 +101,7 @@ def test_an_outlier_alone_proves_nothing():
     values[0] += noise(2)[0] / 100
     values[1] = values[0]
     values[1, 0, 0] = 5.0
-    assert verdicts(comparison(values))[0].judgement == NOTHING
+    assert verdicts(comparison(values))[0].judgement == NO_DIFFERENCE
 
 
 def test_too_few_pairs_are_told():
@@ -143,7 +143,7 @@ def test_a_failed_cell_is_left_out_and_counted():
     values = noise(6)
     values[1, 2, 1] = np.nan
     (verdict,) = verdicts(comparison(values))
-    assert (verdict.pairs, verdict.left_out) == (17, 1)
+    assert (verdict.pairs, verdict.incomplete) == (17, 1)
     found = summarise(comparison(values).of("c", "other"), "ate_rmse")
     assert found.count == 2
     assert found.median == pytest.approx(values[1, 2, [0, 2]].mean())

@@ -70,7 +70,7 @@ def test_every_key_is_read(tmp_path):
         ("frames: 20", "frame: 20", r"sequences.office.render: unknown key frame; did you mean"),
         ("frames: 20", "frames: few", r"frames = few is not a whole number"),
         ("frames: 20", "seed: 2", r"render: seed = 2 is each cell's own; write it in seeds"),
-        ("name: office", "name: attic", r"name = 'attic' is no scene; there are: office"),
+        ("name: office", "name: attic", r"name = 'attic' is not a scene; there are: office"),
         ("folder: kitchen, ", "", r"sequences.kitchen: give either folder or render"),
         ("folder: kitchen", "path: kitchen", r"sequences.kitchen: unknown key path"),
         ("loops.enabled", "loop.enabled", r"configurations.other: --set .*did you mean loops"),
@@ -85,7 +85,7 @@ def test_every_key_is_read(tmp_path):
         ("ate_rmse: {xyz", "ate: {xyz", r"published\[0\]: unknown key ate"),
         ("{xyz: 0.011}", "{xyz: 1 cm}", r"ate_rmse.xyz = '1 cm': give a number"),
         ('source: "a table", ', "", r"published\[0\]: source is missing"),
-        ("method: DVO", "method: default", "too alike"),
+        ("method: DVO", "method: default", "too similar"),
         ("  ORB:", "  O/B:", "method 'O/B': use letters and digits"),
     ],
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bmask_slam.comparison.experiment.data_folders import data_folders, find_site
+from bmask_slam.comparison.experiment.data_folders import data_folders, locate_sequence
 from bmask_slam.comparison.experiment.experiment import (
     Configuration,
     Experiment,
@@ -17,11 +17,11 @@ from bmask_slam.comparison.experiment.experiment import (
 from bmask_slam.comparison.experiment.options import (
     CompareOptions,
     parse_trajectory,
-    with_files,
+    with_trajectories,
 )
 from bmask_slam.comparison.experiment.result import CellStatus
 from bmask_slam.comparison.jobs.bar import JobBar
-from bmask_slam.comparison.jobs.cells import drawn_place, run_jobs
+from bmask_slam.comparison.jobs.cells import CellKey, rendered_sequence, run_jobs
 from bmask_slam.comparison.jobs.errors import Rules, trajectory_errors
 from bmask_slam.comparison.jobs.external import published_cells
 from bmask_slam.comparison.jobs.job import Job, Outcome
@@ -52,7 +52,7 @@ def make(folder: Path, *names: str) -> Path:
 @pytest.mark.parametrize("lists", [("rgb.txt",), ("associations.txt",)])
 def test_a_sequence_is_found_by_each_of_its_names(tmp_path, place, lists):
     folder = make(tmp_path / "data" / place, *lists, "groundtruth.txt")
-    site = find_site(XYZ, experiment(tmp_path), [tmp_path / "data"], [])
+    site = locate_sequence(XYZ, experiment(tmp_path), [tmp_path / "data"], [])
     assert (site.folder, site.reference, site.problem) == (folder, folder / "groundtruth.txt", "")
 
 
@@ -60,14 +60,14 @@ def test_a_sequence_is_found_by_each_of_its_names(tmp_path, place, lists):
                                   "fr1_xyz-groundtruth.txt"])  # fmt: skip
 def test_truth_without_images_is_found_beside_a_trajectory(tmp_path, name):
     folder = make(tmp_path / "elsewhere", name)
-    site = find_site(XYZ, experiment(tmp_path), [], [folder / "estimate.txt"])
+    site = locate_sequence(XYZ, experiment(tmp_path), [], [folder / "estimate.txt"])
     assert (site.folder, site.reference) == (None, folder / name)
     assert "bmask-slam download tum/freiburg1_xyz" in site.problem
 
 
 def test_a_folder_without_lists_is_told(tmp_path):
     folder = make(tmp_path / "freiburg1_xyz", "groundtruth.txt")
-    site = find_site(XYZ, experiment(tmp_path), [tmp_path], [])
+    site = locate_sequence(XYZ, experiment(tmp_path), [tmp_path], [])
     assert site.folder is None
     assert site.reference == folder / "groundtruth.txt"
     assert site.problem.startswith(f"{folder}: holds no rgb.txt")
@@ -90,7 +90,7 @@ def test_a_method_may_have_a_colon():
 
 def test_a_given_file_replaces_the_experiments(tmp_path):
     file = make(tmp_path, "f.txt") / "f.txt"
-    found = with_files(experiment(tmp_path), {("ORB", "xyz"): file})
+    found = with_trajectories(experiment(tmp_path), {("ORB", "xyz"): file})
     assert found.systems["ORB"].trajectories == {"xyz": str(file)}
 
 
@@ -116,20 +116,20 @@ def test_a_seed_draws_a_rendered_sequence_and_only_seeds_a_recorded_one(tmp_path
     plan = make_plan(given, tmp_path / "out", CompareOptions(data=(tmp_path,)))
     assert set(plan.cells()) == set(plan.jobs)
     assert len(plan.jobs) == 8
-    recorded = [plan.jobs["xyz", "default", seed] for seed in (3, 7)]
+    recorded = [plan.jobs[CellKey("xyz", "default", seed)] for seed in (3, 7)]
     assert all(str(folder) in job.arguments for job in recorded)
     assert [job.arguments[-1] for job in recorded] == [
         f"loops.verification.seed={seed}" for seed in (3, 7)
     ]
     assert recorded[0].depends["sequence"] == recorded[1].depends["sequence"]
-    drawn = [plan.jobs["office", "default", seed] for seed in (3, 7)]
+    drawn = [plan.jobs[CellKey("office", "default", seed)] for seed in (3, 7)]
     assert drawn[0].depends["sequence"] != drawn[1].depends["sequence"]
-    renders = [plan.place("office", seed).render for seed in (3, 7)]
+    renders = [plan.sequence("office", seed).render for seed in (3, 7)]
     for job, render, seed in zip(drawn, renders, (3, 7), strict=True):
         assert str(Path(render.product).parent) in job.arguments
         assert render.arguments[:4] == ("render", "office", "--seed", str(seed))
     assert not drawn[0].sequence
-    assert plan.jobs["office", "other", 3].sequence, "labels are compared with the truth"
+    assert plan.jobs[CellKey("office", "other", 3)].sequence, "labels are compared with the truth"
 
 
 def test_what_a_cell_depends_on(tmp_path):
@@ -137,8 +137,8 @@ def test_what_a_cell_depends_on(tmp_path):
 
     def depends(source: SequenceSource, configuration: Configuration) -> dict[str, str]:
         given = experiment(tmp_path, source, configurations={"default": configuration})
-        place = drawn_place(source, source.render, 0, tmp_path)
-        return run_jobs(given, [place], tmp_path)["office", "default", 0].depends
+        data = rendered_sequence(source, source.render, 0, tmp_path)
+        return run_jobs(given, [data], tmp_path)[CellKey("office", "default", 0)].depends
 
     base = depends(OFFICE, Configuration())
     assert base == depends(OFFICE, Configuration(note="told otherwise"))
@@ -187,10 +187,10 @@ def test_the_time_left_follows_from_jobs_of_the_same_group():
 
     jobs = [job("a"), job("a"), job("b"), job("r", "render")]
     with JobBar(jobs, 2, quiet=True) as bar:
-        assert bar.left_s() == 0
+        assert bar.remaining_s() == 0
         bar.update(jobs[0], Outcome(CellStatus.DONE, wall_s=10))
-        assert bar.left_s() == (10 + 10 + 10) / 2
+        assert bar.remaining_s() == (10 + 10 + 10) / 2
         bar.update(jobs[3], Outcome(CellStatus.DONE, wall_s=100))
-        assert bar.left_s() == (10 + 10) / 2
+        assert bar.remaining_s() == (10 + 10) / 2
         bar.update(jobs[2], Outcome(CellStatus.FAILED, wall_s=1))
-        assert bar.left_s() == 5
+        assert bar.remaining_s() == 5
