@@ -1,4 +1,4 @@
-"""Which keypoints of a frame lie on moving things, by earlier views and by boxes in space."""
+"""Finds keypoints on moving objects, by earlier views and by moving boxes."""
 
 from __future__ import annotations
 
@@ -20,14 +20,13 @@ from bmask_slam.sequences.frame import Frame
 NEAREST_M = 0.2
 """Boxes whose centre is nearer to the camera are not projected into the image."""
 
-
 Boxes = tuple[Array, Array]
 """Centres in the world (T, 3) m, and half sizes (T, 3) m along an image's columns, its rows and
 the depth."""
 
 
 class FeatureMotions(NamedTuple):
-    """The motion of features (N,), and where the frame moves; None without views."""
+    """The motion of features (N,), and the moving part of the frame; None without views."""
 
     point_motions: PointMotions
     space: MovingSpace | None
@@ -54,13 +53,12 @@ class FeatureMotion:
     ) -> FeatureMotions:
         """The motion of features at a predicted pose, by earlier views and by moving boxes.
 
-        Features that a view saw to be static stay static inside a box.
+        Features that are static by a view stay static inside a box.
         """
         judged = FeatureMotions(np.zeros(len(features), np.int8), None)
         if views:
             judged = self._by_views(frame, features, T_world_camera, views, moving)
-        where = features.image_pixels, features.depth_m
-        in_boxes = self.in_boxes(where, moving, T_world_camera)
+        in_boxes = self.in_boxes(features.image_pixels, features.depth_m, moving, T_world_camera)
         judged.point_motions[in_boxes & (judged.point_motions != PointMotion.STATIC)] = (
             PointMotion.MOVING
         )
@@ -74,7 +72,7 @@ class FeatureMotion:
         views: Sequence[PosedView],
         boxes_world: Boxes,
     ) -> FeatureMotions:
-        """The motion of features by views; ``boxes_world`` move, with what they carry.
+        """The motion of features by views; ``boxes_world`` move, with what is carried.
 
         All features on a moving segment move.
         """
@@ -82,31 +80,31 @@ class FeatureMotion:
         samples = (self._rays * segments.depth_m[..., None]).reshape(-1, 3)
         points = self.camera.backproject(features.pixels, features.depth_m)
         points_world = transform(T_world_camera, np.concatenate([points, samples]))
-        told = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
-        point_motions = self._check.agree(told)
+        by_view = self._check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
+        point_motions = self._check.agree(by_view)
         by_sample = point_motions[len(features) :].reshape(segments.labels.shape)
-        where = self._samples, segments.depth_m.ravel().astype(float)
+        depth_m = segments.depth_m.ravel().astype(float)
         moving = segments.moving(by_sample)
-        taken = self.in_boxes(where, boxes_world, T_world_camera).reshape(by_sample.shape)
-        taken &= (by_sample != PointMotion.STATIC) & (segments.labels > 0)
-        taken |= segments.held(moving | taken, by_sample)
-        seen, space = segments.space(moving), segments.space(moving | taken)
+        carried = self.in_boxes(self._samples, depth_m, boxes_world, T_world_camera)
+        carried = carried.reshape(by_sample.shape)
+        carried &= (by_sample != PointMotion.STATIC) & (segments.labels > 0)
+        carried |= segments.held(moving | carried, by_sample)
+        observed, space = segments.space(moving), segments.space(moving | carried)
         point_motions = self._check.spread(
             features.pixels, features.depth_m, point_motions[: len(features)]
         )
-        where = features.image_pixels, features.depth_m
-        point_motions[space.on(*where) & (point_motions != PointMotion.STATIC)] = PointMotion.MOVING
-        point_motions[seen.on(*where)] = PointMotion.MOVING
+        on_space = space.on(features.image_pixels, features.depth_m)
+        point_motions[on_space & (point_motions != PointMotion.STATIC)] = PointMotion.MOVING
+        point_motions[observed.on(features.image_pixels, features.depth_m)] = PointMotion.MOVING
         return FeatureMotions(point_motions, space)
 
     def in_boxes(
-        self, where: tuple[Array, Array], boxes_world: Boxes, T_world_camera: Array
+        self, pixels: Array, depth_m: Array, boxes_world: Boxes, T_world_camera: Array
     ) -> Mask:
-        """Mask (N,) of points of a frame that lie in any of the boxes, in image and depth.
+        """Mask (N,) of pixels (N, 2) with depths (N,) that lie in any of the boxes.
 
-        ``where`` are their pixels (N, 2) and depths (N,) in m; without depth only the image counts.
+        Of a pixel without depth (NaN) only the position in the image counts.
         """
-        pixels, depth_m = where
         centres_world, half_sizes_m = boxes_world
         centres = transform(inverse(T_world_camera), centres_world)
         ahead = centres[:, 2] >= NEAREST_M

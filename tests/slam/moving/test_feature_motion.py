@@ -57,7 +57,7 @@ def test_keypoints_in_boxes_one_by_one(count: int) -> None:
     depth_m[::5] = np.nan
     centres = transform(T_world_camera, rng.uniform([-1, -0.6, -1], [1, 0.6, 4], (count, 3)))
     sizes = rng.uniform(0.2, 1.0, (count, 3))
-    found = check().in_boxes((pixels, depth_m), (centres, sizes), T_world_camera)
+    found = check().in_boxes(pixels, depth_m, (centres, sizes), T_world_camera)
     slow = [
         any(inside_one(p, z, (c, s), T_world_camera) for c, s in zip(centres, sizes, strict=True))
         for p, z in zip(pixels, depth_m, strict=True)
@@ -66,17 +66,17 @@ def test_keypoints_in_boxes_one_by_one(count: int) -> None:
     assert found.any() == (count > 1)
 
 
-def man_with_box() -> np.ndarray:
-    """Metres: a man at 1.5 before a wall at 3, and what he holds beside him."""
+def person_with_box() -> np.ndarray:
+    """Depth in m: a person at 1.5, a carried object beside, and a wall at 3."""
     depth_m = np.full((480, 640), 3.0, np.float32)
     depth_m[96:384, 200:360] = 1.5
     depth_m[192:304, 360:456] = 1.45
     return depth_m
 
 
-def judged(view: DepthView, T_world_camera: Array) -> list[int]:
-    """Of keypoints on the man, what he holds and the wall, where his box is known to move."""
-    depth_m = man_with_box()
+def point_motions(view: DepthView, T_world_camera: Array) -> list[int]:
+    """Motions of keypoints on the person, the carried object and the wall; the box moves."""
+    depth_m = person_with_box()
     frame = Frame(1, 1.0, np.zeros((480, 640, 3), np.uint8), depth_m, "1")
     pixels = np.array([[280.0, 240.0], [410.0, 250.0], [560.0, 250.0]])
     features = keypoints(pixels, np.array([1.5, 1.45, 3.0]))
@@ -91,10 +91,10 @@ def judged(view: DepthView, T_world_camera: Array) -> list[int]:
     return found.point_motions.tolist()  # type: ignore[no-any-return]
 
 
-def test_what_a_man_holds_moves_unless_it_was_seen_to_stand() -> None:
+def test_a_carried_object_moves_unless_a_view_shows_it_static() -> None:
     T_world_camera = se3_exp(np.array([0.1, -0.4, 0.2, 1.0, 0.3, -0.5]))
-    blind = depth_view(np.full((480, 640), np.nan, np.float32), 5)
-    assert judged(blind, T_world_camera) == [-1, -1, 0]
-    saw_it = man_with_box()
-    saw_it[:, :360] = np.nan
-    assert judged(depth_view(saw_it, 5), T_world_camera) == [-1, 1, 1]
+    empty = depth_view(np.full((480, 640), np.nan, np.float32), 5)
+    assert point_motions(empty, T_world_camera) == [-1, -1, 0]
+    view_m = person_with_box()
+    view_m[:, :360] = np.nan
+    assert point_motions(depth_view(view_m, 5), T_world_camera) == [-1, 1, 1]
