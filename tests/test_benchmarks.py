@@ -71,7 +71,7 @@ def test_the_page_of_make_bench_names_commands_commit_and_date() -> None:
     assert "\nbmask-slam run " in page.partition("## Commands")[2]
 
 
-def test_a_section_without_a_stamp_is_noticed(tmp_path: Path) -> None:
+def test_a_section_without_a_stamp_is_reported(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     stamp = "CPU; commit 0123abcd with changes in a.py; 2026-01-02 03:04 UTC; 5 s."
     command = "`python -m benchmarks.loops.loop_closing corridor`"

@@ -85,14 +85,14 @@ def _check(rule: str, found: dict[str, object]) -> None:
 # --- layers and rooms ----------------------------------------------------------------------------
 
 
-def test_there_is_something_to_check() -> None:
+def test_the_source_tree_is_found() -> None:
     assert {location(path).partition("/")[0] for path in SOURCES} == set(LAYERS)
     assert "graph/smoother/smoother.py" in offenders("numpy")
     assert f"{PACKAGE}.graph.geometry" in imported_modules(f"{PACKAGE}.graph.metrics")
 
 
 @pytest.mark.parametrize("folder", ROOMS)
-def test_every_room_has_a_place_in_the_order(folder: str) -> None:
+def test_every_room_is_in_the_order(folder: str) -> None:
     named = ROOMS[folder].replace("[...]", "").split()
     here = LAYERS if folder == "the layers" else _entries(folder)
     if "[...]" in ROOMS[folder]:  # where a module need not be named
@@ -139,7 +139,7 @@ def test_a_room_imports_only_from_its_left(folder: str) -> None:
     _check("rooms", found)
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
+def test_there_are_no_import_cycles() -> None:
     graph = {module: set(imported_modules(module)) for module in PATHS}
     circle = []
     try:
@@ -167,7 +167,7 @@ def test_gtsam_stays_in_graph() -> None:
     assert offenders("gtsam") - _within("graph", offenders("gtsam")) == set()
 
 
-def test_graph_knows_no_images_and_no_networks() -> None:
+def test_graph_imports_no_images_or_networks() -> None:
     for package in ("cv2", "torch", "open3d", "matplotlib"):
         assert _within("graph", offenders(package)) == set()
 
@@ -199,7 +199,7 @@ def test_numpy_only_modules_import_without_anything_else() -> None:
 # --- sizes and docstrings ------------------------------------------------------------------------
 
 
-def test_every_package_and_module_says_what_it_is() -> None:
+def test_every_package_and_module_has_a_docstring() -> None:
     docstrings = {location(path): ast.get_docstring(parse(path)) for path in SOURCES}
     found = {path: text for path, text in docstrings.items() if text in (None, "", "TODO.")}
     _check("docstrings", dict(found))
@@ -243,7 +243,7 @@ def _parameters(arguments: ast.arguments) -> list[ast.arg]:
     return [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
 
 
-def test_a_small_module_lives_with_its_only_user() -> None:
+def test_a_small_module_is_in_its_only_users_folder() -> None:
     found: dict[str, object] = {}
     for module, users in users_of_modules().items():
         path = PATHS[module]

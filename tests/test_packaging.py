@@ -152,7 +152,7 @@ def test_only_one_import_name_is_installed(installed: Environment) -> None:
     assert names - {"__pycache__"} == {"bmask_slam", information, "dependencies.pth"}
 
 
-def test_it_works_beside_a_users_own_modules(installed: Environment) -> None:
+def test_it_works_with_user_modules_of_the_same_names(installed: Environment) -> None:
     assert set(USERS_OWN) <= {path.name for path in installed.users_folder.iterdir()}
     code = f"import bmask_slam; from bmask_slam import {PUBLIC_NAMES}; print(bmask_slam.__file__)"
     file = installed.run("python", "-c", code).strip()
@@ -162,7 +162,7 @@ def test_it_works_beside_a_users_own_modules(installed: Environment) -> None:
     assert re.fullmatch(r"bmask-slam \d+\.\d+\.\d+\n", version)
 
 
-def test_every_shipped_configuration_is_found_in_the_wheel(installed: Environment) -> None:
+def test_every_shipped_configuration_is_in_the_wheel(installed: Environment) -> None:
     code = "from bmask_slam.graph.data_files import data_path; print(data_path('configs'))"
     folder = installed.run("python", "-c", code).strip()
     assert folder == str(installed.site_packages / "bmask_slam/data/configs")

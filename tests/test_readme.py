@@ -57,7 +57,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page):
+def test_links_have_targets(page):
     for link in LINK.findall(page.read_text(encoding="utf-8")):
         if link.startswith("http"):
             continue
@@ -140,7 +140,7 @@ def test_the_results_are_those_of_the_benchmark():
     assert len(rows) > 2, "no sequence was measured"
 
 
-def test_figures_of_results_stand_nowhere_else_in_the_readme():
+def test_figures_of_results_are_only_in_the_results_table():
     """Nothing measured is typed by hand: units of results appear in written blocks only."""
     example = README.partition("<!-- example:")[2].partition("<!-- end of example -->")[0]
     rest = README.replace(block(README), "").replace(example, "")

@@ -29,7 +29,7 @@ def test_axes_are_right_down_forward() -> None:
     np.testing.assert_allclose(down, [318.5, 241.5 + 255.0])
 
 
-def test_projection_is_that_of_K() -> None:
+def test_projection_equals_that_by_K() -> None:
     homogeneous = (CAMERA.K @ POINTS.T).T
     np.testing.assert_allclose(
         CAMERA.project(POINTS), homogeneous[:, :2] / homogeneous[:, 2:], rtol=1e-12
@@ -37,7 +37,7 @@ def test_projection_is_that_of_K() -> None:
 
 
 @pytest.mark.parametrize("shape", [(3,), (40, 3), (4, 10, 3)])
-def test_backprojection_undoes_projection(shape: tuple[int, ...]) -> None:
+def test_backprojection_inverts_projection(shape: tuple[int, ...]) -> None:
     points = POINTS.reshape(-1)[: np.prod(shape)].reshape(shape)
     pixels = CAMERA.project(points)
     assert pixels.shape == (*shape[:-1], 2)
@@ -58,13 +58,13 @@ def test_the_right_image_lies_to_the_left_by_bf_over_z() -> None:
     assert far[2] == pytest.approx(318.5 - 10.0)
 
 
-def test_the_right_image_is_seen_from_a_baseline_to_the_right() -> None:
+def test_the_right_camera_is_a_baseline_to_the_right() -> None:
     shifted = CAMERA.project(POINTS - [CAMERA.baseline_m, 0.0, 0.0])
     np.testing.assert_allclose(CAMERA.project_stereo(POINTS)[:, 2], shifted[:, 0], rtol=1e-12)
     assert CAMERA.baseline_m == pytest.approx(40.0 / 525.0)
 
 
-def test_distortion_is_opencvs_to_the_last_bit() -> None:
+def test_distortion_equals_opencvs_to_the_last_bit() -> None:
     points = RNG.uniform([-2.0, -1.5, 1.0], [2.0, 1.5, 6.0], (1000, 3))
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), FREIBURG1.K, LENS)
     np.testing.assert_array_equal(FREIBURG1.project_distorted(points), expected[:, 0])
@@ -77,7 +77,7 @@ def test_distortion_is_opencvs_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_undistortion_is_opencvs_to_the_last_bit(dtype: type) -> None:
+def test_undistortion_equals_opencvs_to_the_last_bit(dtype: type) -> None:
     """Far outside the image too, where the lens model folds back."""
     pixels = RNG.uniform([-600, -600], [1300, 1100], (2000, 2)).astype(dtype)
     expected = cv2.undistortPoints(pixels[:, None], FREIBURG1.K, LENS, P=FREIBURG1.K)[:, 0]
@@ -86,7 +86,7 @@ def test_undistortion_is_opencvs_to_the_last_bit(dtype: type) -> None:
     np.testing.assert_array_equal(undistorted, expected)
 
 
-def test_undistortion_undoes_distortion() -> None:
+def test_undistortion_inverts_distortion() -> None:
     grid = np.stack(np.meshgrid(np.linspace(30, 610, 15), np.linspace(30, 450, 12)), axis=-1)
     raw = FREIBURG1.distort(grid)
     assert np.abs(raw - grid).max() > 5.0

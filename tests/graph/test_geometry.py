@@ -56,7 +56,7 @@ def test_so3_exp_turns_x_towards_y_about_z() -> None:
 
 
 @pytest.mark.parametrize("angle_rad", ANGLES_RAD)
-def test_exponentials_are_those_of_matrices(angle_rad: float) -> None:
+def test_exponentials_equal_matrix_exponentials(angle_rad: float) -> None:
     axes = unit(RNG.normal(size=(20, 3)))
     xi = np.concatenate([angle_rad * axes, RNG.normal(size=(20, 3))], axis=1)
     expected = np.array([expm(hat4(row)) for row in xi])
@@ -65,7 +65,7 @@ def test_exponentials_are_those_of_matrices(angle_rad: float) -> None:
 
 
 @pytest.mark.parametrize("angle_rad", ANGLES_RAD)
-def test_logarithms_undo_exponentials(angle_rad: float) -> None:
+def test_logarithms_invert_exponentials(angle_rad: float) -> None:
     axes = np.concatenate([unit(RNG.normal(size=(20, 3))), np.eye(3), -np.eye(3)])
     omega = angle_rad * axes
     np.testing.assert_allclose(so3_log(so3_exp(omega)), omega, rtol=0, atol=1e-12)
@@ -82,7 +82,7 @@ def test_half_a_turn_has_the_axis_of_either_sign() -> None:
 
 @settings(deadline=None)
 @given(st.lists(st.floats(-1.8, 1.8), min_size=6, max_size=6))
-def test_log_of_any_small_motion_comes_back(xi: list[float]) -> None:
+def test_log_of_small_motions_inverts_exp(xi: list[float]) -> None:
     omega = np.array(xi[:3])
     if np.linalg.norm(omega) < 3.0:
         np.testing.assert_allclose(se3_log(se3_exp(np.array(xi))), xi, atol=1e-9)
@@ -124,7 +124,7 @@ def test_quaternion_of_every_branch_of_shepperds_method(largest: int) -> None:
     )
 
 
-def test_inverse_undoes_a_transform_of_any_leading_shape() -> None:
+def test_inverse_of_stacks_of_transforms() -> None:
     T = se3_exp(RNG.normal(size=(2, 3, 6)))
     assert inverse(T).shape == (2, 3, 4, 4)
     np.testing.assert_allclose(inverse(T) @ T, np.broadcast_to(np.eye(4), T.shape), atol=1e-14)
@@ -167,7 +167,7 @@ def predicted_and_tracked(orthonormalise: bool) -> np.ndarray:
     return T
 
 
-def test_orthonormalised_is_the_nearest_rotation_for_a_stack() -> None:
+def test_orthonormalised_gives_the_nearest_rotations() -> None:
     T = se3_exp(RNG.normal(size=(2, 5, 6)))
     disturbed = T.copy()
     disturbed[..., :3, :3] += 1e-3 * RNG.normal(size=(2, 5, 3, 3))
@@ -194,7 +194,7 @@ def test_orthonormalised_changes_little_and_keeps_the_translation() -> None:
     np.testing.assert_array_equal(fixed[:, :3, 3], spoiled[:, :3, 3])
 
 
-def test_a_pose_that_is_carried_along_a_thousand_times_stays_rigid():
+def test_a_pose_composed_a_thousand_times_stays_rigid():
     rng = np.random.default_rng(5)
     step = se3_exp(np.array([0.02, -0.01, 0.03, 0.05, 0.0, 0.02]))
     reference, T = np.eye(4), step

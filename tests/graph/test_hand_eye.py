@@ -32,13 +32,13 @@ def reference_of(camera: Trajectory, T_camera_body: Array) -> Trajectory:
     return Trajectory(body.timestamps_s, T_WORLDS @ body.poses_world_camera)
 
 
-def test_exact_motion_tells_the_place_exactly() -> None:
+def test_exact_motion_gives_the_exact_lever_arm() -> None:
     camera = moving(np.array([0.4, 0.5, 0.3]))
     found = hand_eye(camera, reference_of(camera, T_CAMERA_IMU))
     np.testing.assert_allclose(found, T_CAMERA_IMU, atol=1e-6)
 
 
-def test_noise_moves_the_place_little() -> None:
+def test_noise_has_little_effect_on_the_lever_arm() -> None:
     camera = moving(np.array([0.4, 0.5, 0.3]))
     found = hand_eye(shaken(camera, 0.003), reference_of(camera, T_CAMERA_IMU))
     off = inverse(T_CAMERA_IMU) @ found
@@ -46,7 +46,7 @@ def test_noise_moves_the_place_little() -> None:
     assert np.arccos((np.trace(off[:3, :3]) - 1) / 2) < 0.005
 
 
-def test_about_one_axis_what_no_motion_shows_stays_zero() -> None:
+def test_rotation_about_one_axis_leaves_the_unobservable_part_zero() -> None:
     """A robot on a floor: turns about y, moves in x and z; the body's height cannot be told."""
     t = np.arange(200) / 10
     turns = np.column_stack([0 * t, np.sin(0.9 * t), 0 * t])
@@ -58,7 +58,7 @@ def test_about_one_axis_what_no_motion_shows_stays_zero() -> None:
     np.testing.assert_allclose(found[:3, 3], [0.1, 0.0, -0.2], atol=1e-5)
 
 
-def test_a_camera_that_does_not_turn_is_refused() -> None:
+def test_a_camera_without_rotation_is_rejected() -> None:
     camera = moving(np.zeros(3))
     with pytest.raises(InputError, match=r"turns by at most 0\.00 degrees.*without --hand-eye"):
         hand_eye(camera, reference_of(camera, T_CAMERA_IMU))

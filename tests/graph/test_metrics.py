@@ -63,7 +63,7 @@ def test_align_never_reflects():
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
-def test_align_is_the_least_squares_optimum():
+def test_align_gives_the_least_squares_optimum():
     points = walk().positions_world
     target = noisy(walk(), sigma=0.1).positions_world
     found = align(points, target)
@@ -149,7 +149,7 @@ def test_relative_error_of_planted_drift():
     np.testing.assert_allclose(per_second.timestamps_s, stamps[:16])
 
 
-def test_relative_error_against_the_loop():
+def test_relative_error_equals_a_loop():
     """The vectorised form against the definition, pair by pair."""
     g = walk(30)
     e = noisy(g)
@@ -167,7 +167,7 @@ def test_relative_error_against_the_loop():
     np.testing.assert_allclose(error.rotation_rad.errors, angles, atol=1e-9)
 
 
-def test_time_pairs_pass_over_gaps():
+def test_time_pairs_skip_gaps():
     stamps = np.r_[np.arange(0, 2, 0.1), np.arange(5.03, 7, 0.1)]
     i, j = time_pairs(stamps)
     assert np.abs(stamps[j] - stamps[i] - 1).max() < 0.1 + 1e-9
@@ -179,7 +179,7 @@ def test_time_pairs_pass_over_gaps():
 
 @given(seeds, st.floats(0.05, 3))
 @settings(max_examples=40, deadline=None)
-def test_distance_pairs_against_the_loop(seed, delta_m):
+def test_distance_pairs_equal_a_loop(seed, delta_m):
     """Each i with the later j nearest in path length, stops on the way included."""
     rng = np.random.default_rng(seed)
     steps = rng.normal(0, 0.05, (50, 3)) * (rng.random((50, 1)) < 0.7)
@@ -194,7 +194,7 @@ def test_distance_pairs_against_the_loop(seed, delta_m):
     assert list(zip(*(k.tolist() for k in found), strict=True)) == expected
 
 
-def test_no_pair_is_no_number():
+def test_no_pairs_give_no_error():
     t = walk(1)
     assert relative_error(t, t, frame_pairs(1)) is None
     assert not len(distance_pairs(t.positions_world)[0])

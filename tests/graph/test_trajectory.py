@@ -33,7 +33,7 @@ def greedy_association(a_s, b_s, limit_s):
     return sorted(used_a), sorted(used_b)
 
 
-def test_sorts_and_refuses_repeats():
+def test_stamps_are_sorted_and_repeated_ones_rejected():
     t = random_trajectory(5)
     shuffled = Trajectory(t.timestamps_s[::-1], t.poses_world_camera[::-1])
     np.testing.assert_array_equal(shuffled.timestamps_s, t.timestamps_s)
@@ -121,7 +121,7 @@ def test_missing_file(tmp_path):
 
 @given(stamps, stamps, st.sampled_from([0.0, 0.02, 0.3, 10.0]))
 @settings(max_examples=150, deadline=None)
-def test_association_is_the_greedy_one(a_s, b_s, limit_s):
+def test_association_is_greedy(a_s, b_s, limit_s):
     i, j = associate_stamps(a_s, b_s, limit_s)
     assert (np.diff(i) > 0).all()
     assert (np.diff(j) > 0).all()

@@ -121,14 +121,16 @@ def test_the_format_is_recognised(tmp_path: Path, trajectory: Trajectory, start_
         np.testing.assert_allclose(found.poses_world_camera, moved.poses_world_camera, atol=2e-9)
 
 
-def test_tum_with_commas_is_no_euroc(tmp_path: Path) -> None:
+def test_tum_with_commas_is_not_euroc(tmp_path: Path) -> None:
     file = tmp_path / "a.txt"
     file.write_text("".join(f"{1403636579 + k},{k},0,0,0,0,0,1\n" for k in range(4)))
     assert recognise(file) == "tum"
     assert read_trajectory(file).timestamps_s.tolist() == [1403636579.0 + k for k in range(4)]
 
 
-def test_kitti_needs_stamps_and_says_how(tmp_path: Path, trajectory: Trajectory) -> None:
+def test_kitti_without_stamps_is_rejected_with_the_cure(
+    tmp_path: Path, trajectory: Trajectory
+) -> None:
     file = tmp_path / "a.txt"
     write_kitti(file, trajectory.poses_world_camera)
     with pytest.raises(InputError, match=r"has no stamps; give them with --times"):
@@ -137,7 +139,7 @@ def test_kitti_needs_stamps_and_says_how(tmp_path: Path, trajectory: Trajectory)
         read_trajectory(file, trajectory.timestamps_s[1:])
 
 
-def test_times_are_read_back_and_taken_from_tum(tmp_path: Path, trajectory: Trajectory) -> None:
+def test_times_are_read_back_or_read_from_tum(tmp_path: Path, trajectory: Trajectory) -> None:
     write_times(tmp_path / "times.txt", trajectory.timestamps_s)
     write_tum(tmp_path / "tum.txt", trajectory)
     for name in ("times.txt", "tum.txt"):

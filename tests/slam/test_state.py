@@ -200,7 +200,7 @@ def test_every_array_of_the_state_matters(system: SlamSystem) -> None:
         assert next(differences(system, other), None) is not None, name
 
 
-def test_both_go_on_the_same() -> None:
+def test_a_restored_system_continues_identically() -> None:
     """To the last bit: poses, map, graph and final adjustment."""
     system = at_checkpoint()
     twin = restored(system.state())
@@ -213,7 +213,7 @@ def test_both_go_on_the_same() -> None:
     assert list(differences(system, twin)) == []
 
 
-def test_what_is_compared_by_contents_has_no_other_attributes(system: SlamSystem) -> None:
+def test_compared_classes_have_only_compared_attributes(system: SlamSystem) -> None:
     """One that is added here must be added to ``graph_arrays`` or the table's columns, too."""
     tables, table = system.mapper.smoother._tables, system.mapper.world.landmarks
     pose_factors = {"pose_factors", "pose_factors_of", "_next_number"}

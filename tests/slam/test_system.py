@@ -72,7 +72,7 @@ def test_pose_agrees_with_the_truth_in_frame_unit_and_sign() -> None:
     assert np.allclose(results[-1].T_world_camera, T_first_last, atol=0.004)
 
 
-def test_lost_frames_get_no_pose_and_tracking_comes_back() -> None:
+def test_lost_frames_get_no_pose_and_tracking_recovers() -> None:
     system = SlamSystem(CAMERA)
     there = path(15)
     poses = [*there, *[None] * 5, *there[5:10]]
@@ -141,7 +141,7 @@ def test_frames_of_culled_keyframes_keep_their_poses() -> None:
     assert largest_error_m(system, poses) < 0.003
 
 
-def test_a_place_walked_again_needs_no_more_keyframes() -> None:
+def test_a_second_pass_needs_no_more_keyframes() -> None:
     system, there = SlamSystem(CAMERA), path(108)[::6]
     poses = [*there, *there[-2::-1]]
     made = np.array([r.keyframe_id is not None for r in process_views(system, poses)])
@@ -165,7 +165,7 @@ def test_a_place_walked_again_needs_no_more_keyframes() -> None:
         "final_adjustment=false",
     ],
 )
-def test_every_option_still_tracks(override: str) -> None:
+def test_tracking_works_with_every_option(override: str) -> None:
     poses = path(8)
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, [override]))
     results = process_views(system, poses)
@@ -187,7 +187,7 @@ def test_graph_is_saved_with_every_keyframe(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not KITCHEN.exists(), reason="needs ../shared/data/redkitchen")
-def test_real_kitchen_start_is_tracked() -> None:
+def test_the_start_of_the_red_kitchen_is_tracked() -> None:
     from bmask_slam.evaluation import evaluate_trajectory
 
     sequence = open_sequence(KITCHEN)

@@ -73,7 +73,7 @@ def test_the_cost_is_half_the_chi_squares_of_observations() -> None:
     assert 2 * done.final_cost == pytest.approx(degrees, rel=5 / np.sqrt(degrees))
 
 
-def test_wrong_observations_leave_and_the_rest_finds_the_truth() -> None:
+def test_wrong_observations_are_removed_and_the_truth_is_found() -> None:
     room = make_room(mono_share=0.2)
     rng = np.random.default_rng(5)
     seen, measurements = room.observations, room.observations.measurements.copy()
@@ -89,7 +89,7 @@ def test_wrong_observations_leave_and_the_rest_finds_the_truth() -> None:
     assert errors(tables, room).max() < 1e-6
 
 
-def test_without_the_last_stage_the_graph_keeps_its_observations() -> None:
+def test_without_the_last_stage_no_observation_is_removed() -> None:
     room = make_room(noise_px=2.0)
     tables = factor_tables_of(replace(room))
     done = adjust(tables, CAMERA, config=AdjustmentConfig(drop_observations=False))
@@ -140,7 +140,7 @@ def test_wrong_loops_are_found_and_right_ones_close_the_gap() -> None:
     assert "loops" in [stage.name for stage in done.stages]
 
 
-def test_loops_that_agree_all_stay() -> None:
+def test_consistent_loops_are_all_kept() -> None:
     room, tables = two_rooms()
     tables.add_pose_factors([loop(room, 0, 11), loop(room, 2, 9)])
     done = adjust(tables, CAMERA)
@@ -159,7 +159,7 @@ def test_results_move_with_the_world() -> None:
     assert there.final_cost == pytest.approx(here.final_cost, rel=1e-6)
 
 
-def test_an_empty_graph_and_a_spoiled_one_are_refused() -> None:
+def test_an_empty_graph_and_one_with_nan_are_rejected() -> None:
     with pytest.raises(InputError, match="no keyframe"):
         adjust(FactorTables(), CAMERA)
     room = make_room()

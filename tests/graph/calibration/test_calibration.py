@@ -44,7 +44,7 @@ def test_model_fits_exact_views() -> None:
     assert np.abs(linearise(problem.views, poses, points, on_time).residuals[:, 2]).max() > 1
 
 
-def test_derivatives_are_those_of_finite_differences() -> None:
+def test_derivatives_equal_finite_differences() -> None:
     problem, poses, points = make_problem(keyframes=4, points=40)
     views, h = problem.views, 1e-6
     calibration = TRUTH + 0.03 * PRIORS
@@ -72,7 +72,7 @@ def test_derivatives_are_those_of_finite_differences() -> None:
             )
 
 
-def test_everything_is_found_with_an_anchor() -> None:
+def test_all_parameters_are_found_with_an_anchor() -> None:
     problem, poses, _ = make_problem(start=START)
     result = calibrate(anchored(problem, poses, 1e-4))
     assert result.converged
@@ -96,7 +96,7 @@ def test_a_rolling_shutter_is_found_with_its_sign() -> None:
     assert found == pytest.approx(0.0, abs=1e-4)
 
 
-def test_without_an_anchor_the_scale_keeps_its_prior_and_all_else_is_found() -> None:
+def test_without_an_anchor_only_the_scale_stays_at_its_prior() -> None:
     problem, _, _ = make_problem(start=START, noise=0.1)
     result = calibrate(problem)
     sigma = np.sqrt(np.diag(result.covariance))
@@ -124,7 +124,7 @@ def on_body(problem: CalibrationProblem, poses: Array, sigma_m: float) -> Calibr
     return dataclasses.replace(problem, anchors=dataclasses.replace(problem.anchors, on_body=True))
 
 
-def test_an_anchor_on_another_body_tells_scale_and_place() -> None:
+def test_an_anchor_on_another_body_gives_scale_and_lever_arm() -> None:
     problem, poses, _ = make_problem(start=START)
     problem = on_body(problem, poses, 1e-4)
     result = calibrate(problem)
@@ -145,7 +145,7 @@ def test_an_anchor_on_another_body_tells_scale_and_place() -> None:
     assert sigmas[0] > 1.05 * sigmas[1]
 
 
-def test_derivatives_of_a_body_s_positions_at_its_best_place() -> None:
+def test_derivatives_of_body_positions_at_the_best_lever_arm() -> None:
     problem, poses, points = make_problem(keyframes=5, points=40)
     problem, h = on_body(problem, poses, 0.01), 1e-6
     start = poses @ se3_exp(0.02 * np.random.default_rng(3).standard_normal((5, 6)))
@@ -179,7 +179,7 @@ def test_one_known_distance_is_an_anchor() -> None:
     )
 
 
-def test_what_is_held_fixed_stays() -> None:
+def test_fixed_parameters_do_not_change() -> None:
     fixed = [PARAMETERS.index(name) for name in ("k1", "k2", "time_offset_s")]
     problem, _, _ = make_problem(start=START, noise=0.1)
     sigmas = PRIORS.copy()
@@ -189,7 +189,7 @@ def test_what_is_held_fixed_stays() -> None:
     assert not result.covariance[fixed].any() and not result.covariance[:, fixed].any()
 
 
-def test_a_fifth_of_wrong_matches_does_little() -> None:
+def test_twenty_percent_wrong_matches_have_little_effect() -> None:
     problem, _, _ = make_problem(start=START, noise=0.5)
     views, rng = problem.views, np.random.default_rng(5)
     wrong = rng.random(len(views.pixels)) < 0.2
@@ -202,7 +202,7 @@ def test_a_fifth_of_wrong_matches_does_little() -> None:
     assert sigma[:4].max() < 0.6
 
 
-def test_stated_uncertainty_is_honest() -> None:
+def test_sigmas_agree_with_the_errors() -> None:
     """NEES over noisy scenes: normalised errors of every parameter have about unit variance."""
     z, nees = [], []
     free = np.flatnonzero(PRIORS > 0)
@@ -221,7 +221,7 @@ def test_stated_uncertainty_is_honest() -> None:
     assert 0.5 * len(free) < np.mean(nees) < 1.5 * len(free)
 
 
-def test_errors_that_a_stretch_of_the_path_shares_widen_the_bounds() -> None:
+def test_errors_correlated_along_the_path_widen_the_bounds() -> None:
     """Each pair of keyframes sees the images a little too large or too small."""
 
     def ratio(spread: float) -> Array:

@@ -19,7 +19,7 @@ def _problem(truth, start, keyframes=20):
     return dataclasses.replace(problem, prior_sigmas=TIMES_ONLY)
 
 
-def test_both_halves_find_a_rolling_shutter_that_the_other_half_confirms() -> None:
+def test_both_halves_confirm_a_rolling_shutter() -> None:
     found = cross_validate(_problem(ROLLING, np.where(np.arange(13) == SHUTTER, 0.0, ROLLING)))
     assert found is not None
     error = found.calibrations - ROLLING
@@ -29,12 +29,12 @@ def test_both_halves_find_a_rolling_shutter_that_the_other_half_confirms() -> No
     assert len(found.gains) == 20 and found.gain_sigmas > 4
 
 
-def test_a_right_camera_is_not_improved() -> None:
+def test_a_correct_camera_is_not_improved() -> None:
     found = cross_validate(_problem(ROLLING, ROLLING))
     assert found is not None
     assert found.gain_sigmas < 2
     assert np.abs(found.calibrations - ROLLING)[:, SHUTTER].max() < 0.001
 
 
-def test_too_few_keyframes_say_nothing() -> None:
+def test_too_few_keyframes_give_no_result() -> None:
     assert cross_validate(make_problem(keyframes=8)[0]) is None

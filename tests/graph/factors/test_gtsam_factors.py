@@ -40,7 +40,7 @@ def values_at(T: np.ndarray, point: np.ndarray) -> gtsam.Values:
 
 
 @pytest.mark.parametrize("mono", [False, True])
-def test_error_is_half_of_whitened_projection_minus_measurement(mono: bool) -> None:
+def test_error_is_half_the_squared_whitened_residual(mono: bool) -> None:
     (factor,) = FactorMaker(CAMERA, SmootherConfig(robust=False)).observations(
         one_observation(mono)
     )
@@ -59,14 +59,14 @@ def test_stereo_error_is_that_of_independent_pixel_and_disparity() -> None:
     assert chi2[0] == pytest.approx(chi2_of_offset(mono=True), rel=1e-9)
 
 
-def test_covariance_is_that_of_simulated_measurements() -> None:
+def test_covariance_equals_that_of_simulated_measurements() -> None:
     noise = RNG.normal(size=(100_000, 3)) * SIGMAS_PX
     z = noisy(np.tile([300.0, 200.0, 280.0], (len(noise), 1)), noise)
     np.testing.assert_allclose(np.cov(z.T), COVARIANCE_PX2, atol=0.05)
 
 
 @pytest.mark.parametrize("mono", [False, True])
-def test_jacobians_agree_with_finite_differences_of_our_camera(mono: bool) -> None:
+def test_jacobians_equal_finite_differences_of_the_camera_model(mono: bool) -> None:
     """GTSAM's linear factor against central differences of Camera.project_stereo.
 
     Jacobian and error are compared through J^T J, J^T b and b^T b, which any square root of
@@ -154,7 +154,7 @@ def test_factors_keep_the_order_of_mixed_observations() -> None:
     assert make_graph(factors).size() == len(seen)
 
 
-def test_values_come_back_in_the_order_of_ids() -> None:
+def test_values_are_returned_in_the_order_of_ids() -> None:
     keyframe_ids = np.array([2, 11, 100, 1000])
     landmark_ids = np.array([0, 5, 70, 10_000_000])
     poses, points = se3_exp(RNG.normal(size=(4, 6))), RNG.normal(size=(4, 3))

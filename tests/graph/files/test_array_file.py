@@ -45,7 +45,7 @@ def test_what_was_written_is_read(file: Path) -> None:
     assert [path.name for path in file.parent.iterdir()] == ["box"]
 
 
-def test_a_compressed_file_is_smaller_and_says_the_same(file: Path, tmp_path: Path) -> None:
+def test_a_compressed_file_is_smaller_with_the_same_contents(file: Path, tmp_path: Path) -> None:
     arrays = {**ARRAYS, "room": np.zeros((1000, 3))}
     for kind, name in ((KIND, "plain"), (replace(KIND, compressed=True), "tight")):
         write_arrays(tmp_path / name, kind, {}, arrays)
@@ -81,7 +81,7 @@ def test_a_truncated_file_is_refused(file: Path, length: int) -> None:
         read_arrays(file, KIND)
 
 
-def test_another_kind_another_version_and_none_at_all(file: Path) -> None:
+def test_another_kind_another_version_and_a_missing_file(file: Path) -> None:
     with pytest.raises(InputError, match=r"box: holds 'bmask-slam shoebox' version 3, expected"):
         read_arrays(file, FileKind("shoebox", 4))
     with pytest.raises(InputError, match=r"expected 'bmask-slam hatbox' version 3"):
@@ -112,7 +112,7 @@ def test_a_failed_write_keeps_the_old_file(file: Path, monkeypatch: pytest.Monke
     assert [path.name for path in file.parent.iterdir()] == ["box"]
 
 
-def test_parts_are_found_again() -> None:
+def test_parts_are_read_back() -> None:
     inner = {"x": np.arange(2), "y.z": np.arange(3)}
     arrays = nested(a=inner, ab={"x": np.arange(4)})
     assert list(arrays) == ["a.x", "a.y.z", "ab.x"]
@@ -129,7 +129,7 @@ def test_parts_are_found_again() -> None:
         ({"nothing": np.zeros((0, 4))}, r"holds float64 of shape .'N', 4., not .*'N', 4, 4"),
     ],
 )
-def test_arrays_of_another_make_are_refused(change: dict, message: str) -> None:
+def test_arrays_of_another_type_or_shape_are_rejected(change: dict, message: str) -> None:
     longer = {**ARRAYS, "ids": np.arange(9), "a.b.names": np.array(["bridge"])}
     check_like(longer, ARRAYS, Path("box"))
     found = {name: array for name, array in {**ARRAYS, **change}.items() if array is not None}
@@ -137,7 +137,7 @@ def test_arrays_of_another_make_are_refused(change: dict, message: str) -> None:
         check_like(found, ARRAYS, Path("box"))
 
 
-def test_columns_of_unequal_length_are_split_again() -> None:
+def test_columns_of_unequal_length_are_read_back() -> None:
     columns = [np.arange(3), np.zeros(0, int), np.arange(5, 7)]
     counts = np.array([len(column) for column in columns])
     for found, column in zip(split_rows(np.concatenate(columns), counts), columns, strict=True):

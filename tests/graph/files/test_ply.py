@@ -82,7 +82,7 @@ def test_broken_headers_are_refused(tmp_path: Path, header: str, message: str) -
     assert message in str(error.value)
 
 
-def test_what_follows_the_vertices_is_passed_over(tmp_path: Path) -> None:
+def test_data_after_the_vertices_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     header = HEADER + "element vertex 2\nproperty uchar x\n"
     header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"

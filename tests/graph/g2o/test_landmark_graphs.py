@@ -78,7 +78,7 @@ def test_everything_is_read_back(file: Path) -> None:
                 assert getattr(found, name) == value
 
 
-def test_g2os_own_error_of_the_file_is_ours(file: Path) -> None:
+def test_the_cost_equals_g2os(file: Path) -> None:
     """EdgeSE3PointXYZDisparity in g2o's source: p = K T^-1 x, e = (px/pz, py/pz, 1/pz) - z."""
     lines = [line.split() for line in file.read_text().splitlines() if line[0] != "#"]
     numbers = {tag: [list(map(float, w[1:])) for w in lines if w[0] == tag] for tag, *_ in lines}
@@ -104,7 +104,7 @@ def test_g2os_own_error_of_the_file_is_ours(file: Path) -> None:
     assert total == pytest.approx(reprojection(seen, *rows, CAMERA)[1].sum(), rel=1e-9)
 
 
-def test_adjusting_the_file_is_adjusting_the_graph(file: Path) -> None:
+def test_adjusting_the_file_equals_adjusting_the_graph(file: Path) -> None:
     graph, (read, camera) = room_graph(), read_landmark_graph(file)
     here, there = adjust(graph, CAMERA), adjust(read, camera)
     assert there.initial_cost == pytest.approx(here.initial_cost, rel=1e-9)
@@ -167,7 +167,9 @@ def test_fixed_keyframes_stand_still(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("prior", [False, True])
-def test_of_separate_parts_the_held_or_the_largest_is_taken(tmp_path: Path, caplog, prior) -> None:
+def test_the_component_with_fixed_keyframes_or_the_largest_is_used(
+    tmp_path: Path, caplog, prior
+) -> None:
     """Keyframes 0 and 1 see landmarks 2 and 3; keyframe 10 alone sees landmark 11."""
     other = f"VERTEX_SE3:QUAT 10 {IDENTITY}\nVERTEX_TRACKXYZ 11 0 0 2\n"
     other += "EDGE_PROJECT_DISPARITY 10 11 0 320 240 0.5 4 0 0 1 0 10000\n"
@@ -223,7 +225,9 @@ def test_broken_files_are_refused_with_their_line(tmp_path: Path, text: str, mes
     assert message in str(error.value)
 
 
-def test_graphs_with_landmarks_are_known_by_their_views(file: Path, tmp_path: Path) -> None:
+def test_graphs_with_landmarks_are_recognised_by_their_observations(
+    file: Path, tmp_path: Path
+) -> None:
     assert has_landmarks(file)
     (tmp_path / "poses.g2o").write_text(POSES + EDGE)
     assert not has_landmarks(tmp_path / "poses.g2o")

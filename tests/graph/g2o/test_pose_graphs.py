@@ -26,7 +26,7 @@ def read_text(tmp_path: Path, text: str):
     return read_g2o(file)
 
 
-def test_2d_numbers_come_to_their_places(tmp_path: Path) -> None:
+def test_2d_values_are_read_in_order(tmp_path: Path) -> None:
     graph = read_text(tmp_path, "# a comment\n" + VERTICES_2D + "FIX 7\n" + EDGE_2D)
     assert graph.is_planar
     assert graph.ids.tolist() == [3, 7]
@@ -40,7 +40,7 @@ def test_2d_numbers_come_to_their_places(tmp_path: Path) -> None:
     np.testing.assert_array_equal(graph.information[0], [[11, 12, 13], [12, 22, 23], [13, 23, 33]])
 
 
-def test_3d_information_is_turned_to_rotation_first(tmp_path: Path) -> None:
+def test_3d_information_is_reordered_to_rotation_first(tmp_path: Path) -> None:
     graph = read_text(tmp_path, VERTICES_3D + EDGE_3D)
     assert not graph.is_planar
     assert np.diagonal(graph.information[0]).tolist() == [104, 105, 106, 101, 102, 103]
@@ -82,7 +82,7 @@ def test_unknown_tags_are_counted_once(tmp_path: Path, caplog: pytest.LogCapture
     assert "2 lines of the unknown type VERTEX_XY" in messages[0]
 
 
-def test_of_separate_parts_the_largest_is_taken(tmp_path: Path, caplog) -> None:
+def test_the_largest_component_is_used(tmp_path: Path, caplog) -> None:
     def edge(i: int, j: int) -> str:
         return f"EDGE_SE2 {i} {j} {j - i} 0 0 1 0 0 1 0 1\n"
 
@@ -95,7 +95,7 @@ def test_of_separate_parts_the_largest_is_taken(tmp_path: Path, caplog) -> None:
     assert "4 vertices are left out" in caplog.text
 
 
-def test_edges_alone_are_a_graph_without_poses(tmp_path: Path) -> None:
+def test_edges_without_vertices_give_a_graph_without_poses(tmp_path: Path) -> None:
     graph = read_text(tmp_path, EDGE_2D)
     assert graph.ids.tolist() == [3, 7]
     assert not graph.has_poses

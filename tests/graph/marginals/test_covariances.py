@@ -62,7 +62,7 @@ def assert_consistent(values: list[float], dof: int) -> None:
 
 
 @pytest.mark.parametrize("mono_share", [0.0, 0.4])
-def test_poses_landmarks_and_pairs_err_as_they_say(mono_share: float) -> None:
+def test_nees_of_poses_landmarks_and_pairs_is_one(mono_share: float) -> None:
     """One pose, landmark and pair a run, so that the values are independent."""
     pose, point, pair, step = [], [], [], []
     for seed in range(RUNS):
@@ -95,7 +95,7 @@ def relative(smoother: Smoother, room: Room, ids: Array, joint: Array) -> tuple[
     return error[None], (J @ joint @ J.T)[None]
 
 
-def test_all_keyframes_at_once_are_as_each_alone() -> None:
+def test_covariances_of_all_keyframes_equal_those_of_each() -> None:
     smoother = solved(0)
     marginals = smoother.marginals()
     assert marginals.keyframe_ids.tolist() == list(range(6))
@@ -106,7 +106,7 @@ def test_all_keyframes_at_once_are_as_each_alone() -> None:
         smoother.marginals(np.array([99999]))
 
 
-def test_the_world_is_the_first_keyframes() -> None:
+def test_covariances_are_relative_to_the_first_keyframe() -> None:
     """Moved as a whole, the covariances of poses stay, those of points turn with the world."""
     room, T_new_old = make_room(5, 60, 0.5), se3_exp(np.array([0.4, -1.1, 0.7, 3.0, -5.0, 2.0]))
     found = []
@@ -123,7 +123,7 @@ def test_the_world_is_the_first_keyframes() -> None:
     np.testing.assert_allclose(here.keyframes[0], np.eye(6) * 1e-8, rtol=0.05, atol=1e-11)
 
 
-def test_an_outlier_counts_by_its_kernels_weight() -> None:
+def test_an_outlier_has_the_weight_of_its_robust_kernel() -> None:
     """Far off, it says as much of the pose as if it were not there; without a kernel, all."""
     room = room_of(3, 0.0)
     seen = room.observations

@@ -82,7 +82,7 @@ def test_the_schur_complement_is_that_of_the_whole_normal_matrix() -> None:
     assert np.abs(H @ together).max() < 1e-7 * scale
 
 
-def test_two_keyframes_lose_nothing() -> None:
+def test_marginalisation_over_two_keyframes_is_exact() -> None:
     """Between two poses one relative pose is all there is to say: it is exact."""
     room = make_room(keyframes=2, points=60, noise_px=0.5)
     full, sparse = filled(room), filled(room)
@@ -130,7 +130,7 @@ def test_a_graph_of_relative_poses_alone_is_consistent() -> None:
     assert 6 * 0.3 < np.mean(nees) < 6 * 1.7
 
 
-def test_a_landmark_comes_back_with_its_summary() -> None:
+def test_a_restored_landmark_includes_its_marginal_factor() -> None:
     """Its position is unchanged; its old observations are refused a second time."""
     smoother = filled(until=6)
     before = smoother.optimise_batch()
@@ -190,7 +190,7 @@ def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
     assert sparse.landmark_ids.tolist() == expected.landmark_ids.tolist()
 
 
-def test_a_removed_observation_leaves_its_group() -> None:
+def test_a_removed_observation_is_removed_from_its_group() -> None:
     """A marginalised outlier is removed afterwards: the result is that without it."""
     room = make_room(keyframes=2, points=80, noise_px=0.3)
     seen = room.observations

@@ -126,7 +126,7 @@ def test_a_single_fixed_vertex_is_the_anchor_of_a_graph_without_poses(planar: bo
     np.testing.assert_allclose(result.graph.poses, expected, atol=1e-5)
 
 
-def test_bad_poses_in_the_file_give_way_to_chordal_ones() -> None:
+def test_bad_poses_in_the_file_are_replaced_by_chordal_ones() -> None:
     truth = ring(40, False, sigma=0.01)
     bad = truth.with_poses(se3_exp(np.random.default_rng(0).normal(size=(40, 6)) * 2))
     result = optimise_pose_graph(bad)
@@ -176,7 +176,7 @@ def far_loops(graph: PoseGraph) -> PoseGraph:
 
 
 @BOTH
-def test_a_prediction_is_what_the_cost_rises_by(planar: bool) -> None:
+def test_the_predicted_cost_of_a_loop_equals_the_increase(planar: bool) -> None:
     """Of poses that drifted, each loop is added alone to the odometry and all is solved again."""
     graph = far_loops(ring(90, planar, seed=2, sigma=0.01))
     used = graph.is_odometry
@@ -214,7 +214,7 @@ def test_right_loops_that_close_a_long_drift_are_kept_without_consistent_ones(pl
 
 
 @BOTH
-def test_loops_are_consistent_with_their_neighbours(planar: bool) -> None:
+def test_neighbouring_loops_are_consistent(planar: bool) -> None:
     graph, wrong = with_wrong_loops(ring(90, planar, seed=2, sigma=0.01), 10)
     consistent = loop_consistency(graph).consistent
     assert not consistent[wrong].any()
@@ -230,7 +230,7 @@ def test_loops_are_consistent_with_their_neighbours(planar: bool) -> None:
 
 @BOTH
 @pytest.mark.parametrize(("stated", "scale"), [(1e-5, 1e-4), (1.0, 1.0), (100.0, 10.0)])
-def test_wrong_loops_are_found_where_the_stated_information_is_off(
+def test_wrong_loops_are_found_with_a_wrong_information_scale(
     planar: bool, stated: float, scale: float
 ) -> None:
     """Information 1e-5 of what the noise is (as parking-garage's): random loops would fit in."""
@@ -242,7 +242,7 @@ def test_wrong_loops_are_found_where_the_stated_information_is_off(
     assert result.is_outlier[~wrong].sum() <= 1
 
 
-def test_truncated_weights_go_from_all_to_nothing() -> None:
+def test_truncated_weights_fall_from_one_to_zero() -> None:
     chi_squares = np.array([0.0, 5.0, 10.0, 20.0, 1e9])
     sharp = truncated_weights(chi_squares, 10.0, 1e6)
     np.testing.assert_allclose(sharp, [1, 1, 0.5, 0, 0], atol=1e-5)

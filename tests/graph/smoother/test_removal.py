@@ -13,7 +13,7 @@ from bmask_slam.graph.smoother.smoother import Smoother
 ROOM = make_room(keyframes=8, points=80, noise_px=0.3)
 
 
-def test_a_landmark_goes_with_all_its_factors() -> None:
+def test_a_landmark_is_removed_with_all_its_factors() -> None:
     smoother = filled(ROOM)
     before = smoother.estimate()
     victims = before.landmark_ids[[3, 10]]
@@ -26,7 +26,7 @@ def test_a_landmark_goes_with_all_its_factors() -> None:
     assert_same_optimum(smoother, ROOM)
 
 
-def test_a_keyframe_goes_with_all_its_factors() -> None:
+def test_a_keyframe_is_removed_with_all_its_factors() -> None:
     smoother = filled(ROOM)
     before = smoother.estimate()
     after = smoother.update(GraphUpdate(remove_keyframes=np.array([4])))
@@ -37,7 +37,7 @@ def test_a_keyframe_goes_with_all_its_factors() -> None:
     assert_same_optimum(smoother, ROOM)
 
 
-def test_an_observation_goes_and_comes_again() -> None:
+def test_an_observation_is_removed_and_added_again() -> None:
     smoother = filled(ROOM)
     before = smoother.estimate()
     row = int(np.flatnonzero(seen_often(ROOM))[40])
@@ -56,7 +56,7 @@ def test_an_observation_goes_and_comes_again() -> None:
 
 
 @pytest.mark.parametrize("in_one_update", [False, True])
-def test_an_id_is_used_again(in_one_update: bool) -> None:
+def test_a_removed_id_can_be_added_again(in_one_update: bool) -> None:
     """Landmark 5 becomes another point, keyframe 7 is made anew."""
     smoother = filled(ROOM)
     seen = ROOM.observations
@@ -83,7 +83,7 @@ def test_an_id_is_used_again(in_one_update: bool) -> None:
     assert_same_optimum(smoother, ROOM)
 
 
-def test_many_random_removals_and_returns() -> None:
+def test_many_random_removals_and_additions() -> None:
     """Slots are used again and again and always hold what the factor tables say."""
     rng = np.random.default_rng(5)
     smoother = filled(ROOM)
@@ -125,7 +125,7 @@ def seen_often(room: Room) -> np.ndarray:
     return np.isin(room.observations.landmark_ids, ids[views >= 4])
 
 
-def test_what_is_not_there_is_passed_over() -> None:
+def test_unknown_ids_are_ignored_in_removals() -> None:
     nothing = GraphUpdate(
         remove_landmarks=np.array([99999]),
         remove_keyframes=np.array([77]),
@@ -139,7 +139,7 @@ def test_what_is_not_there_is_passed_over() -> None:
     assert smoother.update(nothing).factors == before.factors
 
 
-def test_a_landmark_left_with_one_monocular_view_goes_too() -> None:
+def test_a_landmark_with_one_remaining_monocular_view_is_removed() -> None:
     room = make_room(keyframes=8, points=80, noise_px=0.3, mono_share=1.0)
     stereo = make_room(keyframes=8, points=80, noise_px=0.3)
     smoother = filled(stereo)
@@ -164,7 +164,7 @@ def test_a_landmark_left_with_one_monocular_view_goes_too() -> None:
     assert_isam_matches_tables(smoother)
 
 
-def test_a_keyframe_that_loses_its_landmarks_is_held_where_it_was() -> None:
+def test_a_keyframe_without_landmarks_is_anchored_at_its_pose() -> None:
     smoother = filled(ROOM)
     before = smoother.estimate()
     seen = ROOM.observations
@@ -179,7 +179,7 @@ def test_a_keyframe_that_loses_its_landmarks_is_held_where_it_was() -> None:
     assert (sigma_m > 0.01).any()  # and it says how badly it is known
 
 
-def test_two_keyframes_that_hold_only_each_other_are_tied_to_the_rest() -> None:
+def test_a_disconnected_pair_of_keyframes_is_anchored() -> None:
     """Each shares enough with the other; what both share with the rest leaves a turn open."""
     smoother, seen = filled(ROOM), ROOM.observations
     last_two = np.isin(seen.keyframe_ids, [6, 7])
@@ -199,7 +199,7 @@ def test_two_keyframes_that_hold_only_each_other_are_tied_to_the_rest() -> None:
     assert_isam_matches_tables(smoother)
 
 
-def test_the_world_stays_when_the_first_keyframe_goes() -> None:
+def test_the_gauge_is_kept_when_the_first_keyframe_is_removed() -> None:
     smoother = filled(ROOM)
     before = smoother.optimise_batch()
     after = smoother.update(GraphUpdate(remove_keyframes=np.array([0])))
@@ -210,7 +210,7 @@ def test_the_world_stays_when_the_first_keyframe_goes() -> None:
     np.testing.assert_allclose(after.poses_world_camera[0], before.poses_world_camera[1], atol=1e-3)
 
 
-def test_everything_goes_and_a_new_graph_starts() -> None:
+def test_after_removing_everything_a_new_graph_starts() -> None:
     smoother = filled(ROOM)
     empty = smoother.update(GraphUpdate(remove_keyframes=np.arange(8)))
     assert empty.factors == 0
@@ -223,7 +223,7 @@ def test_everything_goes_and_a_new_graph_starts() -> None:
 
 
 @pytest.mark.parametrize(("robust", "wrong_by"), [(None, 0.03), ("cauchy", 0.5), ("dcs", 0.5)])
-def test_a_wrong_loop_goes_by_its_name(robust: str | None, wrong_by: float) -> None:
+def test_a_wrong_loop_is_removed_by_name(robust: str | None, wrong_by: float) -> None:
     smoother = filled(ROOM)
     right = smoother.optimise_batch()
     covariance = 1e-6 * np.eye(6)

@@ -86,7 +86,9 @@ def assert_only_this_left(
 
 @FEW
 @given(room=SEEDS, steps=st.lists(st.tuples(KINDS, SEEDS), min_size=1, max_size=4))
-def test_only_what_is_asked_for_or_reported_leaves(room: int, steps: list[tuple[str, int]]) -> None:
+def test_only_requested_or_reported_items_are_removed(
+    room: int, steps: list[tuple[str, int]]
+) -> None:
     smoother = filled(random_room(room))
     for kind, seed in steps:
         before, pairs = smoother.estimate(), pairs_of(smoother)
@@ -96,9 +98,7 @@ def test_only_what_is_asked_for_or_reported_leaves(room: int, steps: list[tuple[
 
 @FEW
 @given(room=SEEDS, kind=KINDS, seed=SEEDS)
-def test_what_is_removed_and_added_again_gives_the_same_optimum(
-    room: int, kind: str, seed: int
-) -> None:
+def test_removing_and_adding_again_gives_the_same_optimum(room: int, kind: str, seed: int) -> None:
     made = random_room(room)
     smoother = filled(made)
     before, pairs = smoother.optimise_batch(), pairs_of(smoother)

@@ -82,7 +82,7 @@ def test_a_landmark_behind_the_camera_is_dropped(smoother: Smoother) -> None:
     assert_continues(smoother, estimate)
 
 
-def test_many_bad_landmarks_go_at_once(smoother: Smoother) -> None:
+def test_many_bad_landmarks_are_dropped_at_once(smoother: Smoother) -> None:
     """More than could be dropped one by one as GTSAM names them."""
     count = 3 * SmootherConfig().max_repairs
     behind = np.column_stack([np.linspace(-1, 1, count), np.zeros(count), np.full(count, -2.0)])
@@ -113,7 +113,9 @@ def test_a_landmark_with_one_monocular_view_is_dropped(smoother: Smoother) -> No
     assert_continues(smoother, estimate)
 
 
-def test_a_pose_on_one_point_is_dropped_though_gtsam_blames_the_point(smoother: Smoother) -> None:
+def test_a_pose_with_one_point_is_dropped_although_gtsam_names_the_point(
+    smoother: Smoother,
+) -> None:
     known = int(smoother.estimate().landmark_ids[3])
     estimate = smoother.update(
         GraphUpdate(
@@ -128,7 +130,7 @@ def test_a_pose_on_one_point_is_dropped_though_gtsam_blames_the_point(smoother: 
     assert_continues(smoother, estimate)
 
 
-def test_a_segment_that_hangs_on_one_point_is_dropped(smoother: Smoother) -> None:
+def test_a_segment_connected_by_one_point_is_dropped(smoother: Smoother) -> None:
     """Every new keyframe has many landmarks, but the segment turns about a single point."""
     before = smoother.estimate()
     far = ROOM.moved(se3_exp(np.array([0.0, 0.0, 0.0, 40.0, 0.0, 0.0])))
@@ -161,7 +163,7 @@ def test_a_segment_that_hangs_on_one_point_is_dropped(smoother: Smoother) -> Non
     assert_continues(smoother, estimate)
 
 
-def test_a_measurement_that_is_nan_is_found_though_gtsam_blames_another(
+def test_a_nan_measurement_is_found_although_gtsam_names_another(
     smoother: Smoother,
 ) -> None:
     before = smoother.estimate()
@@ -215,7 +217,7 @@ def test_a_batch_optimisation_is_repaired_too(smoother: Smoother) -> None:
     np.testing.assert_allclose(found.poses_world_camera, expected.poses_world_camera, atol=2e-3)
 
 
-def test_a_batch_optimisation_that_fails_leaves_the_values(
+def test_a_failed_batch_optimisation_keeps_the_values(
     smoother: Smoother, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:

@@ -57,7 +57,7 @@ def again(room: Room, estimate: GraphEstimate) -> GraphUpdate:
     )
 
 
-def test_incremental_result_is_the_batch_optimum() -> None:
+def test_the_incremental_result_equals_the_batch_optimum() -> None:
     room = make_room(noise_px=0.5, mono_share=0.2)
     smoother, incremental = run(room, SmootherConfig(extra_iterations=3))
     batch = smoother.optimise_batch()
@@ -87,7 +87,7 @@ def test_two_runs_are_identical() -> None:
     np.testing.assert_array_equal(first.points_world, second.points_world)
 
 
-def test_huber_bounds_the_harm_of_outliers() -> None:
+def test_huber_bounds_the_effect_of_outliers() -> None:
     room = make_room(noise_px=0.5)
     seen = room.observations
     measurements = seen.measurements.copy()
@@ -135,7 +135,7 @@ def test_covariances_of_isam_and_of_all_factors_agree() -> None:
         smoother.marginal_covariance(77)
 
 
-def test_a_relative_pose_carries_a_keyframe_without_observations() -> None:
+def test_a_relative_pose_constrains_a_keyframe_without_observations() -> None:
     room = make_room()
     smoother, _ = run(room)
     T_a_b = se3_exp(np.array([0.1, 0.2, -0.1, 0.5, 0.1, -0.4]))
@@ -148,7 +148,7 @@ def test_a_relative_pose_carries_a_keyframe_without_observations() -> None:
     np.testing.assert_allclose(smoother.estimate().poses_world_camera[12], expected, atol=1e-5)
 
 
-def test_a_second_segment_stands_on_its_own_prior() -> None:
+def test_a_second_segment_has_its_own_prior() -> None:
     room = make_room(keyframes=4)
     smoother, _ = run(room)
     moved = room.moved(T_NEW_OLD)
@@ -221,7 +221,7 @@ def test_relative_poses_of_a_kind_are_listed_with_their_covariances() -> None:
     assert other.relative_pose_errors("loop").keyframe_b.tolist() == [3]
 
 
-def test_notes_say_what_was_refused_and_why() -> None:
+def test_notes_list_refused_factors_with_reasons() -> None:
     room, smoother = make_room(noise_px=0.3), Smoother(CAMERA)
     first, second = room.update_of(0), room.update_of(1)
     assert smoother.update(first).notes() == []

@@ -38,7 +38,7 @@ def smoother() -> Smoother:
     return smoother
 
 
-def test_a_loaded_graph_is_the_saved_one(smoother: Smoother, tmp_path: Path) -> None:
+def test_a_loaded_graph_equals_the_saved_one(smoother: Smoother, tmp_path: Path) -> None:
     smoother.save(tmp_path / "graph")
     loaded = Smoother.load(tmp_path / "graph")
     before, after = smoother.estimate(), loaded.estimate()
@@ -55,9 +55,7 @@ def test_a_loaded_graph_is_the_saved_one(smoother: Smoother, tmp_path: Path) -> 
     assert first.cost_after == second.cost_after
 
 
-def test_a_loaded_run_goes_on_like_one_that_restarted_there(
-    smoother: Smoother, tmp_path: Path
-) -> None:
+def test_a_loaded_run_continues_like_a_restarted_one(smoother: Smoother, tmp_path: Path) -> None:
     smoother.save(tmp_path / "graph")
     smoother.restart()
     loaded = Smoother.load(tmp_path / "graph")
@@ -69,7 +67,7 @@ def test_a_loaded_run_goes_on_like_one_that_restarted_there(
     assert undisturbed.keyframe_ids.tolist() == [0, 1, 3, 4, 5, 6, 7]
 
 
-def test_the_loop_can_still_be_removed_by_name(smoother: Smoother, tmp_path: Path) -> None:
+def test_a_loop_of_a_loaded_graph_is_removed_by_name(smoother: Smoother, tmp_path: Path) -> None:
     smoother.save(tmp_path / "graph")
     loaded = Smoother.load(tmp_path / "graph")
     before = loaded.estimate().factors
@@ -120,7 +118,7 @@ def test_missing_foreign_and_newer_files_are_refused(smoother: Smoother, tmp_pat
         ("pose_factor_keyframes", lambda a: a + 100000, "unknown id"),
     ],
 )
-def test_contents_that_do_not_fit_together_are_refused(
+def test_inconsistent_contents_are_rejected(
     smoother: Smoother, tmp_path: Path, name: str, spoil: object, word: str
 ) -> None:
     arrays = saved_arrays(smoother, tmp_path)
@@ -146,7 +144,7 @@ def test_a_folder_that_does_not_exist_is_an_input_error(smoother: Smoother, tmp_
         smoother.save(tmp_path / "missing" / "graph")
 
 
-def test_updates_and_estimates_cross_a_process_border() -> None:
+def test_updates_and_estimates_can_be_pickled() -> None:
     update = ROOM.update_of(1)
     copy = pickle.loads(pickle.dumps(update))
     np.testing.assert_array_equal(copy.observations.measurements, update.observations.measurements)
@@ -155,7 +153,7 @@ def test_updates_and_estimates_cross_a_process_border() -> None:
     assert pickle.loads(pickle.dumps(estimate)).factors == estimate.factors
 
 
-def test_what_the_front_end_needs_imports_without_gtsam() -> None:
+def test_front_end_modules_import_without_gtsam() -> None:
     """Updates are made, checked and saved in numpy; another process need not load GTSAM."""
     modules = (
         *("factors.graph_update", "factors.graph_estimate", "factors.factor_tables"),

@@ -57,7 +57,7 @@ def graph_ids(smoother: Smoother) -> np.ndarray:
         ({"measurements": [300.0, 9000.0, 290.0]}, RefusalReason.REPROJECTION),
     ],
 )
-def test_one_bad_observation_is_refused_alone(
+def test_only_the_bad_observation_is_refused(
     smoother: Smoother, columns: dict[str, object], reason: RefusalReason
 ) -> None:
     estimate = smoother.update(changed(in_the_graph(smoother), **columns))
@@ -73,7 +73,7 @@ def test_a_monocular_view_needs_no_disparity_sigma(smoother: Smoother) -> None:
     assert len(smoother.update(update).refused) == 0
 
 
-def test_a_pair_enters_once(smoother: Smoother) -> None:
+def test_a_repeated_observation_is_added_once(smoother: Smoother) -> None:
     seen = NEXT.observations
     doubled = seen.select(np.array([0, 1, 1, *range(2, len(seen))]))
     estimate = smoother.update(dataclasses.replace(NEXT, observations=doubled))
@@ -88,7 +88,9 @@ def test_a_pair_enters_once(smoother: Smoother) -> None:
         (100.0, RefusalReason.OUT_OF_RANGE),
     ],
 )
-def test_depth_in_the_camera_decides(smoother: Smoother, z_m: float, reason: RefusalReason) -> None:
+def test_points_behind_the_camera_are_refused_by_depth(
+    smoother: Smoother, z_m: float, reason: RefusalReason
+) -> None:
     T_world_camera = smoother.estimate().poses_world_camera[2]
     point = T_world_camera[:3, 3] + z_m * T_world_camera[:3, 2]
     seen = Observations(
@@ -133,7 +135,7 @@ def test_a_monocular_landmark_needs_parallax(baseline_m: float, enters: bool) ->
     assert refused == len(estimate.refused) == (0 if enters else 2)
 
 
-def test_parallax_of_many_landmarks_against_a_plain_loop() -> None:
+def test_parallax_of_many_landmarks_equals_a_loop() -> None:
     rng = np.random.default_rng(1)
     count = 300
     centres, points = rng.normal(0, 0.05, (6, 3)), rng.uniform(2, 6, (100, 3))
@@ -159,7 +161,7 @@ def test_parallax_of_many_landmarks_against_a_plain_loop() -> None:
     assert found.tolist() == expected
 
 
-def test_a_keyframe_that_knows_too_little_is_refused(smoother: Smoother) -> None:
+def test_an_underconstrained_keyframe_is_refused(smoother: Smoother) -> None:
     """Many new landmarks do not help: they would hang on the keyframe, not hold it."""
     known = np.isin(NEXT.observations.landmark_ids, graph_ids(smoother))
     few = np.concatenate([np.flatnonzero(known)[:5], np.flatnonzero(~known)])
@@ -200,7 +202,7 @@ def seen_from(keyframe: int, points_world: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("spoil", ["nan", "scaled", "mirrored"])
-def test_a_new_pose_that_is_no_rigid_transform_is_refused(smoother: Smoother, spoil: str) -> None:
+def test_a_new_pose_that_is_not_rigid_is_refused(smoother: Smoother, spoil: str) -> None:
     T = NEXT.poses_world_camera.copy()
     T[0, :3, :3] *= {"nan": np.nan, "scaled": 1.1, "mirrored": -1.0}[spoil]
     estimate = smoother.update(dataclasses.replace(NEXT, poses_world_camera=T))

@@ -35,7 +35,7 @@ def all_of(mapper: DenseMapper, given: list[DenseKeyframe]) -> list[FusedKeyfram
     return [r for k in given for r in mapper.add(k)] + mapper.flush()
 
 
-def test_a_keyframe_is_returned_after_six_more() -> None:
+def test_a_keyframe_is_fused_after_six_more() -> None:
     mapper, given = DenseMapper(CAMERA), keyframes(16)
     ids = [[r.keyframe.id for r in mapper.add(k)] for k in given]
     assert ids == [[]] * WINDOW + [[k] for k in range(16 - WINDOW)]
@@ -43,7 +43,7 @@ def test_a_keyframe_is_returned_after_six_more() -> None:
     assert [r.keyframe.id for r in mapper.flush()] == list(range(10, 16))
 
 
-def test_an_unwanted_keyframe_is_only_a_neighbour() -> None:
+def test_a_skipped_keyframe_is_only_a_neighbour() -> None:
     given = keyframes(9)
     expected = {r.keyframe.id: r for r in all_of(DenseMapper(CAMERA), given)}
     mapper = DenseMapper(CAMERA)

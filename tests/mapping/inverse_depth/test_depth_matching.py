@@ -44,7 +44,7 @@ def tensor(array) -> torch.Tensor:
     return torch.tensor(np.asarray(array), dtype=torch.float32)
 
 
-def test_the_cost_is_that_of_the_formula() -> None:
+def test_the_cost_equals_the_formula() -> None:
     a, b = texture(7, 9), texture(7, 9)
     cost = matching_cost(tensor(a), tensor(b), SMALL).numpy()
     for v in range(7):
@@ -57,7 +57,7 @@ def test_the_cost_is_that_of_the_formula() -> None:
             assert cost[v, u] == pytest.approx(0.1 * colour + 0.9 * slope, rel=1e-4, abs=1e-4)
 
 
-def test_support_weights_are_those_of_the_formula() -> None:
+def test_support_weights_equal_the_formula() -> None:
     a, b, cost = texture(6, 8), texture(6, 8), RNG.uniform(0, 5, (6, 8))
     fast = support_weighted(tensor(cost), tensor(a), tensor(b), SMALL).numpy()
     for v in range(6):
@@ -74,7 +74,7 @@ def test_support_weights_are_those_of_the_formula() -> None:
             assert fast[v, u] == pytest.approx(total / norm, rel=1e-4)
 
 
-def test_the_guided_filter_is_that_of_loops() -> None:
+def test_the_guided_filter_equals_loops() -> None:
     image, cost = texture(7, 9), RNG.uniform(0, 5, (7, 9))
     fast = GuidedFilter(tensor(image), SMALL)(tensor(cost)).numpy()
     guide = image.mean(axis=0) / 255
@@ -92,7 +92,7 @@ def test_the_guided_filter_is_that_of_loops() -> None:
         assert fast[v, u] == pytest.approx(slow, rel=1e-4, abs=1e-5)
 
 
-def test_the_winner_has_the_parabolas_fraction() -> None:
+def test_the_minimum_is_refined_by_a_parabola() -> None:
     levels = np.arange(7.0)
     costs = tensor((levels - 3.3) ** 2 + 1)[:, None, None]
     index, clear = winner(costs)
@@ -120,7 +120,7 @@ def test_stereo_finds_the_disparity_with_the_right_sign(exact: bool) -> None:
     np.testing.assert_allclose(found.variance.numpy()[known], (1 / 9.0) ** 2, rtol=1e-5)
 
 
-def test_a_disparity_outside_the_range_is_not_taken_for_its_rim() -> None:
+def test_a_disparity_outside_the_range_gives_no_depth() -> None:
     wide = texture(40, 90)
     left, right = tensor(wide[:, :, :70]), tensor(wide[:, :, 12:82])  # u_right = u_left - 12
     camera = dataclasses.replace(CAMERA, width=70, height=40)
@@ -136,7 +136,7 @@ def test_a_disparity_outside_the_range_is_not_taken_for_its_rim() -> None:
     assert beyond.min() > 1.01 and beyond.max() < 9.99
 
 
-def test_what_the_other_side_does_not_confirm_is_dropped() -> None:
+def test_left_right_inconsistencies_are_dropped() -> None:
     left, right = tensor(np.full((1, 8), 2.0)), tensor(np.full((1, 8), 2.0))
     right[0, 3] = 5.0
     np.testing.assert_array_equal(
@@ -162,7 +162,7 @@ def plane_views():
     return a, b, plane_rho(T_a, normal, offset_m, CAMERA), inverse(T_a) @ T_b
 
 
-def test_a_sweep_finds_the_plane_with_an_honest_sigma() -> None:
+def test_a_plane_sweep_finds_the_plane_with_a_consistent_sigma() -> None:
     a, b, truth, T_a_b = plane_views()
     found = sweep(a, [(b, T_a_b)], CAMERA, (0.4, 1.0), SweepConfig(shrink=1, levels=40))
     known = found.known.numpy()
@@ -174,7 +174,7 @@ def test_a_sweep_finds_the_plane_with_an_honest_sigma() -> None:
     assert np.mean((error[known] / sigma) ** 2) < 1.5
 
 
-def test_the_wrong_motion_finds_nothing_much() -> None:
+def test_a_wrong_motion_gives_little_depth() -> None:
     a, b, _, T_a_b = plane_views()
     config = SweepConfig(shrink=1, levels=40)
     right = sweep(a, [(b, T_a_b)], CAMERA, (0.4, 1.0), config).known
@@ -182,7 +182,7 @@ def test_the_wrong_motion_finds_nothing_much() -> None:
     assert wrong.sum() < 0.3 * right.sum()
 
 
-def test_a_shrunk_camera_sees_the_same_rays() -> None:
+def test_a_scaled_camera_has_the_same_rays() -> None:
     small = shrunk_camera(CAMERA, 2)
     point = np.array([[0.1, -0.2, 1.5]])
     np.testing.assert_allclose(
@@ -190,7 +190,7 @@ def test_a_shrunk_camera_sees_the_same_rays() -> None:
     )
 
 
-def test_measurements_come_before_the_sweep() -> None:
+def test_measurements_are_preferred_to_the_sweep() -> None:
     half = tensor([[1.0, np.nan]])
     swept = InverseDepthMap(tensor([[3.0, 4.0]]), tensor([[0.1, 0.2]]))
     result = fill_missing(InverseDepthMap(half, half / 100), swept)

@@ -114,7 +114,7 @@ def fused(source: DepthSource, device: str) -> list[FusedKeyframe]:
 
 
 @pytest.mark.parametrize("source", get_args(DepthSource))
-def test_all_steps_run_on_the_device_that_is_asked_for(source: DepthSource) -> None:
+def test_all_steps_run_on_the_chosen_device(source: DepthSource) -> None:
     with StandIn(), FromLists():
         away = fused(source, AWAY)
         assert {type(r.map.rho) for r in away} == {Elsewhere}
@@ -127,7 +127,7 @@ def test_all_steps_run_on_the_device_that_is_asked_for(source: DepthSource) -> N
     assert sum(len(s) for s in submaps) > 100
 
 
-def test_the_stand_in_keeps_devices_apart() -> None:
+def test_the_fake_device_rejects_mixed_devices() -> None:
     with StandIn():
         away, here = torch.arange(4.0, device=AWAY), torch.arange(4.0)
         assert (2 * away).cpu().tolist() == [0, 2, 4, 6]
@@ -138,7 +138,7 @@ def test_the_stand_in_keeps_devices_apart() -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU: the stand-in must do")
-def test_a_gpu_gives_what_the_processor_gives() -> None:
+def test_gpu_and_cpu_give_the_same_result() -> None:
     for source in get_args(DepthSource):
         for found, expected in zip(fused(source, "cuda"), fused(source, "cpu"), strict=True):
             same = np.isclose(found.map.depth_m(), expected.map.depth_m(), 1e-4, equal_nan=True)

@@ -106,7 +106,7 @@ def scene(seed: int, count: int):
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 7])
-def test_it_follows_the_formulas(count: int) -> None:
+def test_the_result_equals_the_formulas(count: int) -> None:
     own, views = scene(count, count)
     result = fuse(own, views, CAMERA)
     rho, variance, used = reference(own, views, hole_seeds(own, views, CAMERA).numpy())
@@ -155,14 +155,14 @@ def test_moving_the_world_changes_nothing() -> None:
     assert np.quantile(np.abs(a - b)[both], 0.998) < 1e-4
 
 
-def test_independent_views_add_up() -> None:
+def test_independent_views_add_information() -> None:
     truth = np.full((30, 40), 0.5)
     views = [View(as_map(truth, 0.01), np.eye(4)) for _ in range(3)]
     result = fuse(as_map(truth, 0.01), views, CAMERA)
     np.testing.assert_allclose(result.map.variance.numpy(), 0.01**2 / 4, rtol=2e-2)
 
 
-def test_an_estimate_that_a_neighbour_sees_through_is_removed() -> None:
+def test_an_estimate_in_a_neighbours_free_space_is_removed() -> None:
     own = as_map(np.full((30, 40), 0.505), 0.001)
     behind = View(as_map(np.full((30, 40), 0.5), 0.001), np.eye(4))
     before = View(as_map(np.full((30, 40), 0.51), 0.001), np.eye(4))
@@ -170,7 +170,7 @@ def test_an_estimate_that_a_neighbour_sees_through_is_removed() -> None:
     assert fuse(own, [before], CAMERA).map.known.all()
 
 
-def test_a_hole_takes_what_two_neighbours_agree_on_in_the_right_colour() -> None:
+def test_a_hole_is_filled_where_two_neighbours_and_colours_agree() -> None:
     rho = np.full((30, 40), 0.5)
     holed = rho.copy()
     holed[10:20, 10:20] = np.nan
@@ -210,7 +210,7 @@ def test_the_factor_corrects_wrong_variances(scale: float) -> None:
     assert variance_factor(maps[0], said) == pytest.approx(scale**2, rel=0.1)
 
 
-def test_no_neighbours_no_factor() -> None:
+def test_no_neighbours_give_no_factor() -> None:
     assert variance_factor(as_map(np.full((30, 40), 0.5), 0.01), []) == 1.0
 
 
@@ -229,7 +229,7 @@ def test_the_calibrated_variance_grows_with_the_slope() -> None:
     np.testing.assert_allclose(extra, BLUR_PX**2 * slope, rtol=1e-3)
 
 
-def test_the_calibrated_variance_shrinks_by_what_was_smoothed_away() -> None:
+def test_the_calibrated_variance_decreases_with_smoothing() -> None:
     rng = np.random.default_rng(4)
     given = as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004)
     final = regularise(given)
@@ -239,7 +239,7 @@ def test_the_calibrated_variance_shrinks_by_what_was_smoothed_away() -> None:
     assert smoothed < said - slope < 0.8 * 0.004**2
 
 
-def test_a_rim_may_belong_to_the_other_side() -> None:
+def test_an_edge_pixel_may_belong_to_either_surface() -> None:
     rho = np.full((30, 40), 0.5)
     rho[:, :20], rho[:, 20] = 1.0, np.nan
     rho[4, 5] = np.nan
@@ -260,7 +260,7 @@ def test_a_rim_may_belong_to_the_other_side() -> None:
     np.testing.assert_allclose(added[:, 10], 0, atol=1e-9)
 
 
-def test_a_neighbours_surface_does_not_grow_beyond_its_rim() -> None:
+def test_a_neighbours_surface_does_not_grow_beyond_its_edge() -> None:
     T_own_other = make_pose(np.eye(3), np.array([0.4 / 38, 0.0, 0.0]))
     rho = np.full((30, 40), np.nan)
     rho[:, :20] = 1.0

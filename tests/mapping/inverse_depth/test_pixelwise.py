@@ -46,7 +46,7 @@ def test_two_estimates_agree_below_the_bound() -> None:
     np.testing.assert_array_equal(found.numpy(), [8, 8, 0, 0, 0])
 
 
-def test_the_sensor_counts_within_its_range() -> None:
+def test_sensor_depth_is_used_within_its_range() -> None:
     depth_m = np.full((5, 5), 2.0, np.float32)
     depth_m[0] = 0.0, 0.29, 8.01, np.nan, np.inf
     given = from_sensor(depth_m, CAMERA, DepthNoise())

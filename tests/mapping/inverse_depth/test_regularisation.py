@@ -39,7 +39,7 @@ def reference(given: InverseDepthMap, fill_support: int):
 
 
 @pytest.mark.parametrize("fill_support", [2, 5])
-def test_it_follows_the_formulas(fill_support: int) -> None:
+def test_the_result_equals_the_formulas(fill_support: int) -> None:
     given = noisy_map(RNG, np.eye(4), missing=0.25)
     rho, variance = reference(given, fill_support)
     result = regularise(given, fill_support)
@@ -78,5 +78,5 @@ def test_an_empty_map_stays_empty() -> None:
     assert not regularise(InverseDepthMap(empty, empty)).known.any()
 
 
-def test_larger_sets_come_first_then_early_members() -> None:
+def test_larger_sets_are_preferred_then_earlier_members() -> None:
     assert set_order(3) == [0b111, 0b011, 0b101, 0b110]

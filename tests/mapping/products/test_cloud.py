@@ -49,7 +49,7 @@ def table(rows: list[int], classes: int) -> LabelTable:
     return LabelTable.of(told, LabelStoreConfig())
 
 
-def test_it_is_that_of_a_loop_over_voxels(tmp_path: Path) -> None:
+def test_the_cloud_equals_a_loop_over_voxels(tmp_path: Path) -> None:
     placed = [
         PlacedSubmap(submap(0), se3_exp(RNG.normal(0, 0.3, 6)), 0),
         PlacedSubmap(submap(1), np.eye(4), 3),
@@ -76,7 +76,7 @@ def test_it_is_that_of_a_loop_over_voxels(tmp_path: Path) -> None:
             assert abs(cloud.sigmas_m[k] - weights.max() ** -0.5) < 1e-5
 
 
-def test_labels_are_those_of_a_loop_over_voxels_and_submaps() -> None:
+def test_labels_equal_a_loop_over_voxels_and_submaps() -> None:
     """Each submap counts once; one without a point in the voxel, by its points in the cell."""
     told, points, voxels = table([3, 2, 4], 5), 300, 60
     voxel = np.r_[np.arange(voxels), RNG.integers(0, voxels, points - voxels)]
@@ -100,7 +100,7 @@ def test_labels_are_those_of_a_loop_over_voxels_and_submaps() -> None:
         assert abs(probabilities[v] - share.max()) < 1e-4
 
 
-def test_an_object_that_some_views_missed_is_kept_and_one_seen_once_is_not() -> None:
+def test_objects_in_several_views_are_kept_and_in_one_view_dropped() -> None:
     """As in the label store: misses of an object are not independent."""
     store, classes = LabelStoreConfig(), 40
     seen = np.zeros(classes, np.float32)
@@ -134,7 +134,7 @@ def test_blocks_do_not_share_voxels(tmp_path: Path) -> None:
     assert len(np.unique(np.floor(points / VOXEL_M), axis=0)) == len(points)
 
 
-def test_files_hold_what_was_written(tmp_path: Path) -> None:
+def test_files_are_read_back(tmp_path: Path) -> None:
     files = sort_into_blocks([PlacedSubmap(submap(0), np.eye(4), 0)], VOXEL_M, tmp_path)
     (cloud, *rest) = list(merge_blocks(files, VOXEL_M, table([3], 5)))
     with CloudWriter(tmp_path / "cloud") as writer:
@@ -168,7 +168,7 @@ def instance(rows: slice, label: int, score: float, mask_score: float) -> Instan
     return Instance(mask, mask_box(mask), label, certain(label, 4, score), score, mask_score)
 
 
-def test_where_masks_overlap_the_better_wins() -> None:
+def test_the_better_of_overlapping_masks_is_used() -> None:
     found = [instance(slice(0, 3), 1, 0.9, 0.4), instance(slice(2, 5), 2, 0.9, 0.8)]
     labels = keyframe_labels(found, (6, 8), 4, LabelStoreConfig())
     np.testing.assert_array_equal(labels.numbers[:, 0], [1, 1, 2, 2, 2, 0])

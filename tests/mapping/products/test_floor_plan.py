@@ -47,7 +47,7 @@ TURN = so3_exp(np.array([1.3, 0.2, -0.4]))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.15])
-def test_walls_do_not_pull_up_aside(noise: float) -> None:
+def test_walls_do_not_tilt_the_up_direction(noise: float) -> None:
     """A camera that looks down by 37 degrees: walls are only 53 degrees from its own up."""
     given = room(TURN)
     normals = given.normals + noise * RNG.standard_normal(given.normals.shape)
@@ -59,7 +59,7 @@ def test_walls_do_not_pull_up_aside(noise: float) -> None:
     assert frame.floor_m == pytest.approx(0.0, abs=0.01)
 
 
-def test_up_is_found_from_a_tilted_guess() -> None:
+def test_up_is_found_from_a_tilted_initial_guess() -> None:
     guess = TURN @ np.array([0.4, -0.3, 1.0])
     np.testing.assert_allclose(up_direction(room(TURN).normals, guess), TURN[:, 2], atol=1e-5)
 
@@ -70,7 +70,7 @@ def test_the_floor_is_below_the_table() -> None:
     assert floor_height(np.zeros(0)) == 0.0
 
 
-def test_cells_are_what_stands_there() -> None:
+def test_cells_have_the_labels_of_the_points_above() -> None:
     cloud = room(TURN)
     frame = plan_frame(cloud, TURN @ np.array([0.2, 0.1, 1.0]), 0.1)
     plan = FloorPlan(frame, 3)
@@ -87,7 +87,7 @@ def test_cells_are_what_stands_there() -> None:
         assert grid[int(row), int(column)] == -1
 
 
-def test_the_picture_holds_a_path_outside_the_map() -> None:
+def test_the_picture_includes_a_path_outside_the_map() -> None:
     cloud = room(np.eye(3))
     plan = FloorPlan(plan_frame(cloud, np.array([0, 0, 1.0]), 0.05), 2)
     plan.add(cloud)

@@ -31,7 +31,7 @@ VIEWS = [view(T) for T in poses(np.random.default_rng(1), 3)]
 EMPTY = replace(VIEWS[0], depth_m=np.full((30, 40), np.nan, np.float32))
 
 
-def test_the_surface_is_that_of_the_views_and_its_normals_face_the_camera() -> None:
+def test_the_surface_agrees_with_the_views_and_normals_face_the_camera() -> None:
     points, normals = sampled(tsdf_mesh(VIEWS, CAMERA, VOXEL_M), 1000)
     length = np.linalg.norm(NORMAL)
     assert len(points) == 1000

@@ -36,14 +36,14 @@ def fused_plane(sigma: float = 0.004) -> FusedKeyframe:
     return FusedKeyframe(keyframe, given, np.ones((30, 40), np.uint8))
 
 
-def test_points_are_those_of_the_camera_model() -> None:
+def test_points_agree_with_the_camera_model() -> None:
     given = as_map(plane_rho(T), 0.01)
     v, u = np.mgrid[:30, :40].astype(float)
     expected = CAMERA.backproject(np.stack([u, v], -1), 1 / plane_rho(T))
     np.testing.assert_allclose(back_project(given, CAMERA).numpy(), expected, rtol=1e-5)
 
 
-def test_normals_are_the_planes_and_face_the_camera() -> None:
+def test_normals_of_a_plane_face_the_camera() -> None:
     normals = surface_normals(as_map(plane_rho(T), 0.01), CAMERA).numpy()
     expected = -(T[:3, :3].T @ NORMAL) / np.linalg.norm(NORMAL)
     np.testing.assert_allclose(
@@ -52,7 +52,7 @@ def test_normals_are_the_planes_and_face_the_camera() -> None:
     assert np.isnan(normals[0]).all()
 
 
-def test_noise_does_not_draw_normals_towards_the_camera() -> None:
+def test_noise_does_not_bias_normals_towards_the_camera() -> None:
     camera = replace(CAMERA, width=160, height=120)
     floor = np.array([0.05, 1.0, 0.1])
     pose = make_pose(np.eye(3), np.array([0.0, -1.2, 0.0]))
@@ -69,7 +69,7 @@ def test_noise_does_not_draw_normals_towards_the_camera() -> None:
     assert np.median(off_deg) < 5
 
 
-def test_normals_stay_on_their_side_of_an_edge() -> None:
+def test_normals_do_not_cross_an_edge() -> None:
     rho = np.full((30, 40), 0.5)
     rho[:, 20:] = np.linspace(0.8, 1.0, 30)[:, None]
     normals = surface_normals(as_map(rho, 0.01), CAMERA).numpy()
@@ -89,7 +89,7 @@ def test_placed_points_lie_on_the_plane_and_follow_the_anchor() -> None:
     np.testing.assert_allclose(turned, normals @ moved[:3, :3].T, atol=1e-5)
 
 
-def test_colours_and_instances_stay_with_their_pixels() -> None:
+def test_points_have_colour_and_instance_of_their_pixels() -> None:
     result = fused_plane()
     submap = make_submap(result, CAMERA, 1e-4)
     pixels = np.rint(CAMERA.project(submap.points.astype(float))).astype(int)
@@ -98,20 +98,20 @@ def test_colours_and_instances_stay_with_their_pixels() -> None:
     assert len(submap) == 28 * 38
 
 
-def test_the_variance_is_that_of_the_depth() -> None:
+def test_the_variance_equals_that_of_the_depth() -> None:
     submap = make_submap(fused_plane(0.004), CAMERA, 1e-4)
     np.testing.assert_allclose(
         np.sqrt(submap.variances), 0.004 * submap.points[:, 2] ** 2, rtol=1e-3
     )
 
 
-def test_one_point_a_voxel_the_surest() -> None:
+def test_the_point_with_least_variance_of_a_voxel_is_kept() -> None:
     points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [-0.1, 0.1, 0.1], [0.3, 0.3, 0.3]])
     kept = surest_per_voxel(points.astype(np.float32), np.array([3, 1, 2, 4], np.float32), 1.0)
     np.testing.assert_array_equal(kept, [1, 2])
 
 
-def test_one_point_a_voxel_of_many() -> None:
+def test_one_point_is_kept_of_many_in_a_voxel() -> None:
     rng = np.random.default_rng(5)
     points = rng.uniform(-1, 1, (4000, 3)).astype(np.float32)
     variances = rng.integers(1, 4, 4000).astype(np.float32)
@@ -123,7 +123,7 @@ def test_one_point_a_voxel_of_many() -> None:
     np.testing.assert_array_equal(kept, sorted(best.values()))
 
 
-def test_it_reads_back_as_it_was(tmp_path: Path) -> None:
+def test_a_submap_is_read_back(tmp_path: Path) -> None:
     submap = make_submap(fused_plane(), CAMERA, 0.05)
     write_submap(tmp_path / "7", submap)
     again = read_submap(tmp_path / "7")
@@ -138,13 +138,13 @@ def test_a_broken_file_is_refused(tmp_path: Path) -> None:
         read_submap(tmp_path / "7")
 
 
-def test_nothing_known_gives_no_points() -> None:
+def test_no_depth_gives_no_points() -> None:
     result = fused_plane()
     nothing = result.map.where(torch.zeros(30, 40, dtype=torch.bool))
     assert len(make_submap(FusedKeyframe(result.keyframe, nothing, result.views), CAMERA)) == 0
 
 
-def test_new_instances_reach_the_pixels_that_points_were_made_of() -> None:
+def test_new_instances_relabel_the_points_of_their_pixels() -> None:
     result = fused_plane()
     submap = make_submap(result, CAMERA, 0.01)
     numbers = np.arange(1200, dtype=np.uint16).reshape(30, 40)

@@ -33,7 +33,7 @@ def evidence(masks, instances) -> InstanceEvidence:
     )
 
 
-def test_landmarks_are_the_prior_of_an_instances_class() -> None:
+def test_landmarks_give_the_prior_of_an_instances_class() -> None:
     rng = np.random.default_rng(0)
     masks = rng.dirichlet(np.ones(4), 4)
     instances = np.array([1] * 20 + [2] * MIN_LANDMARKS + [3] * 9)
@@ -63,7 +63,7 @@ def test_landmarks_of_an_object_on_an_instance_do_not_overrule_its_mask() -> Non
     assert given.with_landmarks(p, all_known, PRIOR)[0].argmax() == 2
 
 
-def test_dilate_grows_by_the_margin() -> None:
+def test_dilation_grows_masks_by_the_margin() -> None:
     shown = np.zeros((20, 30), bool)
     shown[10, 12] = True
     rows, columns = np.nonzero(dilate(shown, 3))
@@ -79,7 +79,7 @@ def cloud(points, labels) -> Cloud:
     )  # fmt: skip
 
 
-def test_points_go_to_the_object_whose_box_holds_them(tmp_path: Path) -> None:
+def test_points_belong_to_the_object_whose_box_contains_them(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     poses = [se3_exp(np.r_[rng.normal(0, 0.5, 3), shift, 0, 0]) for shift in (0.0, 0.3, 3.0)]
     size = np.array([0.5, 0.4, 0.6])

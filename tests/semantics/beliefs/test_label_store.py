@@ -29,7 +29,7 @@ def posterior(p: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return belief
 
 
-def test_many_things_at_once_equal_bayes_one_by_one() -> None:
+def test_a_batch_update_equals_bayes_rule_one_by_one() -> None:
     rng = np.random.default_rng(1)
     store, ids = LabelStore(C, NO_LIMIT), np.array([3, 0, 1500])
     seen = [views(3, rng) for _ in range(6)]
@@ -41,7 +41,7 @@ def test_many_things_at_once_equal_bayes_one_by_one() -> None:
     assert store.estimates(ids).views.tolist() == [6, 6, 6]
 
 
-def test_nothing_is_known_before_the_first_view() -> None:
+def test_the_distribution_is_uniform_before_the_first_view() -> None:
     store = LabelStore(C)
     found = store.estimates(np.array([0, 7, 99999]))
     assert found.labels.tolist() == [0, 0, 0]
@@ -51,7 +51,7 @@ def test_nothing_is_known_before_the_first_view() -> None:
     assert len(store.estimates(np.zeros(0, np.int64)).labels) == 0
 
 
-def test_one_view_is_believed_as_far_as_its_mask() -> None:
+def test_one_view_counts_by_its_mask_score() -> None:
     store = LabelStore(C)
     sure = np.eye(C, dtype=np.float32)[[2, 2]]
     store.update(np.array([0, 1]), sure, np.array([0.8, 0.0], np.float32))
@@ -82,7 +82,7 @@ def missed_by_integral(prior: np.ndarray, misses: float, a: float, b: float) -> 
     return belief / belief.sum()
 
 
-def test_misses_are_views_of_one_recall_that_is_not_known() -> None:
+def test_misses_of_one_view_are_dependent() -> None:
     config = LabelStoreConfig(recall_found=2.0, recall_missed=1.5, max_log_odds=60.0)
     store, three = LabelStore(C, config), np.array([3])
     p, weights = views(1, np.random.default_rng(6))
@@ -98,7 +98,7 @@ def test_misses_are_views_of_one_recall_that_is_not_known() -> None:
     assert then - first > first - np.log(PRIOR[1])  # the second adds less than the first
 
 
-def test_a_fused_thing_keeps_both_histories() -> None:
+def test_a_fused_landmark_combines_both_distributions() -> None:
     p, weights = views(4, np.random.default_rng(3))
     store, whole = LabelStore(C, NO_LIMIT), LabelStore(C, NO_LIMIT)
     store.update(np.array([1, 1]), p[:2], weights[:2])
@@ -114,7 +114,7 @@ def test_a_fused_thing_keeps_both_histories() -> None:
     assert store.known().tolist() == []
 
 
-def test_a_wrong_belief_can_be_overcome() -> None:
+def test_a_wrong_label_can_be_corrected() -> None:
     store, one = LabelStore(C), np.array([0])
     wrong, right = np.eye(C, dtype=np.float32)[[1]], np.eye(C, dtype=np.float32)[[2]]
     weight = np.array([0.9], np.float32)
@@ -125,7 +125,7 @@ def test_a_wrong_belief_can_be_overcome() -> None:
     assert store.estimates(one).labels[0] == 2
 
 
-def test_a_store_becomes_the_same_from_its_state() -> None:
+def test_a_store_is_restored_from_its_state() -> None:
     p, weights = views(3, np.random.default_rng(4))
     store = LabelStore(C)
     store.update(np.array([2, 5000, 7]), p, weights)
@@ -156,7 +156,7 @@ def test_a_keyframe_takes_at_most_two_milliseconds() -> None:
         assert min(took_s) < 2e-3, classes
 
 
-def test_a_thing_beyond_the_capacity_is_moved_to_a_smaller_id_and_back() -> None:
+def test_an_id_beyond_the_capacity_is_moved_to_a_smaller_id_and_back() -> None:
     """After a move to 3000 no id above it is known, and the tables shrink below the first."""
     p, weights = views(1, np.random.default_rng(7))
     store, whole = LabelStore(C), LabelStore(C)

@@ -14,7 +14,7 @@ from bmask_slam.semantics.labels import label_set
 IDS = np.array([3, 2000])
 
 
-def test_evidence_counts_as_in_bayes_rule() -> None:
+def test_evidence_is_combined_by_bayes_rule() -> None:
     movability = MovabilityFilter(0.3, MovabilityConfig(hit_rate=0.8, max_evidence=50))
     p = 0.3
     for says_moving in (True, True, False, True):
@@ -26,7 +26,7 @@ def test_evidence_counts_as_in_bayes_rule() -> None:
     assert movability.moving(np.array([3, 7])).tolist() == [True, False]
 
 
-def test_power_is_an_exponent_of_the_likelihood() -> None:
+def test_the_power_is_an_exponent_of_the_likelihood() -> None:
     whole, quarters = (MovabilityFilter(0.5) for _ in range(2))
     whole.update(IDS, np.array([True, False]))
     for _ in range(4):
@@ -34,7 +34,7 @@ def test_power_is_an_exponent_of_the_likelihood() -> None:
     np.testing.assert_allclose(whole.log_odds(IDS), quarters.log_odds(IDS), rtol=1e-6)
 
 
-def test_it_recovers_from_any_number_of_wrong_answers() -> None:
+def test_it_recovers_from_any_number_of_wrong_observations() -> None:
     movability = MovabilityFilter(0.2)
     for _ in range(100):
         movability.update(IDS, np.array([True, True]))
@@ -53,7 +53,7 @@ def test_a_label_changes_the_prior_and_keeps_the_evidence() -> None:
     np.testing.assert_allclose(moved_by, [np.log(0.95 / 0.05) - np.log(0.2 / 0.8), 0], atol=1e-6)
 
 
-def test_fused_things_share_evidence_and_the_dropped_are_unknown() -> None:
+def test_fused_landmarks_share_evidence_and_dropped_ones_are_unknown() -> None:
     movability = MovabilityFilter(0.2)
     movability.update(IDS, np.array([True, True]), 0.5)
     movability.set_priors(IDS[1:], np.array([0.9]))
@@ -64,7 +64,7 @@ def test_fused_things_share_evidence_and_the_dropped_are_unknown() -> None:
     assert not len(movability.known())
 
 
-def test_state_and_back() -> None:
+def test_the_state_is_restored() -> None:
     movability, other = MovabilityFilter(0.2), MovabilityFilter(0.2)
     movability.update(IDS, np.array([True, False]))
     other.update(np.array([5]), np.array([True]))

@@ -47,13 +47,13 @@ def test_a_landmark_on_an_instance_gets_its_distribution_and_score() -> None:
     assert found.weights == pytest.approx([0.9, 1.0])
 
 
-def test_columns_are_not_taken_for_rows() -> None:
+def test_columns_and_rows_are_not_exchanged() -> None:
     assignment = assign_pixels([CHAIR], flat(), SIZE, CONFIG)
     found = vote(assignment, np.array([[50.0, 100.0]]), np.array([2.0]), 4, CONFIG)
     assert found.instances.tolist() == [-1]  # column 50, row 100 is below; row 50 would be inside
 
 
-def test_near_a_border_nobody_votes_on_either_side() -> None:
+def test_near_a_mask_border_no_landmark_votes() -> None:
     assignment = assign_pixels([CHAIR], flat(), SIZE, CONFIG)
     columns = np.arange(20, 100)
     pixels = np.stack([columns, np.full(len(columns), 50)], axis=1).astype(float)
@@ -71,14 +71,14 @@ def test_near_a_border_nobody_votes_on_either_side() -> None:
     assert found.weights == pytest.approx(weights)
 
 
-def test_the_edge_of_the_image_is_no_border() -> None:
+def test_the_image_edge_is_not_a_mask_border() -> None:
     corner = instance(slice(0, 60), slice(0, 60), 2)
     assignment = assign_pixels([corner], flat(), SIZE, CONFIG)
     found = vote(assignment, np.array([[0.0, 0.0]]), np.array([2.0]), 4, CONFIG)
     assert found.instances.tolist() == [0]
 
 
-def test_where_masks_overlap_the_better_one_owns_the_pixel() -> None:
+def test_a_pixel_belongs_to_the_better_of_overlapping_masks() -> None:
     cup = instance(slice(40, 70), slice(50, 80), 3, 0.95)
     for given in ([CHAIR, cup], [cup, CHAIR]):
         assignment = assign_pixels(given, flat(), SIZE, CONFIG)
@@ -91,7 +91,7 @@ def test_where_masks_overlap_the_better_one_owns_the_pixel() -> None:
     assert assignment.instances[found.instances[0]].label == 1
 
 
-def test_what_lies_in_a_larger_thing_of_another_class_is_in_front_of_it() -> None:
+def test_a_mask_inside_a_larger_one_of_another_class_is_in_front() -> None:
     inside, part = (instance(slice(40, 60), slice(40, 60), label, 0.3) for label in (3, 1))
     large = instance(slice(40, 80), slice(34, 90), 3, 0.3)
     for other, label in ((inside, 3), (part, 1), (large, 1)):
@@ -102,7 +102,7 @@ def test_what_lies_in_a_larger_thing_of_another_class_is_in_front_of_it() -> Non
         assert (front.mask_score == 0.3) == (other is inside)
 
 
-def test_what_the_mask_in_front_leaves_open_the_one_behind_says() -> None:
+def test_outside_the_front_mask_the_one_behind_votes() -> None:
     cup = instance(slice(40, 60), slice(40, 60), 3, 0.3)
     assignment = assign_pixels([CHAIR, cup], flat(), SIZE, CONFIG)
     found = vote(assignment, np.array([[50.0, 50.0], [80.0, 70.0]]), np.full(2, 2.0), 4, CONFIG)
@@ -121,7 +121,7 @@ def test_a_landmark_that_is_not_on_the_surface_does_not_vote() -> None:
     assert found.rows.tolist() == [1, 3]  # of an unknown depth nothing speaks against it
 
 
-def test_a_slanted_surface_votes_as_a_whole() -> None:
+def test_a_slanted_surface_votes_completely() -> None:
     depth_m = np.repeat(np.linspace(3.5, 0.9, SIZE[0] // 2)[:, None], SIZE[1] // 2, axis=1)
     assignment = assign_pixels([CHAIR], depth_m.astype(np.float32), SIZE, CONFIG)
     rows = np.arange(24, 76)
@@ -137,7 +137,7 @@ def stepped() -> np.ndarray:
     return depth_m
 
 
-def test_near_a_border_the_depth_says_which_side_it_is() -> None:
+def test_near_a_border_depth_decides_the_side() -> None:
     assignment = assign_pixels([CHAIR], stepped(), SIZE, CONFIG)
     columns = np.array([28, 31, 33, 31, 28, 31])  # the mask begins at column 30
     z_m = np.array([2.0, 2.02, 1.99, 4.0, 4.0, np.nan])
@@ -150,7 +150,7 @@ def test_near_a_border_the_depth_says_which_side_it_is() -> None:
     assert vote(assignment, pixels[[0, 1]], z_m[[0, 1]], 4, without).rows.tolist() == []
 
 
-def test_on_the_border_of_two_things_of_one_class_the_class_is_known_and_the_thing_is_not() -> None:
+def test_at_a_border_of_two_instances_of_a_class_only_the_class_is_known() -> None:
     for label, rows in ((1, [0]), (2, [])):
         right = instance(slice(20, 80), slice(90, 140), label, 0.7)
         depth_m = flat(4.0)
@@ -188,7 +188,7 @@ def test_masks_of_another_image_or_label_set_are_refused() -> None:
     check_instances([CHAIR], SIZE, LABELS, "keyframe 7")
 
 
-def test_grouped_median_equals_one_group_after_the_other() -> None:
+def test_grouped_median_equals_a_loop_over_groups() -> None:
     rng = np.random.default_rng(3)
     values, groups = rng.normal(size=301), rng.integers(0, 6, 301)
     groups[groups == 2] = 3

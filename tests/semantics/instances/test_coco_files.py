@@ -77,7 +77,7 @@ def test_polygons_and_both_kinds_of_run_lengths(tmp_path: Path) -> None:
         ({"category_id": 1}, "category_id 1"),
     ],
 )
-def test_a_broken_object_is_named_and_the_rest_is_used(
+def test_a_broken_object_is_reported_and_the_others_are_used(
     tmp_path: Path, change: dict[str, Any], words: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = write(tmp_path / "c.json", [annotation(id=3, **change), annotation()])

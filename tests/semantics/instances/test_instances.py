@@ -30,7 +30,7 @@ def case() -> dict[str, Instance]:
     }
 
 
-def test_boxes_bring_forward_what_a_larger_mask_leaves_out() -> None:
+def test_small_masks_in_holes_of_larger_boxes_are_in_front() -> None:
     found = case()
     ranked, names = list(found.values()), list(found)
     by_masks = [names[k] for k in painting_order(ranked, 0.8, False)]
@@ -39,7 +39,7 @@ def test_boxes_bring_forward_what_a_larger_mask_leaves_out() -> None:
     assert by_boxes == ["chair", "bookcase", "cup", "book"]
 
 
-def test_nothing_of_the_same_class_or_of_like_size_comes_forward() -> None:
+def test_masks_of_the_same_class_or_size_are_not_in_front() -> None:
     found = case()
     same = instance(found["cup"].mask, found["bookcase"].label, 0.4)
     large = np.zeros((120, 160), bool)
@@ -49,6 +49,6 @@ def test_nothing_of_the_same_class_or_of_like_size_comes_forward() -> None:
     assert painting_order([], 0.8, True).tolist() == []
 
 
-def test_a_box_is_that_of_whole_pixels() -> None:
+def test_a_box_covers_whole_pixels() -> None:
     assert mask_box(case()["cup"].mask).tolist() == [60, 80, 80, 92]
     assert mask_box(np.zeros((5, 6), bool)).tolist() == [0, 0, 0, 0]

@@ -28,7 +28,7 @@ def test_the_mask_enters_as_the_last_channel_pooled_two_by_two() -> None:
     torch.testing.assert_close(seen[0][:, 6], expected)
 
 
-def test_masks_and_ious_are_those_of_the_label() -> None:
+def test_masks_and_ious_of_the_predicted_label_are_used() -> None:
     torch.manual_seed(0)
     heads = RoIHeads(CONFIG).eval()
     table = feature_table([torch.randn(1, 6, 64 >> k, 64 >> k) for k in range(4)], 256)
@@ -46,7 +46,7 @@ def test_masks_and_ious_are_those_of_the_label() -> None:
     torch.testing.assert_close(ious, torch.tensor([0.6, 1.0]))  # an IoU is at most 1
 
 
-def test_without_the_head_every_mask_counts_in_full() -> None:
+def test_without_the_head_every_mask_has_full_score() -> None:
     heads = RoIHeads(replace(CONFIG, maskiou_channels=0)).eval()
     table = feature_table([torch.randn(1, 6, 64 >> k, 64 >> k) for k in range(4)], 256)
     masks, ious = heads.masks(table, [torch.tensor([[0.0, 0.0, 50.0, 50.0]])], torch.tensor([1]))
@@ -54,7 +54,7 @@ def test_without_the_head_every_mask_counts_in_full() -> None:
     assert ious.tolist() == [1.0]
 
 
-def test_the_expected_iou_is_that_of_objects_drawn_from_the_probabilities() -> None:
+def test_the_expected_iou_equals_that_of_sampled_masks() -> None:
     generator = torch.Generator().manual_seed(0)
     masks = (
         torch.rand(3, 28, 28, generator=generator) ** torch.tensor([0.3, 1.0, 2.0])[:, None, None]

@@ -72,7 +72,7 @@ def given() -> Components:
     return Components()
 
 
-def test_anchors_also_where_the_coarsest_level_is_rounded_up() -> None:
+def test_anchors_of_a_rounded_up_coarsest_level() -> None:
     grids = [(40, 56), (20, 28), (10, 14), (5, 7), (3, 4)]
     anchors = make_anchors([torch.zeros(1, 1, *grid) for grid in grids], (160, 224), AnchorConfig())
     assert [len(a) for a in anchors] == [3 * h * w for h, w in grids]
@@ -122,7 +122,7 @@ def test_nms(given: Components, max_iou: float) -> None:
     assert_golden(f"component/batched_nms{max_iou}", grouped, 0)
 
 
-def test_a_chain_of_suppressions_is_settled_from_its_best_box_on() -> None:
+def test_a_chain_of_suppressions_starts_at_the_best_box() -> None:
     x = torch.arange(40.0) * 4
     boxes = torch.stack([x, torch.zeros(40), x + 10, torch.full((40,), 10.0)], dim=1)
     kept = nms(boxes, torch.arange(40.0, 0, -1), 0.4)  # each overlaps its neighbours by 6 / 14
@@ -222,7 +222,7 @@ def test_the_whole_network(named: tuple[str, MaskRCNN]) -> None:
     assert_golden(f"{name}/box_logits", seen["box"][0][::40])
 
 
-def test_the_whole_network_as_it_runs(named: tuple[str, MaskRCNN]) -> None:
+def test_the_whole_network_at_inference(named: tuple[str, MaskRCNN]) -> None:
     """In float32, whose rounding moves no box by more than 1e-4 px (7e-5 px where it was tried)."""
     name, model = named
     images = [torch.from_numpy(picture(96, 128, 0)), torch.from_numpy(picture(120, 90, 1))]

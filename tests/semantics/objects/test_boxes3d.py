@@ -33,7 +33,7 @@ def cuboid(rng: np.random.Generator, size_m: Array, count: int = 3000) -> Array:
 
 
 @pytest.mark.parametrize("yaw_deg", [0, 20, 45, 77])
-def test_a_box_around_a_turned_cuboid_is_that_cuboid(yaw_deg: float) -> None:
+def test_the_box_of_a_rotated_cuboid_equals_the_cuboid(yaw_deg: float) -> None:
     rng, size_m = np.random.default_rng(1), np.array([1.2, 0.5, 0.8])
     T = T_B_A @ se3_exp(np.array([0, 0, np.deg2rad(yaw_deg), 0.3, 0.1, -0.2]))
     box = box_around(transform(T, cuboid(rng, size_m)), T_B_A[:3, :3] @ UP)
@@ -54,7 +54,7 @@ def test_lone_points_are_not_supported() -> None:
     assert np.allclose(box_around(points[kept], UP).size_m, 1.0, atol=0.01)
 
 
-def test_a_face_of_few_points_stays_in_the_box() -> None:
+def test_a_face_with_few_points_is_inside_the_box() -> None:
     """A book's back has 2000 points, its cover, seen at a glancing angle, eight."""
     rng = np.random.default_rng(3)
     back = rng.uniform(0, 1, (2000, 3)) * [0.03, 0.0, 0.3]
@@ -86,7 +86,7 @@ def test_noise_along_the_rays_does_not_make_a_box_thicker() -> None:
             assert np.allclose(without_noise(here, 0 * noise, up, 0.02), here)
 
 
-def test_support_is_what_counting_neighbours_says() -> None:
+def test_support_equals_a_count_of_neighbours() -> None:
     points = np.random.default_rng(4).normal(size=(80, 3))
     apart = np.sort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)[:, 3]
     assert (supported(points, 3, 0.1) == (apart <= 3 * np.median(apart))).all()
@@ -101,7 +101,7 @@ def test_one_point_and_a_flat_thing_have_boxes() -> None:
     assert box_around(flat, UP).volume_m3 > 0
 
 
-def test_iou_of_axis_parallel_boxes_is_what_one_counts_by_hand() -> None:
+def test_iou_of_axis_parallel_boxes_equals_manual_results() -> None:
     a = OrientedBox(np.eye(4), np.array([2.0, 2.0, 2.0]))
     T = np.eye(4)
     T[0, 3] = 1.0
@@ -130,7 +130,7 @@ def test_gravity_axes_are_a_rotation_with_up_last() -> None:
         assert np.allclose(R[:, 2], unit)
 
 
-def test_up_is_found_although_all_cameras_look_down() -> None:
+def test_up_is_found_with_all_cameras_pointing_down() -> None:
     rng = np.random.default_rng(5)
     up = se3_exp(np.array([0.3, 0.2, -0.1, 0, 0, 0]))[:3, :3] @ UP
     R = gravity_axes(up)

@@ -38,7 +38,7 @@ def noisy(rng: np.random.Generator) -> np.ndarray:
     return depth_m.astype(np.float32)
 
 
-def test_depths_are_means_of_inverse_depth_over_like_pixels_of_the_instance() -> None:
+def test_depths_are_means_of_inverse_depth_over_similar_pixels() -> None:
     depth_m = noisy(np.random.default_rng(0))
     points = found(depth_m, 1.0).points_camera
     assert len(points) > 400
@@ -62,7 +62,7 @@ def test_smoothed_points_lie_nearer_to_the_surface() -> None:
     assert spread[1][1] - spread[1][0] < 0.5 * (spread[0][1] - spread[0][0])
 
 
-def test_only_masks_that_may_be_wrong_lose_their_borders() -> None:
+def test_only_uncertain_masks_are_eroded() -> None:
     depth_m = np.full((45, 60), 2.0, np.float32)
     columns = {}
     for score in (1.0, 0.9):
@@ -77,7 +77,7 @@ def test_only_masks_that_may_be_wrong_lose_their_borders() -> None:
     [(1, slice(20, 70), False), (2, slice(20, 70), True), (1, slice(0, 90), True)],
     ids=["of-them", "other-class", "more-than-them"],
 )
-def test_another_outline_of_things_of_its_class_is_none(
+def test_a_mask_covered_by_others_of_its_class_is_dropped(
     label: int, rows: slice, alone: bool
 ) -> None:
     """A mask over two others."""

@@ -92,7 +92,7 @@ def seen(T: Array, cards: list[Card], score: float) -> tuple[list[Instance], np.
 PATH = np.linspace(-0.6, 0.6, 7)
 
 
-def test_two_chairs_side_by_side_stay_two() -> None:
+def test_two_adjacent_chairs_remain_two_objects() -> None:
     scene = Scene()
     for x in PATH:
         scene.show(x, CHAIRS)
@@ -108,7 +108,7 @@ def test_two_chairs_side_by_side_stay_two() -> None:
         assert (o.first_seen_s, o.last_seen_s) == (0.0, 3.0)
 
 
-def test_the_same_scene_elsewhere_gives_the_same_objects_there() -> None:
+def test_objects_move_with_the_world() -> None:
     T = se3_exp(np.array([0.5, -1.2, 0.8, 4.0, 5.0, -6.0]))
     here, there = Scene(), Scene(T)
     for x in PATH:
@@ -118,7 +118,7 @@ def test_the_same_scene_elsewhere_gives_the_same_objects_there() -> None:
         assert np.allclose((T @ a.box.T_world_box)[:3, 3], b.box.T_world_box[:3, 3], atol=0.01)
 
 
-def test_objects_follow_the_keyframes_that_saw_them() -> None:
+def test_objects_move_with_their_keyframes() -> None:
     scene = Scene()
     for x in PATH:
         scene.show(x, CHAIRS)
@@ -129,7 +129,7 @@ def test_objects_follow_the_keyframes_that_saw_them() -> None:
         assert np.allclose(transform(moved, old[None])[0], o.centroid_world, atol=1e-6)
 
 
-def test_rays_say_what_an_error_of_depth_does_to_points() -> None:
+def test_point_covariances_follow_from_rays_and_depth_errors() -> None:
     scene = Scene(se3_exp(np.array([0.5, 0.2, -0.7, 1.0, 2.0, 3.0])))
     for x in (0.0, 0.2):
         scene.show(x, CHAIRS)
@@ -142,7 +142,7 @@ def test_rays_say_what_an_error_of_depth_does_to_points() -> None:
     assert np.allclose(np.abs(rays).max(), 4.0, rtol=0.6)
 
 
-def test_points_of_a_culled_keyframe_stay_where_they_are() -> None:
+def test_points_of_a_culled_keyframe_keep_their_position() -> None:
     scene = Scene()
     for x in PATH:
         scene.show(x, CHAIRS)
@@ -154,7 +154,7 @@ def test_points_of_a_culled_keyframe_stay_where_they_are() -> None:
     assert 3 in after[0].keyframe_ids  # it did see them
 
 
-def test_parts_that_were_seen_apart_become_one_when_seen_whole() -> None:
+def test_parts_are_merged_when_one_mask_covers_them() -> None:
     sofa = Card(-1.4, 1.4)
     scene = Scene()
     first, second = (scene.show(x, [sofa])[0] for x in (-1.7, 1.7))
@@ -166,7 +166,7 @@ def test_parts_that_were_seen_apart_become_one_when_seen_whole() -> None:
     assert found.keyframe_ids.tolist() == [0, 1, 2, 3, 4]
 
 
-def test_what_one_mask_held_together_is_split_once_masks_tell_it_apart() -> None:
+def test_an_object_is_split_when_masks_separate_it() -> None:
     scene, both = Scene(), [Card(-0.42, 0.42)]
     for x in PATH[:3]:
         scene.show(x, both)
@@ -189,14 +189,14 @@ def test_one_wrong_class_neither_makes_an_object_nor_changes_its_label() -> None
     assert found.distribution[1] > 0.95
 
 
-def test_a_cup_on_a_desk_is_no_part_of_the_desk() -> None:
+def test_a_cup_on_a_desk_is_not_merged_with_the_desk() -> None:
     scene = Scene()
     for x in PATH:
         scene.show(x, [Card(-0.9, 0.9, 2), Card(-0.1, 0.1, 3, -0.1, 0.1, 0.05)], 0.9)
     assert sorted(o.label for o in scene.objects()) == [2, 3]
 
 
-def test_what_one_keyframe_saw_is_not_told() -> None:
+def test_objects_of_one_keyframe_are_not_reported() -> None:
     scene = Scene()
     scene.show(0.0, CHAIRS)
     assert scene.objects() == []
@@ -205,7 +205,7 @@ def test_what_one_keyframe_saw_is_not_told() -> None:
     assert len(scene.objects()) == 1
 
 
-def test_points_stay_few() -> None:
+def test_the_number_of_points_is_bounded() -> None:
     scene = Scene(config=ObjectConfig(max_points=500))
     for x in (*PATH, *PATH):
         scene.show(x, CHAIRS)
@@ -214,7 +214,7 @@ def test_points_stay_few() -> None:
     assert scene.objects()[0].box.size_m[2] == pytest.approx(0.6, abs=0.04)
 
 
-def test_a_map_restored_from_its_state_goes_on_the_same() -> None:
+def test_a_restored_map_continues_identically() -> None:
     scene, twin = Scene(), Scene()
     for x in PATH[:4]:
         scene.show(x, CHAIRS)
@@ -242,7 +242,7 @@ def test_landmarks_of_merged_objects_and_fused_landmarks() -> None:
     assert points.landmarks_of(a).tolist() == [3, 4]
 
 
-def test_the_assignment_is_the_best_of_all_and_keeps_the_gate() -> None:
+def test_the_assignment_is_optimal_within_the_gate() -> None:
     """Taking the best pair first would leave the second detection with nothing."""
     of_detection = np.array([[0.9, 0.8], [0.85, 0.0], [0.1, 0.1]])
     overlap = Overlap(of_detection, of_detection, np.array([50, 50]))

@@ -67,7 +67,7 @@ def quiet(done: int, total: int) -> None:
     assert done <= total
 
 
-def test_perfect_masks_reach_one_and_none_reach_zero(truth: tuple[CocoFile, Path]) -> None:
+def test_perfect_masks_have_ap_one_and_no_masks_zero(truth: tuple[CocoFile, Path]) -> None:
     perfect = [instance(disc(x, 45, 20), 0.9, 1.0) for x in (30, 85)]
     result = evaluate_segmenter(Scripted(perfect), *truth, quiet)
     assert [c.ap for c in result.curves] == pytest.approx([1, 1, 1])
@@ -121,7 +121,7 @@ def test_the_correlation_counts_bad_masks_in_good_boxes(truth: tuple[CocoFile, P
     assert result.iou_correlation_of_good != pytest.approx(result.iou_correlation, abs=1e-4)
 
 
-def test_the_command_finds_the_truth_perfect(
+def test_the_command_gives_ap_one_for_the_truth(
     truth: tuple[CocoFile, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, folder = truth

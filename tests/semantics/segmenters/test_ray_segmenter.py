@@ -53,7 +53,7 @@ def equal(a: list[Instance], b: list[Instance]) -> bool:
     ]
 
 
-def test_an_instance_travels_with_a_bit_a_pixel() -> None:
+def test_a_mask_is_sent_with_one_bit_per_pixel() -> None:
     mask = np.random.default_rng(0).random((37, 51)) > 0.5
     sent = Instance(mask, mask_box(mask), 2, certain(2, 4), 0.75, 0.5)
     data = pickle.dumps(sent, protocol=5)
@@ -62,7 +62,7 @@ def test_an_instance_travels_with_a_bit_a_pixel() -> None:
     np.testing.assert_array_equal(pickle.loads(data).distribution, sent.distribution)
 
 
-def test_it_finds_what_one_here_finds(segmenter, options, folder) -> None:
+def test_the_remote_segmenter_equals_the_local_one(segmenter, options, folder) -> None:
     here = make_segmenter(replace(options, ray=""), folder)
     assert segmenter.labels == here.labels
     found = segmenter.segment(IMAGE, "a.png")
@@ -70,14 +70,14 @@ def test_it_finds_what_one_here_finds(segmenter, options, folder) -> None:
     assert equal(found, here.segment(IMAGE, "a.png"))
 
 
-def test_what_it_refuses_there_is_said_here(segmenter) -> None:
+def test_a_remote_input_error_is_raised_locally(segmenter) -> None:
     with pytest.raises(InputError, match=r"b\.png"):
         segmenter.segment(IMAGE, "b.png")
     with pytest.raises(InputError, match="8 bits"):
         segmenter.segment(IMAGE.astype(float), "a.png")
 
 
-def test_one_that_is_killed_costs_its_image_alone(segmenter) -> None:
+def test_a_killed_worker_loses_only_its_image(segmenter) -> None:
     pid = ray.get(segmenter._actor.__ray_call__.remote(lambda _: os.getpid()))
     os.kill(pid, signal.SIGKILL)
     with pytest.raises(InputError, match="lost"):
@@ -86,7 +86,7 @@ def test_one_that_is_killed_costs_its_image_alone(segmenter) -> None:
     assert len(segmenter.segment(IMAGE, "a.png")) == 2
 
 
-def test_one_that_cannot_start_says_why(segmenter, options, folder) -> None:
+def test_a_worker_that_cannot_start_reports_the_reason(segmenter, options, folder) -> None:
     broken = replace(options, masks=folder / "none.json")
     with pytest.raises(InputError, match=r"none\.json"):
         make_segmenter(broken, folder)

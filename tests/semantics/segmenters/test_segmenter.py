@@ -83,7 +83,7 @@ def quiet(done: int, total: int) -> None:
     assert 0 < done <= total
 
 
-def test_cached_masks_come_back_as_they_were(tmp_path: Path, images: list) -> None:
+def test_cached_masks_are_read_back(tmp_path: Path, images: list) -> None:
     out = tmp_path / "masks"
     drawer = Drawer()
     result = cache_masks(drawer, images, CacheOptions(out, {"name": "x"}), quiet)
@@ -108,7 +108,7 @@ def test_cached_masks_come_back_as_they_were(tmp_path: Path, images: list) -> No
         again.segment(image[:, :30], "rgb/1.25.png")
 
 
-def test_what_is_done_is_not_done_again(tmp_path: Path, images: list) -> None:
+def test_cached_images_are_not_segmented_again(tmp_path: Path, images: list) -> None:
     options = CacheOptions(tmp_path / "masks", {"name": "x"}, overlays=False)
     drawer = Drawer()
     cache_masks(drawer, images[:2], options, quiet)
@@ -124,7 +124,7 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, images: list) -> None:
         cache_masks(drawer, images, replace(options, out=tmp_path / "rgb"), quiet)
 
 
-def test_a_broken_image_is_left_out_but_not_the_first(tmp_path: Path, images: list) -> None:
+def test_a_broken_image_is_skipped_except_the_first(tmp_path: Path, images: list) -> None:
     images[1][1].write_bytes(b"\x89PNG cut")
     options = CacheOptions(tmp_path / "masks", {}, overlays=False)
     result = cache_masks(Drawer(), images, options, quiet)
@@ -162,7 +162,7 @@ def test_label_images_of_any_tool(tmp_path: Path) -> None:
         np.zeros((4, 5, 3), np.float32),
     ],
 )
-def test_what_is_no_colour_image_is_refused(image: np.ndarray) -> None:
+def test_other_than_colour_images_are_rejected(image: np.ndarray) -> None:
     torch.manual_seed(0)
     network = NetworkSegmenter(TrainedNetwork(MaskRCNN(TINY).eval(), LABELS), device="cpu")
     segmenters: list[Segmenter] = [NoSegmenter(), network]
@@ -232,7 +232,7 @@ def test_masks_of_a_mirrored_scene_are_the_mirrored_masks() -> None:
 
 
 @pytest.mark.parametrize("channels", [0, 4])
-def test_the_iou_of_masks_from_both_ways_is_judged_and_expected(channels: int) -> None:
+def test_mask_ious_are_predicted_and_expected(channels: int) -> None:
     torch.manual_seed(0)
     config = replace(TINY, class_agnostic=True, maskiou_channels=channels)
     model = MaskRCNN(config).eval()
@@ -249,7 +249,7 @@ def test_the_iou_of_masks_from_both_ways_is_judged_and_expected(channels: int) -
     assert float(found.mask_ious) == pytest.approx(0.55 if channels else 1.0)
 
 
-def test_mask_scores_reorder_detections_and_empty_masks_go() -> None:
+def test_mask_scores_reorder_detections_and_empty_masks_are_dropped() -> None:
     boxes = torch.tensor([[2.0, 2.0, 20.0, 20.0], [5.0, 5.0, 30.0, 30.0], [1.0, 1.0, 9.0, 9.0]])
     masks = torch.stack([torch.full((28, 28), p) for p in (0.9, 0.9, 0.1)])
     found = ClassifiedBoxes(

@@ -38,7 +38,7 @@ def both() -> YoloxDetector:
     return YoloxDetector(ONNX, YoloxConfig(mirror=False, sizes_px=(416, 640)))
 
 
-def test_decoding_against_a_loop_over_cells() -> None:
+def test_decoding_equals_a_loop_over_cells() -> None:
     rng = np.random.default_rng(0)
     side = 64
     cells = [(s, r, c) for s in STRIDES for r in range(side // s) for c in range(side // s)]
@@ -79,7 +79,7 @@ def test_the_real_network_finds_large_objects_in_real_photographs(small: YoloxDe
     assert hits / total > 0.6
 
 
-def test_a_kept_box_is_the_mean_of_those_of_its_class_that_lie_on_it() -> None:
+def test_a_kept_box_is_the_mean_of_overlapping_boxes_of_its_class() -> None:
     boxes = torch.tensor([
         [0.0, 0.0, 100.0, 100.0],
         [0.0, 0.0, 110.0, 100.0],  # IoU 0.91 with the first

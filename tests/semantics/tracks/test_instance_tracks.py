@@ -31,7 +31,7 @@ def test_a_walker_is_predicted_between_keyframes() -> None:
     assert (tracks.reach_m(tracks.predicted(track, 4.0)) > tracks.reach_m(ahead)).all()
 
 
-def test_the_filter_agrees_with_the_textbook() -> None:
+def test_the_filter_equals_the_textbook_kalman_filter() -> None:
     config = TrackConfig(acceleration_m_s2=1.5, speed_m_s=0.9, centroid_sigma_m=0.1)
     tracks, dt, z = InstanceTracks(config), 0.5, np.array([0.3, -0.1, 3.2])
     tracks.update(0.0, [seen(0.0)])
@@ -46,7 +46,7 @@ def test_the_filter_agrees_with_the_textbook() -> None:
     np.testing.assert_allclose(tracks.tracks[0].covariance, P - K @ P[:3], atol=1e-9)
 
 
-def test_two_that_cross_keep_their_tracks_in_any_order() -> None:
+def test_crossing_people_keep_their_tracks_in_any_order() -> None:
     tracks = InstanceTracks()
     for k in range(11):
         both = [seen(-2 + 0.4 * k), seen(2 - 0.4 * k, z=3.3)]
@@ -56,14 +56,14 @@ def test_two_that_cross_keep_their_tracks_in_any_order() -> None:
     assert ends == {2.0, -2.0}
 
 
-def test_a_chair_is_not_the_person_who_stood_there() -> None:
+def test_a_chair_is_not_assigned_to_a_persons_track() -> None:
     tracks = InstanceTracks(TrackConfig(class_cost=20.0))
     first = tracks.update(0.0, [seen(0.0)])
     assert tracks.update(0.3, [seen(0.0, what=CHAIR)]) != first
     assert len(tracks.tracks) == 2
 
 
-def test_far_away_is_another_and_the_unseen_end() -> None:
+def test_a_distant_instance_starts_a_track_and_unobserved_tracks_end() -> None:
     tracks = InstanceTracks(TrackConfig(patience_s=1.0))
     assert tracks.update(0.0, [seen(0.0)]) == [0]
     assert tracks.update(0.3, [seen(3.0)]) == [1]
@@ -71,7 +71,7 @@ def test_far_away_is_another_and_the_unseen_end() -> None:
     assert [t.id for t in tracks.tracks] == [1]
 
 
-def test_masks_out_of_order_change_nothing() -> None:
+def test_masks_out_of_order_are_ignored() -> None:
     tracks = InstanceTracks()
     tracks.update(1.0, [seen(0.0)])
     before = tracks.state()
@@ -87,7 +87,7 @@ def moving_after(evidence: list[float], prior: float) -> bool:
     return tracks.tracks[0].moving
 
 
-def test_what_views_say_adds_up_until_it_outweighs_the_class() -> None:
+def test_evidence_accumulates_until_it_outweighs_the_class() -> None:
     dog, person, step = np.log(0.89 / 0.11), np.log(0.95 / 0.05), np.log(9)
     assert moving_after([0.0], dog)
     assert not moving_after([-step] * 2, dog)
@@ -96,7 +96,7 @@ def test_what_views_say_adds_up_until_it_outweighs_the_class() -> None:
     assert not moving_after([step] * 9 + [-step] * 4, dog)
 
 
-def test_a_track_that_keyframes_miss_where_they_look_ends() -> None:
+def test_a_track_missed_by_keyframes_in_view_ends() -> None:
     tracks = InstanceTracks(TrackConfig(max_missed=2))
     tracks.update(0.0, [seen(0.0), seen(3.0)])
     missed = tracks.tracks[0]
@@ -108,14 +108,14 @@ def test_a_track_that_keyframes_miss_where_they_look_ends() -> None:
     assert [t.id for t in tracks.tracks] == [1]
 
 
-def test_what_a_keyframe_shows_it_does_not_miss() -> None:
+def test_an_observed_track_is_not_counted_as_missed() -> None:
     tracks = InstanceTracks(TrackConfig(max_missed=1))
     tracks.update(0.2, [seen(0.0)])
     tracks.miss(0.2, tracks.tracks)
     assert [t.missed for t in tracks.tracks] == [0]
 
 
-def test_state_and_back() -> None:
+def test_the_state_is_restored() -> None:
     tracks, other = InstanceTracks(), InstanceTracks()
     tracks.update(0.0, [seen(0.0), seen(2.0, what=CHAIR)])
     tracks.update(0.4, [seen(0.2)])
@@ -141,7 +141,7 @@ def part(x: float, y: float, z: float) -> Sighting:
     return Sighting(np.array([x, y, z]), SIZE / 3, PERSON, 2.0)
 
 
-def test_a_part_seen_besides_its_whole_is_no_second_person() -> None:
+def test_a_part_beside_its_whole_is_not_a_second_person() -> None:
     tracks = InstanceTracks()
     assert tracks.update(0.0, [part(0.1, -0.6, 3.1), seen(0.0), seen(0.0, what=CHAIR)]) == [0, 0, 1]
     (person, _) = tracks.tracks
@@ -150,7 +150,7 @@ def test_a_part_seen_besides_its_whole_is_no_second_person() -> None:
     assert first == 0 != second
 
 
-def test_boxes_have_the_axes_of_the_camera_that_saw_them() -> None:
+def test_boxes_have_the_axes_of_their_camera() -> None:
     R_world_camera = so3_exp(np.array([0.0, np.pi / 2, 0.0]))
     beside = R_world_camera @ np.array([0.22, 0.0, 0.0])
     behind = R_world_camera @ np.array([0.0, 0.0, 0.22])
@@ -159,7 +159,7 @@ def test_boxes_have_the_axes_of_the_camera_that_saw_them() -> None:
         assert InstanceTracks().update(0.0, both, R_world_camera) == ids
 
 
-def test_an_unseen_track_where_its_like_was_seen_ends() -> None:
+def test_an_unobserved_track_ends_where_a_similar_one_is_observed() -> None:
     tracks = InstanceTracks()
     four = [seen(0.0), seen(0.3), seen(0.1, what=CHAIR), seen(1.0)]
     assert tracks.update(0.0, four) == [0, 1, 2, 3]
@@ -167,7 +167,7 @@ def test_an_unseen_track_where_its_like_was_seen_ends() -> None:
     assert [t.id for t in tracks.tracks] == [kept, 2, 3]
 
 
-def test_a_class_does_not_count_any_more_for_a_thing_that_was_found_to_stand() -> None:
+def test_the_class_prior_is_ignored_for_a_reinstated_track() -> None:
     tracks = InstanceTracks()
     (mine, other) = tracks.update(0.0, [seen(0.0), seen(2.0)])
     tracks.reinstate(mine, -1.4)

@@ -56,7 +56,7 @@ def scene() -> tuple[MaskRCNN, torch.Tensor, Target]:
     return model, torch.rand(3, 96, 128), Target(boxes, torch.tensor([1, 1]), masks)
 
 
-def test_overlaps_of_masks_against_counting_pixels() -> None:
+def test_mask_overlaps_equal_pixel_counts() -> None:
     masks = torch.rand(5, 9, 7) > torch.tensor([0.2, 0.5, 0.8, 0.5, 2.0])[:, None, None]
     found = mask_iou(masks, masks[1:])
     for i, a in enumerate(masks):
@@ -65,7 +65,7 @@ def test_overlaps_of_masks_against_counting_pixels() -> None:
             assert abs(float(found[i, k]) - (int((a & b).sum()) / either if either else 0)) < 1e-6
 
 
-def test_examples_are_the_masks_and_judgements_of_both_ways() -> None:
+def test_examples_hold_masks_and_scores_of_both_passes() -> None:
     model, image, target = scene()
     found = ClassifiedBoxes(BOXES, LABELS, SCORES, torch.full((6, 3), 1 / 3))
     given = examples(model, image, found, target, DetectedConfig())
@@ -79,7 +79,7 @@ def test_examples_are_the_masks_and_judgements_of_both_ways() -> None:
     assert (given.ious > 0).all()
 
 
-def test_a_mirrored_example_is_what_the_network_sees_in_the_mirror_image() -> None:
+def test_a_mirrored_example_equals_that_of_the_mirrored_image() -> None:
     model, image, target = scene()
     mirrored = Target(
         torch.tensor([[68.0, 10.0, 118.0, 70.0], [0.0, 0.0, 8.0, 8.0]]),
@@ -110,7 +110,7 @@ def drawn(count: int) -> Examples:
     return Examples(features, masks, labels, expected_iou(masks.float()) / 2)
 
 
-def test_the_mean_with_the_expected_iou_comes_to_the_true_one() -> None:
+def test_the_mean_with_the_expected_iou_approaches_the_true_iou() -> None:
     head = scene()[0].roi_heads.maskiou_head
     assert head is not None
     given, config = drawn(128), DetectedConfig(epochs=30, rate=3e-3)

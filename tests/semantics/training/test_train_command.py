@@ -30,7 +30,7 @@ def few(tmp_path: Path) -> Path:
     return tmp_path / "few.json"
 
 
-def test_a_light_network_is_trained_and_trained_on(
+def test_a_light_network_is_trained_and_resumed(
     few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     images = str(SHARED / "coco_excerpt" / "images")
@@ -72,7 +72,7 @@ def test_a_light_network_is_trained_and_trained_on(
         (["--weights", "none.pth"], "none.pth: no such file"),
     ],
 )
-def test_what_does_not_go_together_is_refused(
+def test_incompatible_options_are_rejected(
     few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], extra: list[str], words: str
 ) -> None:
     images = str(SHARED / "coco_excerpt" / "images")
@@ -83,7 +83,7 @@ def test_what_does_not_go_together_is_refused(
     assert not out.exists()
 
 
-def test_transfer_keeps_the_rows_of_classes_that_both_know() -> None:
+def test_transfer_keeps_the_weights_of_common_classes() -> None:
     torch.manual_seed(0)
     config = replace(LIGHT, classes=4, class_agnostic=False)
     old = TrainedNetwork(MaskRCNN(config), label_set(["person", "boat", "cup"]))
@@ -101,7 +101,7 @@ def test_transfer_keeps_the_rows_of_classes_that_both_know() -> None:
     assert torch.equal(after["rpn.head.cls_logits.weight"], before["rpn.head.cls_logits.weight"])
 
 
-def test_transfer_to_more_anchors_keeps_what_was_said_of_the_old_ones() -> None:
+def test_transfer_to_more_anchors_keeps_the_weights_of_old_ones() -> None:
     torch.manual_seed(0)
     config = replace(LIGHT, classes=3, anchors=AnchorConfig())
     old = TrainedNetwork(MaskRCNN(config).eval(), label_set(["person", "cup"]))

@@ -37,7 +37,7 @@ TINY = NetworkConfig(
 )  # fmt: skip
 
 
-def test_matching_and_the_rescue_of_an_object_without_a_good_box() -> None:
+def test_matching_keeps_the_best_box_of_each_object() -> None:
     objects = torch.tensor([[0.0, 0.0, 10.0, 10.0], [50.0, 50.0, 60.0, 60.0]])
     boxes = torch.tensor([
         [0.0, 0.0, 10.0, 9.0],  # IoU 0.9 with the first
@@ -185,7 +185,7 @@ def descend(model: MaskRCNN, steps: int, rois: Literal["proposals", "objects"]) 
     return totals
 
 
-def test_masks_of_one_image_are_learnt_by_heart() -> None:
+def test_the_network_overfits_the_masks_of_one_image() -> None:
     model = learner()
     descend(model, 60, "objects")
     image, target = scene(0)
@@ -198,6 +198,6 @@ def test_masks_of_one_image_are_learnt_by_heart() -> None:
     torch.testing.assert_close(result.mask_ious, overlap, atol=0.15, rtol=0)
 
 
-def test_all_losses_together_fall() -> None:
+def test_the_total_loss_decreases() -> None:
     totals = descend(learner(), 10, "proposals")
     assert np.mean(totals[-3:]) < 0.6 * np.mean(totals[:2])

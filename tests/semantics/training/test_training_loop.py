@@ -70,7 +70,7 @@ def colours(sample: Sample) -> list[int]:
     return [int(np.median(sample.image[m, 0])) for m in sample.masks]
 
 
-def test_masks_stay_on_their_objects() -> None:
+def test_augmentation_moves_masks_with_their_objects() -> None:
     sample, other = painted(0), painted(1)
     other.image[other.masks.any(0), 0] += 100
     mirrored = flipped(sample)
@@ -134,7 +134,7 @@ def test_classes_are_matched_by_name(data: tuple[CocoFile, Path]) -> None:
         dataset.load(1)
 
 
-def test_the_split_of_the_real_excerpt_holds_images_apart() -> None:
+def test_the_split_of_the_real_excerpt_separates_images() -> None:
     content = read_coco(SHARED / "coco_excerpt" / "instances.json")
     training, validation = split(content, 0.28, seed=0)
     assert (len(training.images), len(validation.images)) == (256, 99)
@@ -154,7 +154,7 @@ def quiet(done: int, total: int) -> None:
     assert 0 < done <= total
 
 
-def test_an_interrupted_training_goes_on_as_if_nothing_had_been(
+def test_a_resumed_training_equals_an_uninterrupted_one(
     data: tuple[CocoFile, Path], tmp_path: Path
 ) -> None:
     dataset = Dataset(*data, LABELS)
@@ -178,7 +178,7 @@ def test_an_interrupted_training_goes_on_as_if_nothing_had_been(
     assert (tmp_path / "a" / STATE).is_file()
 
 
-def test_only_what_should_be_trained_changes(data: tuple[CocoFile, Path], tmp_path: Path) -> None:
+def test_only_trainable_parameters_change(data: tuple[CocoFile, Path], tmp_path: Path) -> None:
     dataset = Dataset(*data, LABELS)
     start = network()
     before = {k: v.clone() for k, v in start.model.state_dict().items()}
@@ -234,7 +234,7 @@ def test_images_with_many_objects_are_drawn_more_often(
 
 
 @pytest.mark.parametrize("only", ["", "boxes", "masks", "maskiou"])
-def test_each_training_changes_its_parameters_alone(only: Only) -> None:
+def test_each_stage_changes_only_its_parameters(only: Only) -> None:
     model = MaskRCNN(TINY)
     trainable(model, replace(CONFIG, only=only, freeze=("backbone.body",)))
     learning = {n for n, p in model.named_parameters() if p.requires_grad}

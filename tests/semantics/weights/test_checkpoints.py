@@ -189,7 +189,7 @@ def test_files_that_are_no_state_dict_are_refused(tmp_path: Path, capsys) -> Non
         load_network(tmp_path / "none.pth")
 
 
-def test_our_own_files_say_what_they_are(tmp_path: Path) -> None:
+def test_our_files_describe_their_network(tmp_path: Path) -> None:
     config = NetworkConfig(
         classes=3, backbone="mobilenet_v2", norm="none", channels=16, box_hidden=8,
         mask_channels=8, maskiou_channels=8, maskiou_hidden=8,

@@ -106,7 +106,7 @@ def test_observations_belong_to_their_keypoints() -> None:
     np.testing.assert_allclose(seen.measurements, expected, atol=1e-9)
 
 
-def test_a_landmark_enters_with_its_second_view_and_all_views_so_far() -> None:
+def test_a_landmark_is_added_at_its_second_observation_with_all() -> None:
     world, _ = make_world(1)
     factor_selection = FactorSelector(EVERYTHING)
     first = factor_selection.keyframe_update(world, world.keyframes[0])
@@ -122,7 +122,7 @@ def test_a_landmark_enters_with_its_second_view_and_all_views_so_far() -> None:
     np.testing.assert_array_equal(second.points_world, world.landmarks.points_world[:10])
 
 
-def test_nothing_is_sent_twice_and_in_the_end_everything_is_sent() -> None:
+def test_every_observation_is_sent_exactly_once() -> None:
     """Landmarks that come and go, one keyframe after the other."""
     world, points = WorldMap(), points_before(np.eye(4), COUNT, RNG)
     factor_selection, sent = FactorSelector(EVERYTHING), set()
@@ -162,7 +162,7 @@ def test_observations_in_keyframes_older_than_the_landmark_are_sent() -> None:
     assert pairs(update) == {(k, i) for k in (old.id, new.id) for i in ids.tolist()}
 
 
-def test_observations_older_than_an_heir_are_sent() -> None:
+def test_observations_older_than_a_parent_are_sent() -> None:
     """The keyframe that made a landmark is culled; its heir is newer than another observer."""
     world, _ = make_world(4, count=20)
     world.remove_keyframe(world.keyframes[0], parent=world.keyframes[2])
@@ -191,7 +191,7 @@ def test_landmarks_in_the_graph_count_towards_the_cap() -> None:
     assert {(2, i) for i in range(45)} <= pairs(update)
 
 
-def test_what_is_forgotten_is_removed_once() -> None:
+def test_removed_landmarks_are_removed_once() -> None:
     world, _ = make_world(3)
     factor_selection = FactorSelector(EVERYTHING)
     factor_selection.forget_landmarks(np.array([4, 5]))
@@ -229,7 +229,7 @@ def test_poses_and_points_are_read_back() -> None:
     assert np.flatnonzero(world.landmarks.in_graph).tolist() == inside.tolist()
 
 
-def test_landmarks_outside_follow_their_host_alone() -> None:
+def test_landmarks_outside_the_graph_move_with_their_host() -> None:
     world, _ = make_world(2)
     world.landmarks.host[30:] = 1
     before = world.landmarks.points_world.copy()
@@ -243,7 +243,7 @@ def test_landmarks_outside_follow_their_host_alone() -> None:
     )
 
 
-def test_landmarks_that_the_graph_refused_follow_their_host_too() -> None:
+def test_refused_landmarks_move_with_their_host() -> None:
     """They were sent (in_graph is set) but the estimate does not hold them."""
     world, _ = make_world(3)
     before = world.landmarks.points_world.copy()
@@ -255,7 +255,7 @@ def test_landmarks_that_the_graph_refused_follow_their_host_too() -> None:
     assert np.flatnonzero(world.landmarks.in_graph).tolist() == list(range(40))
 
 
-def test_the_dead_stay_where_they_are() -> None:
+def test_removed_landmarks_are_not_moved() -> None:
     world, _ = make_world(2)
     world.landmarks.remove(np.array([3]))
     before = world.landmarks.points_world[3].copy()
@@ -266,7 +266,7 @@ def test_the_dead_stay_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("whole", [False, True])
-def test_the_smoother_brings_spoiled_poses_back(whole: bool) -> None:
+def test_the_smoother_corrects_disturbed_poses(whole: bool) -> None:
     """Map, feed, graph, read-back with exact measurements: the truth comes out."""
     world, points = make_world(1)
     factor_selection, smoother = FactorSelector(EVERYTHING), Smoother(CAMERA)
@@ -319,7 +319,7 @@ def test_a_small_map_keeps_every_landmark_in_the_graph() -> None:
     assert len(smoother.estimate().landmark_ids) == 2 * COUNT
 
 
-def test_two_batches_retire_at_once_at_most() -> None:
+def test_at_most_two_batches_are_marginalised_at_once() -> None:
     config = replace(WINDOWED, marginalise_batch=5)
     world, factor_selection, _ = windowed_world(replace(config, full_keyframes=100))
     factor_selection.config = config
@@ -328,7 +328,7 @@ def test_two_batches_retire_at_once_at_most() -> None:
     assert len(update.marginalise_landmarks) == 10
 
 
-def test_landmarks_outside_the_window_retire_and_come_back_when_seen() -> None:
+def test_landmarks_outside_the_window_are_marginalised_and_restored() -> None:
     world, factor_selection, smoother = windowed_world(WINDOWED)
     old, new = np.arange(COUNT), COUNT + np.arange(COUNT)
     assert not world.landmarks.in_graph[old].any()
@@ -352,7 +352,7 @@ def test_landmarks_outside_the_window_retire_and_come_back_when_seen() -> None:
     assert world.landmarks.in_graph[old].all()
 
 
-def test_a_retired_landmark_that_is_given_observations_comes_back_at_once() -> None:
+def test_a_marginalised_landmark_with_new_observations_is_restored() -> None:
     """As fusing does after a loop: what a newer landmark held, an old one now holds."""
     world, factor_selection, _ = windowed_world(WINDOWED)
     gone = world.replace_landmarks(np.array([COUNT + 3]), np.array([4]))
@@ -363,7 +363,7 @@ def test_a_retired_landmark_that_is_given_observations_comes_back_at_once() -> N
     assert world.landmarks.in_graph[4]
 
 
-def test_the_whole_map_holds_the_retired_landmarks_too() -> None:
+def test_the_map_includes_marginalised_landmarks() -> None:
     world, factor_selection, _ = windowed_world(WINDOWED)
     update = factor_selection.whole_update(world)
     assert update.landmark_ids.tolist() == list(range(2 * COUNT))

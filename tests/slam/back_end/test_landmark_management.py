@@ -45,7 +45,7 @@ def scene(views: int, T_world_first: Array | None = None) -> tuple[WorldMap, Arr
 
 
 @pytest.mark.parametrize("T_world_first", [np.eye(4), T_NEW_OLD], ids=["origin", "moved world"])
-def test_landmarks_are_made_where_depth_says(T_world_first: Array) -> None:
+def test_landmarks_are_made_at_the_measured_depth(T_world_first: Array) -> None:
     world, points_world, (keyframe,) = scene(1, T_world_first)
     keyframe.features.depth_m[:10] = np.nan
     ids = create_landmarks(world, keyframe, CAMERA)
@@ -75,7 +75,7 @@ def test_free_keypoints_of_neighbours_observe_the_new_landmarks() -> None:
     assert (first.landmark_ids[20:] == new).all()
 
 
-def test_landmarks_rarely_found_or_seen_once_are_culled() -> None:
+def test_landmarks_rarely_matched_or_observed_once_are_culled() -> None:
     world, _, keyframes = scene(3)
     ids = create_landmarks(world, keyframes[0], CAMERA)
     world.attach(keyframes[1], np.arange(40), ids[:40])
@@ -86,13 +86,13 @@ def test_landmarks_rarely_found_or_seen_once_are_culled() -> None:
     assert not world.landmarks.alive[culled].any()
 
 
-def test_a_new_landmark_is_on_probation() -> None:
+def test_a_new_landmark_is_not_culled_yet() -> None:
     world, _, keyframes = scene(2)
     ids = create_landmarks(world, keyframes[1], CAMERA)
     assert len(cull_landmarks(world, ids, CONFIG)) == 0
 
 
-def test_only_a_keyframe_that_adds_nothing_is_redundant() -> None:
+def test_only_a_keyframe_without_own_landmarks_is_redundant() -> None:
     world, _, keyframes = scene(5)
     ids = create_landmarks(world, keyframes[0], CAMERA)
     for keyframe in keyframes[1:]:

@@ -46,7 +46,7 @@ def row_of_keyframes(count: int, mapping: MappingConfig) -> Mapper:
     return mapper
 
 
-def test_the_youngest_redundant_keyframe_leaves_but_none_of_the_last_three() -> None:
+def test_the_newest_redundant_keyframe_is_culled_except_the_last_three() -> None:
     mapper = row_of_keyframes(10, MappingConfig())
     expected = [0, 1, 2, 3, 4, 5, 7, 8, 9]
     assert list(mapper.world.keyframes) == expected
@@ -54,11 +54,11 @@ def test_the_youngest_redundant_keyframe_leaves_but_none_of_the_last_three() -> 
     assert list(mapper.history.parents) == [6]
 
 
-def test_none_leaves_where_too_few_others_see_the_landmarks() -> None:
+def test_no_keyframe_is_culled_with_too_few_other_observations() -> None:
     assert len(row_of_keyframes(10, MappingConfig(redundant_views=10)).world.keyframes) == 10
 
 
-def test_landmarks_of_a_culled_keyframe_alone_leave_with_it() -> None:
+def test_landmarks_of_only_a_culled_keyframe_are_removed() -> None:
     mapper = row_of_keyframes(10, MappingConfig())
     world = mapper.world
     held = {i for k in world.keyframes.values() for i in world.observed(k)[1].tolist()}

@@ -134,7 +134,7 @@ def assert_consistent(world: WorldMap, smoother: Smoother) -> None:
     np.testing.assert_array_equal(landmarks.observations[alive], views[alive])
 
 
-def test_a_mask_covers_pixels_of_the_recorded_image_and_its_border_is_left_out() -> None:
+def test_a_mask_covers_raw_pixels_without_its_border() -> None:
     mask = np.zeros((480, 640), bool)
     mask[100:200, 300:400] = True
     mask[400:, 600:] = True
@@ -157,7 +157,7 @@ def test_masks_are_looked_up_in_the_distorted_image() -> None:
     assert keyframe.masked[chosen].all()
 
 
-def test_a_view_leaves_and_its_landmarks_stay() -> None:
+def test_observations_are_removed_and_landmarks_kept() -> None:
     session = Session(4)
     newest, chosen = session.world.keyframes[3], np.array([5, 17, 30])
     before = in_graph(session.smoother)
@@ -176,7 +176,7 @@ def test_a_view_leaves_and_its_landmarks_stay() -> None:
     assert (session.world.landmarks.last_keyframe[covered_ids] == 2).all()
 
 
-def test_landmarks_leave_with_all_their_views() -> None:
+def test_landmarks_are_removed_with_all_their_observations() -> None:
     session = Session(4)
     asked = np.array([5, 17])
     gone = session.pruner().prune_landmarks(np.array([17, 5, -1, 10**6])).landmark_ids
@@ -190,7 +190,7 @@ def test_landmarks_leave_with_all_their_views() -> None:
     assert str(again) == "nothing removed"
 
 
-def test_a_landmark_that_nobody_else_sees_leaves_with_its_view() -> None:
+def test_a_landmark_with_one_observation_is_removed_with_it() -> None:
     session = Session(3)
     alone = session.add_keyframe(np.arange(40), anew=np.arange(5))
     ids = alone.landmark_ids[:5].copy()
@@ -199,7 +199,7 @@ def test_a_landmark_that_nobody_else_sees_leaves_with_its_view() -> None:
     assert_consistent(session.world, session.smoother)
 
 
-def test_a_late_mask_follows_what_was_fused_and_culled() -> None:
+def test_a_late_mask_applies_after_fusing_and_culling() -> None:
     session = Session(3)
     first = session.add_keyframe(np.arange(COUNT), anew=np.arange(20))
     mask = mask_of(session, first.id, np.array([3, 8, 12]))
@@ -230,7 +230,7 @@ def test_a_late_mask_of_a_culled_keyframe_finds_nothing_to_remove() -> None:
     assert in_graph(session.smoother) == before
 
 
-def test_a_mask_that_comes_twice_does_nothing_the_second_time() -> None:
+def test_a_repeated_mask_has_no_effect() -> None:
     session = Session(4)
     mask = mask_of(session, 2, np.array([5, 17]))
     session.pruner().prune_mask(2, mask)
@@ -249,7 +249,7 @@ def test_a_mask_that_comes_twice_does_nothing_the_second_time() -> None:
         (1, np.zeros((480, 640), np.uint8), "uint8"),
     ],
 )
-def test_a_mask_that_fits_nothing_is_refused_with_the_reason(
+def test_an_unusable_mask_is_rejected_with_the_reason(
     keyframe_id: int, mask: Array, text: str
 ) -> None:
     session = Session(3)
@@ -259,7 +259,7 @@ def test_a_mask_that_fits_nothing_is_refused_with_the_reason(
     assert in_graph(session.smoother) == before
 
 
-def test_a_keyframe_that_loses_all_is_anchored_where_it_is() -> None:
+def test_a_keyframe_without_observations_is_anchored() -> None:
     session = Session(4)
     mask = np.ones((CAMERA.height, CAMERA.width), bool)
     report = session.pruner().prune_mask(2, mask)
@@ -274,7 +274,7 @@ EVENT = st.sampled_from(["keyframe", "fuse", "cull landmark", "cull keyframe", "
 
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(st.lists(EVENT, min_size=4, max_size=12), st.integers(0, 1000), st.booleans())
-def test_map_and_graph_agree_whatever_comes_first(
+def test_map_and_graph_agree_in_any_order_of_events(
     events: list[str], seed: int, entirely: bool
 ) -> None:
     session = Session(3, seed)
@@ -356,7 +356,7 @@ def test_masked_keypoints_and_culled_keyframes_are_in_the_state_of_the_map() -> 
         np.testing.assert_array_equal(world.culled[k].landmark_ids, view.landmark_ids)
 
 
-def test_a_wrong_loop_leaves_with_what_it_fused() -> None:
+def test_a_wrong_loop_is_removed_with_its_fusions() -> None:
     """The last keyframes saw other points, 1 m aside; a loop declared them to be the first ones."""
     session = Session(4)
     first, T_wrong = session.points.copy(), np.array([1.0, 0.0, 0.0])

@@ -47,7 +47,7 @@ def joined_map() -> tuple[WorldMap, np.ndarray, Tracked]:
     return world, points_world, join_segment(world, 1, in_segment, recognised)
 
 
-def test_keyframes_and_landmarks_move_to_where_they_belong() -> None:
+def test_keyframes_and_landmarks_move_to_the_joined_frame() -> None:
     world, points_world, _ = joined_map()
     assert [k.segment for k in world.keyframes.values()] == [0, 0]
     assert np.allclose(world.keyframes[1].T_world_camera, T_WORLD_SECOND)
@@ -56,14 +56,14 @@ def test_keyframes_and_landmarks_move_to_where_they_belong() -> None:
     assert np.allclose(world.landmarks.points_world[alive], points_world[number])
 
 
-def test_directions_turn_with_the_segment() -> None:
+def test_viewing_directions_rotate_with_the_segment() -> None:
     world, points_world, _ = joined_map()
     towards = T_WORLD_SECOND[:3, 3] - points_world[30:]
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     assert np.allclose(world.landmarks.directions[50:60], towards)
 
 
-def test_landmarks_at_one_keypoint_become_one() -> None:
+def test_landmarks_at_one_keypoint_are_fused() -> None:
     world, _, joined = joined_map()
     assert world.landmarks.alive.sum() == 40
     assert (world.landmarks.observations[10:30] == 2).all()

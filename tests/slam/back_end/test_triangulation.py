@@ -34,7 +34,7 @@ def sigmas(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("T_world_old", [np.eye(4), T_NEW_OLD], ids=["here", "moved world"])
-def test_exact_rays_meet_in_the_point(T_world_old: np.ndarray) -> None:
+def test_exact_rays_give_the_exact_point(T_world_old: np.ndarray) -> None:
     poses = (T_world_old @ T_FIRST, T_world_old @ T_SECOND)
     expected = transform(T_world_old, points(20, 2.0))
     found, good = triangulate(see(expected, *poses), sigmas(20), poses, CAMERA, CONFIG)
@@ -49,7 +49,7 @@ def test_far_points_have_no_parallax() -> None:
     assert not good.any()
 
 
-def test_rays_that_miss_each_other_make_no_landmark() -> None:
+def test_skew_rays_make_no_landmark() -> None:
     poses = (T_FIRST, T_SECOND)
     first, second = see(points(20, 2.0), *poses)
     second[::2, 1] += 6.0  # across the epipolar line, which is nearly horizontal

@@ -31,7 +31,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return make_run(tmp_path_factory.mktemp("calibrate"), TRUTH, WRONG, DELAY_S)
 
 
-def test_wrong_camera_and_late_depth_are_found(made: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_wrong_camera_and_delayed_depth_are_found(
+    made: tuple[Path, Path], tmp_path: Path
+) -> None:
     sequence, run = made
     out = tmp_path / "camera.yaml"
     options = CalibrateOptions(run, out, reference=sequence, anchor_sigma_m=0.002)
@@ -146,7 +148,7 @@ def test_impossible_options_are_refused(made, tmp_path, changes, words) -> None:
     assert not (tmp_path / "camera.yaml").exists()
 
 
-def test_two_rounds_run_again_with_the_camera_found(
+def test_two_rounds_rerun_with_the_found_camera(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """On rendered images, with focal lengths 3 % off; only the camera.yaml is left."""

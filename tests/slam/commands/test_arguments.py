@@ -19,11 +19,11 @@ def parsed(*words: str) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def test_what_is_not_given_stays() -> None:
+def test_options_not_given_keep_their_values() -> None:
     assert segmenter_options(parsed(), BASE) == BASE
 
 
-def test_weak_detections_in_a_detectors_boxes_do_not_vote_unless_that_is_configured() -> None:
+def test_weak_detections_in_proposals_vote_only_if_configured() -> None:
     given = parsed("--proposals", "yolox.onnx")
     found = segmenter_options(given, BASE)
     assert found.proposals == Path("yolox.onnx").absolute()

@@ -66,7 +66,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert call(capsys, "--version") == (0, f"bmask-slam {bmask_slam.__version__}\n", "")
 
 
-def test_python_m_slam() -> None:
+def test_python_m_bmask_slam() -> None:
     command = [sys.executable, "-m", "bmask_slam", "--version"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == f"bmask-slam {bmask_slam.__version__}\n"
@@ -136,7 +136,7 @@ def test_every_shipped_configuration_runs(capsys, sequence: Path, tmp_path: Path
         (["render", "office", "--out", "x", "--frames", "0"], "frames=0"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(
+def test_bad_input_is_one_line_and_leaves_no_files(
     capsys, sequence: Path, tmp_path: Path, monkeypatch, arguments: list[str], expected: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -242,7 +242,7 @@ def test_unknown_errors_keep_their_traceback(monkeypatch) -> None:
         cli.main(["info", "x"])
 
 
-def test_a_stopped_run_says_so(capsys, monkeypatch, sequence: Path) -> None:
+def test_a_stopped_run_reports_it(capsys, monkeypatch, sequence: Path) -> None:
     import signal
 
     import bmask_slam.offline.runner
@@ -255,7 +255,7 @@ def test_a_stopped_run_says_so(capsys, monkeypatch, sequence: Path) -> None:
     assert "2 broken frames were skipped" in output
 
 
-def test_a_reader_that_goes_away_is_no_error(sequence: Path) -> None:
+def test_a_closed_output_pipe_is_not_an_error(sequence: Path) -> None:
     command = f"{sys.executable} -m bmask_slam info {sequence} | true; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr

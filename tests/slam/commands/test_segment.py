@@ -57,7 +57,7 @@ def test_the_truth_of_a_rendered_sequence(
     ]
 
 
-def test_a_folder_of_images_and_what_is_refused(
+def test_a_folder_of_images_and_rejected_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "pictures"

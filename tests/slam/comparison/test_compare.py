@@ -52,7 +52,7 @@ def run_again(data: Path, out: Path) -> Comparison:
     return compare(data / "mine.yaml", out, options)
 
 
-def test_a_comparison(data, tmp_path):
+def test_a_comparison_end_to_end(data, tmp_path):
     out = tmp_path / "out"
     found = compare(data / "mine.yaml", out, CompareOptions(quiet=True))
     cells = {cell.method: cell for cell in found.cells}
@@ -88,7 +88,7 @@ def test_a_comparison(data, tmp_path):
     assert json.loads(record.read_text())["depends"]["code"] != "another"
 
 
-def test_a_sequence_that_cannot_be_rendered_fails_its_cells_alone(data, tmp_path):
+def test_a_failed_rendering_fails_only_its_cells(data, tmp_path):
     """The path of the office has fewer frames; a trajectory of a rendered room finds its truth."""
     text = EXPERIMENT.partition("  broken")[0].replace(
         "sequences: {office: office}",
@@ -142,7 +142,7 @@ def processes_on(folder: Path) -> list[str]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="looks into /proc")
-def test_killed_and_interrupted_it_goes_on_without_repeating(data, tmp_path):
+def test_a_killed_and_an_interrupted_comparison_are_resumed(data, tmp_path):
     """Killed in its second cell, interrupted in it again, then left to its end."""
     out = tmp_path / "out"
     records = [out / f"cells/office/default/{seed}/cell.json" for seed in range(2)]
@@ -166,7 +166,7 @@ def test_killed_and_interrupted_it_goes_on_without_repeating(data, tmp_path):
     assert records[0].stat().st_mtime_ns == first
 
 
-def test_a_sequence_that_is_not_there_leaves_the_others(tmp_path, monkeypatch):
+def test_a_missing_sequence_does_not_affect_the_others(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     truth = "".join(f"{k} {k % 3} {k % 5} {k % 7} 0 0 0 1\n" for k in range(10))
     (tmp_path / "freiburg1_xyz-groundtruth.txt").write_text(truth)
@@ -209,7 +209,7 @@ def test_rgbd_slam_on_freiburg1_xyz(given, tmp_path, monkeypatch):
         (CompareOptions(trajectories={("default", "office"): Path("y")}), "another row's name"),
     ],
 )
-def test_what_the_experiment_does_not_have_is_refused(data, tmp_path, options, message):
+def test_names_outside_the_experiment_are_rejected(data, tmp_path, options, message):
     with pytest.raises(InputError, match=message):
         compare(data / "mine.yaml", tmp_path / "out", options)
 

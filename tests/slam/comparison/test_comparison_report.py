@@ -85,7 +85,7 @@ def test_every_figure_of_every_cell_is_in_the_page_and_the_csv(comparison, writt
             )
 
 
-def test_a_failed_run_is_shown_with_its_log_and_never_averaged(comparison, written, page):
+def test_a_failed_run_is_listed_with_its_log_and_not_averaged(comparison, written, page):
     table = metric_table(comparison, ATE)
     entry = table.rows[1].entries[0]
     assert (entry.text, entry.note, entry.failed) == ("0.77", "1 of 2 failed", True)
@@ -110,7 +110,7 @@ def judged(comparison: Comparison, ratio: float) -> Comparison:
     return replace(comparison, sequences=names, methods=methods, cells=cells, provenance={})
 
 
-def test_a_difference_is_called_one_where_it_is_shown(comparison, tmp_path):
+def test_a_significant_difference_is_reported(comparison, tmp_path):
     sections = make_sections(judged(comparison, 1.5), tmp_path)
     tables = {table.name: table for section in sections for table in section.tables}
     (row,) = tables["verdict-ate_rmse"].rows
@@ -126,18 +126,18 @@ def test_a_difference_is_called_one_where_it_is_shown(comparison, tmp_path):
     assert said == f"ATE: {HOSTILE} is worse than default by 0.72 cm on the mean of 10 pairs."
 
 
-def test_no_difference_is_called_none(comparison, tmp_path):
+def test_no_significant_difference_is_reported_as_none(comparison, tmp_path):
     same = judged(comparison, 1.0)
     assert summary(same)[1] == "ATE: no difference from default is shown."
     page = Page(next(p for p in write_report(same, tmp_path)).read_text(encoding="utf-8"))
     assert "no difference shown" in page.text
 
 
-def test_a_method_that_failed_has_no_place_among_the_ablations(comparison):
+def test_a_failed_method_is_not_in_the_ablation_table(comparison):
     assert ablation_table(comparison) is None, "failed once, pending once"
 
 
-def test_the_provenance_is_told_in_full_without_what_is_empty(comparison, tmp_path):
+def test_the_provenance_is_complete_without_empty_values(comparison, tmp_path):
     given = {
         "commit": "abc",
         "workers": 2,
@@ -148,13 +148,13 @@ def test_the_provenance_is_told_in_full_without_what_is_empty(comparison, tmp_pa
     assert told == {"Run": "commit: abc\nworkers: 2", "Experiment": "seeds: [0]"}
 
 
-def test_pending_cells_and_partial_truth_are_said(comparison):
+def test_pending_cells_and_partial_truth_are_reported(comparison):
     first, second = metric_table(comparison, ATE).rows[:2]
     assert first.entries[1].note == "1 of 2 pending"
     assert second.entries[1].note == "over 62 %"
 
 
-def test_only_what_was_measured_without_scale_can_be_best(comparison):
+def test_only_measured_se3_results_are_compared_for_the_best(comparison):
     table = metric_table(comparison, ATE)
     best = [row.label for row in table.rows for entry in row.entries if entry.best]
     assert best == [HOSTILE]
@@ -163,7 +163,7 @@ def test_only_what_was_measured_without_scale_can_be_best(comparison):
     assert tags["paper"] == ("published",)
 
 
-def test_published_rows_name_their_source(page):
+def test_published_rows_have_their_source(page):
     assert "Table 3 of X & Y" in page.text
 
 
@@ -195,7 +195,7 @@ def test_latex_compiles(written, tmp_path):
     assert done.returncode == 0, done.stdout[-2000:]
 
 
-def test_a_report_of_wide_tables_and_long_names_can_be_written(comparison, folder, tmp_path):
+def test_a_report_with_wide_tables_and_long_names(comparison, folder, tmp_path):
     """Forty sequences, names without a place to break, a log of one endless line."""
     names = tuple(f"freiburg3_walking_halfsphere_validation_{k}" for k in range(40))
     log = tmp_path / "log.txt"
@@ -210,7 +210,7 @@ def test_a_report_of_wide_tables_and_long_names_can_be_written(comparison, folde
     assert all(path.stat().st_size for path in write_report(wide, tmp_path))
 
 
-def test_nothing_finished_is_a_report_too(comparison, tmp_path):
+def test_a_report_without_finished_cells(comparison, tmp_path):
     cells = tuple(replace(c, status=CellStatus.PENDING, metrics={}) for c in comparison.cells)
     page = next(p for p in write_report(replace(comparison, cells=cells), tmp_path))
     assert "10 pending" in page.read_text(encoding="utf-8")
@@ -229,7 +229,7 @@ def test_the_same_comparison_gives_the_same_bytes(comparison, written, folder):
     assert again == written
 
 
-def test_the_drawn_errors_are_those_of_the_trajectories(comparison, folder):
+def test_drawn_errors_equal_those_of_the_trajectories(comparison, folder):
     """The height swings by 5 cm: an RMSE of 5 cm / sqrt(2), which no alignment takes away."""
     errors = read_errors(comparison.cells[0], folder, RULES)
     assert errors.absolute.translation_m.rmse == pytest.approx(WAVE_M / np.sqrt(2), rel=0.01)
@@ -238,7 +238,7 @@ def test_the_drawn_errors_are_those_of_the_trajectories(comparison, folder):
 
 
 @pytest.mark.parametrize("with_scale", [False, True])
-def test_the_drawn_errors_are_those_of_the_tables(comparison, folder, with_scale):
+def test_drawn_errors_equal_those_of_the_tables(comparison, folder, with_scale):
     """Of a path half as large: its scale must be found for relative errors too."""
     small = read_tum(folder / "bad.txt")
     poses = small.poses_world_camera.copy()
@@ -268,6 +268,6 @@ def test_a_trajectory_without_any_error_is_drawn_without_a_warning(comparison, f
         error_picture(comparison.methods[0], errors, scales)
 
 
-def test_a_missing_trajectory_leaves_its_figure_out(comparison, folder, caplog):
+def test_a_missing_trajectory_has_no_figure(comparison, folder, caplog):
     assert read_errors(comparison.cells[-1], folder, RULES) is None
     assert "missing.txt" in caplog.text

@@ -47,18 +47,18 @@ def test_a_missing_value_stays_missing(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 99}'])
-def test_what_is_no_comparison_is_refused(tmp_path, text):
+def test_other_files_than_results_are_rejected(tmp_path, text):
     (tmp_path / RESULTS).write_text(text)
     with pytest.raises(InputError, match=r"results\.json"):
         read_results(tmp_path)
 
 
-def test_a_missing_file_names_the_cure(tmp_path):
+def test_a_missing_file_is_an_error_with_the_cure(tmp_path):
     with pytest.raises(InputError, match="bmask-slam compare"):
         read_results(tmp_path)
 
 
-def test_a_frame_has_a_row_a_cell_and_a_column_a_metric():
+def test_a_data_frame_has_a_row_per_cell_and_a_column_per_metric():
     pytest.importorskip("pandas")
     frame = COMPARISON.to_pandas()
     assert list(frame["kind"]) == ["run", "run", "published"]

@@ -43,7 +43,7 @@ def noise(seed: int, seeds: int = 3) -> np.ndarray:
     return rng.lognormal(-4, 0.5, (1, 6, 1)) * rng.lognormal(0, 0.2, (2, 6, seeds))
 
 
-def test_sign_test_against_all_outcomes_and_scipy():
+def test_sign_test_equals_enumeration_and_scipy():
     for count in range(1, 9):
         for wins in range(count + 1):
             least = min(wins, count - wins)
@@ -55,7 +55,7 @@ def test_sign_test_against_all_outcomes_and_scipy():
     assert sign_test(0, 5) > 0.05 >= sign_test(0, 6)
 
 
-def test_bootstrap_against_the_loop_and_the_normal_interval():
+def test_bootstrap_equals_a_loop_and_is_near_the_normal_interval():
     rng = np.random.default_rng(3)
     differences = rng.normal(1.0, 2.0, 200)
     means = [rng.choice(differences, 200).mean() for _ in range(4000)]
@@ -75,12 +75,12 @@ def test_bootstrap_covers_the_truth():
     assert np.mean(covered) > 0.87  # the percentile interval of 18 is a little short of 0.95
 
 
-def test_holm_by_hand():
+def test_holm_equals_a_manual_result():
     assert holm([0.01, 0.04, 0.03, 0.5]) == pytest.approx([0.04, 0.09, 0.09, 0.5])
     assert holm([]) == []
 
 
-def test_nothing_is_said_of_noise():
+def test_noise_gives_no_verdict():
     """Two methods of the same distribution: a verdict is false, and rarer than the level."""
     false = [verdicts(comparison(noise(seed)))[0].judgement != NO_DIFFERENCE for seed in range(300)]
     assert np.mean(false) <= 0.05
@@ -96,7 +96,7 @@ def test_a_difference_is_found(factor, judgement):
     assert (verdict.wins, verdict.losses) == ((18, 0) if factor < 1 else (0, 18))
 
 
-def test_an_outlier_alone_proves_nothing():
+def test_one_outlier_gives_no_verdict():
     values = np.full((2, 6, 3), 0.01)
     values[0] += noise(2)[0] / 100
     values[1] = values[0]
@@ -104,14 +104,14 @@ def test_an_outlier_alone_proves_nothing():
     assert verdicts(comparison(values))[0].judgement == NO_DIFFERENCE
 
 
-def test_too_few_pairs_are_told():
+def test_too_few_pairs_are_noted():
     given = comparison(noise(3, 1), drawn=())
     assert verdicts(given)[0].note == ""
     few = replace(given, sequences=SEQUENCES[:5])
     assert verdicts(few)[0].note == "too few pairs for a verdict"
 
 
-def test_a_method_that_tracks_less_is_told():
+def test_a_method_that_tracks_less_is_noted():
     given = comparison(noise(4))
     cells = tuple(
         replace(c, metrics=c.metrics | {"tracked_share": 0.6 if c.method == "other" else 1.0})
@@ -139,7 +139,7 @@ def test_seeds_of_a_recording_are_one_pair():
     assert (theirs[0], own[0]) == (values[0, 0, 0], values[1, 0, 0])
 
 
-def test_a_failed_cell_is_left_out_and_counted():
+def test_a_failed_cell_is_an_incomplete_pair():
     values = noise(6)
     values[1, 2, 1] = np.nan
     (verdict,) = verdicts(comparison(values))
@@ -150,13 +150,13 @@ def test_a_failed_cell_is_left_out_and_counted():
     assert (found.low, found.high) == (values[1, 2, [0, 2]].min(), values[1, 2, [0, 2]].max())
 
 
-def test_nothing_is_compared_across_alignments_or_with_published_figures():
+def test_other_alignments_and_published_figures_are_not_compared():
     given = comparison(noise(7))
     for other in (Method("other", Kind.RUN, with_scale=True), Method("other", Kind.PUBLISHED)):
         assert verdicts(replace(given, methods=(METHODS[0], other))) == ()
 
 
-def test_higher_is_better_where_it_is():
+def test_metrics_where_higher_is_better():
     values = noise(8)
     values[1] = values[0] * 1.5
     given = comparison(values)

@@ -89,7 +89,7 @@ def test_every_key_is_read(tmp_path):
         ("  ORB:", "  O/B:", "method 'O/B': use letters and digits"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path, old, new, message):
+def test_errors_name_the_wrong_key(tmp_path, old, new, message):
     assert old in WHOLE
     path = write(tmp_path, WHOLE.replace(old, new))
     with pytest.raises(InputError, match=message) as caught:

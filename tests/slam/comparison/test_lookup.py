@@ -58,14 +58,14 @@ def test_a_sequence_is_found_by_each_of_its_names(tmp_path, place, lists):
 
 @pytest.mark.parametrize("name", ["xyz-groundtruth.txt", "freiburg1_xyz_groundtruth.txt",
                                   "fr1_xyz-groundtruth.txt"])  # fmt: skip
-def test_truth_without_images_is_found_beside_a_trajectory(tmp_path, name):
+def test_truth_is_found_beside_a_trajectory(tmp_path, name):
     folder = make(tmp_path / "elsewhere", name)
     site = locate_sequence(XYZ, experiment(tmp_path), [], [folder / "estimate.txt"])
     assert (site.folder, site.reference) == (None, folder / name)
     assert "bmask-slam download tum/freiburg1_xyz" in site.problem
 
 
-def test_a_folder_without_lists_is_told(tmp_path):
+def test_a_folder_without_lists_is_reported(tmp_path):
     folder = make(tmp_path / "freiburg1_xyz", "groundtruth.txt")
     site = locate_sequence(XYZ, experiment(tmp_path), [tmp_path], [])
     assert site.folder is None
@@ -79,12 +79,12 @@ def test_data_folders_come_from_options_and_environment(monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["", "a=b", "a:=b", ":a=b", "a:b=", "a:b"])
-def test_a_trajectory_is_written_in_one_way(text):
+def test_trajectory_arguments_are_parsed(text):
     with pytest.raises(InputError, match="METHOD:SEQUENCE=FILE"):
         parse_trajectory(text)
 
 
-def test_a_method_may_have_a_colon():
+def test_a_method_name_may_contain_a_colon():
     assert parse_trajectory("A: b:xyz@2=f=1") == (("A: b", "xyz@2"), Path("f=1"))
 
 
@@ -106,7 +106,7 @@ def test_a_sequence_may_have_figures_from_two_sources(tmp_path):
     ]
 
 
-def test_a_seed_draws_a_rendered_sequence_and_only_seeds_a_recorded_one(tmp_path):
+def test_seeds_apply_to_rendered_images_and_to_the_system(tmp_path):
     folder = make(tmp_path / "freiburg1_xyz", "rgb.txt")
     rows = {
         "default": Configuration(segmenter="none"),
@@ -132,7 +132,7 @@ def test_a_seed_draws_a_rendered_sequence_and_only_seeds_a_recorded_one(tmp_path
     assert plan.jobs[CellKey("office", "other", 3)].sequence, "labels are compared with the truth"
 
 
-def test_what_a_cell_depends_on(tmp_path):
+def test_a_cell_depends_on_configuration_and_images(tmp_path):
     """Each change of configuration or images is seen; a moved folder is not."""
 
     def depends(source: SequenceSource, configuration: Configuration) -> dict[str, str]:
@@ -169,7 +169,7 @@ def test_truth_that_covers_a_part(tmp_path):
         trajectory_errors(*files, Rules(0.01))
 
 
-def test_sim3_only_where_it_is_asked_for(tmp_path):
+def test_sim3_only_on_request(tmp_path):
     stamps = np.arange(50) / 10
     truth = Trajectory(stamps, se3_exp(np.random.default_rng(0).normal(0, 1, (50, 6))))
     half = truth.poses_world_camera.copy()
@@ -181,7 +181,7 @@ def test_sim3_only_where_it_is_asked_for(tmp_path):
     assert trajectory_errors(*files, Rules(0.02, True))["ate_rmse"] == pytest.approx(0, abs=1e-6)
 
 
-def test_the_time_left_follows_from_jobs_of_the_same_group():
+def test_the_remaining_time_is_estimated_from_the_same_group():
     def job(group: str, command: str = "run") -> Job:
         return Job(group, group, (command,), "", "", "")
 

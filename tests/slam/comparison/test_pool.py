@@ -57,7 +57,7 @@ def test_a_job_does_not_import_from_the_current_folder(tmp_path, monkeypatch):
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_job_is_recorded_and_is_finished_while_nothing_changes(tmp_path):
+def test_a_recorded_job_is_finished_until_its_inputs_change(tmp_path):
     given = job(tmp_path)
     assert finished(given) is None
     outcome = run_job(given)
@@ -70,12 +70,12 @@ def test_a_job_is_recorded_and_is_finished_while_nothing_changes(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"status": "odd"}', '{"stat": "done"}'])
-def test_a_broken_record_is_none(tmp_path, text):
+def test_a_broken_record_is_ignored(tmp_path, text):
     (tmp_path / "record.json").write_text(text)
     assert read_record(tmp_path / "record.json") is None
 
 
-def test_a_failure_says_why_and_is_not_finished(tmp_path):
+def test_a_failure_is_recorded_with_its_reason(tmp_path):
     given = job(tmp_path, "one", "export", str(tmp_path / "nothing"), "--format", "kitti")
     given = replace(given, arguments=(*given.arguments, "--out", given.product))
     outcome = run_job(given)
@@ -99,7 +99,7 @@ def test_a_pool_runs_all_and_passes_on_failures(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
-def test_a_pool_that_is_closed_ends_what_runs(tmp_path):
+def test_closing_a_pool_kills_running_jobs(tmp_path):
     pids: list[int] = []
 
     class Watched(LocalPool):

@@ -37,9 +37,7 @@ def write_frames(path: Path, rows: list[dict[str, object]]) -> None:
         writer.writerows(rows)
 
 
-def test_stage_times_are_of_all_runs_and_of_keyframes_where_only_they_take_a_stage(
-    comparison, tmp_path
-):
+def test_stage_times_are_over_frames_or_keyframes_of_all_runs(comparison, tmp_path):
     frames = [{"tracking_ms": ms, "graph_ms": 0.0, "keyframe": ""} for ms in (10.0, 20.0)]
     write_frames(tmp_path / "run0/frames.csv", frames)
     keyframe = {"tracking_ms": 60.0, "graph_ms": 7.0, "keyframe": 3}
@@ -51,11 +49,11 @@ def test_stage_times_are_of_all_runs_and_of_keyframes_where_only_they_take_a_sta
     assert entries["loops"].text == "–"
 
 
-def test_no_run_folder_is_no_table(comparison, tmp_path):
+def test_without_run_folders_there_is_no_stage_table(comparison, tmp_path):
     assert stage_table(comparison, tmp_path) is None
 
 
-def test_maps_are_those_of_the_first_run_that_made_any_and_made_smaller(comparison, tmp_path):
+def test_map_pictures_are_of_the_first_run_with_maps_and_scaled(comparison, tmp_path):
     (tmp_path / "run1/dense").mkdir()
     image = np.zeros((600, 1800, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "run1/dense/view_overview.png"), image)
@@ -83,7 +81,7 @@ def test_losses_are_summed_and_smoothed(tmp_path):
     assert curves["total"][0, 0] == 49, "a mean over fifty steps stands at the last of them"
 
 
-def test_precision_survives_its_file(tmp_path):
+def test_precision_recall_curves_are_read_back(tmp_path):
     precision = np.linspace(1, 0, 101) ** 2
     curve = ApCurve("segm", "class score x MaskIoU", 0.5, 0.6, 0.7, precision)
     write_curves(
@@ -99,7 +97,7 @@ def test_precision_survives_its_file(tmp_path):
     )
 
 
-def test_networks_are_drawn_beside_each_other(comparison, tmp_path, caplog):
+def test_networks_are_drawn_in_one_figure(comparison, tmp_path, caplog):
     write_losses(tmp_path / "a", 1.0)
     write_losses(tmp_path / "b", 2.0)
     (tmp_path / "b/precision_recall.csv").write_text("kind,recall\n1,2\n")

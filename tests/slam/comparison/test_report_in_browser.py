@@ -42,7 +42,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.mark.parametrize(
     ("width_px", "media"), [(PHONE_PX, "screen"), (DESK_PX, "screen"), (A4_PX, "print")]
 )
-def test_nothing_reaches_beyond_the_page(browser, page, width_px, media, scheme):
+def test_the_page_has_no_horizontal_overflow(browser, page, width_px, media, scheme):
     browser.open(page, width_px, media, scheme)
     width = browser.evaluate("document.documentElement.clientWidth")
     assert width == width_px
@@ -50,7 +50,7 @@ def test_nothing_reaches_beyond_the_page(browser, page, width_px, media, scheme)
     assert browser.evaluate(BEYOND) == []
 
 
-def test_all_pictures_load_and_nothing_else_is_asked_for(browser, page):
+def test_all_pictures_load_without_other_requests(browser, page):
     browser.open(page, PHONE_PX)
     pictures = browser.evaluate("[...document.images].map(i => i.complete && i.naturalWidth > 100)")
     assert len(pictures) >= 5

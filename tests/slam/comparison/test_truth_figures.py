@@ -66,7 +66,7 @@ def test_labels_in_another_world(run, office):
     assert label_accuracy(run, open_sequence(office)) == pytest.approx(1 - 1 / WRONG, abs=0.03)
 
 
-def test_labels_of_a_wrong_world_are_wrong(run, office):
+def test_labels_in_a_wrong_world_are_wrong(run, office):
     """Keyframes that are not where the landmarks believe them to be."""
     sequence = open_sequence(office)
     moved = sequence.groundtruth.moved(T_WORLD_TRUTH @ se3_exp([0, 0.5, 0, 0, 0, 0]))

@@ -78,7 +78,7 @@ def test_defaults_file_and_overrides_in_this_order(tmp_path: Path) -> None:
     assert type(config.tracking.sigma_px) is float
 
 
-def test_nothing_given_is_the_default() -> None:
+def test_no_options_give_the_default() -> None:
     assert resolve(Config) == Config()
 
 

@@ -128,7 +128,7 @@ def test_an_icl_archive_is_brought_to_tum_layout(server, tmp_path):
     assert np.linalg.det(truth.poses_world_camera[1][:3, :3]) == pytest.approx(1)
 
 
-def test_an_archive_without_lists_leaves_nothing_but_the_archive(server, tmp_path):
+def test_an_archive_without_lists_leaves_only_the_archive(server, tmp_path):
     with pytest.raises(InputError, match=r"holds no rgb\.txt"):
         obtain(Recording("x/none", f"{server.url}/none.tgz"), tmp_path)
     assert [path.name for path in (tmp_path / "x").iterdir()] == ["none.tgz"]
@@ -141,7 +141,7 @@ def write_catalogue(path: Path, url: str, size: int) -> Path:
     return path
 
 
-def test_the_command_says_where_the_sequence_is(server, tmp_path, capsys):
+def test_the_command_prints_the_sequence_folder(server, tmp_path, capsys):
     catalogue = write_catalogue(tmp_path / "c.yaml", server.url, len(server.files["tiny.tgz"]))
     words = ["download", "tum/tiny", "--to", str(tmp_path / "to"), "--catalogue", str(catalogue)]
     assert main(words) == 0
@@ -166,7 +166,7 @@ def test_the_shipped_catalogue_is_sound(capsys):
     assert len(capsys.readouterr().out.splitlines()) == len(catalogue)
 
 
-def test_what_the_shipped_experiments_compare_can_be_downloaded():
+def test_sequences_of_shipped_experiments_are_in_the_catalogue():
     catalogue = read_catalogue()
     files = sorted(data_path("experiments").glob("*.yaml"))
     named = {s.folder for file in files for s in read_experiment(file).sequences if s.folder}

@@ -41,7 +41,7 @@ def member(name: str, kind: bytes, target: str = "") -> tarfile.TarInfo:
 
 
 @pytest.mark.parametrize("make", [tar_of, zip_of], ids=["tar", "zip"])
-def test_files_come_out_as_they_went_in(make, tmp_path):
+def test_files_are_unpacked_unchanged(make, tmp_path):
     archive = make(tmp_path / "a", files=FILES)
     told: list[tuple[int, int]] = []
     unpack(archive, tmp_path / "out", lambda *done: told.append(done))
@@ -55,7 +55,7 @@ def test_files_come_out_as_they_went_in(make, tmp_path):
     "name", ["/etc/evil", "../evil", "seq/../../evil", "C:/evil", "seq\\..\\evil"]
 )
 @pytest.mark.parametrize("make", [tar_of, zip_of], ids=["tar", "zip"])
-def test_nothing_leaves_the_folder(make, name, tmp_path):
+def test_no_file_is_written_outside_the_folder(make, name, tmp_path):
     archive = make(tmp_path / "a", files={name: b"evil"})
     with pytest.raises(InputError, match="leads out of its folder"):
         unpack(archive, tmp_path / "out" / "deep")
@@ -89,7 +89,7 @@ def test_a_link_in_a_zip_is_refused(tmp_path):
         unpack(tmp_path / "a", tmp_path / "out")
 
 
-def test_a_name_that_comes_twice_is_refused(tmp_path):
+def test_a_repeated_name_is_rejected(tmp_path):
     again = tarfile.TarInfo("seq/rgb.txt")
     with pytest.raises(InputError, match="twice"):
         unpack(tar_of(tmp_path / "a", again), tmp_path / "out")

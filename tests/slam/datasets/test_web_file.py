@@ -35,7 +35,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_file_arrives_whole_and_is_asked_for_once(server, tmp_path):
+def test_a_file_is_downloaded_completely_with_one_request(server, tmp_path):
     told: list[tuple[int, int]] = []
     file = WebFile(f"{server.url}/file.tgz", SHA256, len(CONTENT))
     path = tmp_path / "new" / "file.tgz"
@@ -53,7 +53,7 @@ def test_a_connection_that_ends_early_is_resumed_where_it_ended(server, tmp_path
     assert server.asked == ["", "bytes=300000-", "bytes=600000-"]
 
 
-def test_an_interrupted_download_goes_on_in_the_next_call(server, tmp_path, monkeypatch):
+def test_an_interrupted_download_is_resumed_by_the_next_call(server, tmp_path, monkeypatch):
     server.cut_after, server.cuts = 300_000, 1
     monkeypatch.setattr(web_file, "TRIES", 1)
     with pytest.raises(InputError, match="300000 bytes are kept"):
@@ -64,13 +64,13 @@ def test_an_interrupted_download_goes_on_in_the_next_call(server, tmp_path, monk
     assert names(tmp_path) == ["f"]
 
 
-def test_a_server_without_ranges_is_asked_for_all_again(server, tmp_path):
+def test_a_server_without_ranges_restarts_the_download(server, tmp_path):
     server.ranges, server.cut_after, server.cuts = False, 300_000, 1
     assert download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f") == SHA256
     assert (tmp_path / "f").read_bytes() == CONTENT
 
 
-def test_halves_of_two_files_are_never_put_together(server, tmp_path):
+def test_parts_of_different_files_are_not_combined(server, tmp_path):
     """The file changes on the server while it is on the way, and its hash is not known."""
     server.cut_after, server.cuts = 300_000, 1
 
@@ -81,56 +81,56 @@ def test_halves_of_two_files_are_never_put_together(server, tmp_path):
     assert (tmp_path / "f").read_bytes() == CONTENT[::-1]
 
 
-def test_a_part_longer_than_the_file_is_thrown_away(server, tmp_path):
+def test_a_part_longer_than_the_file_is_discarded(server, tmp_path):
     (tmp_path / "f.part").write_bytes(CONTENT * 2)
     (tmp_path / "f.part.mark").write_text(f'"{hash(CONTENT)}"')
     assert download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f") == SHA256
 
 
-def test_a_wrong_hash_is_refused_and_nothing_is_left(server, tmp_path):
+def test_a_wrong_hash_is_rejected_and_the_file_removed(server, tmp_path):
     with pytest.raises(InputError, match=r"SHA-256 begins with .* not 0000"):
         download(WebFile(f"{server.url}/file.tgz", "0" * 64), tmp_path / "f")
     assert names(tmp_path) == []
 
 
-def test_another_size_is_refused_before_it_is_fetched(server, tmp_path):
+def test_a_wrong_size_is_rejected_before_downloading(server, tmp_path):
     with pytest.raises(InputError, match=f"{len(CONTENT)} bytes, not 77"):
         download(WebFile(f"{server.url}/file.tgz", size=77), tmp_path / "f")
     assert names(tmp_path) == []
 
 
-def test_a_broken_file_on_disk_is_fetched_again(server, tmp_path):
+def test_a_broken_file_on_disk_is_downloaded_again(server, tmp_path):
     (tmp_path / "f").write_bytes(CONTENT[:-1])
     download(WebFile(f"{server.url}/file.tgz", SHA256), tmp_path / "f")
     assert (tmp_path / "f").read_bytes() == CONTENT
 
 
-def test_what_is_not_there_is_asked_for_once(server, tmp_path):
+def test_a_missing_file_is_requested_once(server, tmp_path):
     with pytest.raises(InputError, match=rf"404 Not Found.*put it to {tmp_path}/f$"):
         download(WebFile(f"{server.url}/none"), tmp_path / "f")
     assert len(server.asked) == 1
 
 
-def test_a_server_in_trouble_is_asked_again_but_not_for_ever(server, tmp_path):
+def test_server_errors_are_retried_a_few_times(server, tmp_path):
     server.status = 503
     with pytest.raises(InputError, match="503"):
         download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f")
     assert len(server.asked) == web_file.TRIES
 
 
-def test_nobody_at_the_address_is_said_at_once(tmp_path):
+def test_an_unreachable_server_is_reported_at_once(tmp_path):
     with pytest.raises(InputError, match="refused"):
         download(WebFile("http://127.0.0.1:9/f"), tmp_path / "f")
 
 
-def test_a_disk_without_room_is_told_before_it_is_filled(server, tmp_path, monkeypatch):
+def test_too_little_disk_space_is_reported_before_downloading(server, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
     with pytest.raises(InputError, match="free some space"):
         download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f")
 
 
-def test_a_disk_that_fills_up_is_no_fault_of_the_connection(server, tmp_path, monkeypatch):
+def test_a_full_disk_is_not_reported_as_a_connection_error(server, tmp_path, monkeypatch):
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -140,7 +140,7 @@ def test_a_disk_that_fills_up_is_no_fault_of_the_connection(server, tmp_path, mo
     assert len(server.asked) == 1, "it must not be tried again"
 
 
-def test_two_at_a_time_fetch_it_once(server, tmp_path):
+def test_two_processes_download_once(server, tmp_path):
     file = WebFile(f"{server.url}/file.tgz", SHA256)
     both = [threading.Thread(target=download, args=(file, tmp_path / "f")) for _ in range(2)]
     for thread in both:

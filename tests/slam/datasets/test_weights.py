@@ -39,7 +39,7 @@ def test_a_file_with_another_sha_is_not_kept(server: Served, tmp_path: Path) -> 
     assert list((tmp_path / "cache").iterdir()) == []
 
 
-def test_published_files_come_over_https_with_their_sha() -> None:
+def test_published_files_have_https_and_a_sha() -> None:
     for name, url in PUBLISHED.items():
         assert url.startswith("https://")
         assert url.rsplit("/", 1)[1].startswith(name)

@@ -62,7 +62,7 @@ def test_the_products_are_written(mapped: Path) -> None:
         assert (image < 250).any(axis=2).mean() > 0.05
 
 
-def test_fused_depth_is_nearer_to_the_truth_than_the_sensors(mapped: Path, room: Path) -> None:
+def test_fused_depth_is_more_accurate_than_the_sensors(mapped: Path, room: Path) -> None:
     run = open_run(mapped)
     folder = DenseFolder.open(mapped)
     before, after, chi2 = [], [], []
@@ -80,7 +80,7 @@ def test_fused_depth_is_nearer_to_the_truth_than_the_sensors(mapped: Path, room:
     assert 0.4 < np.concatenate(chi2).mean() < 2.5  # coarse steps of depth are shared
 
 
-def test_labels_are_those_of_the_truth(mapped: Path, room: Path) -> None:
+def test_labels_agree_with_the_truth(mapped: Path, room: Path) -> None:
     run = open_run(mapped)
     cloud = read_ply(mapped / "dense" / "cloud.ply")
     points = np.stack([cloud[c] for c in "xyz"], axis=1).astype(float)
@@ -213,7 +213,7 @@ def test_a_full_disk_keeps_the_keyframes_written_before(
     assert main(["map", str(run), "--voxel", "0.05", "--quiet"]) == 0
 
 
-def test_a_run_can_fuse_its_keyframes_on_the_way(
+def test_a_run_can_fuse_keyframes_while_tracking(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"

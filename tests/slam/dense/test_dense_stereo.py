@@ -116,7 +116,7 @@ def test_the_map_of_pairs_is_right_whatever_the_sensor_measures(
     assert (run / "dense" / "mesh.ply").is_file()
 
 
-def test_the_baseline_is_that_of_the_sequences_camera_file(
+def test_the_baseline_is_read_from_the_sequences_camera_file(
     sequence: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = run_of(sequence, (0, 1))
@@ -199,7 +199,7 @@ def test_missing_inputs_of_pairs_are_one_line(
     assert not (run / "dense").exists()
 
 
-def test_images_with_distortion_are_no_rectified_pair(pairs: Path) -> None:
+def test_distorted_images_are_rejected_for_stereo(pairs: Path) -> None:
     distorted = replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="distortion"):
         read_right_images(open_sequence(pairs), distorted)
@@ -216,7 +216,7 @@ class PersonInTheMiddle:
         return [Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 1.0)]
 
 
-def test_excluded_classes_get_no_depth_from_pairs_either(sequence: Path) -> None:
+def test_excluded_classes_get_no_stereo_depth(sequence: Path) -> None:
     opened = open_run(run_of(sequence, (0,)))
     options = MapOptions(opened.path, excluded=("person",), source="stereo")
     assert RunFusion(opened, PersonInTheMiddle(), options).fuse_all().fused == 1

@@ -30,7 +30,7 @@ def shaken(t: Trajectory, sigma: float = 0.01) -> Trajectory:
     return Trajectory(t.timestamps_s, t.poses_world_camera @ se3_exp(xi))
 
 
-def test_rows():
+def test_evaluation_rows():
     reference = arc()
     result = evaluate_trajectory(shaken(reference), reference, expected_frames=400)
     units = {row["name"]: row["unit"] for row in result.rows}
@@ -55,7 +55,7 @@ def test_rows():
     assert len(result.per_second.timestamps_s) > 250
 
 
-def test_shares():
+def test_tracked_and_evaluated_shares():
     """The reference, at 90 Hz, covers the first half of the time only."""
     reference = arc(450, fps=90)
     estimate = arc(300, fps=30)
@@ -78,7 +78,7 @@ def test_scale_only_on_request():
     assert scaled.value("ate_rmse") < 1e-9
 
 
-def test_no_row_where_there_is_no_number(caplog):
+def test_metrics_without_a_value_have_no_row(caplog):
     reference = arc(10)  # a third of a second
     names = [row["name"] for row in evaluate_trajectory(reference, reference).rows]
     assert "rpe_trans_rmse_frame" in names
@@ -148,7 +148,7 @@ def test_picture(tmp_path, with_reference):
     assert path.read_bytes() == before
 
 
-def test_picture_of_nothing(tmp_path):
+def test_picture_of_an_empty_trajectory(tmp_path):
     """A run that was lost from the start still leaves its picture."""
     empty = arc().select(np.arange(0))
     for reference in (None, arc()):

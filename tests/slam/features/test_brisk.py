@@ -66,7 +66,7 @@ def test_the_same_frame_gives_the_same_arrays() -> None:
 
 
 @pytest.mark.parametrize("contrast", [1.0, 0.7, 0.5, 0.3])
-def test_corners_are_those_of_the_highest_threshold_with_enough(contrast: float) -> None:
+def test_the_highest_threshold_with_enough_corners_is_used(contrast: float) -> None:
     """Against asking FAST at one threshold after the other, also for dull images."""
     rgb = np.rint(128 + contrast * (FRONTAL.rgb.astype(float) - 128)).astype(np.uint8)
     frame = dataclasses.replace(FRONTAL, rgb=rgb)
@@ -86,7 +86,7 @@ def test_corners_are_those_of_the_highest_threshold_with_enough(contrast: float)
 
 
 @pytest.mark.parametrize("octaves", [0, 2])
-def test_descriptors_are_those_of_opencv_at_these_keypoints(octaves: int) -> None:
+def test_descriptors_equal_opencvs_at_the_same_keypoints(octaves: int) -> None:
     """Rows belong together: each descriptor is that of its own pixel, size and angle."""
     features = extract(FRONTAL, dataclasses.replace(CONFIG, octaves=octaves))
     keypoints = [
@@ -110,7 +110,7 @@ def test_keypoints_are_capped_and_spread(cap: int) -> None:
     assert np.bincount(quarter, minlength=4).min() > cap / 8
 
 
-def test_one_rich_corner_does_not_take_all_keypoints() -> None:
+def test_one_textured_corner_does_not_get_all_keypoints() -> None:
     """Strong texture in one quarter, weak elsewhere: the weak ones are still chosen."""
     weak = np.rint(128 + 0.6 * (FRONTAL.rgb.astype(float) - 128)).astype(np.uint8)
     weak[:240, :320] = FRONTAL.rgb[:240, :320]
@@ -135,7 +135,7 @@ def slow_spread_order(bucket: list[int], score: list[float]) -> list[int]:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 60])
-def test_spread_order_serves_the_buckets_in_rounds(count: int) -> None:
+def test_spread_order_visits_buckets_in_rounds(count: int) -> None:
     bucket, score = RNG.integers(0, 9, count), RNG.permutation(count).astype(float)
     order = spread_order(bucket, score)
     assert order.tolist() == slow_spread_order(bucket.tolist(), score.tolist())
@@ -150,7 +150,7 @@ def test_depth_and_disparity_of_a_plane() -> None:
     np.testing.assert_allclose(features.measurements[:, 2], stereo[:, 0] - stereo[:, 2], atol=1e-9)
 
 
-def test_sigmas_are_the_sensors_and_grow_with_the_root_of_scale() -> None:
+def test_sigmas_grow_with_the_square_root_of_scale() -> None:
     frontal = extract(FRONTAL, dataclasses.replace(CONFIG, octaves=2))
     np.testing.assert_allclose(frontal.sigmas_px[:, 2], CONFIG.disparity_sigma_px, rtol=1e-3)
     np.testing.assert_array_equal(frontal.sigmas_px[:, 0], frontal.sigmas_px[:, 1])
@@ -175,7 +175,7 @@ def test_disparity_sigma_of_a_slanted_plane_has_the_depth_change_of_a_pixel() ->
     np.testing.assert_allclose(features.sigmas_px[finite, 2], expected, rtol=0.01)
 
 
-def test_image_pixels_are_where_the_colour_is_taken() -> None:
+def test_image_pixels_are_distorted_pixels() -> None:
     coloured = FRONTAL.rgb.copy()
     coloured[..., 1] = np.clip(coloured[..., 1].astype(int) + 7, 0, 255)
     features = extract(dataclasses.replace(FRONTAL, rgb=coloured))
@@ -264,14 +264,14 @@ def test_depth_has_a_range(z: float, good: bool) -> None:
     assert np.isfinite(depth_at(np.full((480, 640), z), 200, 100)[0]) == good
 
 
-def test_depth_at_the_images_corners_and_of_nothing() -> None:
+def test_depth_at_image_corners_and_of_no_keypoints() -> None:
     depth = np.full((480, 640), 1.0, np.float32)
     corners = np.array([[0.0, 0.0], [639.0, 479.0], [639.0, 0.0]])
     np.testing.assert_array_equal(sample_depth(depth, corners, CONFIG)[0], 1.0)
     assert len(sample_depth(depth, np.zeros((0, 2)), CONFIG)[0]) == 0
 
 
-def test_a_reserve_is_what_a_larger_search_would_have_found_besides() -> None:
+def test_the_reserve_equals_the_rest_of_a_larger_search() -> None:
     extractor = BriskExtractor(CAMERA, dataclasses.replace(CONFIG, max_keypoints=200))
     features = extractor.extract(FRONTAL)
     reserve = extractor.reserve(FRONTAL, features, 0.5)
@@ -288,7 +288,7 @@ def test_a_reserve_is_what_a_larger_search_would_have_found_besides() -> None:
         np.testing.assert_allclose(mine, others, rtol=1e-5 * (name == "angles_rad"), err_msg=name)
 
 
-def test_with_octaves_there_is_no_reserve() -> None:
+def test_octaves_give_no_reserve() -> None:
     extractor = BriskExtractor(CAMERA, dataclasses.replace(CONFIG, octaves=2))
     features = extractor.extract(FRONTAL)
     assert len(extractor.described(extractor.reserve(FRONTAL, features, 0.5))) == 0

@@ -36,7 +36,7 @@ def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("size", SIZES_PX)
 @pytest.mark.parametrize("name", IMAGES)
-def test_bits_and_orientation_are_those_of_opencv(name: str, size: float) -> None:
+def test_bits_and_orientation_equal_opencvs(name: str, size: float) -> None:
     """All but the few bits that hang on how a box between pixels is summed."""
     gray = IMAGES[name]
     pixels = corners(gray)
@@ -50,7 +50,7 @@ def test_bits_and_orientation_are_those_of_opencv(name: str, size: float) -> Non
     assert ((own_angles >= 0) & (own_angles < 2 * np.pi)).all()
 
 
-def test_a_turned_image_turns_the_orientation_and_keeps_the_bits() -> None:
+def test_rotating_the_image_rotates_the_orientation_and_keeps_the_bits() -> None:
     gray = IMAGES["noise"]
     pixels, brisk = corners(gray), FixedSizeBrisk(12.0)
     descriptors, angles = brisk.describe(gray, pixels)
@@ -61,7 +61,7 @@ def test_a_turned_image_turns_the_orientation_and_keeps_the_bits() -> None:
     assert np.median(apart(turned_angles, angles - np.pi / 2)) < np.deg2rad(2)
 
 
-def test_reach_is_as_far_as_a_change_can_matter() -> None:
+def test_the_reach_covers_every_pixel_that_matters() -> None:
     brisk, pixel = FixedSizeBrisk(12.0), np.array([[320.0, 240.0]])
     other = IMAGES["noise"].copy()
     other[
@@ -75,7 +75,7 @@ def test_reach_is_as_far_as_a_change_can_matter() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_nothing_and_a_blank_image() -> None:
+def test_no_keypoints_and_a_blank_image() -> None:
     brisk, blank = FixedSizeBrisk(12.0), np.full((100, 100), 90, np.uint8)
     descriptors, angles = brisk.describe(blank, np.zeros((0, 2), np.float32))
     assert descriptors.shape == (0, 8)

@@ -70,7 +70,7 @@ def test_expand_ranges_is_a_list_of_ranges() -> None:
 
 
 @pytest.mark.parametrize("radius_px", [0.5, 7.0, 16.0, 60.0])
-def test_window_pairs_are_those_of_the_double_loop(radius_px: float) -> None:
+def test_window_pairs_equal_a_double_loop(radius_px: float) -> None:
     pixels = RNG.uniform([-5.0, -5.0], [645.0, 485.0], (400, 2))  # undistortion leaves the image
     centres = np.concatenate([RNG.uniform([-30, -30], [670, 510], (80, 2)), pixels[:5]])
     radius = radius_px * RNG.uniform(0.5, 1.5, len(centres))
@@ -86,14 +86,14 @@ def test_window_pairs_are_those_of_the_double_loop(radius_px: float) -> None:
     assert set(found) == slow
 
 
-def test_the_windows_edge_belongs_to_it() -> None:
+def test_the_window_includes_its_edge() -> None:
     """Corners of FAST lie on whole pixels, so that distances hit the radius exactly."""
     pixels = np.array([[105.0, 50.0], [95.0, 50.0], [100.0, 55.0], [100.0, 45.0], [103.0, 54.0]])
     _, train = WindowIndex(pixels).pairs(np.array([[100.0, 50.0]]), np.array([5.0]))
     assert sorted(train.tolist()) == [0, 1, 2, 3, 4]
 
 
-def test_window_of_nothing_is_empty() -> None:
+def test_no_keypoints_give_no_window_pairs() -> None:
     none = np.zeros((0, 2))
     for pixels, centres in ((none, RNG.uniform(0, 99, (4, 2))), (RNG.uniform(0, 99, (4, 2)), none)):
         query, train = WindowIndex(pixels).pairs(centres, np.full(len(centres), 50.0))
@@ -102,7 +102,7 @@ def test_window_of_nothing_is_empty() -> None:
 
 @pytest.mark.parametrize("mutual", [False, True])
 @pytest.mark.parametrize("ratio", [0.8, 1.0])
-def test_match_pairs_is_the_loop_over_candidates(mutual: bool, ratio: float) -> None:
+def test_match_pairs_equals_a_loop_over_candidates(mutual: bool, ratio: float) -> None:
     train = bits(25)
     chosen = RNG.integers(0, 25, 40)  # some train keypoints are wanted by several queries
     query = bits(40, flips=60, base=train[chosen])
@@ -134,7 +134,7 @@ def test_no_candidates_no_matches() -> None:
 
 
 @pytest.mark.parametrize("mutual", [False, True])
-def test_brute_force_is_match_pairs_of_all_pairs(mutual: bool) -> None:
+def test_brute_force_equals_match_pairs_of_all_pairs(mutual: bool) -> None:
     train = bits(30)
     query = np.concatenate([bits(20, 70, train[:20]), bits(5, 90, train[:5]), bits(10)])
     config = MatchConfig(max_distance=200, ratio=0.85, mutual=mutual)

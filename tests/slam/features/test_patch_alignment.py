@@ -65,7 +65,7 @@ def test_a_known_shift_is_found(shift: tuple[float, float], gain: float, offset:
     assert correlation.min() > 0.95
 
 
-def test_a_patch_cut_between_pixels_is_found_where_it_was() -> None:
+def test_a_patch_cut_at_a_subpixel_position_is_found() -> None:
     """No bias: the same fraction of a pixel comes back in the same image."""
     patches = cut_patches(image(), PIXELS)
     start = PIXELS + RNG.uniform(-0.8, 0.8, PIXELS.shape)
@@ -76,7 +76,7 @@ def test_a_patch_cut_between_pixels_is_found_where_it_was() -> None:
 
 
 @pytest.mark.parametrize("zoom", [0.72, 0.8, 0.9, 1.1, 1.25, 1.4])
-def test_a_patch_is_found_where_things_look_larger_or_smaller(zoom: float) -> None:
+def test_a_patch_is_found_at_another_zoom(zoom: float) -> None:
     """A template of another scale has a bias of its own at every corner."""
     there = MIDDLE + zoom * (CORNERS - MIDDLE)
     inside = (np.abs(there - MIDDLE) < MIDDLE - 15).all(axis=1)
@@ -102,13 +102,13 @@ def test_every_patch_has_its_own_zoom() -> None:
         np.testing.assert_allclose(together[1][k], alone[1][0], atol=1e-6)
 
 
-def test_patches_are_windows_column_first() -> None:
+def test_patch_pixels_are_column_row() -> None:
     gray = image()
     patch = cut_patches(gray, np.array([[100.0, 60.0]]))[0]
     np.testing.assert_array_equal(patch, gray[60 - HALF : 61 + HALF, 100 - HALF : 101 + HALF])
 
 
-def test_patches_between_pixels_are_those_of_opencv() -> None:
+def test_subpixel_patches_equal_opencvs() -> None:
     gray = image()
     patches = cut_patches(gray, PIXELS)
     for pixel, patch in zip(PIXELS, patches, strict=True):
@@ -116,7 +116,7 @@ def test_patches_between_pixels_are_those_of_opencv() -> None:
         assert np.abs(slow.astype(int) - patch).max() <= 1
 
 
-def test_correlation_tells_another_patch() -> None:
+def test_correlation_distinguishes_another_patch() -> None:
     patches = cut_patches(image(), PIXELS)
     _, correlation = register_patches(image(), PIXELS[::-1].copy(), patches, 0)
     assert np.abs(np.median(correlation)) < 0.3
@@ -125,7 +125,7 @@ def test_correlation_tells_another_patch() -> None:
     assert correlation.max() < -0.95
 
 
-def test_a_flat_patch_moves_nothing_and_correlates_with_nothing() -> None:
+def test_a_flat_patch_has_no_shift_and_no_correlation() -> None:
     flat = np.full((240, 320), 90, np.uint8)
     patches = cut_patches(flat, PIXELS)
     moved, correlation = register_patches(image(), PIXELS, patches, 6)
@@ -136,7 +136,7 @@ def test_a_flat_patch_moves_nothing_and_correlates_with_nothing() -> None:
     assert np.abs(correlation).max() < 0.1
 
 
-def test_pixels_at_the_border_do_no_harm() -> None:
+def test_pixels_at_the_image_border_are_handled() -> None:
     corners = np.array([[0.0, 0.0], [319.0, 0.0], [0.0, 239.0], [319.0, 239.0], [-3.0, 250.0]])
     patches = cut_patches(image(), corners)
     assert patches.shape == (5, PATCH_PX, PATCH_PX)
@@ -144,7 +144,7 @@ def test_pixels_at_the_border_do_no_harm() -> None:
     assert np.isfinite(moved).all()
 
 
-def test_nothing_is_registered_to_nothing() -> None:
+def test_no_patches_are_registered() -> None:
     none = np.zeros((0, 2))
     patches = cut_patches(image(), none)
     assert patches.shape == (0, PATCH_PX, PATCH_PX)

@@ -25,7 +25,7 @@ def world(points_world: np.ndarray) -> Any:
     return SimpleNamespace(landmarks=landmarks, in_segment=in_segment)
 
 
-def test_what_lies_where_the_depth_shows_surface_is_seen_too() -> None:
+def test_landmarks_on_the_measured_surface_are_visible() -> None:
     rng = np.random.default_rng(0)
     local = rng.uniform([-2, -2, -3], [2, 2, 5], (600, 3))
     depth_m = rng.uniform(1.0, 4.0, (CAMERA.height // 2, CAMERA.width // 2)).astype(np.float32)

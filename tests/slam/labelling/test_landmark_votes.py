@@ -8,7 +8,7 @@ from test_semantic_mapper import FRAMES, MANY_KEYFRAMES, Sides, estimates, right
 from bmask_slam.labelling import landmark_votes as label_votes
 
 
-def test_keyframes_vote_on_what_is_made_after_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keyframes_vote_on_landmarks_made_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the last keyframe's new landmarks all the recent ones that show them have their say."""
     views, shares = {}, {}
     for recent in (0, 3):

@@ -95,7 +95,7 @@ def right_share(system: SlamSystem) -> float:
     return float((found.labels == truth)[known].mean())
 
 
-def test_landmarks_get_the_label_of_what_they_are_on(at_once: SlamSystem) -> None:
+def test_landmarks_get_the_label_of_their_mask(at_once: SlamSystem) -> None:
     assert right_share(at_once) > 0.995
     assert np.median(estimates(at_once).probability) > 0.97
     assert estimates(at_once).views.max() > 5
@@ -110,7 +110,7 @@ def late_system() -> SlamSystem:
     return system
 
 
-def test_late_masks_in_any_order_say_the_same(at_once: SlamSystem) -> None:
+def test_late_masks_in_any_order_give_the_same_labels(at_once: SlamSystem) -> None:
     system = late_system()
     world, culled = system.mapper.world, system.mapper.world.culled
     assert len(culled) > 2
@@ -133,7 +133,7 @@ def keyframe_number(system: SlamSystem, keyframe_id: int) -> int:
     return keyframe_id
 
 
-def test_masks_that_come_twice_count_once(at_once: SlamSystem) -> None:
+def test_repeated_masks_count_once(at_once: SlamSystem) -> None:
     semantics, before = at_once.semantics, at_once.semantics.state()
     for k in (3, *list(at_once.mapper.world.culled)[:2]):
         done = semantics.attach(k, Sides(FRAMES).instances(k))
@@ -154,7 +154,7 @@ def test_masks_of_another_size_are_refused_and_change_nothing() -> None:
     assert system.semantics.attach(3, Sides(FRAMES).instances(3)).refused == ""
 
 
-def test_fused_and_culled_landmarks_are_followed(at_once: SlamSystem) -> None:
+def test_labels_follow_fused_and_culled_landmarks(at_once: SlamSystem) -> None:
     """No label is kept of what is not in the map any more."""
     semantics, landmarks = at_once.semantics, at_once.mapper.world.landmarks
     semantics.follow_map()
@@ -212,7 +212,7 @@ def test_the_first_keyframe_must_have_masks_the_others_may_lack_them() -> None:
         run(Sides(FRAMES, late=True))
 
 
-def test_a_map_goes_on_with_its_own_labels_or_without_masks() -> None:
+def test_a_map_continues_with_its_labels_or_without_masks() -> None:
     system = run(Sides(FRAMES))
     state = system.state()
 

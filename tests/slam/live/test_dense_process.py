@@ -68,7 +68,7 @@ def mapped(said: list[Any]) -> list[int]:
     return [m.keyframe_id for m in said if isinstance(m, Mapped)]
 
 
-def test_a_submap_comes_after_its_neighbours_and_lies_on_the_surface(tmp_path) -> None:
+def test_a_submap_is_sent_after_its_neighbours_and_is_accurate(tmp_path) -> None:
     server, said = make_server(tmp_path / "run")
     for number in POSES:
         server.handle(to_map(number, []))
@@ -126,7 +126,7 @@ def same_evidence(one: DenseFolder, other: DenseFolder) -> bool:
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
-def test_masks_that_come_before_a_keyframe_is_fused_are_as_if_in_time(tmp_path, in_time) -> None:
+def test_masks_before_fusion_equal_masks_in_time(tmp_path, in_time) -> None:
     late = with_late_masks(tmp_path / "run", 3)
     for name in ("points", "colours", "variances", "instances"):
         mine, theirs = getattr(late.submap(0), name), getattr(in_time.submap(0), name)
@@ -135,7 +135,7 @@ def test_masks_that_come_before_a_keyframe_is_fused_are_as_if_in_time(tmp_path, 
     assert in_time.evidence(0).landmark_instances.tolist() == [1, 1, 2]
 
 
-def test_a_detection_too_weak_for_an_object_cuts_nothing_out(tmp_path) -> None:
+def test_a_weak_detection_excludes_no_pixels(tmp_path) -> None:
     server, _ = make_server(tmp_path / "run")
     for number in range(7):
         server.handle(to_map(number, [CHAIR, replace(PERSON, class_score=0.2)]))
@@ -144,7 +144,7 @@ def test_a_detection_too_weak_for_an_object_cuts_nothing_out(tmp_path) -> None:
     assert set(folder.submap(0).instances.tolist()) == {0, 1}
 
 
-def test_masks_that_come_after_that_reach_its_submap(tmp_path, in_time) -> None:
+def test_late_masks_relabel_the_submap(tmp_path, in_time) -> None:
     late = with_late_masks(tmp_path / "run", 6)
     for folder in (late, in_time):
         submap = folder.submap(0)
@@ -158,7 +158,7 @@ def test_masks_that_come_after_that_reach_its_submap(tmp_path, in_time) -> None:
     assert same_evidence(late, in_time)
 
 
-def test_what_is_forgotten_is_gone_before_and_after_it_is_saved(tmp_path) -> None:
+def test_a_removed_keyframe_is_removed_before_and_after_saving(tmp_path) -> None:
     server, said = make_server(tmp_path / "run")
     for number in range(7):
         server.handle(to_map(number, []))
@@ -171,14 +171,14 @@ def test_what_is_forgotten_is_gone_before_and_after_it_is_saved(tmp_path) -> Non
     assert not list(folder.path.glob("*/000000"))
 
 
-def test_a_keyframe_that_cannot_be_mapped_is_said(tmp_path) -> None:
+def test_a_keyframe_that_cannot_be_mapped_is_reported(tmp_path) -> None:
     server, said = make_server(tmp_path / "run")
     server.handle(to_map(0, [], np.full((4, 4), np.nan)))
     assert isinstance(said[0], NotMapped)
     assert "not finite" in said[0].reason
 
 
-def test_what_is_done_is_said_again_to_one_who_missed_it(tmp_path) -> None:
+def test_a_finished_keyframe_is_reported_again_on_request(tmp_path) -> None:
     server, _ = make_server(tmp_path / "run")
     for number in range(7):
         server.handle(to_map(number, []))

@@ -59,7 +59,7 @@ def test_masks_from_another_process_label_the_map(recording, tmp_path) -> None:
     assert json.loads((out / "objects.json").read_text())["objects"]
 
 
-def test_a_live_dense_map_is_the_offline_one_and_can_be_taken_up(
+def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
     recording, tmp_path, capsys
 ) -> None:
     """A frame that is dropped puts keyframes' numbers out of step with their images."""

@@ -72,7 +72,7 @@ def off_the_plane_m(run: Path) -> float:
     return float(np.percentile(np.abs((points - at_centre)[:, 2]), 95))
 
 
-def test_a_killed_process_comes_back_and_no_keyframe_is_left_out(tmp_path) -> None:
+def test_a_killed_process_is_restarted_without_losing_keyframes(tmp_path) -> None:
     run = tmp_path / "run"
     with LiveSlam(CAMERA, CONFIG, LiveOptions(run, dense=True)) as slam:
         track_frames(slam, FRAMES[:10], 0)
@@ -88,7 +88,7 @@ def test_a_killed_process_comes_back_and_no_keyframe_is_left_out(tmp_path) -> No
     assert not running(pids)
 
 
-def test_one_that_hangs_is_started_again(tmp_path, monkeypatch) -> None:
+def test_a_hanging_process_is_restarted(tmp_path, monkeypatch) -> None:
     patient = partial(RemoteDenseMapper, policy=RestartPolicy(answer_s=4.0))
     monkeypatch.setattr(start, "RemoteDenseMapper", patient)
     run = tmp_path / "run"
@@ -105,7 +105,7 @@ def test_one_that_hangs_is_started_again(tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("small_disk", ["150m"], indirect=True)
-def test_on_a_full_disk_tracking_goes_on_and_the_end_says_what_is_missing(
+def test_on_a_full_disk_tracking_continues_and_missing_submaps_are_reported(
     small_disk, caplog
 ) -> None:
     run = small_disk / "run"
@@ -129,6 +129,6 @@ def test_on_a_full_disk_tracking_goes_on_and_the_end_says_what_is_missing(
     assert not running(pids)
 
 
-def test_without_a_run_folder_it_is_refused() -> None:
+def test_dense_mapping_without_a_run_folder_is_rejected() -> None:
     with pytest.raises(InputError, match="run folder"):
         LiveSlam(CAMERA, CONFIG, LiveOptions(dense=True))

@@ -61,7 +61,7 @@ def fill(disk: Path) -> Path:
             return ballast
 
 
-def test_tracking_goes_on_while_the_disk_is_full(small_disk, caplog) -> None:
+def test_tracking_continues_while_the_disk_is_full(small_disk, caplog) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(small_disk / "run")) as slam:
         track_frames(slam, FRAMES[:4])
         ballast = fill(small_disk)
@@ -116,7 +116,7 @@ def test_an_unplugged_camera_ends_the_run_with_everything_saved(tmp_path) -> Non
     assert not running(pids)
 
 
-def test_five_seconds_without_a_frame_do_no_harm() -> None:
+def test_five_seconds_without_a_frame_are_tolerated() -> None:
     with LiveSlam(CAMERA, CONFIG) as slam:
         track_frames(slam, FRAMES[:10])
         time.sleep(5.0)
@@ -136,7 +136,7 @@ def label_image(folder: Path) -> SegmenterOptions:
     return SegmenterOptions("precomputed", masks=folder)
 
 
-def test_a_killed_segmenter_costs_masks_alone(tmp_path) -> None:
+def test_a_killed_segmenter_loses_only_masks(tmp_path) -> None:
     semantics = {"semantics": CONFIG.semantics.__class__(segmenter=label_image(tmp_path))}
     config = CONFIG.__class__(**{**vars(CONFIG), **semantics})
     with LiveSlam(CAMERA, config, LiveOptions(tmp_path / "run")) as slam:
@@ -154,7 +154,7 @@ def test_a_killed_segmenter_costs_masks_alone(tmp_path) -> None:
     assert not running(pids)
 
 
-def test_a_segmenter_that_hangs_is_started_again(tmp_path) -> None:
+def test_a_hanging_segmenter_is_restarted(tmp_path) -> None:
     policy = RestartPolicy(answer_s=2.0)
     segmenter = RemoteSegmenter(label_image(tmp_path), tmp_path, policy)
     first = segmenter.pid

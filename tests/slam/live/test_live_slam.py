@@ -90,7 +90,7 @@ def test_live_is_as_good_as_offline_and_leaves_the_same_files(tmp_path, offline)
     assert {"latency_ms_median", "frames_dropped", "isam2_update_ms_median"} <= names
 
 
-def test_a_killed_map_comes_back_and_no_frame_is_lost(tmp_path) -> None:
+def test_a_killed_map_process_is_restarted_without_losing_frames(tmp_path) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         track_frames(slam, FRAMES[:12])
         os.kill(slam.processes()["map"], signal.SIGKILL)
@@ -103,7 +103,7 @@ def test_a_killed_map_comes_back_and_no_frame_is_lost(tmp_path) -> None:
     assert (tmp_path / "run" / "map").stat().st_size > 10_000
 
 
-def test_a_map_that_dies_again_and_again_costs_the_map_but_not_the_trajectory(tmp_path) -> None:
+def test_repeated_map_failures_keep_the_trajectory(tmp_path) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         track_frames(slam, FRAMES[:8])
         for _ in range(3):
@@ -138,7 +138,7 @@ def wait_for_the_map(slam: LiveSlam) -> None:
         slam.catch_up()
 
 
-def test_a_keyframe_that_kills_the_map_is_passed_over(tmp_path, monkeypatch) -> None:
+def test_a_keyframe_that_crashes_the_map_process_is_skipped(tmp_path, monkeypatch) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         track_frames(slam, FRAMES[:6])
         poisoned = poison_next_keyframe(slam, monkeypatch)
@@ -151,7 +151,7 @@ def test_a_keyframe_that_kills_the_map_is_passed_over(tmp_path, monkeypatch) -> 
     assert error_m(trajectory.poses_world_camera) < 0.02
 
 
-def test_a_first_keyframe_that_kills_the_map_costs_its_frame(tmp_path, monkeypatch) -> None:
+def test_a_first_keyframe_that_crashes_the_map_loses_its_frame(tmp_path, monkeypatch) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         poison_next_keyframe(slam, monkeypatch)
         track_frames(slam, FRAMES[:1])
@@ -188,7 +188,7 @@ def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> Non
         assert slam.health().frames_refused == 5
 
 
-def test_black_frames_are_lost_and_tracking_comes_back() -> None:
+def test_black_frames_are_lost_and_tracking_recovers() -> None:
     black = np.zeros_like(FRAMES[0].rgb)
     nothing = np.full_like(FRAMES[0].depth_m, np.nan)
     with LiveSlam(CAMERA, CONFIG) as slam:
@@ -222,7 +222,7 @@ def test_the_callers_settings_are_restored(frozen: bool) -> None:
         faiss.omp_set_num_threads(threads)
 
 
-def test_a_dense_process_that_cannot_start_leaves_nothing(tmp_path, monkeypatch) -> None:
+def test_a_dense_process_that_cannot_start_leaves_no_processes(tmp_path, monkeypatch) -> None:
     def late(_: RemoteDenseMapper) -> None:
         raise InputError("the dense mapper's process did not start")
 
@@ -242,7 +242,7 @@ def test_a_run_folder_in_use_is_refused_and_nothing_starts(tmp_path) -> None:
     assert children() == before
 
 
-def test_a_segmenter_that_cannot_start_says_why(tmp_path) -> None:
+def test_a_segmenter_that_cannot_start_reports_the_reason(tmp_path) -> None:
     options = SegmenterOptions("precomputed", masks=tmp_path / "none.json")
     with pytest.raises(InputError, match=r"none\.json"):
         RemoteSegmenter(options, tmp_path)
@@ -256,7 +256,7 @@ def test_a_run_that_cannot_start_leaves_no_run_folder(tmp_path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_one_that_begins_too_late_is_said_to_be_late(tmp_path) -> None:
+def test_a_process_that_starts_too_late_is_reported(tmp_path) -> None:
     before = children()
     with pytest.raises(InputError, match="segmenter's process has not begun within 0 s"):
         RemoteSegmenter(SegmenterOptions("none"), tmp_path, policy=RestartPolicy(start_s=0.0))

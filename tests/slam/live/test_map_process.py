@@ -49,7 +49,7 @@ def keyframe(
     )
 
 
-def test_after_the_loss_of_its_first_keyframe_a_segment_begins_anew() -> None:
+def test_a_segment_restarts_after_losing_its_first_keyframe() -> None:
     answers: list[Any] = []
     system = SlamSystem(CAMERA)
     server = MapServer(system, answers.append)
@@ -69,7 +69,7 @@ def test_after_the_loss_of_its_first_keyframe_a_segment_begins_anew() -> None:
     assert trajectory.timestamps_s.tolist() == [2 / 30]  # those of the lost ones have no pose
 
 
-def test_what_was_taken_out_under_a_mask_comes_back() -> None:
+def test_observations_removed_under_a_mask_are_restored() -> None:
     answers: list[Any] = []
     system = SlamSystem(CAMERA)
     server = MapServer(system, answers.append)

@@ -60,7 +60,7 @@ def filled(count: int, keep: int) -> Newest:
     return newest
 
 
-def test_items_that_are_taken_in_time_all_come_in_order() -> None:
+def test_items_consumed_in_time_are_all_delivered_in_order() -> None:
     def slowly() -> Iterator[int]:
         for k in range(5):
             time.sleep(0.02)
@@ -71,19 +71,19 @@ def test_items_that_are_taken_in_time_all_come_in_order() -> None:
     assert newest.dropped == 0
 
 
-def test_a_slow_taker_gets_the_newest_and_the_rest_is_counted() -> None:
+def test_a_slow_consumer_gets_the_newest_and_drops_are_counted() -> None:
     newest = filled(10, keep=2)
     assert taken(newest) == [8, 9]
     assert newest.dropped == 8
 
 
-def test_one_too_many_leaves_only_the_newest() -> None:
+def test_an_overflow_keeps_only_the_newest() -> None:
     newest = filled(6, keep=3)
     assert taken(newest) == [3, 4, 5]  # 3 drove out the others
     assert newest.dropped == 3
 
 
-def test_an_error_of_the_source_comes_after_what_it_gave() -> None:
+def test_an_error_of_the_source_is_raised_after_its_frames() -> None:
     def broken() -> Iterator[int]:
         yield 1
         raise InputError("camera: unplugged; plug it in")
@@ -94,7 +94,7 @@ def test_an_error_of_the_source_comes_after_what_it_gave() -> None:
         taken(newest)
 
 
-def test_an_endless_source_stops_when_asked() -> None:
+def test_an_endless_source_stops_on_request() -> None:
     newest = Newest(itertools.count(), keep=1)
     assert newest.get(5) is not None
     newest.stop()
@@ -110,7 +110,7 @@ def slam() -> Iterator[LiveSlam]:
         yield slam
 
 
-def test_a_source_that_waits_is_tracked_whole_and_refused_frames_are_passed_over(slam) -> None:
+def test_a_waiting_source_is_tracked_completely_without_refused_frames(slam) -> None:
     small = Frame(3, FRAMES[3].timestamp_s, FRAMES[3].rgb[::2], FRAMES[3].depth_m)
     frames = [*FRAMES[:3], small, FRAMES[2], *FRAMES[4:6]]
     assert play(slam, Given(frames), PlayOptions(realtime=False, quiet=True)) is None
@@ -118,7 +118,7 @@ def test_a_source_that_waits_is_tracked_whole_and_refused_frames_are_passed_over
     assert (health.frames, health.frames_refused, health.frames_dropped) == (5, 2, 0)
 
 
-def test_a_source_that_waits_does_not_run_away_from_the_map(monkeypatch) -> None:
+def test_a_waiting_source_does_not_outrun_the_map(monkeypatch) -> None:
     settings = ["keyframes.min_interval_frames=1", "keyframes.max_shared=1.1"]
     to_and_fro = [*POSES, *POSES[::-1]] * 2  # keyframes are made when the map has time for them
     frames = [render_plane(pose, index) for index, pose in enumerate(to_and_fro)]
@@ -151,7 +151,7 @@ def test_silence_is_reported_once_and_frames_after_it_are_tracked(slam, caplog) 
     assert caplog.text.count("no frame for") == 1
 
 
-def test_a_recording_is_read_late_and_given_in_time() -> None:
+def test_a_recording_is_delivered_at_its_stamps() -> None:
     frames = [replace(FRAMES[k], timestamp_s=5.0 + 0.1 * k) for k in range(5)]
     read_s, given_s = [], []
 

@@ -91,7 +91,7 @@ def no(number: int) -> bool:
     return False
 
 
-def test_the_newest_goes_first_and_one_at_a_time(dense) -> None:
+def test_the_newest_keyframe_is_sent_first_and_one_at_a_time(dense) -> None:
     world, worker = a_map(4), process(dense)
     frame = ask(dense, 0, 1, 2)
     frame.rgb[:] = 7  # the caller's buffer: it may be used again
@@ -108,7 +108,7 @@ def test_the_newest_goes_first_and_one_at_a_time(dense) -> None:
     np.testing.assert_array_equal(worker.sent[1].poses[2], world.keyframes[2].T_world_camera)
 
 
-def test_too_many_drive_out_the_oldest_but_never_one_that_is_promised(dense) -> None:
+def test_too_many_keyframes_drop_the_oldest_that_was_not_sent(dense) -> None:
     world, worker = a_map(MAX_WAITING + 3), process(dense)
     ask(dense, 0)
     dense.update(world, no, no)
@@ -123,7 +123,7 @@ def test_too_many_drive_out_the_oldest_but_never_one_that_is_promised(dense) -> 
     assert dense.submaps == {0}
 
 
-def test_it_waits_for_the_map_and_some_time_for_masks(dense, monkeypatch) -> None:
+def test_keyframes_wait_for_the_map_and_some_time_for_masks(dense, monkeypatch) -> None:
     world, worker = a_map(3), process(dense)
     ask(dense, 0, 1, 2)
     dense.update(world, lambda k: k > 0, lambda k: k < 1)
@@ -142,7 +142,7 @@ def test_it_waits_for_the_map_and_some_time_for_masks(dense, monkeypatch) -> Non
     np.testing.assert_allclose(late.pixels, world.keyframes[2].features.image_pixels)
 
 
-def test_where_many_wait_masks_are_not_waited_for_but_those_that_have_them_go_first(dense) -> None:
+def test_crowded_keyframes_do_not_wait_for_masks(dense) -> None:
     world, worker = a_map(CROWDED + 1), process(dense)
     ask(dense, *range(CROWDED - 1))
     dense.update(world, no, lambda k: True)
@@ -154,7 +154,7 @@ def test_where_many_wait_masks_are_not_waited_for_but_those_that_have_them_go_fi
     assert worker.keyframes() == [1, CROWDED - 1]
 
 
-def test_what_leaves_the_map_is_forgotten_and_what_it_does_not_know_yet_is_not(dense) -> None:
+def test_culled_keyframes_are_removed_and_unfinished_ones_kept(dense) -> None:
     world, worker = a_map(4), process(dense)
     ask(dense, 0, 1)
     dense.update(world, no, no)
@@ -169,7 +169,7 @@ def test_what_leaves_the_map_is_forgotten_and_what_it_does_not_know_yet_is_not(d
     assert dense.waiting == 2  # 0 is being worked on, 3 is new
 
 
-def test_what_was_promised_is_sent_again_and_what_kills_twice_is_left_out(dense) -> None:
+def test_sent_keyframes_are_resent_and_skipped_after_two_crashes(dense) -> None:
     world, worker = a_map(3), process(dense)
     ask(dense, 0)
     dense.update(world, no, no)
@@ -190,7 +190,7 @@ def test_what_was_promised_is_sent_again_and_what_kills_twice_is_left_out(dense)
     assert (dense.submaps, dense.waiting) == ({0}, 0)
 
 
-def test_at_the_end_all_that_waits_is_sent_and_a_death_is_made_up_for(dense, monkeypatch) -> None:
+def test_finish_sends_all_waiting_keyframes_despite_a_crash(dense, monkeypatch) -> None:
     world, worker = a_map(3), process(dense)
     ask(dense, 0, 1)
     preview = Preview(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8))
@@ -214,7 +214,7 @@ def test_at_the_end_all_that_waits_is_sent_and_a_death_is_made_up_for(dense, mon
     assert dense.unwritten == 1
 
 
-def test_given_up_it_leaves_out_everything_and_the_end_says_so(dense) -> None:
+def test_after_giving_up_all_keyframes_are_reported_as_skipped(dense) -> None:
     world, worker = a_map(3), process(dense)
     ask(dense, 0, 1)
     dense.update(world, no, no)

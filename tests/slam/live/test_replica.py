@@ -56,7 +56,7 @@ def followed() -> tuple[SlamSystem, WorldMap, FrameHistory, list[int]]:
     return system, copy, history, sizes
 
 
-def test_the_copy_went_through_everything(followed) -> None:
+def test_the_replica_covers_every_map_change(followed) -> None:
     system, copy, history, _ = followed
     assert len(copy.keyframes) >= 3
     assert (copy.landmarks.replaced_by >= 0).any(), "nothing was fused"
@@ -68,7 +68,7 @@ def test_the_copy_went_through_everything(followed) -> None:
         )
 
 
-def test_a_delta_without_change_is_small(followed) -> None:
+def test_an_empty_delta_is_small(followed) -> None:
     system, *_ = followed
     maker = DeltaMaker()
     first = maker.delta(system.mapper.world, system.mapper.history)
@@ -81,7 +81,7 @@ def test_a_delta_without_change_is_small(followed) -> None:
     assert len(pickle.dumps(second)) < 0.2 * len(pickle.dumps(first))
 
 
-def test_keyframes_that_the_owner_has_not_met_move_with_the_others(followed) -> None:
+def test_keyframes_unknown_to_the_owner_move_with_the_others(followed) -> None:
     system, *_ = followed
     world, copy, history = system.mapper.world, WorldMap(), FrameHistory()
     apply_delta(DeltaMaker().delta(world, system.mapper.history), copy, history)

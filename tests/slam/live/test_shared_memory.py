@@ -21,7 +21,7 @@ def data(rng: np.random.Generator, size: int) -> bytes:
     return rng.integers(0, 256, size, np.uint8).tobytes()
 
 
-def test_what_goes_in_comes_out_however_often_the_ring_is_gone_round() -> None:
+def test_data_is_preserved_when_the_ring_wraps_around() -> None:
     rng, (writer, reader) = np.random.default_rng(0), ends(10_000)
     waiting: list[tuple[int, bytes]] = []
     refused = taken = 0
@@ -41,7 +41,7 @@ def test_what_goes_in_comes_out_however_often_the_ring_is_gone_round() -> None:
     assert taken > 500
 
 
-def test_what_is_larger_than_the_memory_is_refused() -> None:
+def test_data_larger_than_the_ring_is_rejected() -> None:
     writer, reader = ends(1024)
     assert writer.write(memoryview(bytes(1025))) is None
     begin = writer.write(memoryview(bytes(range(256)) * 4))
@@ -51,7 +51,7 @@ def test_what_is_larger_than_the_memory_is_refused() -> None:
     assert writer.write(memoryview(b"x")) is not None
 
 
-def test_bytes_taken_are_a_copy_that_may_be_written_to() -> None:
+def test_received_bytes_are_a_writable_copy() -> None:
     writer, reader = ends(1024)
     first = writer.write(memoryview(b"first"))
     assert first is not None

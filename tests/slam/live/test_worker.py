@@ -55,7 +55,7 @@ def answers(worker: Worker, count: int) -> list:
     return found
 
 
-def test_it_shares_its_owners_session_but_not_its_interrupts() -> None:
+def test_a_worker_is_in_its_owners_session_without_its_interrupts() -> None:
     """Priorities count within a session; Ctrl-C goes to a process group."""
     worker = Worker("echo", f"{HERE}:echo", "a")
     try:
@@ -65,7 +65,7 @@ def test_it_shares_its_owners_session_but_not_its_interrupts() -> None:
         worker.kill()
 
 
-def test_messages_of_any_size_come_back_in_order(caplog) -> None:
+def test_messages_of_any_size_are_echoed_in_order(caplog) -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
     sizes = [10, 100_000, 5_000_000, 400_000, 0, *[300_000] * 12]  # more than the memory holds
     arrays = [np.arange(size) for size in sizes]
@@ -83,7 +83,7 @@ def test_messages_of_any_size_come_back_in_order(caplog) -> None:
     worker.stop()
 
 
-def test_what_was_sent_before_a_stop_is_still_done() -> None:
+def test_messages_before_a_stop_are_processed() -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
     for k in range(50):
         worker.send(k)
@@ -91,7 +91,7 @@ def test_what_was_sent_before_a_stop_is_still_done() -> None:
     assert [k for _, k in worker.receive()] == list(range(50))
 
 
-def test_an_error_is_told() -> None:
+def test_a_workers_error_is_raised() -> None:
     worker = Worker("fail", f"{HERE}:fail")
     worker.send("this")
     (failure,) = answers(worker, 1)
@@ -101,7 +101,7 @@ def test_an_error_is_told() -> None:
     assert not worker.alive
 
 
-def test_a_killed_worker_is_seen_and_sending_does_no_harm() -> None:
+def test_a_killed_worker_is_detected_and_sending_is_safe() -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
     worker.send(1)
     answers(worker, 1)
@@ -116,7 +116,7 @@ def test_a_killed_worker_is_seen_and_sending_does_no_harm() -> None:
     worker.stop()
 
 
-def test_one_that_does_not_end_is_killed(caplog) -> None:
+def test_a_worker_that_does_not_end_is_killed(caplog) -> None:
     worker = Worker("sleeper", f"{HERE}:sleep")
     pid = worker.pid
     worker.stop(timeout_s=0.5)
@@ -124,7 +124,7 @@ def test_one_that_does_not_end_is_killed(caplog) -> None:
     assert "sleeper does not end; killed" in caplog.text
 
 
-def test_it_does_not_import_from_the_current_folder(tmp_path, monkeypatch) -> None:
+def test_a_worker_does_not_import_from_the_current_folder(tmp_path, monkeypatch) -> None:
     hostile = "from pathlib import Path; Path('ran').touch()"
     (tmp_path / "queue.py").write_text(hostile)
     monkeypatch.chdir(tmp_path)
@@ -138,7 +138,7 @@ def test_it_does_not_import_from_the_current_folder(tmp_path, monkeypatch) -> No
     assert not (tmp_path / "ran").exists()
 
 
-def test_ctrl_c_in_the_terminal_does_not_reach_it() -> None:
+def test_ctrl_c_in_the_terminal_does_not_reach_a_worker() -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
     worker.send(1)
     answers(worker, 1)
@@ -150,7 +150,7 @@ def test_ctrl_c_in_the_terminal_does_not_reach_it() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_it_ends_with_its_owner_however_that_ends() -> None:
+def test_a_worker_ends_with_its_owner() -> None:
     script = (
         "from bmask_slam.live.processes.worker import Worker; import time\n"
         f"w = Worker('echo', '{HERE}:echo', 'a'); w.send(1); w.receive(20)\n"

@@ -109,7 +109,7 @@ def closed() -> tuple[Ring, list[LoopConstraint]]:
     return ring, ring.run(ONCE_ROUND + 4)
 
 
-def test_a_loop_takes_the_drift_away(closed: tuple[Ring, list[LoopConstraint]]) -> None:
+def test_a_closed_loop_removes_the_drift(closed: tuple[Ring, list[LoopConstraint]]) -> None:
     drifting = Ring(LoopClosingConfig(enabled=False))
     assert drifting.run(ONCE_ROUND + 4) == []
     ring, loops = closed
@@ -118,7 +118,7 @@ def test_a_loop_takes_the_drift_away(closed: tuple[Ring, list[LoopConstraint]]) 
     assert ring.error_rad() < 0.1 * drifting.error_rad()
 
 
-def test_both_sides_share_their_landmarks_afterwards(
+def test_a_closed_loop_fuses_the_landmarks_of_both_sides(
     closed: tuple[Ring, list[LoopConstraint]],
 ) -> None:
     ring, loops = closed
@@ -141,7 +141,7 @@ def test_map_and_graph_hold_the_same_landmarks(closed: tuple[Ring, list[LoopCons
     assert np.array_equal(estimate.points_world, landmarks.points_world[ids])
 
 
-def test_a_wrong_loop_that_entered_is_removed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_accepted_wrong_loop_is_removed_later(monkeypatch: pytest.MonkeyPatch) -> None:
     ring, sound = Ring(), Ring()
     sound.run(20)
     ring.run(18)
@@ -193,7 +193,7 @@ def displaced(world: WorldMap, a: int, b: int, T_drift: Array) -> LoopConstraint
 T_DRIFT = se3_exp(np.array([0.0, 0.03, 0.02, 0.3, 0.1, -0.2]))
 
 
-def test_loops_that_agree_confirm_each_other() -> None:
+def test_consistent_loops_confirm_each_other() -> None:
     world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig())
     first = [displaced(world, k, 36, T_DRIFT) for k in (2, 3)]
     third = displaced(world, 4, 37, T_DRIFT)
@@ -202,7 +202,7 @@ def test_loops_that_agree_confirm_each_other() -> None:
     assert closer.waiting == []
 
 
-def test_one_keyframe_alone_confirms_nothing() -> None:
+def test_loops_of_one_keyframe_do_not_confirm_each_other() -> None:
     world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig())
     loops = [displaced(world, k, 36, T_DRIFT) for k in (2, 3, 4, 5)]
     assert closer.confirm(loops, world) == []
@@ -223,7 +223,7 @@ def test_random_loops_are_never_confirmed() -> None:
     assert entered == right
 
 
-def test_loops_of_a_keyframe_that_left_are_forgotten() -> None:
+def test_loops_of_a_culled_keyframe_are_removed() -> None:
     world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig())
     closer.confirm([displaced(world, k, 36, T_DRIFT) for k in (2, 3)], world)
     closer.remove(2)
@@ -232,7 +232,7 @@ def test_loops_of_a_keyframe_that_left_are_forgotten() -> None:
     assert closer.waiting == []
 
 
-def test_an_old_loop_that_no_longer_fits_goes_with_what_it_fused(
+def test_an_inconsistent_old_loop_is_removed_with_its_fusions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ring = Ring()
@@ -257,7 +257,7 @@ def test_an_old_loop_that_no_longer_fits_goes_with_what_it_fused(
     assert len(np.intersect1d(*(ring.mapper.world.observed(k)[1] for k in (a, b)))) < 10
 
 
-def test_a_loop_that_left_with_its_keyframe_is_not_refuted() -> None:
+def test_a_loop_removed_with_its_keyframe_is_not_rejected() -> None:
     ring = Ring()
     loops = ring.run(ONCE_ROUND)
     mapper = ring.mapper

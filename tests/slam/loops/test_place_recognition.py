@@ -53,7 +53,7 @@ def reference_votes(
 
 
 @pytest.mark.parametrize("config", [WHOLE, PARTITIONED])
-def test_votes_are_those_of_the_definition(config: IndexConfig, rng: np.random.Generator) -> None:
+def test_votes_equal_the_definition(config: IndexConfig, rng: np.random.Generator) -> None:
     shared = random_descriptors(60, rng)
     keyframes = {
         k: np.concatenate([changed(shared[k * 5 :], 20 + 4 * k, rng), random_descriptors(20, rng)])
@@ -71,7 +71,7 @@ def test_votes_are_those_of_the_definition(config: IndexConfig, rng: np.random.G
     assert (np.diff(votes.scores) <= 0).all()
 
 
-def test_the_gate_is_inclusive_and_sharp(rng: np.random.Generator) -> None:
+def test_the_distance_threshold_is_inclusive(rng: np.random.Generator) -> None:
     place = random_descriptors(40, rng)
     index = DescriptorIndex()
     index.add(4, place)
@@ -80,7 +80,7 @@ def test_the_gate_is_inclusive_and_sharp(rng: np.random.Generator) -> None:
     assert len(index.votes(changed(place, gate + 1, rng))) == 0
 
 
-def test_what_is_seen_everywhere_counts_little(rng: np.random.Generator) -> None:
+def test_common_descriptors_have_little_weight(rng: np.random.Generator) -> None:
     wallpaper, poster = random_descriptors(50, rng), random_descriptors(10, rng)
     index = DescriptorIndex()
     for k in range(20):
@@ -92,7 +92,7 @@ def test_what_is_seen_everywhere_counts_little(rng: np.random.Generator) -> None
 
 
 @pytest.mark.parametrize("config", [WHOLE, PARTITIONED])
-def test_removing_is_as_if_never_added(config: IndexConfig, rng: np.random.Generator) -> None:
+def test_removing_equals_never_adding(config: IndexConfig, rng: np.random.Generator) -> None:
     keyframes = {k: random_descriptors(60, rng) for k in range(12)}
     pruned, fresh = DescriptorIndex(config), DescriptorIndex(config)
     for k, descriptors in keyframes.items():
@@ -111,7 +111,7 @@ def test_removing_is_as_if_never_added(config: IndexConfig, rng: np.random.Gener
     assert 0 in pruned.votes(keyframes[0]).keyframe_ids
 
 
-def test_excluded_keyframes_do_not_hide_others(rng: np.random.Generator) -> None:
+def test_excluded_keyframes_do_not_displace_others(rng: np.random.Generator) -> None:
     """The best of the rest is compared with the rest only, not with what was excluded."""
     place = random_descriptors(40, rng)
     index = DescriptorIndex()
@@ -121,7 +121,7 @@ def test_excluded_keyframes_do_not_hide_others(rng: np.random.Generator) -> None
     assert index.votes(place, {1}).keyframe_ids.tolist() == [0]
 
 
-def test_empty_and_double_input(rng: np.random.Generator) -> None:
+def test_empty_and_repeated_input(rng: np.random.Generator) -> None:
     index = DescriptorIndex()
     none = random_descriptors(0, rng)
     assert len(index.votes(random_descriptors(5, rng))) == 0
@@ -163,7 +163,7 @@ def test_a_single_hit_or_a_jump_is_not_consistent(rng: np.random.Generator) -> N
     assert [f for f in found if f] == [[0], [4], [7]]
 
 
-def test_recent_and_covisible_keyframes_are_no_candidates(rng: np.random.Generator) -> None:
+def test_recent_and_covisible_keyframes_are_not_candidates(rng: np.random.Generator) -> None:
     place = random_descriptors(80, rng)
     rules = PlaceConfig(recent=2, consistent_queries=1)
     recogniser = PlaceRecogniser(DescriptorIndex(), rules)

@@ -97,7 +97,7 @@ def test_noisy_mirrored_points_give_a_rotation() -> None:
     np.testing.assert_allclose(np.linalg.det(found[:, :3, :3]), 1.0)
 
 
-def test_an_exact_loop_is_exact_and_has_the_right_sign() -> None:
+def test_exact_landmarks_give_the_exact_loop() -> None:
     result = loop(*views(0, noise=0.0))
     np.testing.assert_allclose(result.T_a_b, T_A_B, atol=1e-6)
     assert (result.keyframe_a, result.keyframe_b) == (7, 8)
@@ -118,7 +118,7 @@ def test_exchanging_the_keyframes_inverts_the_loop() -> None:
 
 
 @pytest.mark.parametrize("outliers", [0.3, 0.6])
-def test_outliers_with_the_right_descriptor_do_not_move_it(outliers: float) -> None:
+def test_outliers_with_matching_descriptors_are_rejected(outliers: float) -> None:
     result = loop(*views(2, count=300, outliers=outliers))
     error = se3_log(inverse(T_A_B) @ result.T_a_b)
     assert error @ np.linalg.solve(result.covariance, error) < chi2.ppf(0.999, 6)
@@ -127,7 +127,7 @@ def test_outliers_with_the_right_descriptor_do_not_move_it(outliers: float) -> N
     assert result.inliers > 0.85 * (1 - outliers) * 300
 
 
-def test_landmark_pairs_are_of_a_then_of_b() -> None:
+def test_landmark_pairs_have_ids_of_a_then_b() -> None:
     pairs = loop(*views(3)).landmark_pairs
     np.testing.assert_array_equal(pairs[:, 1] - pairs[:, 0], 1000)
     view_a, view_b = views(3)
@@ -177,7 +177,7 @@ def test_keypoints_without_landmarks_are_found_by_the_pose() -> None:
     assert both.inliers > 170
 
 
-def test_a_view_holds_living_landmarks_with_depth_in_the_camera_frame() -> None:
+def test_a_view_holds_current_landmarks_with_depth_in_the_camera_frame() -> None:
     rng = np.random.default_rng(8)
     world, points = WorldMap(), points_before(T_WORLD_A, 6, rng)
     features = make_features(T_WORLD_A, points, random_descriptors(6, rng))
@@ -199,7 +199,7 @@ def test_another_place_has_no_matches() -> None:
     assert refusal(nothing, view_b).reason is NoLoopReason.FEW_MATCHES
 
 
-def test_like_descriptors_at_other_places_are_no_consensus() -> None:
+def test_equal_descriptors_at_other_positions_give_no_consensus() -> None:
     found = refusal(*views(11, outliers=1.0))
     assert found.reason is NoLoopReason.NO_CONSENSUS
     assert found.value < found.limit

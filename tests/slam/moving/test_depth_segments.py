@@ -26,7 +26,7 @@ def free_in(rows: slice, columns: slice) -> np.ndarray:
     return point_motions[::8, ::8]
 
 
-def test_the_whole_card_moves_if_a_part_does_and_the_floor_stays() -> None:
+def test_a_whole_segment_moves_if_a_part_does_and_the_floor_does_not() -> None:
     regions = depth_segments(scene(), CONFIG)
     moving = regions.moving(free_in(slice(40, 216), slice(80, 104)))
     expected = np.zeros((240, 320), bool)
@@ -49,7 +49,7 @@ def test_little_evidence_moves_nothing(rows: slice, columns: slice) -> None:
     assert not depth_segments(scene(), config).moving(free_in(rows, columns)).any()
 
 
-def test_keypoints_are_on_what_is_as_far_away_as_they_are() -> None:
+def test_keypoints_belong_to_the_segment_of_their_depth() -> None:
     regions = depth_segments(scene(), CONFIG)
     moving = regions.moving(free_in(slice(40, 216), slice(80, 104)))
     pixels = np.array([[120, 100], [163, 100], [163, 100], [163, 100], [200, 100], [75, 60.0]])
@@ -59,7 +59,7 @@ def test_keypoints_are_on_what_is_as_far_away_as_they_are() -> None:
 
 
 @pytest.mark.parametrize("step", [2, 4])
-def test_every_few_pixels_are_covered_where_keypoints_there_are(step: int) -> None:
+def test_coverage_of_sampled_pixels_equals_that_of_keypoints(step: int) -> None:
     regions = depth_segments(scene(), CONFIG)
     space = regions.space(regions.moving(free_in(slice(40, 216), slice(80, 104))))
     few = scene()[::step, ::step]
@@ -91,18 +91,18 @@ BOX, CARD = BOX[::8, ::8], CARD[::8, ::8]
 ROOM = ~BOX & ~CARD
 
 
-def test_what_moves_holds_what_it_touches_and_no_view_spoke_of() -> None:
+def test_unobserved_segments_touching_a_moving_one_are_carried() -> None:
     np.testing.assert_array_equal(held(loaded(), ROOM), BOX)
 
 
-def test_what_was_seen_to_stand_is_not_held() -> None:
+def test_static_segments_are_not_carried() -> None:
     assert not held(loaded(), ROOM | BOX).any()
     lower = BOX.copy()
     lower[:15] = False
     np.testing.assert_array_equal(held(loaded(), ROOM | lower), BOX & ~lower)
 
 
-def test_a_room_that_was_never_seen_is_not_held() -> None:
+def test_a_large_unobserved_segment_is_not_carried() -> None:
     assert not held(loaded(), np.zeros((30, 40))).any()
 
 
@@ -115,11 +115,11 @@ def test_a_room_that_was_never_seen_is_not_held() -> None:
         (1.9, {"largest": 0.15}),  # no single thing any more
     ],
 )
-def test_not_everything_is_held(box_m: float, config: dict[str, float]) -> None:
+def test_not_all_segments_are_carried(box_m: float, config: dict[str, float]) -> None:
     assert held(loaded(box_m), ROOM, **config).sum() < 0.15 * BOX.sum()
 
 
-def test_regions_are_those_of_a_flood_fill() -> None:
+def test_regions_equal_a_flood_fill() -> None:
     rng = np.random.default_rng(3)
     depth_m = rng.choice([1.0, 1.02, 1.5, np.nan], (30, 40)).astype(np.float32)
     regions = depth_segments(depth_m, DepthSegmentConfig(step_px=1, jump=0.03))

@@ -15,7 +15,7 @@ from bmask_slam.system_config import SystemConfig
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data are not here")
-def test_the_man_moves_and_the_room_does_not_by_geometry_alone() -> None:
+def test_a_person_is_found_moving_by_geometry_alone() -> None:
     total = {"man": Count(), "rest": Count()}
     for folder in (DATA / "test1", DATA / "test2"):
         for pair in permutations(read_pair(folder)):
@@ -27,7 +27,7 @@ def test_the_man_moves_and_the_room_does_not_by_geometry_alone() -> None:
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data are not here")
-def test_a_man_put_into_a_frame_hides_and_is_hidden() -> None:
+def test_a_composited_person_occludes_and_is_occluded() -> None:
     man = read_pair(DATA / "test1")[0]
     depth_m = np.full((480, 640), 4.0, np.float32)
     depth_m[:, 320:] = 0.8

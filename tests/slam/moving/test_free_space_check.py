@@ -53,17 +53,19 @@ def verdict(u: float, v: float, z: float, T: Array = T_WORLD_CAMERA) -> int:
         (80, 60, -1.0, PointMotion.UNKNOWN),  # behind the camera
     ],
 )
-def test_judgement(u: float, v: float, z: float, expected: PointMotion) -> None:
+def test_points_are_static_moving_or_unknown(
+    u: float, v: float, z: float, expected: PointMotion
+) -> None:
     assert verdict(u, v, z) == expected
 
 
-def test_an_error_of_the_pose_is_allowed_for() -> None:
+def test_pose_errors_are_tolerated() -> None:
     T_off = T_WORLD_CAMERA @ se3_exp(np.array([0.01, -0.01, 0.02, 0.02, 0.0, 0.02]))
     assert verdict(130, 30, 3.0, T_off) == PointMotion.STATIC
     assert verdict(130, 30, 2.0, T_off) == PointMotion.MOVING
 
 
-def test_against_a_point_by_point_reference() -> None:
+def test_the_check_equals_a_loop_over_points() -> None:
     rng = np.random.default_rng(0)
     pixels, z = rng.uniform(0, [200, 150], (400, 2)) - 20, rng.uniform(0.5, 4, 400)
     points = transform(T_WORLD_CAMERA, CAMERA.backproject(pixels, z))
@@ -92,12 +94,12 @@ def reference(p: Array, depth_m: Array) -> int:
     return int((not holes and abs(near - p[2]) < margin(near)) or abs(far - p[2]) < margin(far))
 
 
-def test_views_decide_by_majority_and_the_silent_do_not_count() -> None:
+def test_views_decide_by_majority_without_unknown_ones() -> None:
     told = np.array([[-1, -1, 0, 1], [-1, 1, 0, 0], [1, 0, 0, 0]], np.int8)
     assert CHECK.agree(told).tolist() == [-1, 0, 0, 1]
 
 
-def test_neighbours_speak_for_the_silent_of_the_same_depth() -> None:
+def test_unknown_points_follow_neighbours_of_the_same_depth() -> None:
     pixels = np.array([[10, 10], [12, 10], [14, 12], [11, 12], [13, 11], [12, 14], [90, 90.0]])
     depth_m = np.array([2.0, 2.0, 2.0, 2.02, 3.0, np.nan, 2.0])
     point_motions = np.array([-1, -1, -1, 0, 0, 0, 0], np.int8)
@@ -116,7 +118,7 @@ def test_neighbours_speak_for_the_silent_of_the_same_depth() -> None:
         ((1.0, 0.95, 0.0), (1.5, 1.2, 0.3), True),
     ],
 )
-def test_a_thing_that_views_show_there_for_long_stood_still(
+def test_points_in_many_views_are_static(
     shares: tuple[float, ...], apart_s: tuple[float, ...], still: bool
 ) -> None:
     point_motions = np.array([np.where(np.arange(100) < 100 * s, 1, -1) for s in shares], np.int8)
@@ -127,7 +129,7 @@ def test_a_thing_that_views_show_there_for_long_stood_still(
     assert not CHECK.stood_still(np.zeros((2, 5), np.int8), np.array([2.0, 3.0]), 1)
 
 
-def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
+def test_the_buffer_keeps_views_spaced_in_time_and_is_restored() -> None:
     memory, other = DepthViewBuffer(3, 0.25), DepthViewBuffer(3, 0.25)
     for k in range(12):
         pose = se3_exp(np.full(6, 0.1 * k)) if k > 3 else None
@@ -148,7 +150,7 @@ def test_memory_keeps_the_last_views_apart_in_time_and_comes_back() -> None:
     assert [bool(v.view.nearest_m.any()) for v in memory.views] == [True, False, True]
 
 
-def test_what_moves_is_not_remembered_but_was_seen() -> None:
+def test_moving_pixels_are_removed_from_stored_views() -> None:
     depth_m = box_before_wall()
     regions = depth_segments(depth_m, DepthSegmentConfig(step_px=8))
     nearer = regions.depth_m < 2.5

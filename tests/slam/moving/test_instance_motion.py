@@ -53,7 +53,7 @@ def track(centre: Array) -> Track:
         ((0.5, 0.2, -2.0), 4.0, False),
     ],
 )
-def test_a_keyframe_shows_a_place_that_nothing_hides(
+def test_a_keyframe_observes_an_unoccluded_position(
     centre: tuple[float, float, float], there_m: float, shown: bool
 ) -> None:
     depth_m = np.full((120, 160), 4.0, np.float32)
@@ -62,6 +62,6 @@ def test_a_keyframe_shows_a_place_that_nothing_hides(
     assert instance_motion().shows(masks(depth_m), track(np.array(centre))) is shown
 
 
-def test_of_a_view_without_depth_nothing_is_shown() -> None:
+def test_a_view_without_depth_observes_nothing() -> None:
     seen = masks(np.full((120, 160), np.nan, np.float32))
     assert not instance_motion().shows(seen, track(np.array([0.0, 0.0, 2.0])))

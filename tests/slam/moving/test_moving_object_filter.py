@@ -114,7 +114,7 @@ def position_error_m(system: SlamSystem) -> float:
     return float(np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1).max())
 
 
-def test_without_any_label_the_card_is_found_once_it_moves(frames: list[Frame]) -> None:
+def test_without_labels_the_card_is_found_when_it_moves(frames: list[Frame]) -> None:
     system = run(frames)
     inside, found, outside, wrong = np.array(system.counts[25:]).sum(axis=0)
     assert inside > 500
@@ -124,13 +124,13 @@ def test_without_any_label_the_card_is_found_once_it_moves(frames: list[Frame]) 
     assert position_error_m(system) < 0.01
 
 
-def test_switched_off_the_card_stays_in_the_map(frames: list[Frame]) -> None:
+def test_without_the_filter_the_card_is_in_the_map(frames: list[Frame]) -> None:
     system = run(frames, settings=["moving_objects.geometry=false"])
     assert np.array(system.counts)[:, 1].sum() == 0
     assert landmarks_on_card(system) > 50
 
 
-def test_a_person_is_left_out_before_moving_and_between_keyframes(frames: list[Frame]) -> None:
+def test_a_person_is_excluded_before_moving_and_between_keyframes(frames: list[Frame]) -> None:
     system = run(frames[:8], label=1, settings=["moving_objects.geometry=false"])
     inside, found, _, wrong = np.array(system.counts[1:]).sum(axis=0)
     assert found > 0.95 * inside > 0
@@ -147,7 +147,7 @@ def standing(frames: int) -> list[Frame]:
     return [replace(f, index=k, timestamp_s=k / 30, name="0") for k, f in enumerate(still)]
 
 
-def test_what_is_called_a_person_and_stands_for_long_is_structure_again() -> None:
+def test_a_person_label_that_is_static_for_long_is_reinstated() -> None:
     system = run(standing(60), label=1, settings=["moving_objects.check.views=12"])
     counts = np.array(system.counts)
     assert counts[1:10, 1].sum() > 0.9 * counts[1:10, 0].sum()
@@ -155,7 +155,7 @@ def test_what_is_called_a_person_and_stands_for_long_is_structure_again() -> Non
     assert landmarks_on_card(system) > 50
 
 
-def test_what_is_called_a_person_and_stands_comes_back_within_half_a_second() -> None:
+def test_a_static_person_label_is_reinstated_within_half_a_second() -> None:
     frames = standing(20)
     system = run(frames, label=1, settings=["moving_objects.static_verification.stands_s=0.3"])
     counts = np.array(system.counts)
@@ -173,7 +173,7 @@ def test_what_is_called_a_person_and_stands_comes_back_within_half_a_second() ->
     assert landmarks_on_card(system) > 0.7 * landmarks_on_card(unmasked) > 50
 
 
-def test_what_frames_showed_standing_before_it_is_called_a_person_is_not_left_out() -> None:
+def test_a_label_on_verified_static_points_is_not_excluded() -> None:
     late = CardSegmenter(1)
     segment = late.segment
     late.segment = lambda image, name: segment(image, "0") if int(name) > 20 else []  # type: ignore
@@ -188,7 +188,7 @@ def test_what_frames_showed_standing_before_it_is_called_a_person_is_not_left_ou
     assert not any(k.masked.any() for k in system.mapper.world.keyframes.values())
 
 
-def test_one_who_walks_is_left_out_all_the_time_though_suspects_are_watched(
+def test_a_walking_person_is_excluded_all_the_time(
     frames: list[Frame],
 ) -> None:
     system = run(frames[8:], label=1, settings=["moving_objects.static_verification.stands_s=0.3"])
@@ -197,7 +197,7 @@ def test_one_who_walks_is_left_out_all_the_time_though_suspects_are_watched(
     assert landmarks_on_card(system) < 5
 
 
-def test_a_person_whom_only_one_keyframe_shows_is_not_looked_for_any_longer() -> None:
+def test_a_person_in_one_keyframe_only_is_dropped() -> None:
     once = CardSegmenter(1)
     segment = once.segment
     once.segment = lambda image, name: segment(image, name) if not calls else []  # type: ignore
@@ -215,7 +215,7 @@ def test_a_person_whom_only_one_keyframe_shows_is_not_looked_for_any_longer() ->
     assert max(left_out[-6:]) == 0
 
 
-def test_landmarks_that_are_found_in_place_stay_until_what_they_are_on_moves(
+def test_landmarks_are_kept_until_their_object_moves(
     frames: list[Frame],
 ) -> None:
     late = CardSegmenter(1)
@@ -233,7 +233,7 @@ def test_landmarks_that_are_found_in_place_stay_until_what_they_are_on_moves(
     assert landmarks_on_card(system) < 0.1 * before
 
 
-def test_what_is_seen_to_stand_still_is_used_in_a_walkers_box_too(frames: list[Frame]) -> None:
+def test_static_points_in_a_moving_box_are_used(frames: list[Frame]) -> None:
     system = run(frames[:8])
     wall = np.array([0.5, 0.0, 2.0])
     someone = Sighting(wall, np.full(3, 0.5), certain(1, len(NAMES), 0.95), 3.0)
@@ -253,13 +253,13 @@ def replaced(system: SlamSystem, geometry: bool) -> SlamSystem:
     return system
 
 
-def test_a_picture_that_hangs_still_is_structure(frames: list[Frame]) -> None:
+def test_a_person_on_a_picture_is_static(frames: list[Frame]) -> None:
     system = run(frames[:8], label=2)
     assert np.array(system.counts)[:, 1].sum() == 0
     assert landmarks_on_card(system) > 50
 
 
-def test_a_mask_that_comes_late_takes_out_what_was_put_in(frames: list[Frame]) -> None:
+def test_a_late_mask_removes_added_observations(frames: list[Frame]) -> None:
     late = CardSegmenter(1)
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), late)
     late.segment = lambda image, name: []  # type: ignore[method-assign]
@@ -278,13 +278,13 @@ def test_a_mask_that_comes_late_takes_out_what_was_put_in(frames: list[Frame]) -
     assert len(system.mapper.smoother.estimate().landmark_ids) < in_graph
 
 
-def test_a_scene_without_anything_that_moves_is_used_whole() -> None:
+def test_a_static_scene_is_used_completely() -> None:
     system = run([view(k, with_card=False) for k in range(20)])
     _, found, _, wrong = np.array(system.counts).sum(axis=0)
     assert found + wrong == 0
 
 
-def test_when_nearly_everything_moves_all_is_used_and_said(frames: list[Frame]) -> None:
+def test_if_nearly_everything_moves_all_is_used_and_reported(frames: list[Frame]) -> None:
     settings = resolve(SystemConfig, None, [*SETTINGS, "moving_objects.min_static=100000"])
     system = SlamSystem(CAMERA, settings)
     results = [system.process(frame) for frame in frames[:24]]
@@ -294,7 +294,7 @@ def test_when_nearly_everything_moves_all_is_used_and_said(frames: list[Frame]) 
 
 
 @pytest.mark.parametrize("settled_share", [0.2, 1.0])
-def test_much_that_is_seen_to_stand_settles_the_doubt(
+def test_many_static_points_override_the_mostly_moving_case(
     frames: list[Frame], settled_share: float
 ) -> None:
     settings = ["moving_objects.doubt_share=0.0", f"moving_objects.settled_share={settled_share}"]
@@ -309,7 +309,7 @@ def test_much_that_is_seen_to_stand_settles_the_doubt(
     assert bool(asked) is (settled_share == 1.0)
 
 
-def test_where_the_prediction_is_far_off_the_room_does_not_move() -> None:
+def test_a_bad_prediction_does_not_make_the_room_move() -> None:
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS))
     for k in range(4):
         system.process(view(k, with_card=False))

@@ -24,7 +24,7 @@ def filled(u_px: float) -> Features:
     return replenishment.replenished(FRAME, FEATURES, moving, lambda others: left_of(u_px, others))
 
 
-def test_others_come_in_place_of_those_left_out() -> None:
+def test_excluded_keypoints_are_replenished() -> None:
     found = filled(280)
     kept = FEATURES.image_pixels[~left_of(280, FEATURES)]
     assert len(kept) < 0.7 * len(FEATURES)
@@ -37,7 +37,7 @@ def test_others_come_in_place_of_those_left_out() -> None:
     assert columns.min() > 0.5 * columns.max()
 
 
-def test_for_a_few_nothing_is_searched() -> None:
+def test_few_excluded_keypoints_are_not_replenished() -> None:
     found = filled(40)
     kept = ~left_of(40, FEATURES)
     assert 0.9 * len(FEATURES) < kept.sum() < len(FEATURES)

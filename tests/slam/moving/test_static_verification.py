@@ -96,7 +96,7 @@ def verified(
     ]
 
 
-def test_what_stands_is_found_after_a_while_and_pending_no_longer() -> None:
+def test_a_static_instance_is_verified_after_a_while() -> None:
     static_verification, world = watching()
     assert verified(static_verification, world, [depth()] * 30) == [13]  # 0.4 s and two frames more
     assert static_verification.pending == []
@@ -111,12 +111,12 @@ def test_what_stands_is_found_after_a_while_and_pending_no_longer() -> None:
     ],
     ids=["sideways", "away", "near"],
 )
-def test_what_walks_a_third_of_a_metre_a_second_is_not(images: list[Array]) -> None:
+def test_a_slow_walker_is_not_verified(images: list[Array]) -> None:
     static_verification, world = watching()
     assert verified(static_verification, world, images) == []
 
 
-def test_noise_and_lost_depth_do_not_make_it_move() -> None:
+def test_noise_and_missing_depth_do_not_prevent_verification() -> None:
     rng = np.random.default_rng(0)
     images = []
     for _ in range(20):
@@ -127,7 +127,7 @@ def test_noise_and_lost_depth_do_not_make_it_move() -> None:
     assert verified(static_verification, world, images) == [13]
 
 
-def test_it_tells_what_was_taken_out_for_it_but_not_what_another_still_covers() -> None:
+def test_removed_observations_are_listed_without_those_under_another_mask() -> None:
     static_verification, world = watching()
     (removed,) = static_verification.pending[0].removed
     assert removed.keypoints.tolist() == [0, 1, 2]
@@ -140,7 +140,7 @@ def test_it_tells_what_was_taken_out_for_it_but_not_what_another_still_covers() 
     assert static_verification.not_pending(found.removed[0]).tolist() == [True] * 3
 
 
-def test_seen_again_it_is_verified_from_the_first_time_on_unless_it_had_moved() -> None:
+def test_verification_counts_from_the_first_observation_unless_it_moved() -> None:
     for moved, since_s, taken in ((False, 0.0, 2), (True, 0.1, 1)):
         static_verification, world = watching()
         world.add_keyframe(keyframe(1))
@@ -151,7 +151,7 @@ def test_seen_again_it_is_verified_from_the_first_time_on_unless_it_had_moved() 
         assert (one.time_s, len(one.removed)) == (since_s, taken)
 
 
-def test_what_is_out_of_view_or_whose_keyframe_was_culled_is_given_up() -> None:
+def test_pending_instances_out_of_view_or_culled_are_dropped() -> None:
     static_verification, world = watching()
     turned = np.eye(4)
     turned[:3, :3] = np.diag([-1, 1, -1])
@@ -166,7 +166,7 @@ def test_what_is_out_of_view_or_whose_keyframe_was_culled_is_given_up() -> None:
     assert static_verification.pending == []
 
 
-def test_a_restored_state_goes_on_as_if_nothing_had_happened() -> None:
+def test_a_restored_state_continues_identically() -> None:
     static_verification, world = watching()
     world.add_keyframe(keyframe(1))
     add(static_verification, world, masks_of(400, 1), track(9))
@@ -197,7 +197,7 @@ def test_a_restored_state_goes_on_as_if_nothing_had_happened() -> None:
     ],
     ids=["before", "after", "too-recent", "sideways", "away", "hidden"],
 )
-def test_frames_before_or_after_show_that_it_stood(
+def test_earlier_or_later_frames_verify_an_instance(
     left: int, body_m: float, from_s: float, stood: bool
 ) -> None:
     static_verification, now_s, masks = StaticVerification(CHECK, CONFIG, 20, 5), 5.0, masks_of()
@@ -215,12 +215,12 @@ def same(a: Arrays, b: Arrays) -> None:
         np.testing.assert_array_equal(a[key], b[key], err_msg=key)
 
 
-def test_switched_off_nothing_is_pending() -> None:
+def test_without_verification_nothing_is_pending() -> None:
     static_verification, _ = watching(StaticVerificationConfig(stands_s=0))
     assert static_verification.pending == []
 
 
-def test_values_without_sense_are_refused() -> None:
+def test_impossible_values_are_rejected() -> None:
     for wrong in (
         {"stands_s": -1},
         {"share": 0},

@@ -141,7 +141,7 @@ def test_counts_and_broken_frames_are_carried_over(sequence: Path, tmp_path: Pat
     assert "checkpoint after 18 frames" in log
 
 
-def test_nothing_is_saved_or_restarted_without_being_asked(sequence: Path, tmp_path: Path) -> None:
+def test_nothing_is_saved_or_restarted_without_the_option(sequence: Path, tmp_path: Path) -> None:
     systems: list[FakeSystem] = []
 
     def make(*arguments: object) -> FakeSystem:
@@ -153,7 +153,7 @@ def test_nothing_is_saved_or_restarted_without_being_asked(sequence: Path, tmp_p
     assert [system.restarts for system in systems] == [0, 5]  # begin, 6, 12, 18, end
 
 
-def test_a_finished_run_is_left_alone(sequence: Path, tmp_path: Path) -> None:
+def test_a_finished_run_is_not_changed(sequence: Path, tmp_path: Path) -> None:
     run(options(sequence, tmp_path / "out"), FakeSystem)
     before = {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
     assert sorted(path.name for path in before) == sorted(FILES)
@@ -161,7 +161,7 @@ def test_a_finished_run_is_left_alone(sequence: Path, tmp_path: Path) -> None:
     assert {path: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
 
 
-def test_a_stopped_run_is_whole_and_can_go_on(sequence: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_is_complete_and_can_be_resumed(sequence: Path, tmp_path: Path) -> None:
     stopped = partial(FakeSystem, on_frame=signal_at(9, signal.SIGINT))
     summary = run(options(sequence, tmp_path / "out"), stopped)
     assert (summary.stopped_by, summary.frames, summary.resumable) == (signal.SIGINT, 10, True)
@@ -219,7 +219,7 @@ def test_other_options_are_refused(begun: Path, refused) -> None:
     refused(r"config\.yaml: not the configuration that checkpoint was made with")
 
 
-def test_a_frames_file_that_is_not_the_checkpoints_is_refused(begun: Path, refused) -> None:
+def test_a_frames_file_of_another_run_is_rejected(begun: Path, refused) -> None:
     whole = (begun / "frames.csv").read_text()
     (begun / "frames.csv").write_text(whole[:300])
     refused(r"frames\.csv: not the file of the checkpoint, which has at least \d+ bytes")

@@ -63,7 +63,7 @@ def largest_error_m(results: list[FrameResult], poses: list[Array]) -> float:
     return float(np.linalg.norm(offsets, axis=1).max())
 
 
-def test_a_second_session_goes_on_in_the_frame_of_the_map(state: Arrays) -> None:
+def test_a_second_session_continues_in_the_map_frame(state: Arrays) -> None:
     system, poses = started(state), sideways(30, -1.3, 0.05)
     results = process_frames(system, poses)  # most of it beyond what the map knows
     system.finish()
@@ -77,7 +77,7 @@ def test_a_second_session_goes_on_in_the_frame_of_the_map(state: Arrays) -> None
     assert {0, *made} <= set(system.mapper.world.keyframes)
 
 
-def test_what_is_not_recognised_is_a_segment_until_it_is(state: Arrays, caplog) -> None:
+def test_an_unrecognised_start_is_a_segment_until_recognised(state: Arrays, caplog) -> None:
     system, poses = started(state), sideways(46, 1.5, -0.06)
     results = process_frames(system, poses[:10])
     assert {r.segment for r in results} == {1}
@@ -92,7 +92,7 @@ def test_what_is_not_recognised_is_a_segment_until_it_is(state: Arrays, caplog) 
     assert largest_error_m(results[-1:], poses[-1:]) < 0.02
 
 
-def test_a_session_elsewhere_says_that_it_has_a_frame_of_its_own(state: Arrays, caplog) -> None:
+def test_a_session_elsewhere_reports_its_own_frame(state: Arrays, caplog) -> None:
     system = started(state)
     process_frames(system, sideways(6, 1.5))
     system.finish()
@@ -123,7 +123,7 @@ def part_of_state(state: Arrays) -> Arrays:
     return {k: a for k, a in state.items() if k.startswith(kept) and not k.endswith(counters)}
 
 
-def test_localisation_elsewhere_is_lost_and_says_so(state: Arrays) -> None:
+def test_localisation_elsewhere_is_lost_and_reported(state: Arrays) -> None:
     system = started(state, MapLocalisation)
     poses = [*sideways(3, 1.6), *sideways(5, -1.4)]
     results = process_frames(system, poses)
@@ -141,7 +141,7 @@ def test_a_map_is_read_back_from_file_and_folder(state: Arrays, tmp_path: Path) 
         assert all(found[name].tobytes() == array.tobytes() for name, array in state.items())
 
 
-def test_maps_that_are_none_are_refused(state: Arrays, tmp_path: Path) -> None:
+def test_files_that_are_not_maps_are_rejected(state: Arrays, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"map: there is no saved map here"):
         read_map(tmp_path)
     write_map(tmp_path / "map", SlamSystem(CAMERA).state(), CAMERA)
@@ -194,7 +194,7 @@ def cut_out(folder: Path, frames: range, margin_px: int = 0) -> Path:
 
 
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="no ../shared/data/redkitchen here")
-def test_real_frames_go_on_and_are_localised_in_one_frame(tmp_path: Path) -> None:
+def test_real_frames_continue_and_are_localised_in_one_frame(tmp_path: Path) -> None:
     first = cut_out(tmp_path / "first", range(36))
     run(RunOptions(first, out=tmp_path / "old", quiet=True))
     saved = (tmp_path / "old/map").read_bytes()

@@ -67,7 +67,7 @@ def fake_run(sequence: Path, out: Path, **options: object) -> RunSummary:
     return run(RunOptions(sequence, out=out, quiet=True, **options), FakeSystem)
 
 
-def test_a_run_leaves_the_whole_contract(sequence: Path, out: Path) -> None:
+def test_a_run_writes_all_documented_files(sequence: Path, out: Path) -> None:
     config = SystemConfig(tracking=TrackingConfig(min_inliers=41))
     summary = fake_run(sequence, out, config=config)
     assert sorted(p.name for p in out.iterdir()) == sorted(FILES)  # and nothing temporary
@@ -114,7 +114,7 @@ def test_landmarks_are_read_back(sequence: Path, out: Path) -> None:
     assert columns["id"].tolist() == [3, 8]
 
 
-def test_metrics_are_these_and_right(sequence: Path, out: Path) -> None:
+def test_metrics_are_complete_and_correct(sequence: Path, out: Path) -> None:
     options = RunOptions(sequence, out=out, quiet=True)
     summary = run(options, partial(FakeSystem, z_error_m=0.02))
     found = values(summary)
@@ -150,7 +150,7 @@ def test_a_broken_frame_is_skipped_and_counts_as_untracked(sequence: Path, out: 
     assert "frame 4 skipped" in (out / "log.txt").read_text()
 
 
-def test_what_was_found_while_opening_is_in_the_log(sequence: Path, out: Path) -> None:
+def test_warnings_at_opening_are_in_the_log(sequence: Path, out: Path) -> None:
     (sequence / "rgb/4.png").unlink()
     with (sequence / "rgb.txt").open("a") as file:
         file.write("77.0 rgb/1.png\n")
@@ -170,7 +170,7 @@ def test_another_reference(sequence: Path, out: Path, tmp_path: Path) -> None:
     assert found["ate_rmse"] == pytest.approx(0.03, rel=0.02)
 
 
-def test_a_reference_of_another_time_is_refused_first(
+def test_a_reference_of_another_time_is_rejected_before_the_run(
     sequence: Path, out: Path, tmp_path: Path
 ) -> None:
     truth = true_trajectory(20)
@@ -180,7 +180,7 @@ def test_a_reference_of_another_time_is_refused_first(
     assert not out.exists()
 
 
-def test_a_run_without_any_pose_still_ends_well(sequence: Path, out: Path, caplog) -> None:
+def test_a_run_without_poses_finishes(sequence: Path, out: Path, caplog) -> None:
     class Lost(FakeSystem):
         def prepare(self, frame):
             return 6  # a number that is lost
@@ -223,7 +223,7 @@ def test_a_second_interrupt_quits_at_once(sequence: Path, out: Path) -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_killed_run_leaves_what_it_had(tmp_path: Path, out: Path) -> None:
+def test_a_killed_run_keeps_its_written_frames(tmp_path: Path, out: Path) -> None:
     sequence = make_sequence(tmp_path / "seq", 50)
     code = (
         "import sys; from functools import partial; from pathlib import Path; import signal\n"
@@ -255,7 +255,9 @@ def test_too_many_broken_frames_keep_what_was_tracked(sequence: Path, out: Path)
     assert "stopped: " in (out / "log.txt").read_text()
 
 
-def test_a_refusal_before_the_first_frame_leaves_nothing(sequence: Path, tmp_path: Path) -> None:
+def test_an_input_error_before_the_first_frame_leaves_no_folder(
+    sequence: Path, tmp_path: Path
+) -> None:
     def refuse(k: int) -> None:
         raise InputError("first frame unusable")
 
@@ -278,7 +280,7 @@ def test_a_bug_is_in_the_log_with_its_traceback(sequence: Path, out: Path) -> No
     assert logging.getLogger("bmask_slam").handlers == []
 
 
-def test_a_full_disk_is_said_and_keeps_what_was_written(sequence: Path, out: Path) -> None:
+def test_a_full_disk_is_reported_and_written_files_are_kept(sequence: Path, out: Path) -> None:
     class Full(FakeSystem):
         def save(self, path: Path, name: str) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")

@@ -86,7 +86,9 @@ def test_report_and_off_change_nothing(late_depth: Path, tmp_path: Path) -> None
     ("change_ms", "sigma_ms", "differs"),
     [(20.0, 1.0, True), (-14.0, 2.0, True), (2.0, 1.0, False), (20.0, 6.0, False), (60, 1, False)],
 )
-def test_only_what_is_sure_differs(change_ms: float, sigma_ms: float, differs: bool) -> None:
+def test_only_observable_parameters_are_changed(
+    change_ms: float, sigma_ms: float, differs: bool
+) -> None:
     found = np.where(np.arange(13) == TIME, 1e-3 * change_ms, 0.0)
     estimate = Estimate(
         np.zeros(13),
@@ -134,7 +136,7 @@ def test_a_found_camera_is_adopted() -> None:
     assert SelfCalibration(camera, other).adopted
 
 
-def test_two_rounds_show_what_a_run_tends_to() -> None:
+def test_two_rounds_are_extrapolated() -> None:
     """A run that is off by d finds a camera that is off by a share of d."""
     truth, share = 0.026, 0.4
 

@@ -37,7 +37,7 @@ def test_frames_move_with_the_world_when_all_keyframes_do() -> None:
     np.testing.assert_allclose(carried.poses_world_camera, T @ poses, atol=1e-12)
 
 
-def test_a_keyframes_frame_moves_with_it_and_frames_between_are_blended() -> None:
+def test_frames_move_with_their_keyframes_interpolated_between() -> None:
     """Two keyframes turn about their own centres and shift; the frame halfway gets the half."""
     poses = make_pose(np.eye(3), np.arange(5.0)[:, None] * [1.0, 0, 0])
     turn = so3_exp(np.array([0, 0.2, 0]))
@@ -85,7 +85,7 @@ def value(run_folder: Path, name: str) -> float:
     return {row["name"]: row["value"] for row in rows}[name]
 
 
-def test_a_run_folder_becomes_a_better_one(capsys, kitchen: Path, tmp_path: Path) -> None:
+def test_an_adjusted_run_folder_is_more_accurate(capsys, kitchen: Path, tmp_path: Path) -> None:
     before = {p.name: p.read_bytes() for p in kitchen.iterdir()}
     out = tmp_path / "adjusted"
     assert optimise(kitchen, "--out", out, "--reference", KITCHEN) == 0
@@ -104,7 +104,7 @@ def test_a_run_folder_becomes_a_better_one(capsys, kitchen: Path, tmp_path: Path
     assert cli.main(["evaluate", str(out), "--reference", str(KITCHEN)]) == 0
 
 
-def test_keyframes_landmarks_and_graph_fit_together(kitchen: Path, tmp_path: Path) -> None:
+def test_keyframes_landmarks_and_graph_are_consistent(kitchen: Path, tmp_path: Path) -> None:
     out = tmp_path / "adjusted"
     assert optimise(kitchen, "--out", out, "--quiet") == 0
     tables, _ = read_graph(out / "graph")

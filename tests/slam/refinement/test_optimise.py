@@ -34,7 +34,7 @@ def file(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("method", ["lm", "dogleg", "gnc"])
 @pytest.mark.parametrize("vertices", [True, False])
-def test_a_closed_walk_is_found(
+def test_the_optimum_of_a_closed_walk_is_found(
     capsys, file: Path, tmp_path: Path, method: str, vertices: bool
 ) -> None:
     file.write_text(square_text(vertices=vertices))
@@ -53,7 +53,7 @@ def test_a_closed_walk_is_found(
     assert matplotlib.image.imread(plot).std() > 0.02
 
 
-def test_wrong_loops_are_left_out_of_the_output(capsys, file: Path, tmp_path: Path) -> None:
+def test_wrong_loops_are_not_in_the_output(capsys, file: Path, tmp_path: Path) -> None:
     file.write_text(square_text(wrong=True))
     out, plot = tmp_path / "out.g2o", tmp_path / "out.svg"
     words = ["optimise", file, "--out", out, "--method", "gnc", "--plot", plot]
@@ -96,7 +96,7 @@ def test_quiet_prints_only_the_path(capsys, file: Path, tmp_path: Path) -> None:
         ([".", "--out", "b", "--method", "gnc"], "--method gnc: is of pose graphs"),
     ],
 )
-def test_one_line_says_what_is_wrong(
+def test_errors_are_one_line(
     capsys, file: Path, monkeypatch, words: list[str], message: str
 ) -> None:
     monkeypatch.chdir(file.parent)

@@ -16,7 +16,7 @@ from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.semantics.objects.object_map import pixel_rays
 
 
-def test_boxes_hold_the_pixels_of_their_objects_tightly(tmp_path: Path) -> None:
+def test_boxes_fit_the_pixels_of_their_objects(tmp_path: Path) -> None:
     config = RenderConfig("office", frames=3, width=160, height=120, noise=False, fps=2.0, people=1)
     folder = render_sequence(config, tmp_path / "office")
     objects = json.loads((folder / OBJECTS_TRUTH).read_text())["objects"]

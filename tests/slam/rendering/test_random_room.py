@@ -51,7 +51,7 @@ def _built(seed: int) -> SceneBuilder:
     return builder
 
 
-def test_a_seed_gives_one_room_and_another_seed_another() -> None:
+def test_rooms_depend_on_the_seed_only() -> None:
     first, again, other = (_built(seed) for seed in (5, 5, 6))
     assert first.categories == again.categories != other.categories
     assert len(first.parts) == len(again.parts)
@@ -111,7 +111,7 @@ def test_the_camera_keeps_half_a_metre_from_everything(rooms: list[RandomRoom]) 
         assert T[:, 2, 3].min() > 0.95 and T[:, 2, 3].max() < 1.8
 
 
-def test_the_camera_comes_round_and_looks_at_every_wall(rooms: list[RandomRoom]) -> None:
+def test_the_camera_views_every_wall(rooms: list[RandomRoom]) -> None:
     for seed, room in enumerate(rooms):
         T = camera_poses(room.path, 10.0, seed)
         # From rest within a second: half a second is missing at the end.
@@ -136,7 +136,7 @@ def test_every_class_occurs(rooms: list[RandomRoom]) -> None:
     assert "person" in builder.categories
 
 
-def test_people_stand_clear_of_furniture_and_sit_facing_the_desk(rooms: list[RandomRoom]) -> None:
+def test_people_do_not_intersect_furniture_and_face_the_desk(rooms: list[RandomRoom]) -> None:
     seats = 0
     for room in rooms:
         assert len(room.roles) >= 2
@@ -163,7 +163,7 @@ def test_wall_frames_look_into_the_room() -> None:
         assert 0 <= (T @ pose(length, 0))[0, 3] <= 5.0 + 1e-9
 
 
-def test_a_turned_rectangle() -> None:
+def test_corners_of_a_rotated_rectangle() -> None:
     assert moved_rect((0, 0, 2, 1), pose(10, 20, 0, 90)) == pytest.approx((9, 20, 10, 22))
     points = np.array([[0.5, 0.5], [2.0, 0.5], [4.0, 5.0]])
     np.testing.assert_allclose(distance_m((0, 0, 1, 1), points), [0, 1, 5])

@@ -168,7 +168,7 @@ def test_annotations_agree_with_the_instance_pictures(sequence: Path) -> None:
             assert mask[y : y + h, x : x + w].sum() == mask.sum() == mark["area"]
 
 
-def test_people_are_seen_and_labelled(sequence: Path) -> None:
+def test_people_are_visible_and_labelled(sequence: Path) -> None:
     content = json.loads((sequence / "annotations.json").read_text())
     assert any(a["category_id"] == PERSON and a["area"] > 100 for a in content["annotations"])
 
@@ -199,7 +199,7 @@ def test_same_configuration_gives_the_same_bytes(sequence: Path, tmp_path: Path)
     assert not different and not broken
 
 
-def test_late_depth_is_that_of_a_later_camera(tmp_path: Path) -> None:
+def test_delayed_depth_is_rendered_from_a_later_pose(tmp_path: Path) -> None:
     """At 30 Hz, depth 33.3 ms late is the next frame's; colour stays as it is."""
     config = {"frames": 3, "width": 160, "height": 120, "noise": False, "sweeping": True}
     on_time, late = (

@@ -10,7 +10,7 @@ from bmask_slam.rendering.rooms import crowded_office
 from bmask_slam.rendering.things.walks import Escort
 
 
-def test_escorts_keep_their_places_before_the_camera_and_look_where_they_walk() -> None:
+def test_escorts_keep_their_position_before_the_camera_and_face_forward() -> None:
     escorts = [role for role in crowded_office.ROLES if role.escorts]
     assert len(escorts) == 2
     for role in escorts:

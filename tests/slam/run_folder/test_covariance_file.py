@@ -67,7 +67,7 @@ def test_bad_files_are_refused_with_line_and_cure(tmp_path: Path, change, text: 
         read_covariances(tmp_path / "elsewhere.txt")
 
 
-def test_a_run_is_less_sure_the_farther_it_has_gone(tmp_path: Path) -> None:
+def test_uncertainty_grows_along_the_path(tmp_path: Path) -> None:
     system = SlamSystem(CAMERA, SystemConfig(covariances=True))
     for i in range(30):
         system.process(render_plane(se3_exp(np.array([0, 0, 0, -0.6 + 0.05 * i, 0, 0])), i))

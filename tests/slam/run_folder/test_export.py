@@ -111,7 +111,7 @@ def test_points(run: Path, tmp_path: Path) -> None:
         (["kitti.txt", "--format", "tum", "--out", "a"], "has no stamps; give them with --times"),
     ],
 )
-def test_one_line_says_what_is_wrong(
+def test_errors_are_one_line(
     capsys, run: Path, monkeypatch, words: list[str], message: str
 ) -> None:
     monkeypatch.chdir(run.parent)

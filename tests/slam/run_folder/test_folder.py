@@ -23,7 +23,7 @@ def test_a_folder_that_holds_a_run_is_refused_untouched(tmp_path: Path, name: st
     assert (tmp_path / name).read_text() == "earlier"
 
 
-def test_overwrite_removes_the_run_and_nothing_else(tmp_path: Path) -> None:
+def test_overwrite_removes_only_the_run(tmp_path: Path) -> None:
     (tmp_path / "graph").mkdir()
     (tmp_path / "graph/values").write_text("earlier")
     (tmp_path / "metrics.json").write_text("earlier")
@@ -33,7 +33,7 @@ def test_overwrite_removes_the_run_and_nothing_else(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["frames.csv", "log.txt", "notes.txt"]
 
 
-def test_a_file_in_the_way(tmp_path: Path) -> None:
+def test_a_file_at_the_run_folders_path(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"file: is a file; choose another folder with --out"):
         RunFolder(tmp_path / "file")
@@ -48,7 +48,7 @@ def test_a_folder_without_permission(tmp_path: Path) -> None:
         RunFolder(tmp_path / "run")
 
 
-def test_a_place_where_nobody_may_write() -> None:
+def test_a_folder_that_cannot_be_written() -> None:
     with pytest.raises(InputError, match=r"/proc/run: cannot be written"):
         RunFolder(Path("/proc/run"))
 
@@ -66,7 +66,7 @@ def test_an_unknown_stage_is_a_bug(tmp_path: Path) -> None:
         folder.write_frame(result)
 
 
-def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_file_is_replaced_completely_or_not_at_all(tmp_path: Path) -> None:
     with RunFolder(tmp_path) as folder:
         folder.write_text("metrics.json", "old")
         with pytest.raises(TypeError):

@@ -12,7 +12,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.run_folder.map_file import read_run
 
 
-def test_a_run_whose_images_show_nothing_has_metrics_but_no_poses(tmp_path: Path) -> None:
+def test_a_run_on_blank_images_has_metrics_but_no_poses(tmp_path: Path) -> None:
     found = run(make_sequence(tmp_path / "seq", 4), tmp_path / "run")
     assert found.frames.status == ("LOST",) * 4
     assert found.metrics["tracked_share"].value == 0

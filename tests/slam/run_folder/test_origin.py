@@ -22,7 +22,7 @@ def write(run: Path, sequence: object) -> None:
     (run / "config.yaml").write_text(f"# bmask-slam 0.1.0, sequence {sequence}, stride 3\n{{}}\n")
 
 
-def test_what_is_written_is_absolute_and_reads_back(run, tmp_path, monkeypatch) -> None:
+def test_the_sequence_path_is_absolute_and_read_back(run, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     (run / "config.yaml").write_text(f"# {Origin(Path('hall'), 3)}\n{{}}\n")
     monkeypatch.chdir("/")
@@ -43,7 +43,7 @@ def test_a_relative_sequence_of_an_older_run_is_found_from_elsewhere(
 
 
 @pytest.mark.parametrize("sequence", ["/nowhere", "nowhere"])
-def test_a_sequence_that_is_not_there_is_named_with_the_cure(run, sequence) -> None:
+def test_a_missing_sequence_is_reported_with_the_cure(run, sequence) -> None:
     write(run, sequence)
     with pytest.raises(
         InputError, match=f"names '{sequence}', which is not there; give the folder"

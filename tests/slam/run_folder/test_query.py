@@ -46,7 +46,7 @@ def run(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_objects_are_read_back_as_they_were(run: Path) -> None:
+def test_objects_are_read_back(run: Path) -> None:
     names, objects = read_objects(run)
     assert names == ("unknown", "chair", "desk", "cup")
     assert [o.id for o in objects] == [0, 1, 4]
@@ -59,7 +59,7 @@ def test_objects_are_read_back_as_they_were(run: Path) -> None:
     assert o.landmarks.tolist() == [7, 9]
 
 
-def test_the_surest_comes_first(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_most_certain_object_is_first(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     answer = query(run, "chair")
     assert [o.id for o in answer.objects] == [4, 0]
     assert answer.counts == {"chair": 2, "desk": 1}
@@ -72,7 +72,7 @@ def test_the_surest_comes_first(run: Path, capsys: pytest.CaptureFixture[str]) -
     assert second.endswith("0-2, 5")
 
 
-def test_only_the_surest_objects_are_listed_unless_all_are_asked_for(
+def test_only_the_most_certain_objects_are_listed_without_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     things = [thing(k, 1 + k % 3, 0.5 + k / 100, [k]) for k in range(12)]
@@ -88,7 +88,7 @@ def test_only_the_surest_objects_are_listed_unless_all_are_asked_for(
     assert len(capsys.readouterr().out.splitlines()) == 5
 
 
-def test_labels_that_are_not_there(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_labels_in_a_query(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no cup; the run holds chair (2), desk (1)" in format_answer(query(run, "cup"))
     assert main(["query", str(run), "horse"]) == 1
     error = capsys.readouterr().err
@@ -107,7 +107,7 @@ def test_runs_without_objects_or_with_broken_ones(run: Path, tmp_path: Path) -> 
             query(run, "chair")
 
 
-def test_boxes_are_a_line_set(run: Path) -> None:
+def test_boxes_are_written_as_lines(run: Path) -> None:
     head, body = (run / BOXES).read_text().split("end_header\n")
     assert "element vertex 24" in head
     assert "element edge 36" in head

@@ -110,7 +110,7 @@ def test_label_distributions_belong_to_the_landmarks(labelled: Run) -> None:
     assert np.array(labelled.label_names)[p.argmax(axis=1)].tolist() == landmarks.labels.tolist()
 
 
-def test_objects_stand_among_their_landmarks(labelled: Run) -> None:
+def test_objects_are_near_their_landmarks(labelled: Run) -> None:
     landmarks = labelled.landmarks
     assert {"desk", "screen"} <= {o.label for o in labelled.objects}
     for thing in labelled.objects:
@@ -177,7 +177,7 @@ def killed(tmp_path: Path, **options: int) -> Run:
     return Run(tmp_path / "run")
 
 
-def test_a_killed_run_gives_what_is_there(tmp_path: Path) -> None:
+def test_a_killed_run_gives_its_written_parts(tmp_path: Path) -> None:
     found = killed(tmp_path)
     assert not found.is_finished
     assert len(found.frames) == 41
@@ -196,7 +196,7 @@ def test_a_killed_run_with_a_checkpoint_can_be_finished(tmp_path: Path) -> None:
         _ = found.landmarks
 
 
-def test_a_cut_off_last_line_of_frames_is_passed_over(known: Run) -> None:
+def test_an_incomplete_last_line_of_frames_is_skipped(known: Run) -> None:
     path = known.path / "frames.csv"
     os.truncate(path, path.stat().st_size - 7)
     assert len(known.frames) == 19
@@ -244,7 +244,7 @@ def test_a_label_without_a_name_is_refused(labelled: Run, tmp_path: Path) -> Non
         _ = Run(tmp_path).landmarks
 
 
-def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:
+def test_other_folders_than_runs_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nowhere: no such folder; give the folder of a run"):
         Run(tmp_path / "nowhere")
     with pytest.raises(InputError, match="holds no run; make one by: bmask-slam run SEQUENCE"):

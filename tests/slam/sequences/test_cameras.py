@@ -181,13 +181,13 @@ def test_a_preset_alone_is_a_camera_where_intrinsics_are_published(tmp_path, cap
         find_camera(tmp_path, Path("kinectv1"))
 
 
-def test_a_device_keeps_its_own_calibration():
+def test_a_device_overrides_the_preset():
     own = Camera(640, 480, 611.0, 612.0, 320.0, 240.0)
     camera = given_camera(Path("xtion"), own)
     assert (camera.fx, camera.rolling_shutter_s) == (611.0, 0.0248)
 
 
-def test_the_table_of_presets_is_possible():
+def test_all_presets_are_valid_cameras():
     assert {name for _, name in FOLDERS} <= set(PRESETS)
     for name, preset in PRESETS.items():
         if preset.nominal is not None:

@@ -55,7 +55,7 @@ def test_a_stamp_that_does_not_go_forward_is_refused(last_stamp_s: float) -> Non
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_zero_depth_becomes_nan_and_the_callers_array_stays(dtype: Any) -> None:
+def test_zero_depth_becomes_nan_in_a_copy(dtype: Any) -> None:
     given = with_depth(0.0, dtype)
     given[0, 0] = np.nan
     before = given.copy()

@@ -83,7 +83,7 @@ def test_early_stop_wastes_no_work(folder):
     assert prepared == [0, 1]
 
 
-def test_exceptions_cross_over(folder):
+def test_exceptions_are_passed_to_the_consumer(folder):
     def prepare(frame):
         if frame.index == 3:
             raise ZeroDivisionError("from prepare")

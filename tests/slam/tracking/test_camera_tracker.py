@@ -63,7 +63,7 @@ def scene(map_reader: StillMap | None = None) -> tuple[CameraTracker, RecordingT
     return camera_tracker, tracker, features
 
 
-def test_the_camera_is_expected_to_go_on_in_its_own_frame() -> None:
+def test_the_motion_model_continues_in_the_camera_frame() -> None:
     camera_tracker, tracker, features = scene()
     camera_tracker.update_motion(T_NEW_OLD, T_NEW_OLD, NO_IDS)
     camera_tracker.update_motion(T_NEW_OLD @ STEP, T_NEW_OLD @ STEP, NO_IDS)
@@ -75,7 +75,7 @@ def test_the_camera_is_expected_to_go_on_in_its_own_frame() -> None:
     ("stamp_s", "steps"),
     [(2.0, 1.0), (2.1, 1.0), (3.0, 2.0), (1.5, 0.5), (60.0, 4.0), (0.5, 0.0), (-60.0, 0.0)],
 )
-def test_a_frame_that_comes_later_is_expected_farther_on(stamp_s: float, steps: float) -> None:
+def test_the_prediction_is_proportional_to_the_time(stamp_s: float, steps: float) -> None:
     camera_tracker, tracker, features = scene()
     for time_s, pose in ((0.0, T_NEW_OLD), (1.0, T_NEW_OLD @ STEP)):
         camera_tracker.begin_frame(time_s)
@@ -86,7 +86,7 @@ def test_a_frame_that_comes_later_is_expected_farther_on(stamp_s: float, steps: 
     assert np.allclose(tracker.predictions[-1], T_NEW_OLD @ STEP @ ahead)
 
 
-def test_the_speed_is_of_tracking_the_place_of_the_optimised_keyframe() -> None:
+def test_the_velocity_is_of_tracking_and_the_pose_of_the_optimised_keyframe() -> None:
     camera_tracker, tracker, features = scene()
     correction = se3_exp(np.array([0, 0, 0, 0.01, 0.02, 0.0]))
     camera_tracker.update_motion(np.eye(4), np.eye(4), NO_IDS)
@@ -95,7 +95,7 @@ def test_the_speed_is_of_tracking_the_place_of_the_optimised_keyframe() -> None:
     assert np.allclose(tracker.predictions[-1], correction @ STEP @ STEP)
 
 
-def test_the_tracker_is_told_where_the_camera_was_a_moment_ago() -> None:
+def test_the_tracker_gets_the_previous_pose() -> None:
     camera_tracker, tracker, features = scene()
     correction = se3_exp(np.array([0, 0, 0, 0.01, 0.02, 0.0]))
     for stamp_s in (5.00, 5.04, 6.00):
@@ -114,7 +114,7 @@ def test_the_tracker_is_told_where_the_camera_was_a_moment_ago() -> None:
     assert before_lost is not None and lost_already is None
 
 
-def test_a_lost_camera_is_expected_where_it_was_last_seen() -> None:
+def test_a_lost_camera_is_predicted_at_its_last_pose() -> None:
     camera_tracker, tracker, features = scene()
     camera_tracker.update_motion(np.eye(4), np.eye(4), NO_IDS)
     camera_tracker.update_motion(STEP, STEP, NO_IDS)

@@ -76,13 +76,13 @@ def test_the_papers_rule_with_the_printed_numbers(change: dict[str, float], is_d
     assert reason == ("Algorithm 2" if is_due else "")
 
 
-def test_less_need_never_be_new_sooner_than_late() -> None:
+def test_fewer_matches_never_delay_a_keyframe() -> None:
     always = replace(ORB, max_shared=2.0)
     late = replace(DUE, frames_since=30, shared=1.0)
     assert keyframe_reason(late, always) == "new view"
 
 
-def test_the_default_rule_is_orb_slams() -> None:
+def test_the_default_rule_equals_orb_slams() -> None:
     assert KeyframeConfig().rule == "orb"
     assert keyframe_reason(DUE, ORB) == keyframe_reason(
         DUE, replace(KeyframeConfig(), max_shared=0.7)

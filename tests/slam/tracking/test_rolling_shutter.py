@@ -47,13 +47,13 @@ def scene(count: int = 200) -> Array:
     return points_before(T_WORLD_CAMERA, count, np.random.default_rng(1))
 
 
-def test_velocities_are_those_of_a_camera_that_moves_a_little() -> None:
+def test_velocities_equal_finite_differences_of_a_moving_camera() -> None:
     points, h = points_before(np.eye(4), 20, np.random.default_rng(0)), 1e-6
     later, earlier = (transform(inverse(se3_exp(s * h * TWIST)), points) for s in (1, -1))
     np.testing.assert_allclose(velocities(points, TWIST), (later - earlier) / (2 * h), atol=1e-8)
 
 
-def test_keypoints_go_to_where_one_moment_shows_them() -> None:
+def test_keypoints_are_moved_to_a_common_time() -> None:
     points = scene()
     features, T = exposed(points, 0.025)
     truth = CAMERA.project_stereo(transform(inverse(T), points))
@@ -71,7 +71,7 @@ def test_keypoints_go_to_where_one_moment_shows_them() -> None:
     assert error_px(0.025, -TWIST) > 6
 
 
-def test_a_keypoint_without_depth_moves_as_at_the_usual_depth() -> None:
+def test_a_keypoint_without_depth_moves_as_at_the_median_depth() -> None:
     points = scene()
     features, _ = exposed(points, 0.025)
     whole = at_one_moment(features, ROLLING, Motion(TWIST, 0.1))
@@ -100,7 +100,7 @@ def test_the_motion_is_that_since_the_previous_pose() -> None:
     np.testing.assert_allclose(motion.twist, TWIST, atol=1e-9)
 
 
-def test_the_velocity_is_found_from_what_is_seen() -> None:
+def test_the_velocity_is_found_from_matches() -> None:
     """In two steps from an error of 0.2 rad/s and 0.1 m/s, by a prior that hardly holds it back."""
     points = scene(300)
     features, T = exposed(points, 0.025)

@@ -66,7 +66,7 @@ def off(angle_deg: float, shift_m: float, rng: np.random.Generator) -> Array:
 
 
 @pytest.mark.parametrize(("angle_deg", "shift_m"), [(0.0, 0.0), (1.0, 0.02), (3.0, 0.05)])
-def test_the_pose_is_recovered_among_strangers(angle_deg: float, shift_m: float) -> None:
+def test_the_pose_is_recovered_among_other_landmarks(angle_deg: float, shift_m: float) -> None:
     rng = np.random.default_rng(1)
     world, _ = make_map(200, rng)
     features = see(world, rng)
@@ -99,7 +99,7 @@ def test_tracking_moves_with_the_world() -> None:
     ("seen", "status"),
     [(60, TrackingStatus.OK), (22, TrackingStatus.WEAK), (8, TrackingStatus.LOST)],
 )
-def test_the_status_tells_how_many_agree(seen: int, status: TrackingStatus) -> None:
+def test_the_status_depends_on_the_inliers(seen: int, status: TrackingStatus) -> None:
     rng = np.random.default_rng(3)
     config = replace(PLAIN, min_inliers=30, weak_inliers=15)
     world, _ = make_map(200, rng)
@@ -113,7 +113,7 @@ def test_the_status_tells_how_many_agree(seen: int, status: TrackingStatus) -> N
 
 
 @pytest.mark.parametrize("what", ["no keypoints", "no landmarks", "other place", "dead landmarks"])
-def test_it_is_lost_rather_than_made_up(what: str) -> None:
+def test_a_wrong_map_gives_lost(what: str) -> None:
     rng = np.random.default_rng(4)
     world, _ = make_map(150, rng)
     features = see(world, rng)
@@ -159,7 +159,7 @@ def slow_in_view(world: WorldMap, T: Array, ids: Array, max_angle_deg: float) ->
     return kept
 
 
-def test_search_looks_where_a_plain_loop_looks() -> None:
+def test_the_search_equals_a_loop() -> None:
     """From afar and aside, so that some landmarks leave the image, some lie behind, some turn."""
     rng = np.random.default_rng(6)
     world, _ = make_map(300, rng)
@@ -186,7 +186,7 @@ def test_search_looks_where_a_plain_loop_looks() -> None:
     np.testing.assert_array_equal(bits, matches.distance)
 
 
-def test_a_keypoint_of_another_scale_is_no_candidate() -> None:
+def test_a_keypoint_of_another_scale_is_not_matched() -> None:
     rng = np.random.default_rng(7)
     world, _ = make_map(100, rng)
     features = see(world, rng, clutter=0)
@@ -211,7 +211,7 @@ def map_of_plane(extractor: BriskExtractor) -> tuple[WorldMap, np.ndarray]:
     return world, ids
 
 
-def test_images_are_tracked_and_registered_below_a_pixel() -> None:
+def test_rendered_images_are_tracked_with_subpixel_registration() -> None:
     """A rendered textured plane from end to end, moved by a few degrees and centimetres."""
     extractor = BriskExtractor(CAMERA, FeatureConfig())
     world, ids = map_of_plane(extractor)
@@ -234,7 +234,7 @@ def test_images_are_tracked_and_registered_below_a_pixel() -> None:
     assert errors_px[True] < 0.6 * errors_px[False]
 
 
-def test_images_from_nearer_are_registered_as_well() -> None:
+def test_images_at_another_distance_are_registered() -> None:
     """The camera comes nearer by a fifth of the way, where a patch still serves."""
     extractor = BriskExtractor(CAMERA, FeatureConfig())
     world, _ = map_of_plane(extractor)
@@ -249,7 +249,7 @@ def test_images_from_nearer_are_registered_as_well() -> None:
     assert np.sqrt(np.mean((seen - true)[registered] ** 2)) < 0.12
 
 
-def test_registration_leaves_the_frames_own_features_alone() -> None:
+def test_registration_does_not_change_the_frames_features() -> None:
     extractor = BriskExtractor(CAMERA, FeatureConfig())
     world = WorldMap()
     features = extractor.extract(render_plane(np.eye(4)))

@@ -48,7 +48,7 @@ def entities(path: Path) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("name", ["live.rrd", "replay.rrd"])
-def test_the_recording_holds_camera_map_and_plots(recorded, name) -> None:
+def test_the_recording_contains_camera_map_and_plots(recorded, name) -> None:
     rows = entities(recorded / name)
     assert rows["/world/camera"] == len(FRAMES)
     assert rows["/plots/status/status"] == len(FRAMES)
@@ -57,7 +57,7 @@ def test_the_recording_holds_camera_map_and_plots(recorded, name) -> None:
     assert rows["/world/submaps/0" if name == "live.rrd" else "/world/dense"] >= 1
 
 
-def test_without_rerun_it_says_what_to_install(monkeypatch, tmp_path) -> None:
+def test_without_rerun_the_error_names_the_package(monkeypatch, tmp_path) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(InputError, match=r"pip install 'bmask-slam\[view\]'"):
         Scene("a", ViewOptions(record=tmp_path / "a.rrd"))
@@ -82,7 +82,7 @@ def columns(path: Path, entity: str, name: str) -> list[Array]:
     return found
 
 
-def test_submaps_stand_where_their_keyframes_are_and_move_with_them(tmp_path) -> None:
+def test_submaps_are_at_their_keyframes_and_move_with_them(tmp_path) -> None:
     scene = Scene("a", ViewOptions(record=tmp_path / "a.rrd"))
     display, world = Display(scene), WorldMap()
     world.keyframes = {

@@ -69,7 +69,7 @@ def test_a_chain_of_culled_keyframes_composes() -> None:
     np.testing.assert_allclose(moved, T_correction @ frames, atol=1e-11)
 
 
-def test_segments_are_apart_and_joined_with_their_keyframes() -> None:
+def test_segments_are_separate_until_their_keyframes_are_joined() -> None:
     keyframe_poses, frames = random_poses(3), random_poses(3)
     world, history = world_of(keyframe_poses, (0, 0, 1)), FrameHistory()
     for i, T in enumerate(frames):
@@ -81,5 +81,5 @@ def test_segments_are_apart_and_joined_with_their_keyframes() -> None:
     assert {s: len(t) for s, t in history.trajectories(world).items()} == {0: 3}
 
 
-def test_no_frames_no_trajectories() -> None:
+def test_no_frames_give_no_trajectories() -> None:
     assert FrameHistory().trajectories(WorldMap()) == {}

@@ -17,7 +17,7 @@ def columns(count: int, host: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-def test_a_table_grows_and_keeps_what_it_holds() -> None:
+def test_a_table_grows_and_keeps_its_rows() -> None:
     table, points = LandmarkTable(), []
     for count in (3, 0, 900, 500, 5000, 1):
         new = columns(count)
@@ -53,7 +53,7 @@ def test_attributes_write_through_to_the_table() -> None:
     assert table.found[:6].tolist() == [5, 5, 5, 5, 5, 1]
 
 
-def test_removed_landmarks_are_dead_and_their_ids_not_used_again() -> None:
+def test_ids_of_removed_landmarks_are_not_reused() -> None:
     table = LandmarkTable()
     ids = table.add(columns(6))
     table.in_graph[ids] = True
@@ -86,12 +86,12 @@ def test_landmarks_move_rigidly_with_their_own_host() -> None:
         np.testing.assert_allclose(now, in_host, atol=1e-12)
 
 
-def test_an_unknown_column_is_a_bug_that_shows() -> None:
+def test_an_unknown_column_raises() -> None:
     with pytest.raises(AttributeError):
         LandmarkTable().add({**columns(2), "colour_of_the_sky": np.zeros(2)})
 
 
-def test_the_looks_of_the_dead_make_room_for_others() -> None:
+def test_descriptor_rows_of_removed_landmarks_are_reused() -> None:
     table = LandmarkTable()
     first = table.add(columns(500))
     table.descriptors[first] = RNG.integers(0, 1 << 60, (500, 8), dtype=np.uint64)
@@ -113,7 +113,7 @@ def test_the_looks_of_the_dead_make_room_for_others() -> None:
     assert len(table._appearance["descriptors"]) <= 2 * rows
 
 
-def test_a_copy_is_told_who_lives() -> None:
+def test_a_copy_gets_the_current_landmarks() -> None:
     table = LandmarkTable()
     table.add(columns(6))
     table.extent[np.arange(6)] = np.arange(6.0)

@@ -60,7 +60,7 @@ def assert_counts_are_true(world: WorldMap) -> None:
     np.testing.assert_array_equal(world.landmarks.observations[alive], counted[alive])
 
 
-def test_a_landmark_knows_who_made_it_and_who_saw_it_last() -> None:
+def test_a_landmark_has_its_first_and_last_keyframe() -> None:
     world = make_world()
     ids = make(world, 0, [0, 1, 2, 3])
     attach(world, 2, [0, 1], ids[:2])
@@ -81,7 +81,7 @@ def test_a_landmark_knows_who_made_it_and_who_saw_it_last() -> None:
     assert_counts_are_true(world)
 
 
-def test_observed_leaves_out_the_dead() -> None:
+def test_observed_excludes_removed_landmarks() -> None:
     world = make_world()
     ids = make(world, 0, [5, 7, 9])
     world.landmarks.remove(ids[[1]])
@@ -90,7 +90,7 @@ def test_observed_leaves_out_the_dead() -> None:
     assert seen.tolist() == [0, 2]
 
 
-def test_covisible_is_the_count_of_shared_landmarks() -> None:
+def test_covisibility_counts_shared_landmarks() -> None:
     world = make_world(4)
     ids = make(world, 0, list(range(20)))
     attach(world, 1, list(range(12)), ids[:12])
@@ -146,7 +146,7 @@ def test_two_duplicates_fused_into_one_keep_one_observation() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_counts_stay_true_through_any_history(seed: int) -> None:
+def test_counts_are_correct_after_random_changes(seed: int) -> None:
     """Random attaching, fusing and removing of keyframes."""
     rng = np.random.default_rng(seed)
     world = make_world(6)
@@ -166,7 +166,7 @@ def test_counts_stay_true_through_any_history(seed: int) -> None:
     assert 0 not in world.keyframes
 
 
-def test_patches_are_renewed_only_where_they_no_longer_serve() -> None:
+def test_patches_are_replaced_only_at_other_views() -> None:
     """A patch is taken, kept from close by, and retaken from elsewhere."""
     config = SubpixelConfig(max_angle_deg=20.0, max_zoom=1.3)
     frame = render_plane(np.eye(4))
@@ -203,7 +203,7 @@ def test_patches_are_renewed_only_where_they_no_longer_serve() -> None:
     np.testing.assert_array_equal(patches[[1, 2, 4], 1], first[[1, 2, 4]])
 
 
-def test_the_least_similar_patch_makes_room_and_the_most_similar_serves() -> None:
+def test_the_least_similar_patch_is_replaced_and_the_most_similar_used() -> None:
     """Seen from 1, 2, 4 and 8 times as far, then from half as far: the farthest view leaves."""
     world = make_world(1)
     keyframe = world.keyframes[0]

@@ -44,7 +44,7 @@ def assert_same(found: list[Frame], indices: list[int]) -> None:
 
 
 @pytest.mark.parametrize(("name", "storage"), FORMS)
-def test_every_bag_format_gives_the_frames_back(tmp_path: Path, name: str, storage: str) -> None:
+def test_frames_are_read_from_every_bag_format(tmp_path: Path, name: str, storage: str) -> None:
     path = write_bag(tmp_path / name, storage=storage)
     assert is_bag(path)
     source = BagSource(path)

@@ -189,7 +189,7 @@ def test_associations_in_either_order(recorder: Recorder, line: str) -> None:
     assert numbers(frames) == [0, 1, 2, 3]
 
 
-def test_it_ends_after_a_silence_with_the_last_frame(recorder: Recorder) -> None:
+def test_it_ends_with_the_last_frame_after_a_timeout(recorder: Recorder) -> None:
     """The last depth image has the later stamp, so that its pair is final only at the end."""
 
     def write() -> None:

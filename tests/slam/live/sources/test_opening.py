@@ -66,9 +66,7 @@ def source_of(path: Path | str, **options) -> Source:
     return open_source(str(path), SourceOptions(**options))
 
 
-def test_the_name_decides_the_kind_of_source(
-    recording: Sequence, bag: Path, tmp_path: Path
-) -> None:
+def test_the_source_kind_is_chosen_by_name(recording: Sequence, bag: Path, tmp_path: Path) -> None:
     assert isinstance(source_of(recording.folder), RecordedSource)
     assert isinstance(source_of(recording.folder, follow=True), GrowingFolder)
     assert isinstance(source_of(bag), BagSource)
@@ -76,7 +74,7 @@ def test_the_name_decides_the_kind_of_source(
     assert isinstance(source_of(write_bag(tmp_path / "a.mcap")), BagSource)
 
 
-def test_recordings_wait_unless_they_are_played_in_realtime(recording, bag: Path) -> None:
+def test_recordings_do_not_drop_frames_unless_in_realtime(recording, bag: Path) -> None:
     for path in (recording.folder, bag):
         assert source_of(path).waits
         assert not source_of(path, realtime=True).waits

@@ -152,7 +152,7 @@ def test_an_uncalibrated_or_unsupported_camera_is_refused() -> None:
         camera_of(zeros, 1.0, rectified=False, where="here")
 
 
-def test_blue_first_means_the_same_in_opencv_and_ros() -> None:
+def test_bgr_images_agree_between_opencv_and_ros() -> None:
     red = np.zeros((8, 8, 3), np.uint8)
     red[..., 2] = 255  # OpenCV's red
     data = cv2.imencode(".png", red)[1]
