@@ -1,4 +1,4 @@
-"""The benchmarks import and start, and what they wrote under docs/results/ says how it was made."""
+"""The benchmarks import and start, and pages under docs/results/ state how they were made."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SCRIPTS = [
 
 
 def test_every_script_starts(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    """All in one process, since most of the time goes into importing the same libraries."""
+    """All in one process, since importing the libraries takes most of the time."""
     for module in SCRIPTS:
         monkeypatch.setattr(sys, "argv", [module, "--help"])
         code = importlib.import_module(module)

@@ -1,4 +1,4 @@
-"""The examples run as they stand."""
+"""The examples run unchanged."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def new_pose() -> SimpleNamespace:
 
 
 def test_ros2_node(tmp_path, monkeypatch) -> None:
-    """Images of a plane go in as messages; the poses that come out are the camera's."""
+    """Images of a plane are sent as messages; the published poses are the camera's."""
     monkeypatch.chdir(tmp_path)
     published: list[Any] = []
     bridge = runpy.run_path(str(ROOT / "examples" / "ros2_node.py"))["Bridge"](

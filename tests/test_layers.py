@@ -116,7 +116,7 @@ def _entries(folder: str) -> list[str]:
 
 
 def _place(folder: str, module: str) -> int | None:
-    """Where a module's room stands in the order of a folder; nothing for one of another folder."""
+    """The position of a module's room in the order of a folder; None for another folder."""
     path = location(PATHS[module])
     order = ROOMS[folder].split()
     if folder != "the layers":

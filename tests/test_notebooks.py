@@ -1,4 +1,4 @@
-"""The notebooks in docs/ run as they are, in a kernel of their own."""
+"""The notebooks in docs/ run unchanged, in a kernel of their own."""
 
 from __future__ import annotations
 

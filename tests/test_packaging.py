@@ -1,4 +1,4 @@
-"""The wheel: what is in it, and that it works beside a user's own modules of the same names."""
+"""The wheel: its contents, and that it works with user modules of the same names."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def packages_of_the_tree() -> dict[str, Path]:
 
 
 def installed_path(path: Path) -> str:
-    """Where a file of the checkout lies in the wheel."""
+    """The path of a file of the checkout in the wheel."""
     top, *inner = path.relative_to(ROOT).parts
     (name,) = (name for name, folder in FOLDERS.items() if folder == top)
     return "/".join((*name.split("."), *inner))
@@ -51,7 +51,7 @@ def files_of_the_tree() -> set[str]:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A wheel of a copy of the checkout, which therefore stays free of build folders."""
+    """A wheel of a copy of the checkout, so that no build folders are made in it."""
     copy, folder = tmp_path_factory.mktemp("checkout"), tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)

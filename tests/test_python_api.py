@@ -1,4 +1,4 @@
-"""The public Python API: its names, what they load, and the examples of its pages."""
+"""The public Python API: names, loaded modules, and the examples of the docs."""
 
 from __future__ import annotations
 

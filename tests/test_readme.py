@@ -34,7 +34,7 @@ def commands() -> argparse._SubParsersAction:
 
 
 def code_lines(text: str) -> list[str]:
-    """Every line of code in a page, from blocks and from within sentences, without comments."""
+    """Every line of code in a page, from blocks and inline, without comments."""
     pieces = [block or inline for block, inline in CODE.findall(text)]
     return [line.split("#")[0].strip() for piece in pieces for line in piece.splitlines()]
 
@@ -51,7 +51,7 @@ def test_the_readme_is_short():
 
 
 def anchors(page: Path) -> set[str]:
-    """What can follow # in a link to a page: its headings, as GitHub writes them."""
+    """The anchors of a page: its headings as GitHub writes them."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -126,7 +126,7 @@ def test_configuration_keys_exist():
 
 
 def block(text: str) -> str:
-    """What stands between the markers of the results table."""
+    """The text between the markers of the results table."""
     begin, end = "<!-- results: written by benchmarks/run.py -->", "<!-- end of results -->"
     assert text.count(begin) == text.count(end) == 1
     return text.partition(begin)[2].partition(end)[0]

@@ -1,4 +1,4 @@
-"""Rotations, rigid transforms and quaternions against slow, obvious references."""
+"""Rotations, rigid transforms and quaternions against simple references."""
 
 import numpy as np
 import pytest
@@ -157,7 +157,7 @@ def test_make_pose_broadcasts_rotations_and_translations() -> None:
 
 
 def predicted_and_tracked(orthonormalise: bool) -> np.ndarray:
-    """A constant-velocity loop: the pose, and the motion from the last, feed each other."""
+    """A constant-velocity loop: the pose is predicted from the previous motion."""
     T_last, T = np.eye(4), se3_exp(np.array([0.01, -0.02, 0.015, 0.01, 0.02, -0.01]))
     for _ in range(200):
         T_next = T @ inverse(T_last) @ T

@@ -1,4 +1,4 @@
-"""Where a reference's body sits on the camera."""
+"""The lever arm of a reference's body on the camera."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ T_WORLDS = make_pose(so3_exp(np.array([0.3, 2.0, -0.4])), np.array([5.0, -2.0, 1
 
 
 def moving(turn_rad: Array, count: int = 200, fps: float = 10.0) -> Trajectory:
-    """A camera on a curve that swings about the axes by so much."""
+    """A camera on a curve that rotates about the axes by these amplitudes."""
     t = np.arange(count) / fps
     swing = turn_rad * np.sin(np.outer(t, [0.9, 1.3, 0.7]))
     path = np.column_stack([np.sin(0.3 * t), 0.2 * np.cos(0.5 * t), 0.1 * t])
@@ -47,7 +47,7 @@ def test_noise_has_little_effect_on_the_lever_arm() -> None:
 
 
 def test_rotation_about_one_axis_leaves_the_unobservable_part_zero() -> None:
-    """A robot on a floor: turns about y, moves in x and z; the body's height cannot be told."""
+    """A robot on a floor: rotation about y, motion in x, z; the body's height is unobservable."""
     t = np.arange(200) / 10
     turns = np.column_stack([0 * t, np.sin(0.9 * t), 0 * t])
     path = np.column_stack([np.sin(0.3 * t), 0 * t, 0.1 * t])

@@ -180,7 +180,7 @@ def test_time_pairs_skip_gaps():
 @given(seeds, st.floats(0.05, 3))
 @settings(max_examples=40, deadline=None)
 def test_distance_pairs_equal_a_loop(seed, delta_m):
-    """Each i with the later j nearest in path length, stops on the way included."""
+    """Each i with the later j nearest in path length, with stops on the way."""
     rng = np.random.default_rng(seed)
     steps = rng.normal(0, 0.05, (50, 3)) * (rng.random((50, 1)) < 0.7)
     positions = np.cumsum(steps, axis=0)
@@ -315,7 +315,7 @@ def recording(seed: int) -> tuple[Trajectory, Trajectory]:
 
 @pytest.mark.parametrize("seed", range(100))
 def test_everything_agrees_with_evo(seed):
-    """From two trajectories on: association, ATE and RPE, translation and rotation."""
+    """From two trajectories: association, ATE and RPE, translation and rotation."""
     sync = pytest.importorskip("evo.core.sync")
     metrics = pytest.importorskip("evo.core.metrics")
     estimate, reference = recording(seed)

@@ -23,7 +23,7 @@ def random_trajectory(count: int = 20, seed: int = 0) -> Trajectory:
 
 
 def greedy_association(a_s, b_s, limit_s):
-    """The obvious reference: all pairs, the closest first, each stamp once; the stamps taken."""
+    """A simple reference: all pairs, the closest first, each stamp once; returns the stamps."""
     pairs = sorted((abs(a - b), a, b) for a in a_s for b in b_s if abs(a - b) <= limit_s)
     used_a, used_b = set(), set()
     for _, a, b in pairs:
@@ -132,7 +132,7 @@ def test_association_is_greedy(a_s, b_s, limit_s):
 
 
 def test_pairs_do_not_cross():
-    """The closest pair, 3 and 4, leaves 6 and 1, which cross it: they exchange partners."""
+    """The greedy pairs 3-4 and 6-1 cross: they are exchanged."""
     i, j = associate_stamps(np.array([3.0, 6.0]), np.array([1.0, 4.0]), 5.0)
     assert (i.tolist(), j.tolist()) == ([0, 1], [0, 1])
 

@@ -1,4 +1,4 @@
-"""KITTI and EuRoC trajectories: bytes on the page, read back, refusals."""
+"""KITTI and EuRoC trajectories: bytes of the files, round trips, errors."""
 
 from pathlib import Path
 

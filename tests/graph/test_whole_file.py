@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all; links that lie in the folder are not followed."""
+"""Files are written completely or not at all; links in the folder are not followed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run folder and its depth images, exact, of a camera in an empty box-shaped room."""
+"""An exact run folder and its depth images, of a camera in an empty box-shaped room."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def rays_of(pixels: Array, truth: Array) -> Array:
 
 
 def inverse_depth_of(pixels: Array, n: Array, d: Array, truth: Array) -> Array:
-    """What the depth image holds, 1 / raw (M,), at raw pixels of planes n . p = d, n (M, 3)."""
+    """The depth image's 1 / raw (M,) at raw pixels of planes n . p = d, n (M, 3)."""
     z = d / (n * rays_of(pixels, truth)).sum(axis=1)
     return truth[9] / (z - truth[10])
 
@@ -87,7 +87,7 @@ def make_problem(
     pixels = pixels + noise * 0.3 * rng.standard_normal(pixels.shape)
 
     def inverse_depth_at(time_s: float) -> Array:
-        """What the depth image holds at the pixels when it is taken so much later."""
+        """The depth image at the pixels if it is taken with this delay."""
         T = inverse(se3_exp(velocities * time_s))[k]
         n_then = np.einsum("mij,mj->mi", T[:, :3, :3], n)
         point = np.einsum("mij,mj->mi", T[:, :3, :3], seen) + T[:, :3, 3]

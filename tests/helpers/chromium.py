@@ -1,4 +1,4 @@
-"""Drives a headless Chromium by its DevTools protocol over a pipe; needs nothing but Chromium."""
+"""Controls a headless Chromium by its DevTools protocol over a pipe."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ os.execv(sys.argv[3], sys.argv[3:])
 
 
 class Browser:
-    """One tab; every call waits for its answer, what happens meanwhile is kept in ``events``."""
+    """One tab; every call waits for its answer, and events are kept in ``events``."""
 
     def __init__(self, to_browser: int, from_browser: int) -> None:
         self._to, self._from = to_browser, from_browser
@@ -61,7 +61,7 @@ class Browser:
         return answer["result"]
 
     def open(self, page: Path, width_px: int, media: str = "screen", scheme: str = "light") -> None:
-        """Load a file as a window of this width would show it, until all of it is there."""
+        """Load a file completely in a window of this width."""
         self.events.clear()
         size = {"width": width_px, "height": 740, "deviceScaleFactor": 1, "mobile": width_px < 600}
         self.call("Emulation.setDeviceMetricsOverride", **size)
@@ -78,7 +78,7 @@ class Browser:
         return result["result"].get("value")
 
     def requests(self) -> list[str]:
-        """Addresses that the page asked for, but for those that hold their data themselves."""
+        """Addresses that the page requested, without data URIs."""
         asked = [e for e in self.events if e.get("method") == "Network.requestWillBeSent"]
         urls = [event["params"]["request"]["url"] for event in asked]
         return [url for url in urls if not url.startswith("data:")]

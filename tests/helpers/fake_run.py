@@ -1,4 +1,4 @@
-"""A tiny sequence on disk and a system that knows the answer, for the tests of the runner."""
+"""A tiny sequence on disk and a fake system with known poses, for the tests of the runner."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def true_trajectory(count: int) -> Trajectory:
 
 
 class FakeSystem:
-    """Reads the frame's number off its red channel; every seventh frame is lost.
+    """A system that reads the frame number from the red channel; every seventh frame is lost.
 
     ``trajectory()`` is true but for ``z_error_m`` at each odd frame. ``on_frame(k)`` is called
     while frame k is processed.

@@ -1,4 +1,4 @@
-"""Feeds frames to a live system at a rate that the map's process on a busy machine can follow."""
+"""Tracks frames in a live system at a rate that the map process can follow."""
 
 from __future__ import annotations
 

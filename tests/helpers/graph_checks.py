@@ -20,7 +20,7 @@ def filled(room: Room) -> Smoother:
 
 
 def from_scratch(smoother: Smoother, room: Room) -> GraphEstimate:
-    """The optimum of a new graph that is given what this one holds, from the room's truth."""
+    """The optimum of a new graph with the same factors, initialised at the room's truth."""
     tables = smoother._tables
     seen = tables.observations.select(tables.observations.all_rows())
     factors = [f.factor for f in tables.pose_factors.values()]
@@ -40,7 +40,7 @@ def from_scratch(smoother: Smoother, room: Room) -> GraphEstimate:
 
 
 def assert_isam_matches_tables(smoother: Smoother) -> None:
-    """Every slot holds exactly the factor that the tables say."""
+    """Check that every slot holds exactly the factor of the tables."""
     tables, isam = smoother._tables, smoother._solver._isam
     graph = isam.getFactorsUnsafe()
     rows = tables.observations.all_rows()

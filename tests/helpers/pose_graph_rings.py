@@ -1,4 +1,4 @@
-"""Synthetic pose graphs: laps on a circle, each pose tied to those of the lap before."""
+"""Synthetic pose graphs: laps on a circle, each pose connected with the previous lap."""
 
 from __future__ import annotations
 

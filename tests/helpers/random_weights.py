@@ -1,4 +1,4 @@
-"""Weights drawn from a seed with numpy alone, so that this network and torchvision get the same.
+"""Weights drawn from a seed with numpy only, so that this network and torchvision get equal ones.
 
 Plain random weights find nothing: every score is about 1 / classes. These keep the activations'
 variance through the layers and widen the last ones, so that there are many detections, of many

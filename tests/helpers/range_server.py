@@ -1,4 +1,4 @@
-"""A web server on this machine that can do, or fail at, what real ones do."""
+"""A local web server with optional faults."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 @dataclass
 class Served:
-    """What a server shows and how it behaves; it may be changed while it runs.
+    """Files and behaviour of a server; they may be changed while it runs.
 
     Attributes:
         files: content by path without the first slash.

@@ -1,4 +1,4 @@
-"""Small ROS bags, and what is in them: every frame tells its number by its pixels."""
+"""Small ROS bags and their contents; the pixels give the frame number."""
 
 from __future__ import annotations
 

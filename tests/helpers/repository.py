@@ -1,4 +1,4 @@
-"""Where the checkout and the data for tests lie."""
+"""Paths of the checkout and of the data for tests."""
 
 from __future__ import annotations
 

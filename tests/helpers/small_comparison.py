@@ -1,4 +1,4 @@
-"""A small comparison with a failed cell, hostile names, and trajectories whose errors are known."""
+"""A small comparison with a failed cell, difficult names, and trajectories with known errors."""
 
 from __future__ import annotations
 

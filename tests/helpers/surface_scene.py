@@ -1,4 +1,4 @@
-"""Small exact scenes for the tests of the mapping layer, and slow ways to do what it does."""
+"""Small exact scenes for the tests of the mapping layer, and simple reference methods."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ CAMERA = Camera(640, 480, fx=525.0, fy=520.0, cx=318.5, cy=241.5)
 
 @dataclass(frozen=True)
 class Room:
-    """Truth, measurements, and initial values spoiled by noise (the first pose is exact)."""
+    """Truth, measurements, and noisy initial values (the first pose is exact)."""
 
     poses_world_camera: Array
     points_world: Array
@@ -25,7 +25,7 @@ class Room:
     initial_points: Array
 
     def update_of(self, keyframe: int) -> GraphUpdate:
-        """The update that brings this keyframe, and the landmarks that it sees first."""
+        """The update of this keyframe with the landmarks that it is the first to observe."""
         seen = self.observations
         mine = np.flatnonzero(seen.keyframe_ids == keyframe)
         earlier = seen.landmark_ids[seen.keyframe_ids < keyframe]
@@ -93,7 +93,7 @@ def make_room(
 def noisy(measurements: Array, noise_px: Array) -> Array:
     """Measurements (M, 3) ``(u_left, v, u_right)`` with noise (M, 3) of u, v and disparity.
 
-    The right image is not seen: u_right = u_left_noisy - (disparity + disparity noise).
+    The right image is virtual: u_right = u_left_noisy - (disparity + disparity noise).
     """
     u_left, v, u_right = measurements.T
     u_noisy = u_left + noise_px[:, 0]

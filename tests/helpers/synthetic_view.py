@@ -33,7 +33,7 @@ TEXTURE = _texture()
 
 
 def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
-    """What a camera sees of the plane z_world = 2 m; depth is exact.
+    """A camera's image of the plane z_world = 2 m, with exact depth.
 
     Poses (480, 4, 4) are those of the rows of a rolling shutter.
     """
@@ -52,7 +52,7 @@ def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
 def make_features(
     T_world_camera: Array, points_world: Array, descriptors: Array, noise_px: Array | None = None
 ) -> Features:
-    """Keypoints that see these points, in their order; sigmas 0.7, 0.7 and 0.12 px."""
+    """Keypoints that observe these points, in order; sigmas 0.7, 0.7 and 0.12 px."""
     points_camera = transform(inverse(T_world_camera), points_world)
     count = len(points_camera)
     noise_px = np.zeros((count, 3)) if noise_px is None else noise_px
@@ -87,7 +87,7 @@ def points_before(T_world_camera: Array, count: int, rng: np.random.Generator) -
 def add_keyframe(
     world: WorldMap, T_world_camera: Array, features: Features, segment: int = 0
 ) -> Keyframe:
-    """A new keyframe without landmarks, taken into the map."""
+    """Add a new keyframe without landmarks to the map."""
     keyframe_id = world.next_keyframe_id
     none = np.full(len(features), -1, np.int64)
     keyframe = Keyframe(

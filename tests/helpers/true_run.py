@@ -1,4 +1,4 @@
-"""A run folder of a rendered sequence whose keyframes stand where the camera was."""
+"""A run folder of a rendered sequence with true keyframe poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One thread for small networks: on a busy machine, threads mostly wait for each other."""
+"""One thread for small networks, which are slower with more on a busy machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A system restored from its state is the same in every attribute, and goes on the same."""
+"""A system restored from its state has equal attributes and continues identically."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
 
 
 def poses(count: int) -> list[Array | None]:
-    """Sideways along a plane and back, with two dark frames on the way."""
+    """Poses sideways along a plane and back; None for two black frames on the way."""
     x = np.concatenate([np.arange(count), np.arange(count)[::-1]]) * 0.03
     turn = [se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a - 0.4, 0, 0])) for a in x]
     return [None if i in (9, 10) else T for i, T in enumerate(turn)]
@@ -55,7 +55,7 @@ def view(pose: Array | None, index: int) -> Frame:
 
 
 class Halves:
-    """The left half of every image is a thing, the right half another."""
+    """A segmenter: the left half of every image is one instance, the right half another."""
 
     labels = label_set(("left", "right"))
 
@@ -132,7 +132,7 @@ def restored(state: Arrays) -> SlamSystem:
 
 
 def differences(a: Any, b: Any, where: str = "system") -> Iterator[str]:
-    """Where two objects differ, down to the last attribute, and in the order of dictionaries."""
+    """Paths of all attributes in which two objects differ, including the order of dictionaries."""
     if type(a) is not type(b):
         yield f"{where}: {type(a)} and {type(b)}"
     elif isinstance(a, np.ndarray):
@@ -172,7 +172,7 @@ def _different_items(a: Any, b: Any, where: str) -> Iterator[str]:
 
 
 def test_a_state_of_an_older_version_is_restored(system: SlamSystem) -> None:
-    """It holds counts of votes, which nothing reads today."""
+    """It holds counts of votes, which are not used today."""
     names = ("semantics.labels.counts", "semantics.objects.labels.counts")
     older = {**system.state(), **{name: np.zeros(7, np.float32) for name in names}}
     assert list(differences(system, restored(older))) == []
@@ -183,7 +183,7 @@ def test_every_attribute_is_restored(system: SlamSystem) -> None:
 
 
 def test_every_array_of_the_state_matters(system: SlamSystem) -> None:
-    """Each is filled here, and one that is spoiled is seen or refused: so is a forgotten one."""
+    """Every array is filled here, and a change in it has an effect or is rejected."""
     state = system.state()
     empty = sorted(name for name, array in state.items() if array.size == 0)
     assert empty == []
@@ -214,7 +214,7 @@ def test_a_restored_system_continues_identically() -> None:
 
 
 def test_compared_classes_have_only_compared_attributes(system: SlamSystem) -> None:
-    """One that is added here must be added to ``graph_arrays`` or the table's columns, too."""
+    """A new attribute must be added to ``graph_arrays`` or the table's columns, too."""
     tables, table = system.mapper.smoother._tables, system.mapper.world.landmarks
     pose_factors = {"pose_factors", "pose_factors_of", "_next_number"}
     assert vars(tables).keys() == {

@@ -215,7 +215,7 @@ def test_depth_of_zero_is_missing_depth_and_a_stamp_must_go_forward() -> None:
 
 
 class WholeImage(NoSegmenter):
-    """Calls everything one thing."""
+    """A segmenter: the whole image is one instance."""
 
     labels = label_set(("thing",))
 

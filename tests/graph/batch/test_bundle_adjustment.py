@@ -1,4 +1,4 @@
-"""Bundle adjustment on a synthetic room with exact truth: optimum, wrong views, wrong loops."""
+"""Bundle adjustment on a synthetic room with exact truth: optimum, outliers, wrong loops."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ LOOSE = np.diag([0.2] * 3 + [0.5] * 3) ** 2
 
 
 def factor_tables_of(room: Room) -> FactorTables:
-    """The room as a graph at its spoiled initial values, the first pose held."""
+    """The room as a graph at its noisy initial values with the first pose fixed."""
     tables = FactorTables()
     seen = np.unique(room.observations.landmark_ids)
     tables.keyframes.insert(np.arange(len(room.initial_poses)), room.initial_poses)
@@ -98,7 +98,7 @@ def test_without_the_last_stage_no_observation_is_removed() -> None:
 
 
 def two_rooms() -> tuple[Room, FactorTables]:
-    """Cameras 0 to 5 and 6 to 11 see no landmark in common; odometry between is 0.4 m off."""
+    """Cameras 0 to 5 and 6 to 11 have no common landmark; odometry between is 0.4 m off."""
     room = make_room()
     seen = room.observations
     late = seen.keyframe_ids >= 6

@@ -1,4 +1,4 @@
-"""Self-calibration on exact scenes: the truth is found, and its uncertainty is told honestly."""
+"""Self-calibration on exact scenes: the result is the truth, and the uncertainty is consistent."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FREE_GAUGE = np.array([1.0] * 3 + [10.0] * 3)
 
 
 def anchored(problem: CalibrationProblem, poses: Array, sigma_m: float) -> CalibrationProblem:
-    """The problem with the true positions, disturbed by ``sigma_m``, and nothing else fixed."""
+    """The problem with the true positions, disturbed by ``sigma_m``, without other constraints."""
     noise = sigma_m * np.random.default_rng(1).standard_normal((len(poses), 3))
     anchors = Anchors(poses[:, :3, 3] + noise, sigma_m)
     return dataclasses.replace(problem, anchors=anchors, pose_sigmas=FREE_GAUGE)
@@ -117,7 +117,7 @@ ARM_M = np.array([0.05, 0.16, -0.11])
 
 
 def on_body(problem: CalibrationProblem, poses: Array, sigma_m: float) -> CalibrationProblem:
-    """The problem anchored at a body's positions in place of the camera's."""
+    """The problem anchored at a body's positions instead of the camera's."""
     body = poses.copy()
     body[:, :3, 3] += poses[:, :3, :3] @ ARM_M
     problem = anchored(problem, body, sigma_m)

@@ -1,4 +1,4 @@
-"""Calibrations from half the views, judged by the other half."""
+"""Calibrations from half of the views, evaluated on the other half."""
 
 from __future__ import annotations
 

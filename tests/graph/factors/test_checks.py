@@ -1,4 +1,4 @@
-"""The chi-square quantile that gates use."""
+"""The chi-square quantile that checks use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one place where our arrays become GTSAM's: order, frame and sign of every factor."""
+"""Conversion of arrays to GTSAM factors: order, frame and sign."""
 
 import gtsam
 import numpy as np

@@ -1,4 +1,4 @@
-"""Named arrays in a file: whole, the same bytes, and refused by name where something is wrong."""
+"""Files of named arrays: round trip, equal bytes, and errors for damaged files."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_same_contents_are_the_same_bytes(file: Path) -> None:
 
 
 def test_every_damaged_byte_is_found(file: Path) -> None:
-    """Where a changed byte is not noticed, it was none of the contents."""
+    """A changed byte that raises no error does not change the contents."""
     whole = file.read_bytes()
     for at in range(0, len(whole), 13):
         file.write_bytes(whole[:at] + bytes([whole[at] ^ 0x10]) + whole[at + 1 :])

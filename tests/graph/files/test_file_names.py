@@ -1,4 +1,4 @@
-"""Names in files of strangers."""
+"""File names from untrusted files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLY: round trip, what is in the bytes, and refusals."""
+"""PLY: round trip, bytes of the format, and rejected files."""
 
 from pathlib import Path
 

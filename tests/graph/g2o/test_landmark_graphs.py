@@ -1,4 +1,4 @@
-"""g2o files with landmarks: g2o's own error by hand, round trips, foreign files, refusals."""
+"""g2o files with landmarks: g2o's error function, round trips, files of other programs, errors."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -170,7 +170,7 @@ def test_fixed_keyframes_stand_still(tmp_path: Path) -> None:
 def test_the_component_with_fixed_keyframes_or_the_largest_is_used(
     tmp_path: Path, caplog, prior
 ) -> None:
-    """Keyframes 0 and 1 see landmarks 2 and 3; keyframe 10 alone sees landmark 11."""
+    """Keyframes 0 and 1 observe landmarks 2 and 3; only keyframe 10 observes landmark 11."""
     other = f"VERTEX_SE3:QUAT 10 {IDENTITY}\nVERTEX_TRACKXYZ 11 0 0 2\n"
     other += "EDGE_PROJECT_DISPARITY 10 11 0 320 240 0.5 4 0 0 1 0 10000\n"
     held = WITH_PRIOR.replace("PRIOR 0", "PRIOR 10") if prior else ""

@@ -1,4 +1,4 @@
-"""g2o files: orders on the page, GTSAM's reader as a reference, round trips, refusals."""
+"""g2o files: order of values, GTSAM's reader as a reference, round trips, errors."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Covariances on exact synthetic scenes: errors must be as large as they say, no larger."""
+"""Covariances on exact synthetic scenes: they must agree with the errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RUNS = 25
 
 
 def solved(seed: int, mono_share: float = 0.0, config: SmootherConfig = GAUSSIAN) -> Smoother:
-    """A room at its optimum; the first pose is drawn from its prior, so that it errs too."""
+    """A room at its optimum; the first pose is drawn from its prior, so that it has an error."""
     room = room_of(seed, mono_share)
     sigmas = [0.01] * 3 + [0.02] * 3
     error = np.random.default_rng(seed).normal(0, sigmas)
@@ -63,7 +63,7 @@ def assert_consistent(values: list[float], dof: int) -> None:
 
 @pytest.mark.parametrize("mono_share", [0.0, 0.4])
 def test_nees_of_poses_landmarks_and_pairs_is_one(mono_share: float) -> None:
-    """One pose, landmark and pair a run, so that the values are independent."""
+    """One pose, landmark and pair per run, so that the values are independent."""
     pose, point, pair, step = [], [], [], []
     for seed in range(RUNS):
         smoother, room = solved(seed, mono_share), room_of(seed, mono_share)
@@ -107,7 +107,7 @@ def test_covariances_of_all_keyframes_equal_those_of_each() -> None:
 
 
 def test_covariances_are_relative_to_the_first_keyframe() -> None:
-    """Moved as a whole, the covariances of poses stay, those of points turn with the world."""
+    """If the world moves, covariances of poses stay and those of points rotate."""
     room, T_new_old = make_room(5, 60, 0.5), se3_exp(np.array([0.4, -1.1, 0.7, 3.0, -5.0, 2.0]))
     found = []
     for made in (room, room.moved(T_new_old)):
@@ -124,7 +124,7 @@ def test_covariances_are_relative_to_the_first_keyframe() -> None:
 
 
 def test_an_outlier_has_the_weight_of_its_robust_kernel() -> None:
-    """Far off, it says as much of the pose as if it were not there; without a kernel, all."""
+    """A far outlier has no weight with a robust kernel, and full weight without."""
     room = room_of(3, 0.0)
     seen = room.observations
     wrong = np.flatnonzero(seen.keyframe_ids == 5)[::6]

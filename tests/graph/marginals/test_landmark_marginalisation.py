@@ -1,4 +1,4 @@
-"""Landmarks that leave the graph: what they said of the keyframes must stay, once."""
+"""Marginalised landmarks: their information on keyframes must be kept exactly once."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -57,7 +57,7 @@ def test_jacobians_are_finite_differences() -> None:
 
 
 def test_the_schur_complement_is_that_of_the_whole_normal_matrix() -> None:
-    """Against the dense normal equations of all unknowns, and zero for a move of everything."""
+    """Equal to the dense normal equations, and zero for a motion of the whole world."""
     seen = ROOM.observations.select(np.flatnonzero(ROOM.observations.landmark_ids < 20))
     ids, kinds = np.unique(seen.landmark_ids), np.arange(10)
     config = SmootherConfig()
@@ -83,7 +83,7 @@ def test_the_schur_complement_is_that_of_the_whole_normal_matrix() -> None:
 
 
 def test_marginalisation_over_two_keyframes_is_exact() -> None:
-    """Between two poses one relative pose is all there is to say: it is exact."""
+    """For two poses a relative pose represents all information: it is exact."""
     room = make_room(keyframes=2, points=60, noise_px=0.5)
     full, sparse = filled(room), filled(room)
     before = full.optimise_batch()
@@ -160,7 +160,7 @@ def test_a_restored_landmark_includes_its_marginal_factor() -> None:
 
 
 def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
-    """Marginalised, back, marginalised again: every observation is there once in the end."""
+    """Marginalised, restored and marginalised again: every observation is there once."""
     smoother, full = Smoother(CAMERA), Smoother(CAMERA)
     estimate = None
     for k, update in enumerate(ROOM.updates()):
@@ -191,7 +191,7 @@ def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
 
 
 def test_a_removed_observation_is_removed_from_its_group() -> None:
-    """A marginalised outlier is removed afterwards: the result is that without it."""
+    """A marginalised outlier is removed afterwards: the result equals that without it."""
     room = make_room(keyframes=2, points=80, noise_px=0.3)
     seen = room.observations
     bad = int(np.flatnonzero(seen.keyframe_ids == 1)[5])
@@ -236,7 +236,7 @@ def test_removals_apply_to_marginalised_observations_too(what: str) -> None:
 
 
 def test_a_saved_graph_keeps_its_marginalised_landmarks(tmp_path: Path) -> None:
-    """Save, load and continue: as if the smoother had restarted there."""
+    """Saving, loading and continuing equals a restart of the smoother."""
     smoother = filled(until=7)
     ids = smoother.optimise_batch().landmark_ids
     marginalise_landmarks(smoother, ids[::2])
@@ -281,7 +281,7 @@ def _marginalised(smoother: Smoother) -> set[tuple[int, int]]:
 
 
 def _last_view(landmarks: Array, keyframe: int, until: int) -> Array:
-    """Which of the landmarks no keyframe after this one, and before ``until``, saw."""
+    """The landmarks without an observation after this keyframe and before ``until``."""
     seen = ROOM.observations
     later = seen.landmark_ids[(seen.keyframe_ids > keyframe) & (seen.keyframe_ids < until)]
     return ~np.isin(landmarks, later)

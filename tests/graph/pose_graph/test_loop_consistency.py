@@ -1,4 +1,4 @@
-"""Cycles of loops: their chi-square is one, frames and adjoints included."""
+"""Cycles of loops: their chi-square, with frames and adjoints."""
 
 from __future__ import annotations
 

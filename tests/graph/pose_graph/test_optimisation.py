@@ -95,7 +95,7 @@ def test_the_optimum_moves_with_the_world(planar: bool) -> None:
 
 @BOTH
 def test_the_noise_says_how_large_the_cost_is(planar: bool) -> None:
-    """Twice the cost is chi-square with as many degrees of freedom as there are too many."""
+    """Twice the cost is chi-square distributed with the redundant degrees of freedom."""
     graph = ring(120, planar, sigma=0.02)
     d = graph.information.shape[-1]
     white = np.eye(d) / 0.02**2
@@ -151,7 +151,7 @@ def test_gnc_finds_the_wrong_loops_and_the_clean_optimum(planar: bool) -> None:
 
 
 def test_gnc_without_odometry_keeps_the_graph_connected() -> None:
-    """Ids that never follow each other: nothing is known, and no vertex may hang loose."""
+    """Without consecutive ids there is no odometry, and every vertex must stay connected."""
     graph = ring(60, False, seed=2, sigma=0.01)
     graph = replace(graph, ids=3 * graph.ids)
     measurements = graph.measurements.copy()
@@ -177,7 +177,7 @@ def far_loops(graph: PoseGraph) -> PoseGraph:
 
 @BOTH
 def test_the_predicted_cost_of_a_loop_equals_the_increase(planar: bool) -> None:
-    """Of poses that drifted, each loop is added alone to the odometry and all is solved again."""
+    """With drifted poses, each loop alone is added to the odometry and the graph is optimised."""
     graph = far_loops(ring(90, planar, seed=2, sigma=0.01))
     used = graph.is_odometry
     drifted = optimise_pose_graph(graph.with_edges(used)).graph.poses
@@ -233,7 +233,7 @@ def test_neighbouring_loops_are_consistent(planar: bool) -> None:
 def test_wrong_loops_are_found_with_a_wrong_information_scale(
     planar: bool, stated: float, scale: float
 ) -> None:
-    """Information 1e-5 of what the noise is (as parking-garage's): random loops would fit in."""
+    """Information 1e-5 of that of the noise, as in parking-garage: random loops would fit."""
     graph, wrong = with_wrong_loops(ring(90, planar, seed=2, sigma=0.01), 20)
     graph = replace(graph, information=stated * graph.information)
     assert 1.0 <= loop_consistency(graph).noise_scale / scale < 10.0

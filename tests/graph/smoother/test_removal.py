@@ -1,4 +1,4 @@
-"""Removal by id: nothing else may change, nothing may be left underconstrained."""
+"""Removal by id: nothing else may change, and nothing may become underconstrained."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_an_observation_is_removed_and_added_again() -> None:
 
 @pytest.mark.parametrize("in_one_update", [False, True])
 def test_a_removed_id_can_be_added_again(in_one_update: bool) -> None:
-    """Landmark 5 becomes another point, keyframe 7 is made anew."""
+    """Landmark 5 becomes another point, keyframe 7 another keyframe."""
     smoother = filled(ROOM)
     seen = ROOM.observations
     rows = (seen.landmark_ids == 5) | (seen.keyframe_ids == 7)
@@ -84,7 +84,7 @@ def test_a_removed_id_can_be_added_again(in_one_update: bool) -> None:
 
 
 def test_many_random_removals_and_additions() -> None:
-    """Slots are used again and again and always hold what the factor tables say."""
+    """Slots are reused and always hold the factors of the factor tables."""
     rng = np.random.default_rng(5)
     smoother = filled(ROOM)
     seen = ROOM.observations
@@ -180,7 +180,7 @@ def test_a_keyframe_without_landmarks_is_anchored_at_its_pose() -> None:
 
 
 def test_a_disconnected_pair_of_keyframes_is_anchored() -> None:
-    """Each shares enough with the other; what both share with the rest leaves a turn open."""
+    """Each has enough common landmarks with the other, but both can rotate against the rest."""
     smoother, seen = filled(ROOM), ROOM.observations
     last_two = np.isin(seen.keyframe_ids, [6, 7])
     inside = np.isin(seen.landmark_ids, seen.landmark_ids[~last_two])
@@ -243,7 +243,7 @@ def test_a_wrong_loop_is_removed_by_name(robust: str | None, wrong_by: float) ->
 
 
 def test_removal_in_the_first_update_after_a_restart() -> None:
-    """ISAM2 refuses a removal in its very first update; here it is only a smaller graph."""
+    """ISAM2 rejects a removal in its first update; the smoother starts with a smaller graph."""
     smoother = filled(ROOM)
     smoother.restart()
     estimate = smoother.update(

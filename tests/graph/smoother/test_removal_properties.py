@@ -1,4 +1,4 @@
-"""Random graphs and random removals: nothing breaks, and nothing else changes."""
+"""Random graphs and random removals: no error, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KINDS = st.sampled_from(["landmarks", "keyframes", "observations", "mask"])
 
 
 def random_room(seed: int) -> Room:
-    """A walk along which each landmark is seen from a few keyframes only, many without depth."""
+    """A path with each landmark observed by a few keyframes only, many without depth."""
     rng = np.random.default_rng(seed)
     room = make_room(
         keyframes=int(rng.integers(5, 10)),
@@ -41,7 +41,7 @@ def random_room(seed: int) -> Room:
 
 
 def random_removal(smoother: Smoother, kind: str, seed: int) -> GraphUpdate:
-    """Some of what the graph holds: up to a third of it, or nearly all that a keyframe sees."""
+    """A removal of up to a third of the graph, or of nearly all observations of a keyframe."""
     rng, estimate = np.random.default_rng(seed), smoother.estimate()
     pairs = np.array(sorted(pairs_of(smoother)), np.int64).reshape(-1, 2)
     if kind == "landmarks":
@@ -68,7 +68,7 @@ def asked(update: GraphUpdate, pairs: set[tuple[int, int]]) -> set[tuple[int, in
 def assert_only_this_left(
     smoother: Smoother, update: GraphUpdate, before: GraphEstimate, pairs: set[tuple[int, int]]
 ) -> GraphEstimate:
-    """Carry out a removal and compare what is left with what was asked and reported."""
+    """Apply a removal and compare the remaining items with the request and the report."""
     after = smoother.update(update)
     assert not after.rebuilt
     assert_isam_matches_tables(smoother)

@@ -53,7 +53,7 @@ def observe(keyframe: int, landmarks: list[int], measurements: Array) -> Observa
 
 
 def assert_continues(smoother: Smoother, failed: GraphEstimate) -> None:
-    """The rest of the room still comes in, and the optimum is that of an undisturbed run."""
+    """The rest of the room is added, and the optimum equals that of an undisturbed run."""
     assert failed.rebuilt
     estimate = smoother.update(ROOM.update_of(5))
     assert not estimate.rebuilt
@@ -83,7 +83,7 @@ def test_a_landmark_behind_the_camera_is_dropped(smoother: Smoother) -> None:
 
 
 def test_many_bad_landmarks_are_dropped_at_once(smoother: Smoother) -> None:
-    """More than could be dropped one by one as GTSAM names them."""
+    """More than can be dropped one by one as GTSAM reports them."""
     count = 3 * SmootherConfig().max_repairs
     behind = np.column_stack([np.linspace(-1, 1, count), np.zeros(count), np.full(count, -2.0)])
     ids = np.arange(900, 900 + count)
@@ -131,7 +131,7 @@ def test_a_pose_with_one_point_is_dropped_although_gtsam_names_the_point(
 
 
 def test_a_segment_connected_by_one_point_is_dropped(smoother: Smoother) -> None:
-    """Every new keyframe has many landmarks, but the segment turns about a single point."""
+    """Every new keyframe has many landmarks, but the segment can rotate about a single point."""
     before = smoother.estimate()
     far = ROOM.moved(se3_exp(np.array([0.0, 0.0, 0.0, 40.0, 0.0, 0.0])))
     seen = far.observations

@@ -29,7 +29,7 @@ def run(room: Room, config: SmootherConfig | None = None) -> tuple[Smoother, Gra
 
 
 def pose_errors(estimate: GraphEstimate, room: Room) -> Array:
-    """Tangents (K, 6) of the true poses as seen from the estimated ones."""
+    """Tangents (K, 6) of the true poses relative to the estimated ones."""
     truth = room.poses_world_camera[estimate.keyframe_ids]
     return se3_log(inverse(estimate.poses_world_camera) @ truth)
 
@@ -207,7 +207,7 @@ def test_only_poses_are_eliminated_last() -> None:
 
 
 def test_relative_poses_of_a_kind_are_listed_with_their_covariances() -> None:
-    """A new smoother that gets them has the same loops."""
+    """A new smoother with these relative poses has the same loops."""
     room = make_room(noise_px=0.3)
     smoother, _ = run(room)
     T_world_a, T_world_b = room.poses_world_camera[[0, 3]]

@@ -1,4 +1,4 @@
-"""A saved graph comes back whole, and nothing broken or foreign is half-loaded."""
+"""A saved graph is read back completely; damaged files and those of others are rejected."""
 
 import json
 import os
@@ -154,7 +154,7 @@ def test_updates_and_estimates_can_be_pickled() -> None:
 
 
 def test_front_end_modules_import_without_gtsam() -> None:
-    """Updates are made, checked and saved in numpy; another process need not load GTSAM."""
+    """Updates are made, checked and saved with numpy only; a process needs no GTSAM for it."""
     modules = (
         *("factors.graph_update", "factors.graph_estimate", "factors.factor_tables"),
         *("factors.checks", "factors.observability", "factors.smoother_config"),

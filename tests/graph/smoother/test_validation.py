@@ -1,4 +1,4 @@
-"""Each reason for a refusal, and that nothing else is refused."""
+"""Each reason to refuse a factor, and that nothing else is refused."""
 
 import dataclasses
 import math
@@ -162,7 +162,7 @@ def test_parallax_of_many_landmarks_equals_a_loop() -> None:
 
 
 def test_an_underconstrained_keyframe_is_refused(smoother: Smoother) -> None:
-    """Many new landmarks do not help: they would hang on the keyframe, not hold it."""
+    """New landmarks do not constrain the keyframe."""
     known = np.isin(NEXT.observations.landmark_ids, graph_ids(smoother))
     few = np.concatenate([np.flatnonzero(known)[:5], np.flatnonzero(~known)])
     first = few[:5]

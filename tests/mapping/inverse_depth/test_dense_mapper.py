@@ -1,4 +1,4 @@
-"""Keyframes through all Steps in a stream: delayed, bounded, in any world frame."""
+"""A stream of keyframes through all Steps: delay, memory, and any world frame."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def moved_by(T: Array, keyframe: DenseKeyframe) -> DenseKeyframe:
 
 
 def test_the_current_poses_are_used_for_the_fusion() -> None:
-    """The first keyframes stand in another world until they are moved, like before a loop."""
+    """The first keyframes are in another world frame until they are moved, as before a loop."""
     given = keyframes(8)
     expected = all_of(DenseMapper(CAMERA), given)
     mapper = DenseMapper(CAMERA)

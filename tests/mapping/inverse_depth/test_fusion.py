@@ -1,4 +1,4 @@
-"""Step 4 against the formulas, pixel by pixel, and on surfaces that are known."""
+"""Step 4 against the formulas, pixel by pixel, and on known surfaces."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def neighbour_estimate(seed: float, u: int, v: int, view: View, inner: bool):
 
 
 def reference(own: InverseDepthMap, views: list[View], seeds):
-    """Step 4 as it is written, without colours."""
+    """Step 4 by its formulas, without colours."""
     rho0, variance0 = (a.numpy().astype(float) for a in (own.rho, own.variance))
     out = np.full((3, *rho0.shape), np.nan)
     for v, u in np.ndindex(*rho0.shape):
@@ -215,7 +215,7 @@ def test_no_neighbours_give_no_factor() -> None:
 
 
 def unchanged(given: InverseDepthMap, factor: float) -> Fused:
-    """Step 4 of a map that Step 5 leaves as it is."""
+    """Step 4 of a map that Step 5 does not change."""
     return Fused(given, given.known.to(torch.uint8), factor)
 
 

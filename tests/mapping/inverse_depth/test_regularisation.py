@@ -14,7 +14,7 @@ RNG = np.random.default_rng(3)
 
 
 def reference(given: InverseDepthMap, fill_support: int):
-    """Step 3 as it is written."""
+    """Step 3 by its formulas."""
     rho, variance = (a.numpy().astype(float) for a in (given.rho, given.variance))
     out_rho, out_variance = np.full_like(rho, np.nan), np.full_like(rho, np.nan)
     height, width = rho.shape

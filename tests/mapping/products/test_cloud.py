@@ -42,7 +42,7 @@ def submap(anchor: int, count: int = 400, instances: int = 3) -> Submap:
 
 
 def table(rows: list[int], classes: int) -> LabelTable:
-    """Of submaps with so many rows each, the first of no instance."""
+    """A table for submaps with these numbers of rows; the first row is of no instance."""
     told = [RNG.normal(0, 2, (n, classes)).astype(np.float32) for n in rows]
     for keyframe in told:
         keyframe[0] = 0

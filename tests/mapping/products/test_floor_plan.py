@@ -48,7 +48,7 @@ TURN = so3_exp(np.array([1.3, 0.2, -0.4]))
 
 @pytest.mark.parametrize("noise", [0.0, 0.15])
 def test_walls_do_not_tilt_the_up_direction(noise: float) -> None:
-    """A camera that looks down by 37 degrees: walls are only 53 degrees from its own up."""
+    """A camera pitched down by 37 degrees: walls are only 53 degrees from its up axis."""
     given = room(TURN)
     normals = given.normals + noise * RNG.standard_normal(given.normals.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

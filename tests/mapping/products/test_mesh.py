@@ -1,4 +1,4 @@
-"""The mesh of integrated depth: where its surface is, and what Open3D must not say."""
+"""The mesh of integrated depth: its surface, and no warnings of Open3D."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_surface_agrees_with_the_views_and_normals_face_the_camera() -> None
 
 
 def test_a_view_without_depth_is_skipped() -> None:
-    """A keyframe that no other matches has none if depth comes from motion."""
+    """A keyframe without matching neighbours has no depth from motion."""
     alone = np.asarray(tsdf_mesh(VIEWS, CAMERA, VOXEL_M).vertices)
     with_empty = np.asarray(tsdf_mesh([EMPTY, *VIEWS], CAMERA, VOXEL_M).vertices)
     assert len(with_empty) == len(alone) > 100

@@ -1,4 +1,4 @@
-"""Submaps: points where the surface is, moved with their anchor, read back as written."""
+"""Submaps: points on the surface, moved with their anchor, read back as written."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def views(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]
 
 
 def posterior(p: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Bayes' rule for one thing, view by view."""
+    """Bayes' rule for one landmark, view by view."""
     belief = PRIOR.copy()
     for distribution, weight in zip(p, weights, strict=True):
         likelihood = weight * distribution / PRIOR + (1 - weight)
@@ -74,7 +74,7 @@ def test_the_order_of_views_and_repeated_ids_do_not_matter() -> None:
 
 
 def missed_by_integral(prior: np.ndarray, misses: float, a: float, b: float) -> np.ndarray:
-    """A belief after views that missed the thing: its recall integrated out numerically."""
+    """The distribution after views that missed it, with the recall integrated out numerically."""
     recall = (np.arange(200_000) + 0.5) / 200_000
     density = recall ** (a - 1) * (1 - recall) ** (b - 1)
     chance = (density * (1 - recall) ** misses).sum() / density.sum()
@@ -157,7 +157,7 @@ def test_a_keyframe_takes_at_most_two_milliseconds() -> None:
 
 
 def test_an_id_beyond_the_capacity_is_moved_to_a_smaller_id_and_back() -> None:
-    """After a move to 3000 no id above it is known, and the tables shrink below the first."""
+    """After moving 3000 down no larger id remains, and the tables shrink."""
     p, weights = views(1, np.random.default_rng(7))
     store, whole = LabelStore(C), LabelStore(C)
     store.update(np.array([5000]), p, weights)

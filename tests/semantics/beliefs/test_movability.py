@@ -1,4 +1,4 @@
-"""The filter against Bayes' rule written out, and what it forgets, follows and refuses."""
+"""The filter against Bayes' rule written out; fusing, dropping and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which landmarks a keyframe's masks speak about, and what they say."""
+"""The landmarks for which a keyframe's masks vote, and their votes."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_outside_the_front_mask_the_one_behind_votes() -> None:
 
 
 def test_a_landmark_that_is_not_on_the_surface_does_not_vote() -> None:
-    """The mask leaks onto a wall at 4 m; somebody stands before it at 1 m."""
+    """The mask covers some of a wall at 4 m; a person is in front of it at 1 m."""
     depth_m = flat(2.0) + np.random.default_rng(0).normal(0, 0.02, flat().shape)
     depth_m[10:40, 40:45] = 4.0
     assignment = assign_pixels([CHAIR], depth_m.astype(np.float32), SIZE, CONFIG)

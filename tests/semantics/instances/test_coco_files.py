@@ -1,4 +1,4 @@
-"""COCO files: what is read, what is left out."""
+"""COCO files: which objects are read and which are skipped."""
 
 from __future__ import annotations
 

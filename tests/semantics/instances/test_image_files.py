@@ -1,4 +1,4 @@
-"""Images of strangers: their size is known before they are decoded."""
+"""Untrusted images: their size is checked before decoding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which instances are in front of which."""
+"""The order of overlapping instances."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def instance(mask: np.ndarray, label: int, score: float) -> Instance:
 
 
 def case() -> dict[str, Instance]:
-    """A bookcase whose mask leaves out a book, a cup on its mask, a chair that reaches out of it.
+    """A bookcase whose mask has a hole at a book, a cup on its mask, a chair partly outside it.
 
     All have worse masks than the bookcase.
     """

@@ -89,12 +89,12 @@ def network_results(name: str, model: MaskRCNN) -> Arrays:
 
 
 def _stored(array: np.ndarray) -> np.ndarray:
-    """Half the size; the networks are run in float64 so that rounding decides no comparison."""
+    """As float32; the networks run in float64, so that rounding does not affect comparisons."""
     return array.astype(np.float32) if array.dtype == np.float64 else array
 
 
 def component_results() -> Arrays:
-    """Each stage alone, on inputs that test_parity.py makes again from the same seeds."""
+    """Each stage alone, on inputs that test_parity.py draws from the same seeds."""
     rng = np.random.default_rng(5)
     out: Arrays = {}
     generator = AnchorGenerator(((32,), (64,), (128,), (256,), (512,)), ((0.5, 1.0, 2.0),) * 5)

@@ -195,7 +195,7 @@ def named(request: pytest.FixtureRequest) -> tuple[str, MaskRCNN]:
 
 
 def test_the_whole_network(named: tuple[str, MaskRCNN]) -> None:
-    """In float64, so that rounding decides no comparison of nearly equal scores or overlaps."""
+    """In float64, so that rounding does not exchange nearly equal scores or overlaps."""
     name, model = named[0], copy.deepcopy(named[1]).double()
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster
     images = [torch.from_numpy(picture(96, 128, 0)), torch.from_numpy(picture(120, 90, 1))]
@@ -223,7 +223,7 @@ def test_the_whole_network(named: tuple[str, MaskRCNN]) -> None:
 
 
 def test_the_whole_network_at_inference(named: tuple[str, MaskRCNN]) -> None:
-    """In float32, whose rounding moves no box by more than 1e-4 px (7e-5 px where it was tried)."""
+    """In float32, with which boxes differ by less than 1e-4 px."""
     name, model = named
     images = [torch.from_numpy(picture(96, 128, 0)), torch.from_numpy(picture(120, 90, 1))]
     with torch.inference_mode():

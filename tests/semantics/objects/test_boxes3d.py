@@ -55,7 +55,7 @@ def test_lone_points_are_not_supported() -> None:
 
 
 def test_a_face_with_few_points_is_inside_the_box() -> None:
-    """A book's back has 2000 points, its cover, seen at a glancing angle, eight."""
+    """A book's spine has 2000 points; its cover, at a grazing angle, has eight."""
     rng = np.random.default_rng(3)
     back = rng.uniform(0, 1, (2000, 3)) * [0.03, 0.0, 0.3]
     cover = np.array([[0.0, y, z] for y in (0.08, 0.1, 0.12, 0.14) for z in (0.1, 0.12)])
@@ -65,7 +65,7 @@ def test_a_face_with_few_points_is_inside_the_box() -> None:
 
 
 def test_noise_along_the_rays_does_not_make_a_box_thicker() -> None:
-    """A board that many views saw from the front, and a side of few points that they did not."""
+    """A board with many views of its front and few points on a side."""
     rng = np.random.default_rng(5)
     board = rng.uniform(-0.5, 0.5, (2000, 3)) * [0.4, 0.0, 0.3]
     side = np.array([[0.2, y, z] for y in (0.18, 0.2) for z in (0.0, 0.01)])

@@ -1,4 +1,4 @@
-"""Objects from detections: cards before a wall, seen by a camera that moves sideways."""
+"""Objects from detections: cards before a wall, and a camera that moves sideways."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CHAIRS = [Card(-0.42, -0.01), Card(0.01, 0.42)]
 
 
 class Scene:
-    """An object map that is shown the cards; ``T_world_scene`` moves everything."""
+    """An object map of views of the cards; ``T_world_scene`` moves everything."""
 
     def __init__(self, T_world_scene: Array = HERE, config: ObjectConfig | None = None) -> None:
         self.T_world_scene = T_world_scene
@@ -54,7 +54,7 @@ class Scene:
         self.poses: dict[int, Array] = {}
 
     def show(self, x: float, cards: list[Card], score: float = 0.9) -> np.ndarray:
-        """A keyframe at x sees the cards, each as an instance; returns their objects."""
+        """Add a keyframe at x with an instance for each card; returns their objects."""
         number = len(self.poses)
         T_scene_camera = se3_exp(np.array([0, 0.05 * x, 0, x, 0, 0]))
         self.poses[number] = self.T_world_scene @ T_scene_camera
@@ -243,7 +243,7 @@ def test_landmarks_of_merged_objects_and_fused_landmarks() -> None:
 
 
 def test_the_assignment_is_optimal_within_the_gate() -> None:
-    """Taking the best pair first would leave the second detection with nothing."""
+    """A greedy assignment would leave the second detection without an object."""
     of_detection = np.array([[0.9, 0.8], [0.85, 0.0], [0.1, 0.1]])
     overlap = Overlap(of_detection, of_detection, np.array([50, 50]))
     p = np.tile([0.0, 1.0, 0.0, 0.0], (3, 1))

@@ -35,7 +35,7 @@ def instance(mask: np.ndarray, score: float, iou: float) -> Instance:
 
 
 class Scripted:
-    """Says what it was told to."""
+    """Returns given instances."""
 
     labels = LABELS
 
@@ -48,7 +48,7 @@ class Scripted:
 
 @pytest.fixture
 def truth(tmp_path: Path) -> tuple[CocoFile, Path]:
-    """One image with two cups, in a file that numbers its classes otherwise."""
+    """One image with two cups, in a file with other class numbers."""
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((90, 120, 3), np.uint8))
     annotations = [
         {**as_annotation(instance(disc(x, 45, 20), 1, 1)), "image_id": 1, "category_id": 9}

@@ -1,4 +1,4 @@
-"""A segmenter through Ray: what one here would find, and a lost one costs only its image."""
+"""A segmenter through Ray: results equal a local one, and a lost worker loses only its image."""
 
 from __future__ import annotations
 

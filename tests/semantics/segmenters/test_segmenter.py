@@ -1,4 +1,4 @@
-"""Segmenters: those that look masks up, the table of names, the network behind the same call."""
+"""Segmenters: cached masks, label images, the table of names and the network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracks on things that walk at a known speed."""
+"""Tracks of people that walk at a known speed."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def test_a_mirrored_example_equals_that_of_the_mirrored_image() -> None:
 
 
 def drawn(count: int) -> Examples:
-    """Masks whose true IoU is half of what their probabilities promise."""
+    """Masks whose true IoU is half of the expected one."""
     generator = torch.Generator().manual_seed(0)
     masks = torch.rand((count, 28, 28), generator=generator).half()
     masks *= torch.rand((count, 1, 1), generator=generator).half()

@@ -1,4 +1,4 @@
-"""Targets and losses of training against slow, obvious versions; and a tiny overfit."""
+"""Targets and losses of training against simple versions, and a small overfit."""
 
 from __future__ import annotations
 

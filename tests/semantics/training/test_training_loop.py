@@ -102,7 +102,7 @@ def test_augmentation_repeats_from_its_seed() -> None:
 
 @pytest.fixture
 def data(tmp_path: Path) -> tuple[CocoFile, Path]:
-    """Three painted images as a COCO file; the categories have other ids and one name more."""
+    """Three painted images as a COCO file; the categories have other ids and one more name."""
     folder = tmp_path / "images"
     folder.mkdir()
     images, annotations = [], []

@@ -1,4 +1,4 @@
-"""Weight files: which are read, which are refused, and with what words."""
+"""Weight files: which are read, and the errors for the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What enters the graph, and how its answer comes back, with the real smoother in between."""
+"""Selection of factors and reading back of estimates, with the real smoother."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def pose_of(k: int) -> Array:
 
 
 def make_world(keyframes: int, count: int = COUNT) -> tuple[WorldMap, Array]:
-    """Keyframe k sees point i with keypoint i; landmark i is made by the first; exact."""
+    """Keyframe k observes point i with keypoint i; landmark i is made by the first; exact."""
     points = points_before(np.eye(4), count, RNG)
     world = WorldMap()
     for k in range(keyframes):
@@ -76,7 +76,7 @@ def estimate_of(world: WorldMap, landmark_ids: Array, T_correction: Array) -> Gr
 
 
 def test_measurements_are_those_of_the_stereo_camera() -> None:
-    """With noise, too: u_right is the noisy u less the noisy disparity."""
+    """Also with noise: u_right is the noisy u minus the noisy disparity."""
     points = points_before(np.eye(4), 20, RNG)
     noise = RNG.normal(size=(20, 3)) * [0.7, 0.7, 0.12]
     features = make_features(np.eye(4), points, random_descriptors(20, RNG), noise)
@@ -123,7 +123,7 @@ def test_a_landmark_is_added_at_its_second_observation_with_all() -> None:
 
 
 def test_every_observation_is_sent_exactly_once() -> None:
-    """Landmarks that come and go, one keyframe after the other."""
+    """Landmarks are added and removed from keyframe to keyframe."""
     world, points = WorldMap(), points_before(np.eye(4), COUNT, RNG)
     factor_selection, sent = FactorSelector(EVERYTHING), set()
     for k in range(6):
@@ -163,7 +163,7 @@ def test_observations_in_keyframes_older_than_the_landmark_are_sent() -> None:
 
 
 def test_observations_older_than_a_parent_are_sent() -> None:
-    """The keyframe that made a landmark is culled; its heir is newer than another observer."""
+    """The keyframe that made a landmark is culled; its parent is newer than another observer."""
     world, _ = make_world(4, count=20)
     world.remove_keyframe(world.keyframes[0], parent=world.keyframes[2])
     update = FactorSelector(EVERYTHING).keyframe_update(world, world.keyframes[3])
@@ -267,7 +267,7 @@ def test_removed_landmarks_are_not_moved() -> None:
 
 @pytest.mark.parametrize("whole", [False, True])
 def test_the_smoother_corrects_disturbed_poses(whole: bool) -> None:
-    """Map, feed, graph, read-back with exact measurements: the truth comes out."""
+    """Map, factor selection, graph and read-back with exact measurements give the truth."""
     world, points = make_world(1)
     factor_selection, smoother = FactorSelector(EVERYTHING), Smoother(CAMERA)
     read_back(world, smoother.update(factor_selection.keyframe_update(world, world.keyframes[0])))
@@ -290,7 +290,7 @@ def test_the_smoother_corrects_disturbed_poses(whole: bool) -> None:
 
 
 def windowed_world(config: FactorSelectionConfig) -> tuple[WorldMap, FactorSelector, Smoother]:
-    """Six keyframes of one wall, then three that share nothing with them, through the graph."""
+    """Six keyframes of one wall, then three without common landmarks, in the graph."""
     world, points = make_world(0)
     factor_selection, smoother = FactorSelector(config), Smoother(CAMERA)
     walls = [(points, 6), (points_before(np.eye(4), COUNT, RNG), 3)]
@@ -353,7 +353,7 @@ def test_landmarks_outside_the_window_are_marginalised_and_restored() -> None:
 
 
 def test_a_marginalised_landmark_with_new_observations_is_restored() -> None:
-    """As fusing does after a loop: what a newer landmark held, an old one now holds."""
+    """As fusing after a loop does: observations of a newer landmark go to an old one."""
     world, factor_selection, _ = windowed_world(WINDOWED)
     gone = world.replace_landmarks(np.array([COUNT + 3]), np.array([4]))
     factor_selection.forget_landmarks(gone)

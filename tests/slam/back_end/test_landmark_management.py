@@ -32,7 +32,7 @@ STEP = se3_exp(np.array([0.0, 0.01, 0.0, 0.03, 0.0, 0.0]))
 
 
 def scene(views: int, T_world_first: Array | None = None) -> tuple[WorldMap, Array, list[Keyframe]]:
-    """Keyframes in a row that all see the same 60 points; no landmarks yet."""
+    """Keyframes in a row that all observe the same 60 points, without landmarks."""
     rng = np.random.default_rng(2)
     T = np.eye(4) if T_world_first is None else T_world_first
     points_world = points_before(T, 60, rng)

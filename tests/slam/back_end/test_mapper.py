@@ -1,4 +1,4 @@
-"""Which keyframes leave map and graph, and what leaves with them."""
+"""Culling of keyframes, with their landmarks, from map and graph."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STEP = se3_exp(np.array([0.0, 0.01, 0.0, 0.03, 0.0, 0.0]))
 
 
 def row_of_keyframes(count: int, mapping: MappingConfig) -> Mapper:
-    """Keyframes that all see the same 60 points, each of them three more of its own."""
+    """Keyframes that all observe the same 60 points, and three points of their own each."""
     tracker = Tracker(CAMERA, TrackingConfig())
     rules = BackEndConfig(
         replace(mapping, redundant_share=2.0), loops=LoopClosingConfig(enabled=False)

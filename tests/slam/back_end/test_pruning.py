@@ -1,4 +1,4 @@
-"""Masks that come at once or late: what they cover leaves map and graph, and stays out."""
+"""Masks in time or late: covered observations are removed from map and graph."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COUNT = 60
 
 
 class Session:
-    """Keyframes that walk sideways past points, with the real graph; keypoint i sees point i."""
+    """Keyframes on a path along points, with the real graph; keypoint i observes point i."""
 
     def __init__(self, keyframes: int = 0, seed: int = 3) -> None:
         self.rng = np.random.default_rng(seed)
@@ -46,7 +46,7 @@ class Session:
             self.add_keyframe(np.arange(COUNT))
 
     def add_keyframe(self, seen: Array, anew: Array | None = None) -> Keyframe:
-        """A keyframe that sees some points; those in ``anew`` become landmarks of their own."""
+        """Add a keyframe that observes some points; those in ``anew`` become new landmarks."""
         k = self.world.next_keyframe_id
         T = se3_exp(np.array([0.01 * k, -0.02 * k, 0.0, 0.05 * k, 0.01 * k, 0.02 * k]))
         noise_px = self.rng.normal(0, [0.3, 0.3, 0.05], (COUNT, 3))
@@ -64,7 +64,7 @@ class Session:
         return keyframe
 
     def landmark_of_points(self) -> Array:
-        """The newest living landmark (COUNT,) of each point, -1 for none."""
+        """The newest landmark (COUNT,) of each point, -1 for none."""
         known = np.full(COUNT, -1, np.int64)
         for keyframe in self.world.keyframes.values():
             keypoints, ids = self.world.observed(keyframe)
@@ -75,7 +75,7 @@ class Session:
         return MapPruner(self.world, self.smoother, CAMERA, border_px=-3)
 
     def fuse(self) -> None:
-        """Landmarks of one point that were made anew become the oldest of it."""
+        """Fuse the landmarks of each point into its oldest."""
         point = np.full(len(self.world.landmarks), -1, np.int64)
         for keyframe in self.world.keyframes.values():
             keypoints, ids = self.world.observed(keyframe)
@@ -94,7 +94,7 @@ class Session:
 
 
 def mask_of(session: Session, keyframe_id: int, keypoints: Array) -> Array:
-    """A mask that covers just the pixels of these keypoints of a keyframe, living or culled."""
+    """A mask of only the pixels of these keypoints of a keyframe, which may be culled."""
     world = session.world
     views = {k: v.features.image_pixels for k, v in world.keyframes.items()}
     views |= {k: v.image_pixels for k, v in world.culled.items()}
@@ -110,7 +110,7 @@ def in_graph(smoother: Smoother) -> set[tuple[int, int]]:
 
 
 def in_map(world: WorldMap) -> set[tuple[int, int]]:
-    """(keyframe, landmark) of what the map says is in the graph."""
+    """(keyframe, landmark) of observations that the map marks as in the graph."""
     pairs = set()
     for keyframe in world.keyframes.values():
         rows, ids = world.observed(keyframe)
@@ -120,7 +120,7 @@ def in_map(world: WorldMap) -> set[tuple[int, int]]:
 
 
 def assert_consistent(world: WorldMap, smoother: Smoother) -> None:
-    """Map and graph tell the same, counters are right, and masked keypoints see nothing."""
+    """Check that map and graph agree, counters are right, and masked keypoints observe nothing."""
     assert in_map(world) == in_graph(smoother)
     landmarks = world.landmarks
     held = smoother.estimate().landmark_ids
@@ -308,7 +308,7 @@ def test_map_and_graph_agree_in_any_order_of_events(
 
 
 def test_masked_keypoints_stay_out_of_the_running_system() -> None:
-    """A late mask of half a picture, at every third frame; the next keyframes fuse around it."""
+    """A late mask of half a picture, at every third frame; later keyframes fuse landmarks."""
     every_frame = ["keyframes.max_shared=9.0", "keyframes.min_interval_frames=1"]
     all_kept = [*every_frame, "mapping.redundant_share=1.1"]
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, all_kept))
@@ -357,7 +357,7 @@ def test_masked_keypoints_and_culled_keyframes_are_in_the_state_of_the_map() -> 
 
 
 def test_a_wrong_loop_is_removed_with_its_fusions() -> None:
-    """The last keyframes saw other points, 1 m aside; a loop declared them to be the first ones."""
+    """The last keyframes observe other points, 1 m aside; a wrong loop fused both."""
     session = Session(4)
     first, T_wrong = session.points.copy(), np.array([1.0, 0.0, 0.0])
     for _ in range(4):  # on the way, half of the first points are still in view

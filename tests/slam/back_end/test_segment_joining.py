@@ -24,7 +24,7 @@ def tracked(T: np.ndarray, features: Features, keypoints: np.ndarray, ids: np.nd
 
 
 def two_segments() -> tuple[WorldMap, np.ndarray, Features]:
-    """Segment 0 in the world's frame, segment 1 in its own, of the same 40 points."""
+    """Segment 0 in the world frame and segment 1 in its own, with the same 40 points."""
     rng = np.random.default_rng(8)
     points_world = points_before(T_WORLD_FIRST, 40, rng)
     descriptors = random_descriptors(40, rng)

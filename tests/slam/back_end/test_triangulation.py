@@ -66,7 +66,7 @@ def test_points_behind_the_cameras_are_refused() -> None:
 
 
 def two_blind_views() -> tuple[WorldMap, np.ndarray]:
-    """Two keyframes that share 20 landmarks and see 30 points more without depth."""
+    """Two keyframes with 20 common landmarks and 30 more points without depth."""
     rng = np.random.default_rng(5)
     known, blind = points(20, 1.5), points(30, 2.5)
     descriptors = random_descriptors(50, rng)

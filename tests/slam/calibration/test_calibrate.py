@@ -95,7 +95,7 @@ def test_a_known_distance_gives_the_scale(made: tuple[Path, Path], tmp_path: Pat
 
 
 def test_the_next_run_reads_what_was_written(made: tuple[Path, Path], tmp_path: Path) -> None:
-    """Scale, offset and time: depth images become those at the stamps of the colour images."""
+    """Scale, offset and time: depth images are those at the stamps of the colour images."""
     sequence, _ = made
     right = dataclasses.replace(TRUTH, depth_time_offset_s=DELAY_S)
     write_camera(tmp_path / "camera.yaml", right, "a comment\nof two lines")

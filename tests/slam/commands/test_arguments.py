@@ -1,4 +1,4 @@
-"""What the command line makes of a run's segmenter."""
+"""Segmenter options of the command line."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def test_run_prints_table_folder_and_picture(capsys, sequence: Path, tmp_path: P
 
 
 def test_covariances_are_written_on_request(capsys, sequence: Path, tmp_path: Path) -> None:
-    """Nothing is tracked here, so there are none, and the run ends well all the same."""
+    """Nothing is tracked, so there are none, and the run finishes."""
     out = tmp_path / "out"
     assert call(capsys, "run", sequence, "--out", out, "--covariances", "--quiet")[0] == 0
     assert (out / "covariances.txt").read_text().startswith("# covariances of keyframe poses")

@@ -1,4 +1,4 @@
-"""A whole comparison: run, kept, killed, gone on with, evaluated, reported."""
+"""A whole comparison: run, killed, resumed, evaluated, reported."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ DONE, FAILED = CellStatus.DONE, CellStatus.FAILED
 
 @pytest.fixture(scope="module")
 def data(office, tmp_path_factory) -> Path:
-    """A small sequence, its truth seen from another world, and experiments on it."""
+    """A small sequence, its truth in another world frame, and experiments on it."""
     folder = tmp_path_factory.mktemp("data")
     (folder / "office").symlink_to(office)
     truth = read_tum(folder / "office" / "groundtruth.txt")
@@ -89,7 +89,7 @@ def test_a_comparison_end_to_end(data, tmp_path):
 
 
 def test_a_failed_rendering_fails_only_its_cells(data, tmp_path):
-    """The path of the office has fewer frames; a trajectory of a rendered room finds its truth."""
+    """The office has fewer frames; a rendered room's trajectory is evaluated against its truth."""
     text = EXPERIMENT.partition("  broken")[0].replace(
         "sequences: {office: office}",
         "sequences: {office: office, long: {render: {name: office, frames: 9999, width: 160}}}",
@@ -115,7 +115,7 @@ def start(data: Path, out: Path) -> subprocess.Popen:
 
 
 def _heeds_interrupts() -> None:
-    """A shell's background job ignores SIGINT, and so would what the tests start there."""
+    """Whether SIGINT is not ignored, as it is in background jobs of a shell."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -143,7 +143,7 @@ def processes_on(folder: Path) -> list[str]:
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="looks into /proc")
 def test_a_killed_and_an_interrupted_comparison_are_resumed(data, tmp_path):
-    """Killed in its second cell, interrupted in it again, then left to its end."""
+    """Killed in its second cell, interrupted there again, then run to its end."""
     out = tmp_path / "out"
     records = [out / f"cells/office/default/{seed}/cell.json" for seed in range(2)]
     logs = [record.with_name("log.txt") for record in records]

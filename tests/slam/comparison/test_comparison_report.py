@@ -1,4 +1,4 @@
-"""The report holds every figure, averages no failure away, and escapes what it is given."""
+"""The report holds every figure, does not average failures, and escapes texts."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def written(comparison: Comparison, folder: Path) -> dict[str, bytes]:
 
 
 class Page(html.parser.HTMLParser):
-    """What a browser would make of a page: its text, its tags, the addresses it would load."""
+    """Text, tags and loaded addresses of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -98,7 +98,7 @@ def test_a_failed_run_is_listed_with_its_log_and_not_averaged(comparison, writte
 
 
 def judged(comparison: Comparison, ratio: float) -> Comparison:
-    """Ten sequences, two methods, the second with errors so many times as large."""
+    """Ten sequences, two methods, the second with errors larger by a factor."""
     names = tuple(f"room {k}" for k in range(10))
     errors_m = {name: 0.01 * (1 + k / 10) for k, name in enumerate(names)}
     methods = (Method("default", Kind.RUN), Method(HOSTILE, Kind.RUN))
@@ -196,7 +196,7 @@ def test_latex_compiles(written, tmp_path):
 
 
 def test_a_report_with_wide_tables_and_long_names(comparison, folder, tmp_path):
-    """Forty sequences, names without a place to break, a log of one endless line."""
+    """Forty sequences, names that cannot be wrapped, a log of one long line."""
     names = tuple(f"freiburg3_walking_halfsphere_validation_{k}" for k in range(40))
     log = tmp_path / "log.txt"
     log.write_text("x" * 100_000, encoding="utf-8")
@@ -230,7 +230,7 @@ def test_the_same_comparison_gives_the_same_bytes(comparison, written, folder):
 
 
 def test_drawn_errors_equal_those_of_the_trajectories(comparison, folder):
-    """The height swings by 5 cm: an RMSE of 5 cm / sqrt(2), which no alignment takes away."""
+    """The height swings by 5 cm: an RMSE of 5 cm / sqrt(2), which alignment does not remove."""
     errors = read_errors(comparison.cells[0], folder, RULES)
     assert errors.absolute.translation_m.rmse == pytest.approx(WAVE_M / np.sqrt(2), rel=0.01)
     step_m = 2 * WAVE_M * np.sin(3 * np.pi / 10)  # amplitude of a swing's difference over a second
@@ -239,7 +239,7 @@ def test_drawn_errors_equal_those_of_the_trajectories(comparison, folder):
 
 @pytest.mark.parametrize("with_scale", [False, True])
 def test_drawn_errors_equal_those_of_the_tables(comparison, folder, with_scale):
-    """Of a path half as large: its scale must be found for relative errors too."""
+    """A path half as large: its scale must be found for relative errors too."""
     small = read_tum(folder / "bad.txt")
     poses = small.poses_world_camera.copy()
     poses[:, :3, 3] *= 0.5

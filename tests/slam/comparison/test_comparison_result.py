@@ -1,4 +1,4 @@
-"""A comparison survives its file; a file that is none is refused."""
+"""Results are read back from their file; other files are rejected."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What is said of two methods: tests against slow references, and how often it is false."""
+"""Verdicts on two methods: tests against simple references, and the rate of false ones."""
 
 import re
 from dataclasses import replace
@@ -81,7 +81,7 @@ def test_holm_equals_a_manual_result():
 
 
 def test_noise_gives_no_verdict():
-    """Two methods of the same distribution: a verdict is false, and rarer than the level."""
+    """Two methods with the same distribution: false verdicts are rarer than the level."""
     false = [verdicts(comparison(noise(seed)))[0].judgement != NO_DIFFERENCE for seed in range(300)]
     assert np.mean(false) <= 0.05
 
@@ -131,7 +131,7 @@ def test_the_verdicts_as_text():
 
 
 def test_seeds_of_a_recording_are_one_pair():
-    """Or a system that repeats itself would gain certainty from being run again."""
+    """Otherwise a deterministic system would gain significance from repeated runs."""
     values = np.repeat(noise(5, 1), 9, axis=2)
     assert verdicts(comparison(values, drawn=()))[0].pairs == 6
     theirs, own, _ = pairs(comparison(values, ("a",)), ("default", "other"), "ate_rmse")

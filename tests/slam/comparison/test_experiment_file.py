@@ -1,4 +1,4 @@
-"""Experiments are read strictly: what is wrong is named with file, path, value and cure."""
+"""Experiments are read strictly: errors name file, path, value and cure."""
 
 from pathlib import Path
 

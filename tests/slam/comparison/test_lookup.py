@@ -1,4 +1,4 @@
-"""Where sequences, truths and trajectories are found; what is said where they are not."""
+"""Finding sequences, ground truth and trajectories; messages if they are missing."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_seeds_apply_to_rendered_images_and_to_the_system(tmp_path):
 
 
 def test_a_cell_depends_on_configuration_and_images(tmp_path):
-    """Each change of configuration or images is seen; a moved folder is not."""
+    """A change of configuration or images changes the hashes; moving the folder does not."""
 
     def depends(source: SequenceSource, configuration: Configuration) -> dict[str, str]:
         given = experiment(tmp_path, source, configurations={"default": configuration})
@@ -150,7 +150,7 @@ def test_a_cell_depends_on_configuration_and_images(tmp_path):
 
 
 def test_truth_that_covers_a_part(tmp_path):
-    """Only what has a truth within the limit is compared, and how much that is, is told."""
+    """Only poses with a truth within the limit are compared, and their share is reported."""
     stamps = np.arange(100) / 10
     xi = np.column_stack(
         [0.1 * np.sin(stamps), 0 * stamps, 0 * stamps, stamps, stamps**2 / 9, 0 * stamps]

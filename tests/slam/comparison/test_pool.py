@@ -1,4 +1,4 @@
-"""Jobs in processes of their own: how they end, that they are ended, and what is kept."""
+"""Jobs in processes of their own: outcomes, killing, and records."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def job(folder: Path, name: str = "one", *arguments: str) -> Job:
 
 
 def endless(folder: Path, name: str = "endless") -> Job:
-    """One that waits for a folder to grow."""
+    """A job that waits for a folder to grow."""
     return job(folder, name, "live", str(folder), "--follow", "--silence", "1000")
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs; one that has ended but was not waited for does not."""
+    """Whether a process runs; a zombie does not."""
     try:
         status = Path(f"/proc/{pid}/stat").read_text()
     except OSError:

@@ -1,4 +1,4 @@
-"""What run folders and trained networks add to a report: times, maps, losses, curves."""
+"""Report sections of run folders and trained networks: times, maps, losses, curves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report in a real Chromium: on a phone, on a desk, in print, in the dark."""
+"""The report in a real Chromium: narrow and wide windows, print, dark mode."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_text_can_be_read_on_both_backgrounds(browser, page):
 
 
 def test_it_prints(browser, page):
-    """Headings stay with what follows them, rows and figures are whole, nothing dark is printed."""
+    """Headings stay with their content, rows and figures are not split, paper is white."""
     browser.open(page, DESK_PX)
     assert browser.print_pdf().startswith(b"%PDF")
     browser.open(page, A4_PX, "print", "dark")

@@ -1,4 +1,4 @@
-"""Labels and depth against what was drawn, in a world that is not the truth's."""
+"""Labels and depth against the rendered truth, in another world frame."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def run(office, tmp_path):
 
 
 def test_labels_in_another_world(run, office):
-    """Three of four are right, up to landmarks at edges that most frames show as something else."""
+    """Three of four are right, except for some landmarks at edges."""
     assert label_accuracy(run, open_sequence(office)) == pytest.approx(1 - 1 / WRONG, abs=0.03)
 
 
 def test_labels_in_a_wrong_world_are_wrong(run, office):
-    """Keyframes that are not where the landmarks believe them to be."""
+    """Keyframe poses that do not fit to the landmarks."""
     sequence = open_sequence(office)
     moved = sequence.groundtruth.moved(T_WORLD_TRUTH @ se3_exp([0, 0.5, 0, 0, 0, 0]))
     write_tum(run / "keyframes.txt", moved)

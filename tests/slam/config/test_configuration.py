@@ -222,7 +222,7 @@ def test_shipped_configurations_are_found_by_name() -> None:
 
 
 def test_an_older_file_is_read_with_the_present_names_of_its_settings(tmp_path: Path) -> None:
-    """Written by the program before settings were renamed, with all defaults."""
+    """A file of an older version with the former names and all defaults."""
     older = Path(__file__).with_name("before_renaming.yaml")
     differing = differences(resolve(SystemConfig, older), SystemConfig())
     assert set(differing) <= {"semantics.segmenter.name"}, "which conftest.py sets for the tests"

@@ -1,4 +1,4 @@
-"""What is written as YAML reads back as the same."""
+"""YAML that is written is read back unchanged."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def test_a_bonn_archive_gets_its_camera(server, tmp_path):
 
 
 def test_an_icl_archive_is_brought_to_tum_layout(server, tmp_path):
-    """A point's image row must stay where fy < 0 put it, in the mirrored world with fy > 0."""
+    """A point's image row with fy < 0 must be kept in the mirrored world with fy > 0."""
     recording = Recording(
         "icl-nuim/tiny", f"{server.url}/icl.tar.gz", layout="icl-nuim", camera=CAMERA
     )

@@ -1,4 +1,4 @@
-"""Archives are unpacked, and hostile ones refused, each for its own reason."""
+"""Archives are unpacked, and unsafe ones rejected with the reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Downloads from a server of our own that cuts, forgets, changes and refuses."""
+"""Downloads from a local server with interruptions, changes and errors."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_server_without_ranges_restarts_the_download(server, tmp_path):
 
 
 def test_parts_of_different_files_are_not_combined(server, tmp_path):
-    """The file changes on the server while it is on the way, and its hash is not known."""
+    """The file changes on the server during the download, and its hash is not known."""
     server.cut_after, server.cuts = 300_000, 1
 
     def change(done: int, total: int) -> None:

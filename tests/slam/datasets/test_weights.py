@@ -60,7 +60,7 @@ def test_a_name_is_a_path_or_a_published_network(
 def test_a_segmenter_reads_the_weights_that_were_found(
     server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The download is no network, which is what the message must be about."""
+    """The downloaded file is not a network, which the message must name."""
     monkeypatch.setitem(PUBLISHED, "tiny", f"{server.url}/{NAME}")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     options = SegmenterOptions("mask-scoring-rcnn", weights="torchvision:tiny")

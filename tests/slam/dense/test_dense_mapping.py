@@ -1,4 +1,4 @@
-"""``bmask-slam map`` on a small rendered room whose keyframes stand where they were."""
+"""``bmask-slam map`` on a small rendered room with true keyframe poses."""
 
 from __future__ import annotations
 

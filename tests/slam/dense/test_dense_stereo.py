@@ -1,4 +1,4 @@
-"""``bmask-slam map --depth-source stereo`` on a rendered pair of cameras, and what it refuses."""
+"""``bmask-slam map --depth-source stereo`` on a rendered pair of cameras, and its errors."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_the_baseline_is_read_from_the_sequences_camera_file(
 
 
 def test_both_uses_the_pair_where_the_sensor_has_no_depth(sequence: Path) -> None:
-    """The first keyframe has none before it that a sweep could match it with."""
+    """The first keyframe has no earlier one for a sweep."""
     run = run_of(sequence, (2,))
     true_m = open_sequence(sequence).load(2).depth_m
     write_depth(sequence, STAMPS[2], np.where(np.arange(240) < 140, np.nan, 1.02 * true_m))
@@ -206,7 +206,7 @@ def test_distorted_images_are_rejected_for_stereo(pairs: Path) -> None:
 
 
 class PersonInTheMiddle:
-    """A segmenter that sees a person in every image."""
+    """A segmenter that finds a person in every image."""
 
     labels = label_set(("person",))
 

@@ -129,7 +129,7 @@ def test_bad_input(tmp_path):
 
 @pytest.mark.parametrize("with_reference", [False, True])
 def test_picture(tmp_path, with_reference):
-    """It shows the estimate's blue, and the red of differences only against a reference.
+    """It shows the estimate in blue, and differences in red only with a reference.
 
     The estimate's world is 100 m away: were it not aligned, its blue would be a dot.
     """
@@ -149,7 +149,7 @@ def test_picture(tmp_path, with_reference):
 
 
 def test_picture_of_an_empty_trajectory(tmp_path):
-    """A run that was lost from the start still leaves its picture."""
+    """A run that was lost from the start still has a picture."""
     empty = arc().select(np.arange(0))
     for reference in (None, arc()):
         plot_trajectory(tmp_path / "picture.png", empty, reference, "nothing")
@@ -177,7 +177,7 @@ def test_published_figures(estimate, reference, ate_cm):
 
 
 def test_a_reference_of_another_body(tmp_path: Path):
-    """An IMU beside the camera, with axes of its own: its place is found and its path compared."""
+    """An IMU beside the camera, with axes of its own: its lever arm is found."""
     wobble = 0.3 * np.sin(np.outer(np.arange(300) / 30, [1.1, 1.7, 2.3]))
     level = arc()
     turned = level.poses_world_camera @ make_pose(so3_exp(wobble), np.zeros((300, 3)))

@@ -67,7 +67,7 @@ def test_the_same_frame_gives_the_same_arrays() -> None:
 
 @pytest.mark.parametrize("contrast", [1.0, 0.7, 0.5, 0.3])
 def test_the_highest_threshold_with_enough_corners_is_used(contrast: float) -> None:
-    """Against asking FAST at one threshold after the other, also for dull images."""
+    """Equal to FAST at one threshold after the other, also for images with low contrast."""
     rgb = np.rint(128 + contrast * (FRONTAL.rgb.astype(float) - 128)).astype(np.uint8)
     frame = dataclasses.replace(FRONTAL, rgb=rgb)
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
@@ -87,7 +87,7 @@ def test_the_highest_threshold_with_enough_corners_is_used(contrast: float) -> N
 
 @pytest.mark.parametrize("octaves", [0, 2])
 def test_descriptors_equal_opencvs_at_the_same_keypoints(octaves: int) -> None:
-    """Rows belong together: each descriptor is that of its own pixel, size and angle."""
+    """Each descriptor is that of its pixel, size and angle."""
     features = extract(FRONTAL, dataclasses.replace(CONFIG, octaves=octaves))
     keypoints = [
         cv2.KeyPoint(float(u), float(v), float(12.0 * s), float(np.rad2deg(a)))
@@ -111,7 +111,7 @@ def test_keypoints_are_capped_and_spread(cap: int) -> None:
 
 
 def test_one_textured_corner_does_not_get_all_keypoints() -> None:
-    """Strong texture in one quarter, weak elsewhere: the weak ones are still chosen."""
+    """Strong texture in one quarter, weak elsewhere: weak keypoints are still chosen."""
     weak = np.rint(128 + 0.6 * (FRONTAL.rgb.astype(float) - 128)).astype(np.uint8)
     weak[:240, :320] = FRONTAL.rgb[:240, :320]
     config = dataclasses.replace(CONFIG, thresholds=(15,), max_keypoints=190)
@@ -121,7 +121,7 @@ def test_one_textured_corner_does_not_get_all_keypoints() -> None:
 
 
 def slow_spread_order(bucket: list[int], score: list[float]) -> list[int]:
-    """Round by round the best that every bucket has left; within a round by score."""
+    """In rounds: the best remaining keypoint of every bucket; within a round by score."""
     left = sorted(range(len(bucket)), key=lambda i: -score[i])
     order = []
     while left:

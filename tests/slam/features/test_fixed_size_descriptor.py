@@ -37,7 +37,7 @@ def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("size", SIZES_PX)
 @pytest.mark.parametrize("name", IMAGES)
 def test_bits_and_orientation_equal_opencvs(name: str, size: float) -> None:
-    """All but the few bits that hang on how a box between pixels is summed."""
+    """Except for the few bits that depend on the summation of subpixel boxes."""
     gray = IMAGES[name]
     pixels = corners(gray)
     assert len(pixels) > 200

@@ -1,4 +1,4 @@
-"""Every fast search beside the loop that says what it should find."""
+"""Every fast search against a simple loop."""
 
 import numpy as np
 import pytest
@@ -87,7 +87,7 @@ def test_window_pairs_equal_a_double_loop(radius_px: float) -> None:
 
 
 def test_the_window_includes_its_edge() -> None:
-    """Corners of FAST lie on whole pixels, so that distances hit the radius exactly."""
+    """FAST corners are at whole pixels, so that distances can equal the radius."""
     pixels = np.array([[105.0, 50.0], [95.0, 50.0], [100.0, 55.0], [100.0, 45.0], [103.0, 54.0]])
     _, train = WindowIndex(pixels).pairs(np.array([[100.0, 50.0]]), np.array([5.0]))
     assert sorted(train.tolist()) == [0, 1, 2, 3, 4]

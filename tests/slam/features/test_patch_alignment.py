@@ -66,7 +66,7 @@ def test_a_known_shift_is_found(shift: tuple[float, float], gain: float, offset:
 
 
 def test_a_patch_cut_at_a_subpixel_position_is_found() -> None:
-    """No bias: the same fraction of a pixel comes back in the same image."""
+    """No bias: the same fraction of a pixel is found in the same image."""
     patches = cut_patches(image(), PIXELS)
     start = PIXELS + RNG.uniform(-0.8, 0.8, PIXELS.shape)
     moved, correlation = register_patches(image(), start, patches, 10)

@@ -1,4 +1,4 @@
-"""Landmarks that a keyframe shows without having matched them."""
+"""Landmarks that are visible in a keyframe without a match."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ POSE = se3_exp(np.array([0.1, -0.3, 0.05, 0.4, -0.2, 0.3]))
 
 
 def world(points_world: np.ndarray) -> Any:
-    """A map whose landmarks are of keyframe 4 in segment 2, but the last two: dead, elsewhere."""
+    """A map with landmarks of keyframe 4 in segment 2, except the last two (removed, other)."""
     count = len(points_world)
     alive, host = np.ones(count, bool), np.full(count, 4)
     alive[-2], host[-1] = False, 7

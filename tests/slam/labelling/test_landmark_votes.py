@@ -1,4 +1,4 @@
-"""Landmarks that are made late are voted on by the keyframes before them."""
+"""Keyframes vote on landmarks that are made later."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bmask_slam.labelling import landmark_votes as label_votes
 
 
 def test_keyframes_vote_on_landmarks_made_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the last keyframe's new landmarks all the recent ones that show them have their say."""
+    """All recent keyframes that show the last keyframe's new landmarks vote on them."""
     views, shares = {}, {}
     for recent in (0, 3):
         monkeypatch.setattr(label_votes, "RECENT", recent)

@@ -1,4 +1,4 @@
-"""Masks reach the landmarks of the map: at once, late, twice, for a culled keyframe."""
+"""Masks label the landmarks of the map: in time, late, repeated, for a culled keyframe."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def named(frame: Frame, number: int) -> Frame:
 
 
 class Sides:
-    """Knows the plane: left and right of an edge in the world, from the poses of the frames."""
+    """A segmenter of the plane's left and right side, from the true poses."""
 
     labels: LabelSet = label_set(("left", "right"))
 
@@ -87,7 +87,7 @@ def estimates(system: SlamSystem) -> LabelEstimates:
 
 
 def right_share(system: SlamSystem) -> float:
-    """Of the landmarks that are known to be something, how many are what they are."""
+    """The share of labelled landmarks with the right label."""
     cloud, found = system.landmarks(), estimates(system)
     known = found.labels > 0
     truth = np.where(cloud.points_world[:, 0] < EDGE_M, 1, 2)
@@ -155,7 +155,7 @@ def test_masks_of_another_size_are_refused_and_change_nothing() -> None:
 
 
 def test_labels_follow_fused_and_culled_landmarks(at_once: SlamSystem) -> None:
-    """No label is kept of what is not in the map any more."""
+    """Labels of removed landmarks are removed."""
     semantics, landmarks = at_once.semantics, at_once.mapper.world.landmarks
     semantics.follow_map()
     assert landmarks.alive[semantics.labels.known()].all()
@@ -183,7 +183,7 @@ def test_the_estimate_is_the_same_with_and_without_masks(at_once: SlamSystem) ->
 
 
 class Unsure(Sides):
-    """Hardly sees what is on the right."""
+    """Has a low score on the right side."""
 
     def instances(self, number: int) -> list[Instance]:
         left, right = super().instances(number)

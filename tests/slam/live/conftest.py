@@ -1,4 +1,4 @@
-"""What several test files of the live loop need."""
+"""Fixtures of several tests of the live loop."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 @pytest.fixture
 def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
-    """A file system of 300 kB, which a run folder's map does not fit into; or of a size given."""
+    """A file system of 300 kB, too small for a run folder's map, or of another size."""
     path = tmp_path / "disk"
     path.mkdir()
     size = getattr(request, "param", "300k")

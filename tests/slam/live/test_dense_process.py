@@ -1,4 +1,4 @@
-"""The dense map's process, called directly: surfaces in their place, masks early or late."""
+"""The dense map's process, called directly: accuracy of surfaces, masks early or late."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ PERSON = instance(1, slice(250, 400), slice(400, 560))
 
 
 def snapshot(number: int, T: Array | None = None) -> KeyframeSnapshot:
-    """Keyframes that all observe four landmarks, which are the same only in number."""
+    """Keyframes that all observe landmarks with the same four ids."""
     T = POSES[number] if T is None else T
     ids, points = np.arange(4), np.tile([0.0, 0.0, PLANE_Z_M], (4, 1))
     return KeyframeSnapshot(number, 0, T, FRAMES[number], ids, points, PIXELS)
@@ -83,7 +83,7 @@ def test_a_submap_is_sent_after_its_neighbours_and_is_accurate(tmp_path) -> None
 
 
 def test_poses_that_move_before_fusion_are_followed(tmp_path) -> None:
-    """Keyframe 0 comes 0.3 m off; were it left there, none of its depth would be confirmed."""
+    """Keyframe 0 is 0.3 m off at first; without correction its depth would not be confirmed."""
     server, _ = make_server(tmp_path / "run")
     off = POSES[0].copy()
     off[2, 3] += 0.3

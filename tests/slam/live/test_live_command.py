@@ -1,4 +1,4 @@
-"""``bmask-slam live`` as a process: what it leaves however it ends."""
+"""``bmask-slam live`` as a process: its files after every kind of end."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_masks_from_another_process_label_the_map(recording, tmp_path) -> None:
 def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
     recording, tmp_path, capsys
 ) -> None:
-    """A frame that is dropped puts keyframes' numbers out of step with their images."""
+    """After a dropped frame, keyframe numbers differ from image numbers."""
     out, offline = tmp_path / "live", tmp_path / "offline"
     live = start(recording, out, "--realtime", "--map", "--segmenter", "none")
     output, errors = live.communicate(timeout=120)

@@ -1,4 +1,4 @@
-"""``live --map``: a process that dies, hangs or finds no room costs submaps, never the loop."""
+"""``live --map``: if its process crashes, hangs or the disk is full, only submaps are lost."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FRAMES = [
 
 
 def wait_for(slam: LiveSlam, deaths: int) -> None:
-    """Until the dense map's process has died so often, or more, and nothing waits for it."""
+    """Wait until the dense map's process has crashed this often and nothing waits for it."""
     deadline_s = time.monotonic() + 60
     while time.monotonic() < deadline_s:
         slam.catch_up()
@@ -51,7 +51,7 @@ def wait_for(slam: LiveSlam, deaths: int) -> None:
 
 
 def keyframes_without(run: Path) -> dict[int, str]:
-    """Keyframes of the map without a submap, and what dense.json says why; some have one."""
+    """Keyframes of the map without a submap, and the reasons in dense.json."""
     folder = DenseFolder.open(run)
     ids = [k.id for k in read_saved_map(run).keyframes]
     done = [k for k in range(100) if folder.is_done(k)]
@@ -63,7 +63,7 @@ def keyframes_without(run: Path) -> dict[int, str]:
 
 
 def off_the_plane_m(run: Path) -> float:
-    """How far the cloud's points are from the plane that was seen, 95 % of them."""
+    """The 95 % quantile of distances from the cloud's points to the plane."""
     cloud = read_ply(run / "dense" / "cloud.ply")
     world_camera = read_tum(run / "trajectory.txt").poses_world_camera[0]
     depth_m = float(FRAMES[0].depth_m[240, 320])

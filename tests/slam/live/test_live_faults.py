@@ -1,4 +1,4 @@
-"""What goes wrong around the live loop, really caused: the trajectory is saved, nothing is left."""
+"""Real faults around the live loop: the trajectory is saved and no process remains."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FRAMES = [
 
 
 def running(pids: list[int]) -> list[int]:
-    """Those that are not gone, but for zombies."""
+    """The processes that still run, without zombies."""
     states = {}
     for pid in pids:
         path = Path(f"/proc/{pid}/stat")
@@ -51,7 +51,7 @@ def running(pids: list[int]) -> list[int]:
 
 
 def fill(disk: Path) -> Path:
-    """Use up all that is left."""
+    """Fill the file system."""
     ballast = disk / "ballast"
     with ballast.open("wb", buffering=0) as file:
         try:
@@ -85,7 +85,7 @@ def test_tracking_continues_while_the_disk_is_full(small_disk, caplog) -> None:
 
 
 class Camera:
-    """Gives some frames and is then unplugged."""
+    """A camera that is unplugged after some frames."""
 
     name = "camera"
     camera = CAMERA
@@ -183,7 +183,7 @@ def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:
         port = probe.getsockname()[1]
 
     def spawn(stream: rerun.RecordingStream) -> None:
-        """A viewer without a window in place of one with, since tests have no display."""
+        """Start a viewer without a window, since tests have no display."""
         command = [sys.executable, "-m", "rerun", "--serve-grpc", "--port", str(port)]
         viewers.append(subprocess.Popen(command, stdout=-3, stderr=-3))
         stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")

@@ -1,4 +1,4 @@
-"""The live loop on rendered views: as good as offline, and whole whatever dies."""
+"""The live loop on rendered views: as accurate as offline, and robust to crashed processes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def error_m(poses: Array, first: int = 0) -> float:
 
 
 def children() -> set[int]:
-    """Processes of this one's that still run."""
+    """Child processes of this one that still run."""
     tasks = Path("/proc/self/task").glob("*/children")
     found = {int(pid) for task in tasks for pid in task.read_text().split()}
     states = {p: Path(f"/proc/{p}/stat").read_text().rsplit(")", 1)[1].split()[0] for p in found}
@@ -118,7 +118,7 @@ def test_repeated_map_failures_keep_the_trajectory(tmp_path) -> None:
 
 
 def poison_next_keyframe(slam: LiveSlam, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Its message kills the map's process; the list will hold its id."""
+    """The next keyframe's message kills the map's process; the list gets its id."""
     remote, poisoned = slam._system.remote, []
     send = remote.send
 
@@ -202,7 +202,7 @@ def test_black_frames_are_lost_and_tracking_recovers() -> None:
 
 
 def settings() -> tuple[float, int, bool]:
-    """Whether objects are frozen, not how many: those that nothing refers to any more still go."""
+    """The settings; of frozen objects only whether there are any."""
     return sys.getswitchinterval(), faiss.omp_get_max_threads(), gc.get_freeze_count() > 0
 
 

@@ -1,4 +1,4 @@
-"""What the map's process does with what tracking tells it."""
+"""Messages of tracking to the map's process."""
 
 from __future__ import annotations
 

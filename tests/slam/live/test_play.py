@@ -1,4 +1,4 @@
-"""What the live loop takes from a source, and what it leaves."""
+"""The items of a source that the live loop consumes and drops."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def taken(newest: Newest[int]) -> list[int]:
 
 
 def filled(count: int, keep: int) -> Newest:
-    """After a source that gave so many items at once, before any is taken."""
+    """The queue after a source gave this many items at once, before any is consumed."""
     all_there = threading.Event()
 
     def at_once() -> Iterator[int]:

@@ -1,4 +1,4 @@
-"""When the live loop writes its trajectory: often, but never for long."""
+"""How often the live loop writes its trajectory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 def written(clock: SimpleNamespace, cost_s: float, error: OSError | None = None) -> list[float]:
-    """When a trajectory that takes so long is written, of 300 s with ten frames a second."""
+    """Times at which a trajectory is written if this takes so long; 300 s at 10 Hz."""
     times: list[float] = []
 
     def write(_: Trajectory) -> None:

@@ -1,4 +1,4 @@
-"""Which keyframes the dense map's process gets: the stated policy, with a stand-in process."""
+"""The policy of sending keyframes to the dense map's process, with a fake process."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SETUP = DenseSetup(Path("run"), CAMERA, SegmenterOptions(), ("background",))
 
 
 class StandIn:
-    """A process that does nothing by itself, and is told to die."""
+    """A fake process that does nothing and crashes on request."""
 
     def __init__(self, *arguments: Any) -> None:
         self.sent: list[Any] = []
@@ -70,7 +70,7 @@ def process(dense: RemoteDenseMapper) -> StandIn:
 
 
 def a_map(count: int) -> WorldMap:
-    """Keyframes side by side, each with landmarks of its own."""
+    """A map of keyframes side by side, each with its own landmarks."""
     world, rng = WorldMap(), np.random.default_rng(1)
     for k in range(count):
         T = make_pose(np.eye(3), np.array([0.1 * k, 0.0, 0.0]))

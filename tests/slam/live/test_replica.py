@@ -1,4 +1,4 @@
-"""A copy fed with deltas is the owner's map, whatever happened to that."""
+"""A replica updated by deltas equals the owner's map."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def equal(copy: WorldMap, world: WorldMap) -> None:
 
 @pytest.fixture(scope="module")
 def followed() -> tuple[SlamSystem, WorldMap, FrameHistory, list[int]]:
-    """A system, a copy that was brought up to date after every frame, and the deltas' sizes."""
+    """A system, its replica updated after every frame, and the sizes of the deltas."""
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS))
     maker, copy, history, sizes = DeltaMaker(), WorldMap(), FrameHistory(), []
     x = np.concatenate([np.arange(12), np.arange(12)[::-1]]) * 0.03

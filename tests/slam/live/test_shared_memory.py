@@ -1,4 +1,4 @@
-"""Memory between two processes: bytes come out as they went in, and a full one refuses."""
+"""Shared memory of two processes: round trip, and errors if it is full."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes: what is said arrives in order, and no death goes unseen or leaves anything."""
+"""Processes: messages arrive in order; crashes are detected and leave no files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loops from recognition to the optimised map, on a camera that turns once round in a room."""
+"""Loop closing from recognition to the optimised map; the camera turns once in a room."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def pose_of(k: int) -> Array:
 
 @dataclass
 class Ring:
-    """The mapper fed with keyframes whose landmarks are forgotten after five of them."""
+    """The mapper with keyframes whose landmarks are not matched again after five keyframes."""
 
     config: LoopClosingConfig = field(default_factory=LoopClosingConfig)
     memory: int = 5
@@ -54,7 +54,7 @@ class Ring:
         self.noise = rng.normal(size=(60, 1500, 3)) * [0.2, 0.2, 0.05]
 
     def step(self) -> tuple[Keyframe, list[LoopConstraint]]:
-        """One more keyframe: landmarks, optimisation, loops."""
+        """Add a keyframe: landmarks, optimisation, loops."""
         world, k = self.mapper.world, self.mapper.world.next_keyframe_id
         camera_points = transform(inverse(pose_of(k)), self.points)
         pixels = CAMERA.project(np.where(camera_points[:, 2:] > 0.1, camera_points, [9e9, 0, 1]))
@@ -95,7 +95,7 @@ class Ring:
         return [loop for _ in range(count) for loop in self.step()[1]]
 
     def error_rad(self) -> float:
-        """How far the newest keyframe is turned against the first."""
+        """The rotation error of the newest keyframe against the first."""
         keyframes = self.mapper.world.keyframes
         newest = max(keyframes)
         T = inverse(keyframes[0].T_world_camera) @ keyframes[newest].T_world_camera
@@ -155,7 +155,7 @@ def test_an_accepted_wrong_loop_is_removed_later(monkeypatch: pytest.MonkeyPatch
 
 
 def test_wrong_loops_among_a_strong_set_are_removed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A strong set is believed against the path; what contradicts the set itself is not."""
+    """A strong set of loops is accepted against the path; contradictions within the set are not."""
     sound, ring = Ring(), Ring()
     right = sound.run(ONCE_ROUND)
     last = max(loop.keyframe_b for loop in right)
@@ -185,7 +185,7 @@ def straight_world(count: int) -> WorldMap:
 
 
 def displaced(world: WorldMap, a: int, b: int, T_drift: Array) -> LoopConstraint:
-    """What a loop says when b's part of the map is displaced by T_drift (in the world)."""
+    """The loop if b's part of the map is displaced by T_drift (in the world)."""
     T_a, T_b = (world.keyframes[k].T_world_camera for k in (a, b))
     return constraint(a, b, inverse(T_a) @ T_drift @ T_b)
 
@@ -295,7 +295,7 @@ def test_keyframes_at_the_ends_of_loops_are_never_culled(monkeypatch: pytest.Mon
 
 
 def test_joining_a_segment_keeps_the_closed_loops_in_the_graph() -> None:
-    """A loop that were missing there would be refuted at the next closure, and taken apart."""
+    """A missing loop would be rejected and undone at the next closure."""
     ring = Ring()
     assert ring.run(ONCE_ROUND + 4)
     mapper = ring.mapper

@@ -1,4 +1,4 @@
-"""Votes for places on random descriptors, against a slow reference, and what makes a candidate."""
+"""Votes of random descriptors against a simple reference, and the rules for candidates."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def alone(_: int) -> list[int]:
 
 
 def neighbours(places: dict[int, int]) -> Callable[[int], list[int]]:
-    """Covisible are the keyframes of the same visit to a place."""
+    """Keyframes of the same visit to a place, which are covisible."""
     return lambda k: [j for j, place in places.items() if j != k and place == places.get(k)]
 
 
@@ -40,7 +40,7 @@ def rng() -> np.random.Generator:
 def reference_votes(
     query: Bits, keyframes: dict[int, Bits], config: IndexConfig
 ) -> dict[int, float]:
-    """The definition, written down slowly."""
+    """The definition as loops."""
     scores: dict[int, float] = {}
     size = len(keyframes) + 1
     for descriptor in query:
@@ -112,7 +112,7 @@ def test_removing_equals_never_adding(config: IndexConfig, rng: np.random.Genera
 
 
 def test_excluded_keyframes_do_not_displace_others(rng: np.random.Generator) -> None:
-    """The best of the rest is compared with the rest only, not with what was excluded."""
+    """The best of the others is compared with the others only, not with excluded ones."""
     place = random_descriptors(40, rng)
     index = DescriptorIndex()
     index.add(0, changed(place, 40, rng))
@@ -174,7 +174,7 @@ def test_recent_and_covisible_keyframes_are_not_candidates(rng: np.random.Genera
 
 
 def test_covisible_keyframes_vote_together(rng: np.random.Generator) -> None:
-    """Two visits: one keyframe with most votes of all, and three that together have more."""
+    """Two visits: one keyframe with most votes, and three that have more together."""
     place = random_descriptors(120, rng)
     visits = {0: 0, 1: 1, 2: 1, 3: 1}
     rules = PlaceConfig(recent=0, consistent_queries=1, group_share=0.9)

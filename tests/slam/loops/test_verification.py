@@ -1,4 +1,4 @@
-"""Loops on exact synthetic keyframes: pose, frames, covariance, landmarks, and refusals."""
+"""Loops of exact synthetic keyframes: pose, frames, covariance, landmarks, and rejections."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def views(
     noise: float = 1.0,
     T_new_old: Array | None = None,
 ) -> tuple[LoopView, LoopView]:
-    """Two keyframes of one place; their points are their own noisy measurements.
+    """Two keyframes of one place with noisy measurements each.
 
     A share of b's keypoints, ``outliers``, lies elsewhere with the right descriptor.
     """
@@ -137,7 +137,7 @@ def test_landmark_pairs_have_ids_of_a_then_b() -> None:
 
 @pytest.mark.parametrize("points_in", ["both", "half"])
 def test_the_covariance_is_consistent(points_in: str) -> None:
-    """NEES: 6 degrees a run. Information must not count twice what matches both ways."""
+    """NEES with 6 degrees of freedom a run. Matches in both directions must not count twice."""
     nees = []
     for seed in range(60):
         view_a, view_b = views(seed, count=120)
@@ -171,7 +171,7 @@ def test_the_same_call_gives_the_same_bytes() -> None:
 
 
 def test_keypoints_without_landmarks_are_found_by_the_pose() -> None:
-    """Descriptors of points match 100 times; the others only have a point on one side."""
+    """100 points match; the others have a point on one side only."""
     view_a, view_b = views(7)
     both = loop(without_points(view_a, slice(0, 50)), without_points(view_b, slice(150, 200)))
     assert both.inliers > 170
@@ -206,7 +206,7 @@ def test_equal_descriptors_at_other_positions_give_no_consensus() -> None:
 
 
 def test_a_small_common_object_is_refused() -> None:
-    """20 of 200 keypoints agree: a poster that hangs in two rooms."""
+    """20 of 200 keypoints agree, as with the same poster in two rooms."""
     assert refusal(*views(12, outliers=0.9)).reason is NoLoopReason.FEW_INLIERS
     view_a, view_b = views(12, count=600, outliers=0.9)
     other = random_descriptors(540, np.random.default_rng(0))

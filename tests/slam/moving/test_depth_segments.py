@@ -1,4 +1,4 @@
-"""A card before a wall and a floor, in part where space was free."""
+"""A card before a wall and a floor, partly in former free space."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CONFIG = DepthSegmentConfig(step_px=8, least=3, share=0.2)
 
 
 def scene() -> np.ndarray:
-    """Metres: a wall at 4, a card at 2 whose foot stands on a floor that comes nearer."""
+    """Depth in m: a wall at 4, a card at 2 that touches a floor in front."""
     depth_m = np.full((240, 320), 4.0, np.float32)
     depth_m[120:] = (4.0 * 120 / np.arange(120, 240))[:, None]
     depth_m[40:216, 80:160] = 2.0
@@ -20,7 +20,7 @@ def scene() -> np.ndarray:
 
 
 def free_in(rows: slice, columns: slice) -> np.ndarray:
-    """Verdicts of the samples: free space in a part of the image, a surface elsewhere."""
+    """Point motions of the samples: free space in a part of the image, a surface elsewhere."""
     point_motions = np.ones((240, 320), np.int8)
     point_motions[rows, columns] = -1
     return point_motions[::8, ::8]
@@ -72,14 +72,14 @@ def test_coverage_of_sampled_pixels_equals_that_of_keypoints(step: int) -> None:
 
 
 def loaded(box_m: float = 1.9) -> np.ndarray:
-    """The scene, and beside the card a box whose side falls away from it, 8 % every 8 pixels."""
+    """The scene, and beside the card a box with a slanted side, 8 % deeper every 8 pixels."""
     depth_m = scene()
     depth_m[80:160, 160:224] = box_m * 1.08 ** (np.arange(64) // 8)
     return depth_m
 
 
 def held(depth_m: np.ndarray, seen: np.ndarray, **config: float) -> np.ndarray:
-    """What the card holds, where views spoke of samples ``seen`` (30, 40) and nothing else."""
+    """Samples that the card carries if views observed the samples ``seen`` (30, 40) only."""
     regions = depth_segments(depth_m, DepthSegmentConfig(step_px=8, **config))  # type: ignore[arg-type]
     return regions.held(CARD, seen.astype(np.int8))
 
@@ -135,7 +135,7 @@ def test_regions_equal_a_flood_fill() -> None:
 
 
 def reached(region: np.ndarray, depth_m: np.ndarray) -> int:
-    """How many pixels of a region its first one reaches by steps of less than the jump."""
+    """The number of pixels connected with a region's first one by steps below the jump."""
     todo, seen = [tuple(np.argwhere(region)[0])], set()
     while todo:
         i, j = todo.pop()

@@ -1,4 +1,4 @@
-"""Real pairs of frames with a man who walks: he moves, boards and walls do not."""
+"""Real pairs of frames with a walking person: the person moves, boards and walls do not."""
 
 from __future__ import annotations
 

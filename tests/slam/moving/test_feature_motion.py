@@ -1,4 +1,4 @@
-"""Keypoints in boxes in space, and what those in the boxes hold."""
+"""Keypoints in moving boxes, and carried objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Free space seen by views of a plane with a box before it, in a world turned at random."""
+"""Free space by views of a plane with a box before it, in a random world frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a keyframe's masks and views tell of its instances."""
+"""The motion of a keyframe's instances by its masks and views."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def instance_motion() -> InstanceMotion:
 
 
 def masks(depth_m: Floats) -> KeyframeMasks:
-    """Of a keyframe with every fourth pixel of that depth each way, and no instance."""
+    """Masks of a keyframe with depth at every fourth pixel and without instances."""
     assignment = assign_pixels([], depth_m, SIZE, VoteConfig())
     none = np.zeros(0, np.int64)
     return KeyframeMasks(3, NAMES, assignment, depth_m, POSE, none, none, np.zeros((0, 2)))
 
 
 def track(centre: Array) -> Track:
-    """Of a thing half a metre deep, whose middle is there in the camera's frame."""
+    """A track of an object half a metre deep with this centre in the camera frame."""
     (mean,) = transform(POSE, np.array([centre]))
     half_size, distribution = np.array([0.3, 0.9, 0.25]), np.array([0, 1], np.float32)
     state = np.r_[mean, 0, 0, 0], np.eye(6)

@@ -34,7 +34,7 @@ def pose(index: int) -> Array:
 
 
 def card(index: int) -> tuple[slice, slice]:
-    """Rows and columns that the card covers; it stands still in the world until frame 8."""
+    """Rows and columns that the card covers; it is static until frame 8."""
     x_world = -0.55 + 0.04 * max(index - 8, 0)
     corner = transform(inverse(pose(index)), np.array([[x_world, 0.0, CARD_Z_M]]))
     left = round(float(CAMERA.project(corner)[0, 0]))
@@ -69,7 +69,7 @@ class CardSegmenter:
 
 
 class WatchedSystem(SlamSystem):
-    """Counts, for every frame, keypoints on the card and off it, and those left out of either."""
+    """Counts keypoints on and off the card, and the excluded ones of both, for every frame."""
 
     counts: list[tuple[int, int, int, int]]
 
@@ -142,7 +142,7 @@ def test_a_person_is_excluded_before_moving_and_between_keyframes(frames: list[F
 
 
 def standing(frames: int) -> list[Frame]:
-    """The card never moves, the camera hardly."""
+    """The card does not move, and the camera little."""
     still = [view(0)] * frames
     return [replace(f, index=k, timestamp_s=k / 30, name="0") for k, f in enumerate(still)]
 

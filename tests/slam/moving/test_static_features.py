@@ -1,4 +1,4 @@
-"""A frame whose keypoints on one side are of no use gets as many others on the other side."""
+"""If keypoints on one side are excluded, as many are added on the other side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Things that are left out for their class alone, and come back once they are seen to stand."""
+"""Instances excluded by class only, and reinstated when they are verified as static."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def track(track_id: int = 7) -> Track:
 
 
 def watching(config: StaticVerificationConfig = CONFIG) -> tuple[StaticVerification, WorldMap]:
-    """A body that keyframe 0 saw."""
+    """Verification of a person observed by keyframe 0."""
     static_verification, world = StaticVerification(CHECK, config, 20, 5), WorldMap()
     world.add_keyframe(keyframe())
     add(static_verification, world, masks_of(), track())
@@ -87,7 +87,7 @@ def add(
 def verified(
     static_verification: StaticVerification, world: WorldMap, images: list[Array], hz: float = 30
 ) -> list[int]:
-    """In which of some frames something is found to stand."""
+    """The frames in which an instance is verified as static."""
     views = [depth_view(image, CHECK.config.window_px) for image in images]
     return [
         k

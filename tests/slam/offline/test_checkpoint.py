@@ -1,4 +1,4 @@
-"""Checkpoints: a run that is killed at any moment and resumed ends as if nothing had happened."""
+"""Checkpoints: a run killed at any moment and resumed equals an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def options(sequence: Path, out: Path, **more: object) -> RunOptions:
 
 
 def result(folder: Path) -> dict[str, object]:
-    """All that a run leaves, without what holds times."""
+    """All files of a run, without times."""
     files = {path.name: path.read_bytes() for path in folder.iterdir()}
     with (folder / "frames.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -56,7 +56,7 @@ def result(folder: Path) -> dict[str, object]:
 
 
 def killed(work: Callable[[], object]) -> bool:
-    """Do something in a process of its own; whether it was killed while at it."""
+    """Run a function in a process of its own; returns whether it was killed."""
     child = os.fork()
     if child == 0:
         try:
@@ -67,7 +67,7 @@ def killed(work: Callable[[], object]) -> bool:
 
 
 def kill_at_rename(monkeypatch: pytest.MonkeyPatch, number: int, after: bool) -> None:
-    """This process is killed before, or after, it gives the n-th file its final name."""
+    """Kill this process before or after it renames the n-th file to its final name."""
     renames = iter(range(1, 1000))
     rename = os.replace
 
@@ -182,7 +182,7 @@ def begun(sequence: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def refused(begun: Path, sequence: Path) -> Iterator[Callable[..., None]]:
-    """Expects that resuming fails with a message, and leaves the run folder as it is."""
+    """Check that resuming fails with a message and does not change the run folder."""
 
     def check(message: str, given: dict[str, object] | None = None) -> None:
         before = {path: path.read_bytes() for path in begun.iterdir()}
@@ -253,7 +253,7 @@ def test_a_foreign_checkpoint_is_refused(begun: Path, refused) -> None:
 
 
 def test_the_systems_arrays_are_checked(begun: Path) -> None:
-    """The real system refuses the fake one's state."""
+    """The real system rejects the fake one's state."""
     with pytest.raises(InputError, match=r"out/checkpoint: array '[\w.]+' is \w+; save it again"):
         resume(begun)
 
@@ -278,7 +278,7 @@ def test_a_run_without_checkpoints_cannot_be_resumed(sequence: Path, tmp_path: P
 
 
 def kill_after_lines(command: list[str], frames: Path, lines: int, delay_s: float) -> None:
-    """Start the program and kill it soon after frames.csv has so many lines."""
+    """Start the program and kill it soon after frames.csv has this many lines."""
     with subprocess.Popen([sys.executable, "-m", "bmask_slam", *command]) as process:
         while process.poll() is None:
             if frames.exists() and frames.read_bytes().count(b"\n") >= lines:

@@ -1,4 +1,4 @@
-"""A saved map: another recording goes on from it, or is only localised in it."""
+"""A saved map: another recording continues it, or is localised in it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def started(state: Arrays, make: type[SlamSystem] = SlamSystem) -> SlamSystem:
 
 
 def largest_error_m(results: list[FrameResult], poses: list[Array]) -> float:
-    """Of the frames as the map sees them, whose world is the camera at x = -1.6 m."""
+    """The largest error of frames in the map frame, which is the camera at x = -1.6 m."""
     T_map_plane = inverse(sideways(1, -1.6)[0])
     offsets = [
         se3_log(inverse(T_map_plane @ T) @ r.T_world_camera)[3:]
@@ -117,7 +117,7 @@ def test_localisation_finds_every_frame_and_changes_nothing(state: Arrays) -> No
 
 
 def part_of_state(state: Arrays) -> Arrays:
-    """The map proper: not how often landmarks were looked for."""
+    """The map without search counters of landmarks."""
     counters = ("visible", "found")
     kept = ("mapper.world", "mapper.graph")
     return {k: a for k, a in state.items() if k.startswith(kept) and not k.endswith(counters)}
@@ -175,7 +175,7 @@ def test_localisation_excludes_options_that_extend_the_map(other: str, flag: str
 
 
 def cut_out(folder: Path, frames: range, margin_px: int = 0) -> Path:
-    """Some frames of the kitchen as a sequence, seen by a camera with a smaller image."""
+    """Some frames of the kitchen as a sequence with smaller images."""
     inside = slice(margin_px, -margin_px or None)
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True)

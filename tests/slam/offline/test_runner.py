@@ -1,4 +1,4 @@
-"""The runner against a system that knows the answer: files, metrics, stops and refusals."""
+"""The runner with a fake system with known poses: files, metrics, stops and errors."""
 
 from __future__ import annotations
 

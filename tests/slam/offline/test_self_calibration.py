@@ -1,4 +1,4 @@
-"""The camera that a run finds by itself: sure, unsure, adopted, resumed, gone on with."""
+"""Self-calibration in a run: observability, adoption, resuming and continuing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DELAY_S = 0.012
 
 @pytest.fixture(scope="module")
 def late_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered sequence whose depth images are late, which its camera does not say."""
+    """A rendered sequence with delayed depth images, without the delay in its camera."""
     folder = tmp_path_factory.mktemp("late") / "office"
     config = RenderConfig(
         "office", 100, fps=15.0, width=320, height=240, sweeping=True, depth_delay_ms=1e3 * DELAY_S
@@ -137,7 +137,7 @@ def test_a_found_camera_is_adopted() -> None:
 
 
 def test_two_rounds_are_extrapolated() -> None:
-    """A run that is off by d finds a camera that is off by a share of d."""
+    """A run with a camera error d finds a camera with a fraction of d as error."""
     truth, share = 0.026, 0.4
 
     def estimate(start: float) -> Estimate:

@@ -1,4 +1,4 @@
-"""``bmask-slam optimise RUN``: frames move exactly with keyframes; a real run gets no worse."""
+"""``bmask-slam optimise RUN``: frames move with keyframes; a real run does not get worse."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ def test_frames_move_with_the_world_when_all_keyframes_do() -> None:
 
 
 def test_frames_move_with_their_keyframes_interpolated_between() -> None:
-    """Two keyframes turn about their own centres and shift; the frame halfway gets the half."""
+    """Two keyframes rotate about their centres and shift; the frame halfway moves by half."""
     poses = make_pose(np.eye(3), np.arange(5.0)[:, None] * [1.0, 0, 0])
     turn = so3_exp(np.array([0, 0.2, 0]))
     after = np.stack([poses[1], make_pose(turn, poses[3, :3, 3] + [0, 0.4, 0])])
@@ -70,7 +70,7 @@ def test_keyframes_of_other_trajectories_do_not_count() -> None:
 
 @pytest.fixture(scope="module")
 def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run over a part of the red kitchen, without the adjustment that ends a run."""
+    """A run over a part of the red kitchen, without the final adjustment."""
     out = tmp_path_factory.mktemp("runs") / "kitchen"
     config = SystemConfig(final_adjustment=False)
     return run(RunOptions(KITCHEN, config, out=out, max_frames=60, stride=2, quiet=True)).folder
@@ -131,7 +131,7 @@ def test_keyframes_landmarks_and_graph_are_consistent(kitchen: Path, tmp_path: P
 
 
 def test_the_saved_map_is_the_adjusted_one(kitchen: Path, tmp_path: Path) -> None:
-    """Its poses are the graph's; a run can be localised in it, or continue it."""
+    """Its poses equal the graph's; a run can be localised in it, or continue it."""
     out = tmp_path / "adjusted"
     assert optimise(kitchen, "--out", out, "--quiet") == 0
     state, camera = read_map(out)
@@ -174,7 +174,7 @@ def test_the_exported_graph_is_adjusted_to_the_same_cost(kitchen: Path, tmp_path
 
 
 def test_only_the_graph_section_of_the_configuration_is_read(kitchen: Path, tmp_path: Path) -> None:
-    """A run of another version, whose other settings have other names, is adjusted too."""
+    """A run of another version with renamed settings is adjusted too."""
     other = tmp_path / "other"
     shutil.copytree(kitchen, other)
     (other / "config.yaml").write_text("tracking: {gone: 1}\ngraph: {huber_stereo: 5.5}\n")

@@ -1,4 +1,4 @@
-"""``bmask-slam optimise`` as a user meets it, from a g2o file to a g2o file and a picture."""
+"""``bmask-slam optimise`` from a g2o file to a g2o file and a picture."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The boxes that a rendered sequence states hold what its pictures show of the objects."""
+"""The annotated boxes of a rendered sequence contain the pixels of the objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random rooms: the same from the same seed, nothing in anything else, every class somewhere."""
+"""Random rooms: determined by the seed, without intersections, with every class."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def rooms() -> list[RandomRoom]:
 
 
 class _Bare(SceneBuilder):
-    """A builder that saves the time to paint; it draws the same random numbers."""
+    """A builder without textures, for speed; it draws the same random numbers."""
 
     def _paint(self, painter: Painter, width_m: float, height_m: float, px_per_m: float) -> Image:
         self.rng.integers(2**63)
@@ -84,7 +84,7 @@ def test_footprints_lie_in_the_room_and_apart(rooms: list[RandomRoom]) -> None:
 
 
 def test_furniture_stays_on_its_footprint() -> None:
-    """Every corner that is built lies above the rectangles that keep the others away."""
+    """Every corner of an object is above its footprint."""
     for seed in range(4):
         layout = draw_room(seed).layout
         for piece in layout.pieces:

@@ -200,7 +200,7 @@ def test_same_configuration_gives_the_same_bytes(sequence: Path, tmp_path: Path)
 
 
 def test_delayed_depth_is_rendered_from_a_later_pose(tmp_path: Path) -> None:
-    """At 30 Hz, depth 33.3 ms late is the next frame's; colour stays as it is."""
+    """At 30 Hz, depth delayed by 33.3 ms equals that of the next frame; colour is unchanged."""
     config = {"frames": 3, "width": 160, "height": 120, "noise": False, "sweeping": True}
     on_time, late = (
         render_sequence(RenderConfig("office", depth_delay_ms=ms, **config), tmp_path / f"{ms:.0f}")

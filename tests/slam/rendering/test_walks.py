@@ -1,4 +1,4 @@
-"""Rounds that go along with the camera."""
+"""People who walk with the camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The file of keyframe covariances, and what a run puts into it."""
+"""The file of keyframe covariances, also of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``bmask-slam export``: each format read back from a run folder, and what cannot be written."""
+"""``bmask-slam export``: each format is read back, and errors."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ POINTS = np.array([[0.1, 0.2, 3.0], [-0.4, 0.1, 2.5], [0.3, -0.2, 4.0]])
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run folder with what export reads: six frames, two keyframes, three landmarks."""
+    """A run folder with the files that export reads: six frames, two keyframes, three landmarks."""
     folder = tmp_path / "run"
     folder.mkdir()
     poses = se3_exp(0.05 * np.random.default_rng(0).normal(size=(6, 6)))

@@ -1,4 +1,4 @@
-"""The run folder: what it refuses, what it leaves, and that files appear whole."""
+"""The run folder: errors, remaining files, and complete files only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a run's images are, by its config.yaml."""
+"""The sequence of a run by its config.yaml."""
 
 from __future__ import annotations
 

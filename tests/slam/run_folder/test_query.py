@@ -1,4 +1,4 @@
-"""Objects written by a run, read back, and asked for by name."""
+"""Objects of a run: read back, and queried by name."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture
 def known(tmp_path: Path) -> Run:
-    """A run of a system that knows the answer; frames 6 and 13 are lost."""
+    """A run of the fake system; frames 6 and 13 are lost."""
     options = RunOptions(make_sequence(tmp_path / "seq"), out=tmp_path / "run", quiet=True)
     return Run(runner.run(options, FakeSystem).folder)
 
@@ -161,7 +161,7 @@ def test_the_camera_is_that_of_the_sequence(labelled: Run) -> None:
 
 
 def killed(tmp_path: Path, **options: int) -> Run:
-    """What a run leaves that ends without a word after frame 41."""
+    """The folder of a run that is killed after frame 41."""
 
     class KilledError(Exception):
         pass

@@ -1,4 +1,4 @@
-"""A tiny sequence in TUM layout whose pixels tell the frame."""
+"""A tiny sequence in TUM layout with the frame number in the pixels."""
 
 from pathlib import Path
 

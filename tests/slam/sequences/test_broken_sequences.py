@@ -1,4 +1,4 @@
-"""Broken input: one clear line for each case; a single broken frame is passed over."""
+"""Broken input: one clear line for each case; a single broken frame is skipped."""
 
 import re
 from pathlib import Path

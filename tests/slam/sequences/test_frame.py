@@ -1,4 +1,4 @@
-"""Frames that a caller hands in: broken ones are refused, and zeros in depth become NaN."""
+"""Frames from a caller: broken ones are refused, and zeros in depth become NaN."""
 
 from __future__ import annotations
 

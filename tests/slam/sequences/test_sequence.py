@@ -1,4 +1,4 @@
-"""Sequences in TUM layout: what is read, in which order, and by which thread."""
+"""Sequences in TUM layout: frames, their order, and the reading thread."""
 
 import re
 import threading
@@ -66,7 +66,7 @@ def test_early_stop_ends_the_thread(folder):
 
 
 def test_early_stop_wastes_no_work(folder):
-    """Only the frame in hand is finished; those that wait behind it are never prepared."""
+    """Only the current frame is finished; waiting ones are not prepared."""
     prepared, begun, go = [], threading.Event(), threading.Event()
 
     def prepare(frame):
@@ -109,7 +109,7 @@ def test_order_of_lines_never_matters(folder):
 
 
 def test_pairs_by_time_not_by_line(folder):
-    """Without its first depth image the first colour image stays alone; the rest keep theirs."""
+    """Without the first depth image the first colour image has no pair; the others keep theirs."""
     lines = (folder / "depth.txt").read_text().splitlines()
     (folder / "depth.txt").write_text("\n".join(lines[1:]))
     sequence = open_sequence(folder)
@@ -153,7 +153,7 @@ def test_groundtruth(folder):
 
 
 def test_info(folder):
-    """Frames 5 to 8 are taken out; one colour image stays alone at 7 s."""
+    """Frames 5 to 8 are removed; one colour image at 7 s has no pair."""
     for name in ("rgb.txt", "depth.txt"):
         lines = (folder / name).read_text().splitlines()
         lines = [line for line in lines if not re.search(r"/[5-8]", line)]
@@ -180,7 +180,7 @@ def test_info(folder):
 
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="no ../shared/data/redkitchen here")
 def test_red_kitchen():
-    """A real frame: a point of the first image lies on the surface that the 30th sees."""
+    """Real frames: a point of the first image is on the surface in the 30th."""
     sequence = open_sequence(KITCHEN)
     assert len(sequence) == 600
     assert sequence.camera.fx == pytest.approx(527.27)

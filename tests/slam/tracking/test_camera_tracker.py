@@ -26,7 +26,7 @@ NO_IDS = np.zeros(0, np.int64)
 
 
 class RecordingTracker:
-    """Stands for the tracker: notes the prediction, and tracks there or is lost."""
+    """A fake tracker: records the prediction, and tracks there or is lost."""
 
     def __init__(self) -> None:
         self.predictions: list[Array] = []
@@ -41,7 +41,7 @@ class RecordingTracker:
 
 @dataclass
 class StillMap:
-    """A map with one keyframe, whose owner is ready or busy."""
+    """A map with one keyframe and a back end that is ready or busy."""
 
     world: WorldMap = field(default_factory=WorldMap)
     history: FrameHistory = field(default_factory=FrameHistory)

@@ -109,7 +109,7 @@ def test_one_third_outliers_do_not_change_the_pose(seed: int) -> None:
 
 @pytest.mark.parametrize("mono_share", [0.0, 0.6])
 def test_information_is_consistent_with_the_errors(mono_share: float) -> None:
-    """NEES with a gate wide open for honest points: chi-square, 6 degrees a run.
+    """NEES with a wide gate: chi-square with 6 degrees of freedom a run.
 
     The 95 % gate takes the tails, which costs a few per cent of information and of error alike.
     """
@@ -156,7 +156,7 @@ def test_sigmas_are_weights() -> None:
 
 
 def test_depth_is_observed_through_disparity_alone() -> None:
-    """A step along the axis towards points near the axis: pixels hardly tell, disparity does."""
+    """A step along the axis towards points near the axis: it changes disparity, hardly pixels."""
     rng = np.random.default_rng(6)
     z = rng.uniform(1.0, 3.0, 40)
     pixels = rng.uniform([310.0, 235.0], [327.0, 248.0], (40, 2))
@@ -191,7 +191,7 @@ def test_points_behind_the_camera_are_not_inliers() -> None:
 
 
 def test_nan_measurements_give_no_pose() -> None:
-    """Measurements that have nothing to do with the points: hardly any inliers, or not ok."""
+    """Random measurements: few inliers, or no pose."""
     rng = np.random.default_rng(10)
     points = points_before(T_WORLD_CAMERA, 100, rng)
     nonsense = np.column_stack(

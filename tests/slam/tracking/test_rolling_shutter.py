@@ -1,4 +1,4 @@
-"""Rolling shutter: exact exposures are undone, the velocity is found, the path is better."""
+"""Rolling shutter: exact correction, estimated velocity, and a more accurate path."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_the_motion_is_that_since_the_previous_pose() -> None:
 
 
 def test_the_velocity_is_found_from_matches() -> None:
-    """In two steps from an error of 0.2 rad/s and 0.1 m/s, by a prior that hardly holds it back."""
+    """In two steps from an error of 0.2 rad/s and 0.1 m/s, with a weak prior."""
     points = scene(300)
     features, T = exposed(points, 0.025)
     wrong = Motion(TWIST + np.array([0.2, -0.2, 0.2, 0.1, 0.1, -0.1]), 10.0)
@@ -117,7 +117,7 @@ def test_the_velocity_is_found_from_matches() -> None:
 
 
 def test_the_path_of_a_shaken_camera_is_better() -> None:
-    """Rendered images, row by row, of a hand that turns by up to 1 rad/s."""
+    """Images rendered row by row, of a hand-held camera that turns by up to 1 rad/s."""
     times_s = np.arange(24) / 30.0
 
     def path(t: Array) -> Array:

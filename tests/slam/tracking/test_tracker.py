@@ -1,4 +1,4 @@
-"""Tracking against a map: recovered poses, statuses, and search beside a plain loop."""
+"""Tracking against a map: recovered poses, statuses, and search against a simple loop."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ T_WORLD_CAMERA = se3_exp(np.array([0.02, -0.03, 0.01, 0.06, -0.04, 0.05]))
 
 
 def make_map(count: int, rng: np.random.Generator) -> tuple[WorldMap, Array]:
-    """A keyframe at the origin that made a landmark of every point in its view."""
+    """A map of a keyframe at the origin with a landmark for every point in its view."""
     points = points_before(np.eye(4), count, rng)
     world = WorldMap()
     keyframe = add_keyframe(
@@ -41,7 +41,7 @@ def make_map(count: int, rng: np.random.Generator) -> tuple[WorldMap, Array]:
 def see(
     world: WorldMap, rng: np.random.Generator, clutter: int = 200, noise: float = 1.0
 ) -> Features:
-    """Noisy keypoints of all landmarks, 40 bits off, and as many strangers as asked for."""
+    """Noisy keypoints of all landmarks with 40 changed bits, and this many other keypoints."""
     count = len(world.landmarks)
     flips = np.zeros((count, 512), np.uint8)
     for row in flips:
@@ -144,7 +144,7 @@ def test_with_a_recent_landmark_but_no_local_ones_it_is_lost() -> None:
 
 
 def slow_in_view(world: WorldMap, T: Array, ids: Array, max_angle_deg: float) -> list[int]:
-    """Landmark by landmark: in front, inside the image, seen from near its old direction."""
+    """By loop: landmarks in front, inside the image, with a similar viewing direction."""
     kept = []
     for i in ids:
         x, y, z = (inverse(T) @ np.append(world.landmarks.points_world[i], 1.0))[:3]
@@ -160,7 +160,7 @@ def slow_in_view(world: WorldMap, T: Array, ids: Array, max_angle_deg: float) ->
 
 
 def test_the_search_equals_a_loop() -> None:
-    """From afar and aside, so that some landmarks leave the image, some lie behind, some turn."""
+    """From another position, so that some landmarks are outside the image, behind, or rotated."""
     rng = np.random.default_rng(6)
     world, _ = make_map(300, rng)
     random = rng.normal(size=(60, 3))
@@ -235,7 +235,7 @@ def test_rendered_images_are_tracked_with_subpixel_registration() -> None:
 
 
 def test_images_at_another_distance_are_registered() -> None:
-    """The camera comes nearer by a fifth of the way, where a patch still serves."""
+    """The camera is nearer by a fifth of the distance, where a patch can still be used."""
     extractor = BriskExtractor(CAMERA, FeatureConfig())
     world, _ = map_of_plane(extractor)
     T_nearer = se3_exp(np.array([0.0, 0.0, 0.0, 0.02, -0.01, 0.4]))

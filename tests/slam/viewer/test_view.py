@@ -1,4 +1,4 @@
-"""What Rerun receives, read back from the recording."""
+"""Data sent to Rerun, read back from the recording."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_recording_in_a_missing_folder_is_refused(tmp_path) -> None:
 
 
 def columns(path: Path, entity: str, name: str) -> list[Array]:
-    """What a recording holds of one component of an entity, row by row."""
+    """Rows of one component of an entity in a recording."""
     found = []
     for chunk in RrdReader(path).stream().to_chunks():
         if str(chunk.entity_path) != entity:

@@ -1,4 +1,4 @@
-"""Frames follow their keyframes, also those of keyframes that were culled."""
+"""Frames move with their keyframes, also those of culled keyframes."""
 
 import numpy as np
 from synthetic_view import add_keyframe, make_features
@@ -41,7 +41,7 @@ def test_frames_move_rigidly_with_their_keyframe() -> None:
 
 
 def test_a_frame_is_relative_to_the_pose_its_keyframe_had_then() -> None:
-    """The keyframe moved between its making and the frame: the pose given counts."""
+    """The keyframe moved before the frame: its pose at the time of the frame is used."""
     (T_old, T_now, frame) = random_poses(3)
     world, history = world_of(T_old[None], (0,)), FrameHistory()
     world.keyframes[0].T_world_camera = T_now
@@ -52,7 +52,7 @@ def test_a_frame_is_relative_to_the_pose_its_keyframe_had_then() -> None:
 
 
 def test_a_chain_of_culled_keyframes_composes() -> None:
-    """1 hands over to 2, later 2 to 0: at both times no frame moves; then all move with 0."""
+    """Keyframe 1 is culled for 2, later 2 for 0: no frame moves then; later all move with 0."""
     keyframe_poses, frames = random_poses(3), random_poses(9)
     world, history = world_of(keyframe_poses), FrameHistory()
     for i, T in enumerate(frames):

@@ -1,4 +1,4 @@
-"""The landmark table: growth, ids, and landmarks that follow their host keyframes."""
+"""The landmark table: growth, ids, and landmarks that move with their host keyframes."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_ids_of_removed_landmarks_are_not_reused() -> None:
 
 
 def test_landmarks_move_rigidly_with_their_own_host() -> None:
-    """Seen from its host a landmark stays where it is; other landmarks do not move."""
+    """In its host's frame a landmark does not move; other landmarks do not move at all."""
     table = LandmarkTable()
     for host in (3, 5, 9, 4):
         table.add(columns(4, host))

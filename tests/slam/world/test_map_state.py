@@ -1,4 +1,4 @@
-"""A map as arrays and back."""
+"""The map's state as arrays and restored."""
 
 from bmask_slam.world.map_state import world_of, world_state
 from bmask_slam.world.world_map import WorldMap

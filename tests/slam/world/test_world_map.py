@@ -1,4 +1,4 @@
-"""The map's bookkeeping: who sees what stays true through attaching, fusing and removing."""
+"""The map's observations remain consistent through attaching, fusing and removing."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ COUNT = 30
 
 
 def make_world(keyframes: int = 3, keypoints: int = COUNT) -> WorldMap:
-    """Keyframes in a row whose keypoint i sees point i, and no landmark yet."""
+    """Keyframes in a row whose keypoint i observes point i, without landmarks."""
     points = points_before(np.eye(4), keypoints, RNG)
     world = WorldMap()
     for k in range(keyframes):
@@ -107,7 +107,7 @@ def test_covisibility_counts_shared_landmarks() -> None:
 
 
 def test_fused_landmarks_leave_one_observation_a_keyframe() -> None:
-    """Keyframe 0 sees both, 1 only the old one, 2 only the new one."""
+    """Keyframe 0 observes both, 1 only the old one, 2 only the new one."""
     world = make_world()
     new = make(world, 0, [0])
     old = make(world, 0, [1])
@@ -132,7 +132,7 @@ def test_fused_landmarks_leave_one_observation_a_keyframe() -> None:
 
 
 def test_two_duplicates_fused_into_one_keep_one_observation() -> None:
-    """Two old landmarks in one keyframe with the same heir, which that keyframe did not see."""
+    """Two old landmarks of one keyframe are fused into one that it does not observe."""
     world = make_world()
     parent = make(world, 0, [0])
     twins = make(world, 1, [2, 3])
@@ -167,7 +167,7 @@ def test_counts_are_correct_after_random_changes(seed: int) -> None:
 
 
 def test_patches_are_replaced_only_at_other_views() -> None:
-    """A patch is taken, kept from close by, and retaken from elsewhere."""
+    """A patch is cut, kept from a near view, and replaced from another view."""
     config = SubpixelConfig(max_angle_deg=20.0, max_zoom=1.3)
     frame = render_plane(np.eye(4))
     features = BriskExtractor(CAMERA, FeatureConfig()).extract(frame)
@@ -204,7 +204,7 @@ def test_patches_are_replaced_only_at_other_views() -> None:
 
 
 def test_the_least_similar_patch_is_replaced_and_the_most_similar_used() -> None:
-    """Seen from 1, 2, 4 and 8 times as far, then from half as far: the farthest view leaves."""
+    """Observed from 1, 2, 4 and 8 times the distance, then from half: the farthest is replaced."""
     world = make_world(1)
     keyframe = world.keyframes[0]
     ids = world.make_landmarks(keyframe, np.arange(COUNT), points_of(keyframe, np.arange(COUNT)))

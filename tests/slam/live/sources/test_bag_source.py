@@ -1,4 +1,4 @@
-"""Bags that are written to disk give their frames back."""
+"""Bags are read back."""
 
 from __future__ import annotations
 

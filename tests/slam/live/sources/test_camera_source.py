@@ -24,7 +24,7 @@ DISCONNECTED = object()
 
 
 def pixels_of(k: int, height: int = 480, width: int = 640) -> tuple[np.ndarray, np.ndarray]:
-    """Colour, red first, and depth in millimetres with missing values."""
+    """RGB colour, and depth in millimetres with missing values."""
     rgb = np.full((height, width, 3), (10 * k, 20, 200), np.uint8)
     stored = np.full((height, width), 1000 + k, np.uint16)
     stored[0] = 0
@@ -146,7 +146,7 @@ def test_realsense_gives_metres_seconds_and_red_first(monkeypatch) -> None:
 
 
 def test_realsense_counts_incomplete_framesets(monkeypatch) -> None:
-    """Framesets without depth, with old depth, a duplicate, and a clock that is set back."""
+    """Framesets without depth, with old depth, repeated, and after the clock was set back."""
     sets = [frameset(0, 10_000), (frameset(1, 10_033)[0], None), frameset(2, 10_066, lag_ms=-33)]
     sets += [frameset(3, 10_100), frameset(3, 10_100), frameset(4, 50.0)]
     plug_in(monkeypatch, Device(sets))

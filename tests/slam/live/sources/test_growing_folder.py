@@ -72,7 +72,7 @@ def recorder(tmp_path: Path) -> Recorder:
 
 
 def follow_while(recorder: Recorder, write: Callable[[], None]) -> tuple[list[Frame], list[float]]:
-    """The frames that are read while ``write`` runs in a thread, and the time of each."""
+    """The frames that are read while ``write`` runs in a thread, with their times."""
     thread = threading.Thread(target=write)
     thread.start()
     try:

@@ -1,4 +1,4 @@
-"""Images are paired as they come with the result of pairing all of them at once."""
+"""Incremental pairing of images equals pairing of all at once."""
 
 from __future__ import annotations
 
