@@ -18,6 +18,6 @@ def data_path(*parts: str) -> Path:
         raise InputError(f"{root}: the project's data folder is missing; install it again")
     path = root.joinpath(*parts)
     if not path.exists():
-        there = sorted(p.stem for p in path.parent.glob(f"*{path.suffix}"))
-        raise InputError(f"{path}: no such file; there are: {', '.join(there) or 'none'}")
+        available = sorted(p.stem for p in path.parent.glob(f"*{path.suffix}"))
+        raise InputError(f"{path}: no such file; there are: {', '.join(available) or 'none'}")
     return path

@@ -101,12 +101,12 @@ def associate_stamps(
         to_b = nearest_indices(b_s[left_b], a_s[left_a])
         to_a = nearest_indices(a_s[left_a], b_s[left_b])
         near = np.abs(a_s[left_a] - b_s[left_b[to_b]]) <= max_difference_s
-        taken_a = np.flatnonzero((to_a[to_b] == np.arange(len(left_a))) & near)
-        if not len(taken_a):
+        rows_a = np.flatnonzero((to_a[to_b] == np.arange(len(left_a))) & near)
+        if not len(rows_a):
             break
-        taken_b = to_b[taken_a]
-        pairs.append((left_a[taken_a], left_b[taken_b]))
-        left_a, left_b = np.delete(left_a, taken_a), np.delete(left_b, taken_b)
+        rows_b = to_b[rows_a]
+        pairs.append((left_a[rows_a], left_b[rows_b]))
+        left_a, left_b = np.delete(left_a, rows_a), np.delete(left_b, rows_b)
     i, j = np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
     return np.sort(i), np.sort(j)
 

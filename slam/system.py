@@ -222,7 +222,7 @@ class SlamSystem(SystemResults):
 
     @stage("semantics")
     def _label(self, frame: Frame, keyframe: Keyframe, static: StaticFeatures) -> None:
-        self.moving_objects.remember_keyframe(keyframe, static)
+        self.moving_objects.store_keyframe(keyframe, static)
         self.semantics.observe(frame, keyframe)
 
     def _join_segments(self, tracked: Tracked) -> Tracked:

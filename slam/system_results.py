@@ -77,7 +77,7 @@ class SystemResults(ABC):
         table = self.map.world.landmarks
         chosen = self.map.world.in_segment(largest(self.segments()))
         hosts = [k.id for k in chosen]
-        ids = np.flatnonzero(table.alive & np.isin(table.host, hosts))
+        ids = np.flatnonzero(table.in_map & np.isin(table.host, hosts))
         labels = self.semantics.landmark_labels(ids)
         columns = table.points_world[ids], table.colours[ids], table.observations[ids]
         return LandmarkCloud(ids, *columns, labels)
@@ -121,7 +121,7 @@ class SystemResults(ABC):
         """Sizes of the map and the time of every graph update in milliseconds."""
         return {
             "keyframes": len(self.map.world.keyframes),
-            "landmarks": int(self.map.world.landmarks.alive.sum()),
+            "landmarks": int(self.map.world.landmarks.in_map.sum()),
             "loops_closed": len(self.mapper.loops.closed),
             "isam2_update_ms": list(self.mapper.update_ms),
         }

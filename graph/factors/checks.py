@@ -179,12 +179,14 @@ def reprojection(
 
 def observation_errors(tables: FactorTables, camera: Camera) -> ObservationErrors:
     """Chi-square of every observation at the current values."""
-    seen = tables.observations.select(tables.observations.all_rows())
-    poses = tables.keyframes.get(seen.keyframe_ids)
-    points = tables.landmarks.get(seen.landmark_ids)
-    depth_m, chi_squares = reprojection(seen, poses, points, camera)
-    is_stereo = np.isfinite(seen.measurements[:, 2])
-    return ObservationErrors(seen.keyframe_ids, seen.landmark_ids, chi_squares, depth_m, is_stereo)
+    observations = tables.observations.select(tables.observations.all_rows())
+    poses = tables.keyframes.get(observations.keyframe_ids)
+    points = tables.landmarks.get(observations.landmark_ids)
+    depth_m, chi_squares = reprojection(observations, poses, points, camera)
+    is_stereo = np.isfinite(observations.measurements[:, 2])
+    return ObservationErrors(
+        observations.keyframe_ids, observations.landmark_ids, chi_squares, depth_m, is_stereo
+    )
 
 
 def wrong_observations(
@@ -219,16 +221,16 @@ def mahalanobis(r: Array, covariances: Array) -> Array:
 
 def _repeated(observations: Observations, tables: FactorTables) -> Mask:
     """Observations of a (keyframe, landmark) pair that the graph or an earlier row has."""
-    seen: set[tuple[int, int]] = set()
+    observed: set[tuple[int, int]] = set()
     repeated = np.zeros(len(observations), bool)
     pairs = zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
     for i, pair in enumerate(pairs):
         repeated[i] = (
-            pair in seen
+            pair in observed
             or tables.observations.row(*pair) is not None
             or tables.marginalised.contains(*pair)
         )
-        seen.add(pair)
+        observed.add(pair)
     return repeated
 
 

@@ -71,10 +71,10 @@ class MarginalisedLandmarks:
     def add(self, chunk: Chunk, number: int) -> None:
         """Add a chunk, under ``next_number`` or the number that it had before."""
         self.next_number = max(self.next_number, number + 1)
-        self.chunks[number], seen = chunk, chunk.observations
-        for landmark in np.unique(seen.landmark_ids).tolist():
+        self.chunks[number], observations = chunk, chunk.observations
+        for landmark in np.unique(observations.landmark_ids).tolist():
             self._of_landmark[landmark].add(number)
-        for keyframe in np.unique(seen.keyframe_ids).tolist():
+        for keyframe in np.unique(observations.keyframe_ids).tolist():
             self._of_keyframe[keyframe].add(number)
         for keyframe, landmark in _pairs(chunk):
             self.observers[landmark].add(keyframe)
@@ -120,5 +120,7 @@ class MarginalisedLandmarks:
 
 
 def _pairs(chunk: Chunk) -> list[tuple[int, int]]:
-    seen = chunk.observations.select(~chunk.is_summary)
-    return list(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))
+    observations = chunk.observations.select(~chunk.is_summary)
+    return list(
+        zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
+    )

@@ -70,14 +70,14 @@ def loose_keyframes(
     firm[[place[0] for place in places if len(place) == 1]] = True
     while True:
         inside = firm[keyframe]
-        seen, known = np.zeros(len(names), bool), np.zeros(len(names), bool)
-        seen[landmark[inside]] = True
+        observed, known = np.zeros(len(names), bool), np.zeros(len(names), bool)
+        observed[landmark[inside]] = True
         known[landmark[inside & stereo]] = True
         rest = np.flatnonzero(inside & ~known[landmark])
         values = poses_world_camera[rest], points_world[rest]
         by_rays = constrained_landmarks(observations.select(rest), *values, config.min_parallax_deg)
         known[np.searchsorted(names, by_rays)] = True
-        counts = known[landmark] | (stereo & seen[landmark])
+        counts = known[landmark] | (stereo & observed[landmark])
         shared = np.bincount(keyframe[counts], minlength=len(ids))
         now = firm | (shared >= config.min_shared_observations)
         now[pairs[now[pairs].any(axis=1)].ravel()] = True
@@ -93,10 +93,10 @@ def firm_components(ids: Ints, observations: Observations, edges: Edges, minimum
     whose depth one of them measures.
     """
     stereo = np.isfinite(observations.measurements[:, 2])
-    blind = observations.select(~stereo)
+    monocular = observations.select(~stereo)
     shared = shared_landmarks(ids, observations)
-    if len(blind):
-        shared = shared - shared_landmarks(ids, blind)
+    if len(monocular):
+        shared = shared - shared_landmarks(ids, monocular)
     row, column = (shared >= minimum).nonzero()
     pairs = [edge for edge in edges if len(edge) == 2 and np.isin(edge, ids).all()]
     ends = np.searchsorted(ids, np.array(pairs, np.int64).reshape(-1, 2))

@@ -95,9 +95,16 @@ def write_landmark_graph(path: Path, tables: FactorTables, camera: Camera) -> No
     lines += _lines(POINT, offset + landmarks.ids, landmarks.values)
     for number in sorted(tables.pose_factors):
         lines += _pose_factor_lines(tables.pose_factors[number].factor)
-    seen = tables.observations.select(tables.observations.all_rows())
-    names = np.stack([seen.keyframe_ids, offset + seen.landmark_ids, 0 * seen.keyframe_ids], axis=1)
-    write_lines(path, [*lines, *_lines(VIEW, names, _view_columns(seen, camera))])
+    observations = tables.observations.select(tables.observations.all_rows())
+    names = np.stack(
+        [
+            observations.keyframe_ids,
+            offset + observations.landmark_ids,
+            0 * observations.keyframe_ids,
+        ],
+        axis=1,
+    )
+    write_lines(path, [*lines, *_lines(VIEW, names, _view_columns(observations, camera))])
 
 
 def _lines(tag: str, names: Ints, numbers: Array) -> list[str]:
@@ -117,12 +124,12 @@ def _pose_factor_lines(factor: RelativePose | PosePrior) -> list[str]:
     return [note, *_lines(RELATIVE, edge, numbers)]
 
 
-def _view_columns(seen: Observations, camera: Camera) -> Array:
+def _view_columns(observations: Observations, camera: Camera) -> Array:
     """(M, 9) of u, v, 1/z and the upper triangle of their information."""
-    u, v, u_right = seen.measurements.T
+    u, v, u_right = observations.measurements.T
     stereo = np.isfinite(u_right)
     inverse_depth = np.where(stereo, u - u_right, 0.0) / camera.stereo_bf_px_m
-    information = 1 / seen.sigmas_px**2
+    information = 1 / observations.sigmas_px**2
     information[:, 2] = np.where(stereo, information[:, 2] * camera.stereo_bf_px_m**2, 0.0)
     nothing = np.zeros(len(u))
     i_u, i_v, i_z = information.T

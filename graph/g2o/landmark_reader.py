@@ -93,8 +93,8 @@ def read_landmark_graph(
     tables.observations.add(_views(rows[VIEW], names, notes.landmark_offset, camera, path))
     tables.add_pose_factors(_pose_factors(rows, notes, tables.keyframes.ids, path))
     check_fixed(fixed, tables.keyframes.ids, path)
-    held = tables.keyframes.get(np.array(sorted(fixed), np.int64))
-    priors = zip(sorted(fixed), held, strict=True)
+    fixed_poses = tables.keyframes.get(np.array(sorted(fixed), np.int64))
+    priors = zip(sorted(fixed), fixed_poses, strict=True)
     tables.add_pose_factors([PosePrior(k, T, _FIXED_COVARIANCE) for k, T in priors])
     _keep_components_with_priors(tables, path)
     anchor_components(tables, config or SmootherConfig())
@@ -115,11 +115,11 @@ def _add_vertices(
     indices_of(views[:, 1], rows[VIEW].lines, landmark_ids, path)
     poses = poses_of_columns(np.array(rows[POSE].numbers)[keyframe_rows])
     tables.keyframes.insert(keyframe_ids, poses)
-    seen = np.isin(landmark_ids, views[:, 1])
-    if not seen.all():
-        logger.warning("%s: %d landmarks without observations left out", path, np.sum(~seen))
+    observed = np.isin(landmark_ids, views[:, 1])
+    if not observed.all():
+        logger.warning("%s: %d landmarks without observations left out", path, np.sum(~observed))
     points = np.array(rows[POINT].numbers)[landmark_rows]
-    tables.landmarks.insert(landmark_ids[seen] - offset, points[seen])
+    tables.landmarks.insert(landmark_ids[observed] - offset, points[observed])
 
 
 def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:
@@ -225,25 +225,29 @@ def _keep_components_with_priors(tables: FactorTables, path: Path) -> None:
     """Keep the connected components with a prior; if there is none, the largest."""
     ids = tables.keyframes.ids
     edges = [factor.keyframes for factor in tables.pose_factors.values()]
-    seen = tables.observations.select(tables.observations.used_rows())
-    labels = component_labels(ids, seen, edges)
-    held = labels[np.searchsorted(ids, [edge[0] for edge in edges if len(edge) == 1])]
-    keep = np.isin(labels, held) if len(held) else labels == np.argmax(np.bincount(labels))
+    observed = tables.observations.select(tables.observations.used_rows())
+    labels = component_labels(ids, observed, edges)
+    fixed_poses = labels[np.searchsorted(ids, [edge[0] for edge in edges if len(edge) == 1])]
+    keep = (
+        np.isin(labels, fixed_poses)
+        if len(fixed_poses)
+        else labels == np.argmax(np.bincount(labels))
+    )
     if keep.all():
         return
-    gone = ids[~keep].tolist()
-    rows = tables.observations.rows_of_keyframes(gone)
+    removed = ids[~keep].tolist()
+    rows = tables.observations.rows_of_keyframes(removed)
     landmarks = np.unique(tables.observations.select(rows).landmark_ids)
     tables.observations.remove(rows)
     tables.landmarks.remove(landmarks)
-    tables.remove_pose_factors(tables.numbers_of_keyframes(gone))
+    tables.remove_pose_factors(tables.numbers_of_keyframes(removed))
     tables.keyframes.remove(ids[~keep])
     logger.warning(
         "%s: %d parts that no edge connects; the %s taken, %d keyframes and %d landmarks are left "
         "out",
         path,
         labels.max() + 1,
-        "parts with a prior are" if len(held) else "largest is",
-        len(gone),
+        "parts with a prior are" if len(fixed_poses) else "largest is",
+        len(removed),
         len(landmarks),
     )

@@ -65,15 +65,15 @@ def marginalise_landmarks(
     rows = table.rows_of_landmarks(ids.tolist())
     if not len(rows):
         return marginaliser.done
-    seen, points = table.select(rows), ValueTable.of(ids, tables.landmarks.get(ids))
-    is_summary = marginalised.are_summaries(seen.keyframe_ids, seen.landmark_ids)
+    observations, points = table.select(rows), ValueTable.of(ids, tables.landmarks.get(ids))
+    is_summary = marginalised.are_summaries(observations.keyframe_ids, observations.landmark_ids)
     marginaliser.done.slots = [slot for slot in table.slots(rows).tolist() if slot != NO_SLOT]
     table.remove(rows)
     tables.landmarks.remove(ids)
     for landmark in ids.tolist():
         marginalised.returned.pop(landmark, None)
-    for part in _parts(seen, config.marginal_keyframes):
-        chunk = Chunk(seen.select(part), is_summary[part])
+    for part in _parts(observations, config.marginal_keyframes):
+        chunk = Chunk(observations.select(part), is_summary[part])
         marginaliser.add(chunk, marginalised.next_number, points)
     return marginaliser.done
 
@@ -89,11 +89,15 @@ def remove_marginalised(
         keyframes.tolist(), [*landmarks.tolist(), *pairs[:, 1].tolist()]
     )
     for number in touched:
-        seen = marginalised.chunks[number].observations
-        keep = ~np.isin(seen.landmark_ids, landmarks) & ~np.isin(seen.keyframe_ids, keyframes)
-        keep &= tables.keyframes.contains(seen.keyframe_ids)
+        observations = marginalised.chunks[number].observations
+        keep = ~np.isin(observations.landmark_ids, landmarks) & ~np.isin(
+            observations.keyframe_ids, keyframes
+        )
+        keep &= tables.keyframes.contains(observations.keyframe_ids)
         for keyframe, landmark in pairs.tolist():
-            keep &= (seen.keyframe_ids != keyframe) | (seen.landmark_ids != landmark)
+            keep &= (observations.keyframe_ids != keyframe) | (
+                observations.landmark_ids != landmark
+            )
         if not keep.all():
             marginaliser.renew(number, keep)
     for landmark in landmarks.tolist():
@@ -122,14 +126,14 @@ def reinsert(tables: FactorTables, camera: Camera, config: SmootherConfig) -> No
     )
     table.add(old)
     tables.marginalised = MarginalisedLandmarks()
-    seen = table.select(table.all_rows())
-    held = constrained_landmarks(
-        seen,
-        tables.keyframes.get(seen.keyframe_ids),
-        tables.landmarks.get(seen.landmark_ids),
+    observations = table.select(table.all_rows())
+    constrained = constrained_landmarks(
+        observations,
+        tables.keyframes.get(observations.keyframe_ids),
+        tables.landmarks.get(observations.landmark_ids),
         config.min_parallax_deg,
     )
-    loose = np.setdiff1d(tables.landmarks.ids, held)
+    loose = np.setdiff1d(tables.landmarks.ids, constrained)
     table.remove(table.rows_of_landmarks(loose.tolist()))
     tables.landmarks.remove(loose)
 
@@ -145,30 +149,30 @@ class _Marginaliser:
 
     def add(self, chunk: Chunk, number: int, points: ValueTable) -> None:
         """Make a chunk sparse, keep it, and summarise its landmarks that are out of the graph."""
-        tables, seen = self.tables, chunk.observations
+        tables, observations = self.tables, chunk.observations
         marginalised = tables.marginalised
-        keyframes, ids = np.unique(seen.keyframe_ids), np.unique(seen.landmark_ids)
+        keyframes, ids = np.unique(observations.keyframe_ids), np.unique(observations.landmark_ids)
         poses, left = eliminate_points(
-            seen,
+            observations,
             ValueTable.of(keyframes, tables.keyframes.get(keyframes)),
             ValueTable.of(ids, points.get(ids)),
             self.camera,
             self.config,
         )
-        edges = self._tree(poses, seen) if len(keyframes) > 1 else []
+        edges = self._tree(poses, observations) if len(keyframes) > 1 else []
         numbers = tables.add_pose_factors(edges)
         self.done.pose_factors += numbers
         marginalised.add(replace(chunk, numbers=tuple(numbers)), number)
         last = [marginalised.newest_with(j) <= number for j in ids.tolist()]
         out = ~tables.landmarks.contains(ids) & np.array(last, bool)
-        summaries = make_summaries(seen, left, tables, self.camera)
+        summaries = make_summaries(observations, left, tables, self.camera)
         marginalised.summaries.update({int(ids[i]): summaries[i] for i in np.flatnonzero(out)})
 
-    def _tree(self, poses: PoseInformation, seen: Observations) -> list[RelativePose]:
+    def _tree(self, poses: PoseInformation, observations: Observations) -> list[RelativePose]:
         """The relative poses that replace these observations; adds keyframes to the bases."""
         marginalised = self.tables.marginalised
-        keyframes, row = np.unique(seen.keyframe_ids, return_inverse=True)
-        landmarks, column = np.unique(seen.landmark_ids, return_inverse=True)
+        keyframes, row = np.unique(observations.keyframe_ids, return_inverse=True)
+        landmarks, column = np.unique(observations.landmark_ids, return_inverse=True)
         sees = np.zeros((len(keyframes), len(landmarks)), np.int64)
         sees[row, column] = 1
         is_base = np.isin(keyframes, sorted(marginalised.bases))
@@ -197,19 +201,19 @@ class _Marginaliser:
             self.add(Chunk(chunk.observations.select(keep), chunk.is_summary[keep]), number, points)
 
 
-def _parts(seen: Observations, limit: int) -> Iterator[Ints]:
+def _parts(observations: Observations, limit: int) -> Iterator[Ints]:
     """Rows in groups of whole landmarks that at most ``limit`` keyframes observe.
 
     Groups are halved by their landmarks' newest keyframes; one landmark alone may have more.
     """
-    ids, which = np.unique(seen.landmark_ids, return_inverse=True)
+    ids, which = np.unique(observations.landmark_ids, return_inverse=True)
     newest = np.full(len(ids), -1, np.int64)
-    np.maximum.at(newest, which, seen.keyframe_ids)
+    np.maximum.at(newest, which, observations.keyframe_ids)
     waiting = [np.argsort(newest, kind="stable")]
     while waiting:
         group = waiting.pop()
         rows = np.flatnonzero(np.isin(which, group))
-        if len(group) == 1 or len(np.unique(seen.keyframe_ids[rows])) <= limit:
+        if len(group) == 1 or len(np.unique(observations.keyframe_ids[rows])) <= limit:
             yield rows
         else:
             waiting += [group[len(group) // 2 :], group[: len(group) // 2]]

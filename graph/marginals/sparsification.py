@@ -109,8 +109,8 @@ def _anchored(information: PoseInformation) -> tuple[int, Array]:
     H = information.H[others][:, :, others].reshape(size, size)
     H = H + np.diag(np.tile(_KNOWN_SIGMAS**-2, count - 1))
     covariance = np.zeros((count, 6, count, 6))
-    held = np.linalg.inv(H).reshape(count - 1, 6, count - 1, 6)
-    covariance[others[:, None], :, others] = np.swapaxes(held, 1, 2)
+    blocks = np.linalg.inv(H).reshape(count - 1, 6, count - 1, 6)
+    covariance[others[:, None], :, others] = np.swapaxes(blocks, 1, 2)
     return anchor, covariance
 
 

@@ -16,18 +16,18 @@ from bmask_slam.graph.marginals.point_elimination import PointInformation, proje
 
 
 def make_summaries(
-    seen: Observations, points: PointInformation, tables: FactorTables, camera: Camera
+    observations: Observations, points: PointInformation, tables: FactorTables, camera: Camera
 ) -> list[Summary]:
     """One observation a landmark, in the base that observes most of them, else in a keyframe.
 
     Its covariance in u, v and disparity is not diagonal; the diagonal is scaled by the largest
     eigenvalue of the correlations, so that the sigmas are never too small.
     """
-    in_base = np.isin(seen.keyframe_ids, sorted(tables.marginalised.bases))
-    _, which, count = np.unique(seen.keyframe_ids, return_inverse=True, return_counts=True)
-    order = np.lexsort((count[which], in_base, seen.landmark_ids))
-    last = np.append(np.flatnonzero(np.diff(seen.landmark_ids[order])), len(order) - 1)
-    hosts = seen.keyframe_ids[order[last]]
+    in_base = np.isin(observations.keyframe_ids, sorted(tables.marginalised.bases))
+    _, which, count = np.unique(observations.keyframe_ids, return_inverse=True, return_counts=True)
+    order = np.lexsort((count[which], in_base, observations.landmark_ids))
+    last = np.append(np.flatnonzero(np.diff(observations.landmark_ids[order])), len(order) - 1)
+    hosts = observations.keyframe_ids[order[last]]
     T_host_world = inverse(tables.keyframes.get(hosts))
     p = (T_host_world[:, :3, :3] @ points.points_world[:, :, None])[:, :, 0]
     p += T_host_world[:, :3, 3]

@@ -84,11 +84,11 @@ class _Search:
 
     def candidates(self, used: Mask) -> Mask:
         """(M,) the other edges that the solution of ``used``, the solver's, does not contradict."""
-        asked = np.flatnonzero(~used)
+        unused = np.flatnonzero(~used)
         candidates = np.zeros(len(used), bool)
-        if len(asked):
-            predicted = predicted_chi2(self._graph.with_poses(self._solver.poses), used, asked)
-            candidates[asked[predicted <= self.limit]] = True
+        if len(unused):
+            predicted = predicted_chi2(self._graph.with_poses(self._solver.poses), used, unused)
+            candidates[unused[predicted <= self.limit]] = True
         return candidates
 
     def inliers(self, loops: Mask, least: float = 0.0) -> Mask:

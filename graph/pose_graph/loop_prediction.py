@@ -14,7 +14,7 @@ SAMPLES = 100
 SEED = 0
 
 
-def predicted_chi2(graph: PoseGraph, used: Mask, asked: Ints) -> Array:
+def predicted_chi2(graph: PoseGraph, used: Mask, edges: Ints) -> Array:
     """Chi-squares (A,) of edges against the solution of others, including its uncertainty.
 
     ``r^T (Sigma + J P J^T)^-1 r`` with r and J the residual and the Jacobian of an edge of
@@ -27,7 +27,7 @@ def predicted_chi2(graph: PoseGraph, used: Mask, asked: Ints) -> Array:
     """
     d = graph.information.shape[-1]
     A, b = _linearised(graph)
-    rows = (asked[:, None] * d + np.arange(d)).ravel()
+    rows = (edges[:, None] * d + np.arange(d)).ravel()
     moved = (A[rows] @ _draws(A, used, d)).reshape(-1, d, SAMPLES)
     S = np.eye(d) + moved @ moved.swapaxes(1, 2) / SAMPLES
     r = b[rows].reshape(-1, d)

@@ -33,7 +33,7 @@ from bmask_slam.graph.geometry import inverse
 
 
 def anchor_loose(
-    loose: Ints, gone: Observations, edges: Edges, tables: FactorTables, config: SmootherConfig
+    loose: Ints, removed: Observations, edges: Edges, tables: FactorTables, config: SmootherConfig
 ) -> list[int]:
     """Anchor loose keyframes until none is left; returns the numbers of the factors added.
 
@@ -41,7 +41,7 @@ def anchor_loose(
     component that it was in then, to the firm keyframe that shared most with it.
     """
     added: list[int] = []
-    before = _Before.of(gone, edges, tables) if len(loose) else None
+    before = _Before.of(removed, edges, tables) if len(loose) else None
     while before is not None and len(loose):
         factor = before.anchor_for(loose, tables, config)
         added += tables.add_pose_factors([factor])
@@ -60,8 +60,8 @@ def loose_in(tables: FactorTables, config: SmootherConfig) -> Ints:
 def anchor_components(tables: FactorTables, config: SmootherConfig) -> list[int]:
     """Add a prior to each connected component without one; returns their numbers."""
     ids, edges = tables.keyframes.ids, [f.keyframes for f in tables.pose_factors.values()]
-    seen = tables.observations.select(tables.observations.used_rows())
-    labels = component_labels(ids, seen, edges)
+    observations = tables.observations.select(tables.observations.used_rows())
+    labels = component_labels(ids, observations, edges)
     fixed = labels[np.searchsorted(ids, [edge[0] for edge in edges if len(edge) == 1])]
     parts, first = np.unique(labels, return_index=True)
     loose = np.sort(ids[first[~np.isin(parts, fixed)]])
@@ -89,11 +89,11 @@ def release_anchors(
     loose = loose_among(
         tables.keyframes.ids, tables.observations.used_rows(), others, tables, config
     )
-    held = keyframes_anchored_by(anchors, tables)
+    anchored = keyframes_anchored_by(anchors, tables)
     released = [n for n in anchors if tables.pose_factors[n].keyframes[-1] not in loose]
     slots = [tables.pose_factors[number].slot for number in released]
     tables.remove_pose_factors(released)
-    return np.setdiff1d(held, loose), [slot for slot in slots if slot != NO_SLOT]
+    return np.setdiff1d(anchored, loose), [slot for slot in slots if slot != NO_SLOT]
 
 
 def with_first_prior(
@@ -141,9 +141,9 @@ def loose_among(
     config: SmootherConfig,
 ) -> Ints:
     """The keyframes that would be loose with these rows and pose factors alone."""
-    seen, poses, points = rows_in_front(rows, tables, config)
+    observations, poses, points = rows_in_front(rows, tables, config)
     edges = [tables.pose_factors[number].keyframes for number in sorted(numbers)]
-    return loose_keyframes(ids, seen, poses, points, edges, config)
+    return loose_keyframes(ids, observations, poses, points, edges, config)
 
 
 def rows_in_front(
@@ -153,12 +153,12 @@ def rows_in_front(
 
     A factor with its landmark behind the camera has a zero Jacobian.
     """
-    seen = tables.observations.select(rows)
-    poses = tables.keyframes.get(seen.keyframe_ids)
-    points = tables.landmarks.get(seen.landmark_ids)
+    observations = tables.observations.select(rows)
+    poses = tables.keyframes.get(observations.keyframe_ids)
+    points = tables.landmarks.get(observations.landmark_ids)
     depth_m = np.einsum("ij,ij->i", points - poses[:, :3, 3], poses[:, :3, 2])
     front = depth_m >= config.min_depth_m
-    return seen.select(front), poses[front], points[front]
+    return observations.select(front), poses[front], points[front]
 
 
 @dataclass(frozen=True)
@@ -174,23 +174,23 @@ class _Before:
     shared: Array
 
     @classmethod
-    def of(cls, gone: Observations, edges: Edges, tables: FactorTables) -> _Before:
+    def of(cls, removed: Observations, edges: Edges, tables: FactorTables) -> _Before:
         """From the factor tables as they are and what was removed from them."""
         table = tables.observations
-        seen = table.select(table.used_rows())
-        seen = Observations(
-            np.concatenate([seen.keyframe_ids, gone.keyframe_ids]),
-            np.concatenate([seen.landmark_ids, gone.landmark_ids]),
+        observations = table.select(table.used_rows())
+        observations = Observations(
+            np.concatenate([observations.keyframe_ids, removed.keyframe_ids]),
+            np.concatenate([observations.landmark_ids, removed.landmark_ids]),
         )
         edges = [*edges, *(f.keyframes for f in tables.pose_factors.values())]
         ends = np.array([k for edge in edges for k in edge], np.int64)
-        ids = np.unique(np.concatenate([tables.keyframes.ids, seen.keyframe_ids, ends]))
-        shared = shared_landmarks(ids, seen).toarray()
+        ids = np.unique(np.concatenate([tables.keyframes.ids, observations.keyframe_ids, ends]))
+        shared = shared_landmarks(ids, observations).toarray()
         pairs = np.array([edge for edge in edges if len(edge) == 2], np.int64).reshape(-1, 2)
         a, b = np.searchsorted(ids, pairs.T)
         np.add.at(shared, (np.concatenate([a, b]), np.concatenate([b, a])), 1)
         left = np.searchsorted(ids, tables.keyframes.ids)
-        return cls(component_labels(ids, seen, edges)[left], shared[np.ix_(left, left)])
+        return cls(component_labels(ids, observations, edges)[left], shared[np.ix_(left, left)])
 
     def anchor_for(
         self, loose: Ints, tables: FactorTables, config: SmootherConfig

@@ -32,11 +32,11 @@ def marginalised_arrays(tables: FactorTables) -> Arrays:
     """Arrays of the marginalised landmarks, without what refers to removed keyframes."""
     marginalised, known = tables.marginalised, tables.keyframes
     chunks = sorted(marginalised.chunks.items())
-    seen = concatenate([chunk.observations for _, chunk in chunks])
+    observations = concatenate([chunk.observations for _, chunk in chunks])
     number = np.repeat([n for n, _ in chunks], [len(c.observations) for _, c in chunks])
     is_summary = np.concatenate([np.zeros(0, bool), *(c.is_summary for _, c in chunks)])
-    keep = known.contains(seen.keyframe_ids)
-    seen = seen.select(keep)
+    keep = known.contains(observations.keyframe_ids)
+    observations = observations.select(keep)
     chunk_of = {n: number for number, chunk in chunks for n in chunk.numbers}
     summaries = sorted({**marginalised.summaries, **marginalised.returned}.items())
     hosts = np.array([s.keyframe_id for _, s in summaries], np.int64)
@@ -44,10 +44,10 @@ def marginalised_arrays(tables: FactorTables) -> Arrays:
     present = known.contains(hosts)
     return {
         "archived_chunks": number[keep].astype(np.int64),
-        "archived_keyframe_ids": seen.keyframe_ids,
-        "archived_landmark_ids": seen.landmark_ids,
-        "archived_measurements": seen.measurements,
-        "archived_sigmas_px": seen.sigmas_px,
+        "archived_keyframe_ids": observations.keyframe_ids,
+        "archived_landmark_ids": observations.landmark_ids,
+        "archived_measurements": observations.measurements,
+        "archived_sigmas_px": observations.sigmas_px,
         "archived_is_summary": is_summary[keep],
         "summary_landmark_ids": ids[present],
         "summary_keyframe_ids": hosts[present],
@@ -66,7 +66,7 @@ def marginalised_arrays(tables: FactorTables) -> Arrays:
 def read_marginalised(arrays: Arrays) -> MarginalisedLandmarks:
     """The landmarks of arrays that were checked; pose factors are numbered 0, 1, ..."""
     marginalised = MarginalisedLandmarks(bases=set(arrays["base_ids"].tolist()))
-    seen = Observations(
+    observations = Observations(
         arrays["archived_keyframe_ids"],
         arrays["archived_landmark_ids"],
         arrays["archived_measurements"],
@@ -75,7 +75,9 @@ def read_marginalised(arrays: Arrays) -> MarginalisedLandmarks:
     for number in np.unique(arrays["archived_chunks"]).tolist():
         rows = np.flatnonzero(arrays["archived_chunks"] == number)
         edges = np.flatnonzero(arrays["pose_factor_chunks"] == number)
-        chunk = Chunk(seen.select(rows), arrays["archived_is_summary"][rows], tuple(edges.tolist()))
+        chunk = Chunk(
+            observations.select(rows), arrays["archived_is_summary"][rows], tuple(edges.tolist())
+        )
         marginalised.add(chunk, number)
     columns = (
         arrays["summary_landmark_ids"].tolist(),

@@ -66,10 +66,10 @@ def remove(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) ->
     plan = _plan(update, tables, config)
     if not (len(plan.keyframes) or len(plan.landmarks) or plan.numbers or len(plan.rows)):
         return Removal()
-    gone = tables.observations.select(plan.rows)
+    removed = tables.observations.select(plan.rows)
     edges = [tables.pose_factors[number].keyframes for number in plan.numbers]
     slots = _remove_from_tables(plan, tables)
-    added = anchor_loose(plan.loose, gone, edges, tables, config)
+    added = anchor_loose(plan.loose, removed, edges, tables, config)
     return Removal(slots, plan.dropped, added, keyframes_anchored_by(added, tables))
 
 
@@ -96,10 +96,12 @@ def _plan(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) -> 
 
 
 def _numbers_of(names: Iterable[RelativePoseName], tables: FactorTables) -> list[int]:
-    wanted = set(names)
-    numbers = tables.numbers_of_keyframes({k for name in wanted for k in name[:2]})
+    names_to_remove = set(names)
+    numbers = tables.numbers_of_keyframes({k for name in names_to_remove for k in name[:2]})
     factors = {number: tables.pose_factors[number].factor for number in numbers}
-    return [n for n, f in factors.items() if isinstance(f, RelativePose) and f.name in wanted]
+    return [
+        n for n, f in factors.items() if isinstance(f, RelativePose) and f.name in names_to_remove
+    ]
 
 
 def _left_underconstrained(
@@ -110,8 +112,8 @@ def _left_underconstrained(
     hit = np.setdiff1d(table.select(rows).landmark_ids, landmarks)
     remaining = np.setdiff1d(table.rows_of_landmarks(hit.tolist()), rows)
     observations, poses, points = rows_in_front(remaining, tables, config)
-    held = constrained_landmarks(observations, poses, points, config.min_parallax_deg)
-    return np.setdiff1d(hit, held)
+    constrained = constrained_landmarks(observations, poses, points, config.min_parallax_deg)
+    return np.setdiff1d(hit, constrained)
 
 
 def _left_loose(

@@ -54,12 +54,12 @@ def repair(
     config: SmootherConfig,
 ) -> Repair:
     """Remove what makes the system singular; ``new_keyframes`` are removed, not anchored."""
-    held = keyframes_anchored_by(anchor_components(tables, config), tables)
+    constrained = keyframes_anchored_by(anchor_components(tables, config), tables)
     pairs = _broken_observations(tables, camera)
     broken = remove(GraphUpdate(remove_observations=pairs), tables, config)
     landmarks = _loose_landmarks(tables, camera, config)
     keyframes = loose_in(tables, config)
-    if named is not None and not (len(held) or broken or len(landmarks) or len(keyframes)):
+    if named is not None and not (len(constrained) or broken or len(landmarks) or len(keyframes)):
         landmarks = ids_array([named[1]] if named[0] == "landmark" else [])
         keyframes = ids_array([named[1]] if named[0] == "keyframe" else [])
     leaving = ids_array(
@@ -68,7 +68,7 @@ def repair(
     update = GraphUpdate(remove_landmarks=landmarks, remove_keyframes=leaving)
     removal = remove(update, tables, config)
     tied = _anchor(np.setdiff1d(keyframes, leaving), tables, config)
-    anchored = (held, broken.anchored_keyframes, removal.anchored_keyframes, tied)
+    anchored = (constrained, broken.anchored_keyframes, removal.anchored_keyframes, tied)
     dropped = (landmarks, broken.dropped_landmarks, removal.dropped_landmarks)
     return Repair(
         np.unique(np.concatenate(dropped)),
@@ -84,25 +84,25 @@ def _is_anchored(keyframe: int, tables: FactorTables) -> bool:
 
 def _broken_observations(tables: FactorTables, camera: Camera) -> Ints:
     """Pairs (N, 2) of observations without a finite error; a NaN spoils every value."""
-    seen = tables.observations.select(tables.observations.all_rows())
-    poses = tables.keyframes.get(seen.keyframe_ids)
-    points = tables.landmarks.get(seen.landmark_ids)
-    _, chi2 = reprojection(seen, poses, points, camera)
+    observations = tables.observations.select(tables.observations.all_rows())
+    poses = tables.keyframes.get(observations.keyframe_ids)
+    points = tables.landmarks.get(observations.landmark_ids)
+    _, chi2 = reprojection(observations, poses, points, camera)
     bad = ~np.isfinite(chi2)
-    return np.stack([seen.keyframe_ids[bad], seen.landmark_ids[bad]], axis=1)
+    return np.stack([observations.keyframe_ids[bad], observations.landmark_ids[bad]], axis=1)
 
 
 def _loose_landmarks(tables: FactorTables, camera: Camera, config: SmootherConfig) -> Ints:
     """Landmarks that observations from in front of the camera do not constrain."""
-    seen = tables.observations.select(tables.observations.all_rows())
-    poses = tables.keyframes.get(seen.keyframe_ids)
-    points = tables.landmarks.get(seen.landmark_ids)
-    depth_m, _ = reprojection(seen, poses, points, camera)
+    observations = tables.observations.select(tables.observations.all_rows())
+    poses = tables.keyframes.get(observations.keyframe_ids)
+    points = tables.landmarks.get(observations.landmark_ids)
+    depth_m, _ = reprojection(observations, poses, points, camera)
     useful = depth_m >= config.min_depth_m
-    held = constrained_landmarks(
-        seen.select(useful), poses[useful], points[useful], config.min_parallax_deg
+    constrained = constrained_landmarks(
+        observations.select(useful), poses[useful], points[useful], config.min_parallax_deg
     )
-    return np.setdiff1d(tables.landmarks.ids, held)
+    return np.setdiff1d(tables.landmarks.ids, constrained)
 
 
 def _anchor(loose: Ints, tables: FactorTables, config: SmootherConfig) -> Ints:

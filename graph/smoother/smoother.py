@@ -250,8 +250,8 @@ class Smoother:
 
     def _retract(self, validated: Validated, change: Change, report: UpdateReport) -> None:
         """Remove the whole update again, refused as SOLVER_FAILED."""
-        seen = validated.observations
-        pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+        observations = validated.observations
+        pairs = np.stack([observations.keyframe_ids, observations.landmark_ids], axis=1)
         undo = GraphUpdate(
             remove_keyframes=validated.keyframe_ids,
             remove_landmarks=validated.landmark_ids,

@@ -55,17 +55,17 @@ def read_graph(path: Path) -> tuple[FactorTables, Camera]:
 
 def graph_arrays(tables: FactorTables) -> Arrays:
     """All of the factor tables but for the slots of the factors in ISAM2."""
-    seen = tables.observations.select(tables.observations.all_rows())
+    observations = tables.observations.select(tables.observations.all_rows())
     factors = [tables.pose_factors[number].factor for number in sorted(tables.pose_factors)]
     return {
         "keyframe_ids": tables.keyframes.ids,
         "poses_world_camera": np.ascontiguousarray(tables.keyframes.values),
         "landmark_ids": tables.landmarks.ids,
         "points_world": np.ascontiguousarray(tables.landmarks.values),
-        "observation_keyframe_ids": seen.keyframe_ids,
-        "observation_landmark_ids": seen.landmark_ids,
-        "measurements": seen.measurements,
-        "sigmas_px": seen.sigmas_px,
+        "observation_keyframe_ids": observations.keyframe_ids,
+        "observation_landmark_ids": observations.landmark_ids,
+        "measurements": observations.measurements,
+        "sigmas_px": observations.sigmas_px,
         "pose_factor_keyframes": np.array(
             [(factor.keyframe_ids[0], factor.keyframe_ids[-1]) for factor in factors], np.int64
         ).reshape(-1, 2),

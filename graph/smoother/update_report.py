@@ -52,12 +52,12 @@ class UpdateReport:
 
     def refuse_all(self, validated: Validated) -> None:
         """Refuse everything that had passed validation, as SOLVER_FAILED."""
-        seen, keyframes = validated.observations, validated.keyframe_ids
-        count, reason = len(seen) + len(keyframes), RefusalReason.SOLVER_FAILED
+        observations, keyframes = validated.observations, validated.keyframe_ids
+        count, reason = len(observations) + len(keyframes), RefusalReason.SOLVER_FAILED
         whole = np.full(len(keyframes), NO_LANDMARK)
         self.refused = Refusals(
-            np.concatenate([self.refused.keyframe_ids, seen.keyframe_ids, keyframes]),
-            np.concatenate([self.refused.landmark_ids, seen.landmark_ids, whole]),
+            np.concatenate([self.refused.keyframe_ids, observations.keyframe_ids, keyframes]),
+            np.concatenate([self.refused.landmark_ids, observations.landmark_ids, whole]),
             np.concatenate([self.refused.reasons, np.full(count, reason)]),
         )
         self.refused_factors += tuple(

@@ -132,8 +132,8 @@ def _connected(
     waiting = keyframes.tolist()
     old = candidates.tables.landmarks.contains(accepted.landmark_ids)
     while True:
-        seen = accepted.landmark_ids[np.isin(accepted.keyframe_ids, ids_array(inside))]
-        shared = accepted.keyframe_ids[old | np.isin(accepted.landmark_ids, seen)]
+        observed_ids = accepted.landmark_ids[np.isin(accepted.keyframe_ids, ids_array(inside))]
+        shared = accepted.keyframe_ids[old | np.isin(accepted.landmark_ids, observed_ids)]
         joined = [
             k
             for k in waiting

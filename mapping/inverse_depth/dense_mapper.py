@@ -111,18 +111,18 @@ class DenseMapper:
     def __init__(self, camera: Camera, config: DenseConfig | None = None) -> None:
         self.camera = camera
         self.config = config or DenseConfig()
-        self._held: list[_Prepared] = []
-        self._wanted: set[int] = set()
+        self._prepared: list[_Prepared] = []
+        self._to_fuse: set[int] = set()
 
     def add(self, keyframe: DenseKeyframe, wanted: bool = True) -> list[FusedKeyframe]:
         """Add a keyframe; returns the keyframe whose neighbours are complete now, fused.
 
         A keyframe that is not ``wanted`` is only a neighbour of others and is not returned.
         """
-        bisect.insort(self._held, self._prepare(keyframe), key=lambda p: p.keyframe.id)
+        bisect.insort(self._prepared, self._prepare(keyframe), key=lambda p: p.keyframe.id)
         if wanted:
-            self._wanted.add(keyframe.id)
-        return self._finished(len(self._held) - WINDOW)
+            self._to_fuse.add(keyframe.id)
+        return self._finished(len(self._prepared) - WINDOW)
 
     def _prepare(self, keyframe: DenseKeyframe) -> _Prepared:
         """Steps 1 to 3 of a keyframe, with the keyframes before it."""
@@ -145,7 +145,9 @@ class DenseMapper:
             right = as_image(keyframe.right, self.config.device)
             return match_stereo(image, right, self.camera, window)
         T_own_world = inverse(keyframe.T_world_camera)
-        others = [(p.image, T_own_world @ p.keyframe.T_world_camera) for p in self._held[-WINDOW:]]
+        others = [
+            (p.image, T_own_world @ p.keyframe.T_world_camera) for p in self._prepared[-WINDOW:]
+        ]
         apart = [o for o in others if np.linalg.norm(o[1][:3, 3]) > MIN_BASELINE_M]
         if window is None or not apart or self.config.source == "stereo":
             empty = torch.full(image.shape[-2:], torch.nan, device=image.device)
@@ -154,46 +156,48 @@ class DenseMapper:
 
     def update_poses(self, poses: Mapping[int, Array]) -> None:
         """Replace the poses of held keyframes by T_world_camera (4, 4), by id."""
-        for k, held in enumerate(self._held):
-            T = poses.get(held.keyframe.id)
-            if T is not None and T is not held.keyframe.T_world_camera:
-                self._held[k] = replace(held, keyframe=replace(held.keyframe, T_world_camera=T))
+        for k, prepared in enumerate(self._prepared):
+            T = poses.get(prepared.keyframe.id)
+            if T is not None and T is not prepared.keyframe.T_world_camera:
+                self._prepared[k] = replace(
+                    prepared, keyframe=replace(prepared.keyframe, T_world_camera=T)
+                )
 
     def relabel(self, keyframe_id: int, instances: NDArray[np.uint16], hidden: Mask) -> None:
         """Replace the instances (H, W) of a keyframe and remove the depth of its hidden pixels.
 
         Nothing happens if the keyframe does not wait for neighbours.
         """
-        for k, held in enumerate(self._held):
-            if held.keyframe.id == keyframe_id and keyframe_id in self._wanted:
-                depth_m = np.where(hidden, np.float32(np.nan), held.keyframe.depth_m)
+        for k, prepared in enumerate(self._prepared):
+            if prepared.keyframe.id == keyframe_id and keyframe_id in self._to_fuse:
+                depth_m = np.where(hidden, np.float32(np.nan), prepared.keyframe.depth_m)
                 keyframe = replace(
-                    held.keyframe, instances=instances, depth_m=depth_m, unmatched=hidden
+                    prepared.keyframe, instances=instances, depth_m=depth_m, unmatched=hidden
                 )
-                self._held[k] = self._prepare(keyframe)
+                self._prepared[k] = self._prepare(keyframe)
 
     def remove(self, keyframe_ids: Collection[int]) -> None:
         """Remove held keyframes."""
-        self._held = [p for p in self._held if p.keyframe.id not in keyframe_ids]
-        self._wanted -= set(keyframe_ids)
+        self._prepared = [p for p in self._prepared if p.keyframe.id not in keyframe_ids]
+        self._to_fuse -= set(keyframe_ids)
 
     def flush(self) -> list[FusedKeyframe]:
         """Fuse and return the keyframes that still wait; the next one starts a new stream."""
-        results = self._finished(len(self._held))
-        self._held = []
+        results = self._finished(len(self._prepared))
+        self._prepared = []
         return results
 
     def _finished(self, end: int) -> list[FusedKeyframe]:
         """Fuse the held keyframes before ``end`` and drop those that no later one needs."""
-        ids = [p.keyframe.id for p in self._held[: max(end, 0)]]
-        results = [self._fuse(k) for k, number in enumerate(ids) if number in self._wanted]
-        self._wanted -= set(ids)
-        del self._held[: max(end - WINDOW, 0)]
+        ids = [p.keyframe.id for p in self._prepared[: max(end, 0)]]
+        results = [self._fuse(k) for k, number in enumerate(ids) if number in self._to_fuse]
+        self._to_fuse -= set(ids)
+        del self._prepared[: max(end - WINDOW, 0)]
         return results
 
     def _fuse(self, k: int) -> FusedKeyframe:
-        own = self._held[k]
-        window = self._held[max(k - WINDOW, 0) : k + WINDOW + 1]
+        own = self._prepared[k]
+        window = self._prepared[max(k - WINDOW, 0) : k + WINDOW + 1]
         others = {p.keyframe.id: p for p in window if p is not own}
         chosen = choose_neighbours(
             own.keyframe, [p.keyframe for p in others.values()], self.config.neighbours

@@ -82,8 +82,8 @@ def fuse(
     rho += [_without_nan(r + 0 * v, FAR * k) for k, (r, v) in enumerate(hypotheses, 2)]
     weight = [_without_nan(1 / v, 1.0) for v in (own.variance, *(v for _, v in hypotheses))]
     members = compatible_members(rho, weight)
-    seen_through = reduce(torch.minimum, rho) < own.rho
-    members += (members == 0) & known & ~seen_through
+    in_free_space = reduce(torch.minimum, rho) < own.rho
+    members += (members == 0) & known & ~in_free_space
     return Fused(*_fused(rho, weight, members), factor)
 
 
@@ -184,8 +184,8 @@ def reject_other_colours(
         u, v, _ = project(seed, inverse(view.T_own_neighbour), camera, pixels)
         u, v = u.round_().clamp_(0, width - 1), v.round_().clamp_(0, height - 1)
         place = u.add_(v, alpha=width).nan_to_num_().to(torch.int32)
-        there = view.image.reshape(3, -1).index_select(1, place)
-        apart = (colours - there).abs_().amax(0)
+        sampled = view.image.reshape(3, -1).index_select(1, place)
+        apart = (colours - sampled).abs_().amax(0)
         variance.view(-1).index_add_(0, chosen, nan_where_negative(MAX_COLOUR_STEP - apart))
 
 

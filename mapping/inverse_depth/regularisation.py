@@ -96,22 +96,22 @@ def largest_compatible_set(rho: Tensor, weight: Tensor) -> Tensor:
     the first in the order of `set_order` is taken; a single estimate is no set.
     """
     distance = (rho[:, :, None] - rho[:, None]) ** 2 * (weight[:, :, None] + weight[:, None])
-    there = weight > 0
-    apart = there[:, :, None] & there[:, None] & ~(distance < COMPATIBLE)
-    members = there & (there.sum(-1, keepdim=True) > 1)
+    valid = weight > 0
+    apart = valid[:, :, None] & valid[:, None] & ~(distance < COMPATIBLE)
+    members = valid & (valid.sum(-1, keepdim=True) > 1)
     conflicting = torch.nonzero(apart.any((1, 2)))[:, 0]
-    members[conflicting] = _largest_by_trial(apart[conflicting], there[conflicting])
+    members[conflicting] = _largest_by_trial(apart[conflicting], valid[conflicting])
     return members
 
 
-def _largest_by_trial(apart: Tensor, there: Tensor) -> Tensor:
+def _largest_by_trial(apart: Tensor, valid: Tensor) -> Tensor:
     """The same by trying all sets; pairs ``apart`` (N, 8, 8) are incompatible."""
-    n = there.shape[-1]
+    n = valid.shape[-1]
     sets = [[s >> i & 1 for i in range(n)] for s in set_order(n)]
-    tried = torch.tensor(sets, dtype=torch.float32, device=there.device)
+    tried = torch.tensor(sets, dtype=torch.float32, device=valid.device)
     pairs = (tried[:, :, None] * tried[:, None]).reshape(-1, n * n)
     clashes = apart.reshape(-1, n * n).to(torch.float32) @ pairs.T
-    clashes += (~there).to(torch.float32) @ tried.T
+    clashes += (~valid).to(torch.float32) @ tried.T
     free, first = (clashes == 0).to(torch.uint8).max(-1)
     return (tried[first] * free[:, None]) > 0
 

@@ -67,5 +67,5 @@ def left_right_consistent(disparity: Tensor, other: Tensor) -> Tensor:
     columns = torch.arange(disparity.shape[1], device=disparity.device)
     at = torch.round(columns - disparity).long()
     inside = (at >= 0) & (at < disparity.shape[1])
-    there = other.gather(1, at.clamp(0, disparity.shape[1] - 1))
-    return inside & ((disparity - there).abs() <= MAX_DIFFERENCE_PX)
+    matched = other.gather(1, at.clamp(0, disparity.shape[1] - 1))
+    return inside & ((disparity - matched).abs() <= MAX_DIFFERENCE_PX)

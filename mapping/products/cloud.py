@@ -172,9 +172,9 @@ def _views(voxel: NDArray, cell: NDArray, instance: NDArray, submap_of: Ints) ->
     pairs, own = _shares(voxel * count + submap, instance, instances)
     near_pairs, near = _shares(cell[voxel] * count + submap, instance, instances)
     voxels, near_cells = pairs // count, near_pairs // count
-    beside = np.searchsorted(near_pairs, cell[voxels] * count + pairs % count)
+    neighbours = np.searchsorted(near_pairs, cell[voxels] * count + pairs % count)
     missing = _sums(near_cells, near, int(cell.max()) + 1)[cell]
-    return missing + _sums(voxels, own - near[beside], len(cell))
+    return missing + _sums(voxels, own - near[neighbours], len(cell))
 
 
 def _shares(pair: NDArray, instance: NDArray, instances: int) -> tuple[NDArray, csr_matrix]:

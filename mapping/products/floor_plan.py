@@ -165,11 +165,11 @@ class FloorPlan:
 
 def _labels(votes: Ints) -> Ints:
     """The class (N,) of cells by votes (N, C): an object with a fifth of them beats background."""
-    things = votes[:, 1:]
-    if things.shape[1] == 0:
+    class_votes = votes[:, 1:]
+    if class_votes.shape[1] == 0:
         return np.zeros(len(votes), np.int64)
-    enough = things.max(axis=1) > 0.2 * votes.sum(axis=1)
-    return np.where(enough, things.argmax(axis=1) + 1, 0)
+    enough = class_votes.max(axis=1) > 0.2 * votes.sum(axis=1)
+    return np.where(enough, class_votes.argmax(axis=1) + 1, 0)
 
 
 def _scale_bar(image: Image, px_per_m: float, margin: int) -> None:

@@ -232,14 +232,14 @@ def _at_edges(
     around = np.stack([rows, columns], axis=1)[:, None] // step + shifts
     rows, columns = np.moveaxis(np.clip(around, 0, limits), -1, 0)
     apart_m = np.abs(assignment.depth_m[rows, columns] - z_m[:, None])
-    there = apart_m < config.edge_depth * z_m[:, None]
+    near = apart_m < config.edge_depth * z_m[:, None]
     owners = assignment.owner[rows * step, columns * step].astype(np.int64)
     count = len(assignment.instances)
-    first = np.where(there, owners, count).min(axis=1, initial=count)
-    last = np.where(there, owners, NO_INSTANCE).max(axis=1, initial=NO_INSTANCE)
+    first = np.where(near, owners, count).min(axis=1, initial=count)
+    last = np.where(near, owners, NO_INSTANCE).max(axis=1, initial=NO_INSTANCE)
     classes = np.array([i.label for i in assignment.instances])
     of_class = np.where(owners == NO_INSTANCE, 0, classes[owners])
-    one = (~there | (of_class == classes[last][:, None])).all(axis=1) & there.any(axis=1)
+    one = (~near | (of_class == classes[last][:, None])).all(axis=1) & near.any(axis=1)
     return np.where(one, last, NO_INSTANCE), first == last
 
 

@@ -157,17 +157,17 @@ class ObjectMap:
             if len(keyframe_ids) < self.config.min_keyframes:
                 continue
             distribution = self.labels.probabilities(np.array([i]))[0]
-            mine = points[owners == i]
-            near = supported(mine, self.config.neighbours, self.config.support_m)
-            mine = mine[near]
-            inner = without_noise(mine, noise[owners == i][near], up_world, self.config.trim)
+            own_points = points[owners == i]
+            near = supported(own_points, self.config.neighbours, self.config.support_m)
+            own_points = own_points[near]
+            inner = without_noise(own_points, noise[owners == i][near], up_world, self.config.trim)
             box = box_around(inner, up_world)
             found.append(
                 MapObject(
                     id=i,
                     label=int(distribution.argmax()),
                     distribution=distribution,
-                    centroid_world=mine.mean(axis=0),
+                    centroid_world=own_points.mean(axis=0),
                     box=box,
                     keyframe_ids=keyframe_ids,
                     landmark_ids=self.points.landmarks_of(i),

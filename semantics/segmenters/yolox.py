@@ -117,7 +117,7 @@ class YoloxDetector:
 
     def _find_sides(self) -> tuple[int, ...]:
         """The accepted input sizes, found by trial: OpenCV does not show a file's shapes."""
-        sides = tuple(side for side in self._config.sizes_px if self._takes(side))
+        sides = tuple(side for side in self._config.sizes_px if self._accepts(side))
         if not sides:
             raise InputError(
                 f"{self._path}: not a YOLOX network for COCO's 80 classes at one of "
@@ -125,7 +125,7 @@ class YoloxDetector:
             )
         return sides
 
-    def _takes(self, side_px: int) -> bool:
+    def _accepts(self, side_px: int) -> bool:
         """Whether an input of this size gives an output of YOLOX's shape."""
         self._network.setInput(np.zeros((1, 3, side_px, side_px), np.float32))
         try:

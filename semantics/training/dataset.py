@@ -142,8 +142,10 @@ def split(content: CocoFile, share: float, seed: int) -> tuple[CocoFile, CocoFil
     """
     images = sorted(content.images, key=lambda i: i.number)
     order = np.random.default_rng(seed).permutation(len(images))
-    held = {images[k].number for k in order[: round(share * len(images))].tolist()}
-    parts = [tuple(i for i in images if (i.number in held) == second) for second in (False, True)]
+    held_out = {images[k].number for k in order[: round(share * len(images))].tolist()}
+    parts = [
+        tuple(i for i in images if (i.number in held_out) == second) for second in (False, True)
+    ]
     training, validation = (
         CocoFile(content.labels, content.category_ids, part, content.problems) for part in parts
     )

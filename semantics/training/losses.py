@@ -104,19 +104,19 @@ def rpn_losses(
     logits, offsets = model.rpn.head(levels)
     anchors = make_anchors(levels, batch.size, model.config.anchors)
     every, all_logits, all_offsets = torch.cat(anchors), torch.cat(logits, 1), torch.cat(offsets, 1)
-    scored, moved, wanted, truth = [], [], [], []
+    scored, moved, target_masks, truth = [], [], [], []
     for b, (boxes, target) in enumerate(zip(objects, targets, strict=True)):
         matched = match(every, boxes, RPN_RULE)
         positive, negative = draw_samples(matched, target.labels, RPN_RULE, generator)
         scored.append(all_logits[b, torch.cat([positive, negative])])
         truth.append(torch.cat([torch.ones(len(positive)), torch.zeros(len(negative))]))
         moved.append(all_offsets[b, positive])
-        wanted.append(
+        target_masks.append(
             box_ops.encode(boxes[matched[positive]], every[positive].float(), box_ops.RPN_WEIGHTS)
         )
     scores = torch.cat(scored).float()
     objectness = F.binary_cross_entropy_with_logits(scores, torch.cat(truth).to(scores))
-    box = _smooth_l1(torch.cat(moved), torch.cat(wanted), len(scores))
+    box = _smooth_l1(torch.cat(moved), torch.cat(target_masks), len(scores))
     usual = model.config.proposals
     more = replace(usual, after_nms=PROPOSALS_FACTOR * usual.after_nms)
     proposals = select_proposals(anchors, logits, offsets, batch.sizes, more)
@@ -132,7 +132,7 @@ def box_losses(
     generator: torch.Generator,
 ) -> tuple[Losses, Rois]:
     """Losses of class and box over sampled proposals and the objects' own boxes."""
-    chosen, labels, wanted, positives = [], [], [], Rois([], [])
+    chosen, labels, target_masks, positives = [], [], [], Rois([], [])
     for found, boxes, target in zip(proposals, objects, targets, strict=True):
         candidates = torch.cat([found, boxes])
         matched = match(candidates, boxes, BOX_RULE)
@@ -141,11 +141,11 @@ def box_losses(
         chosen.append(candidates[torch.cat([positive, negative])])
         labels.append(torch.cat([target.labels[owner], torch.zeros_like(negative)]))
         offsets = box_ops.encode(boxes[owner], candidates[positive], box_ops.BOX_WEIGHTS)
-        wanted.append(torch.cat([offsets, offsets.new_zeros(len(negative), 4)]))
+        target_masks.append(torch.cat([offsets, offsets.new_zeros(len(negative), 4)]))
         positives.boxes.append(candidates[positive])
         positives.owners.append(owner)
     logits, predicted = model.roi_heads.boxes(table, chosen)
-    label, offset = torch.cat(labels), torch.cat(wanted)
+    label, offset = torch.cat(labels), torch.cat(target_masks)
     is_object = label > 0
     box = _smooth_l1(of_class(predicted, label)[is_object], offset[is_object], len(label))
     return {"class": F.cross_entropy(logits.float(), label), "box": box}, positives
@@ -192,47 +192,47 @@ def mask_losses(
     every = heads.mask_predictor(heads.mask_head(features))
     labels = torch.cat([t.labels[o] for t, o in zip(targets, found.owners, strict=True)])
     logits = of_class(every, labels).float()
-    wanted, object_px, box_px = _wanted_masks(found, targets, batch, logits.shape[-1])
+    target, object_px, box_px = _target_masks(found, targets, batch, logits.shape[-1])
     masks = logits.sigmoid()
     losses = {
-        "mask": F.binary_cross_entropy_with_logits(logits, wanted.to(logits)),
-        "dice": dice_loss(masks, wanted.to(masks)),
+        "mask": F.binary_cross_entropy_with_logits(logits, target.to(logits)),
+        "dice": dice_loss(masks, target.to(masks)),
     }
     if heads.maskiou_head is not None:
         masks = masks.detach()
         ious = of_class(heads.maskiou_head(features, masks), labels).float()
-        truth = iou_targets(masks, wanted, object_px, box_px).to(ious)
+        truth = iou_targets(masks, target, object_px, box_px).to(ious)
         losses["maskiou"] = 0.5 * F.mse_loss(ious, truth)
     return losses
 
 
-def dice_loss(masks: Tensor, wanted: Tensor) -> Tensor:
+def dice_loss(masks: Tensor, target: Tensor) -> Tensor:
     """Mean of 1 - 2 |A B| / (|A|^2 + |B|^2) over masks (R, M, M) in 0..1 (Milletari et al. 2016).
 
     It is relative to the mask's area, so that thin structures (leaves, legs, shelves) count, which
     the mean over cells neglects.
     """
-    both = (masks * wanted).sum(dim=(1, 2))
-    areas = masks.square().sum(dim=(1, 2)) + wanted.square().sum(dim=(1, 2))
+    both = (masks * target).sum(dim=(1, 2))
+    areas = masks.square().sum(dim=(1, 2)) + target.square().sum(dim=(1, 2))
     return (1 - (2 * both + 1) / (areas + 1)).mean()
 
 
-def _wanted_masks(
+def _target_masks(
     found: Rois, targets: Sequence[Target], batch: ImageBatch, bins: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mask targets (R, bins, bins), areas (R,) of objects and of boxes in original pixels."""
-    wanted, object_px, box_px = [], [], []
+    target_masks, object_px, box_px = [], [], []
     for b, (boxes, owner, target) in enumerate(
         zip(found.boxes, found.owners, targets, strict=True)
     ):
         own = box_ops.rescale(boxes, batch.sizes[b], batch.original_sizes[b])
-        wanted.append(mask_targets(target.masks, owner, own, bins))
+        target_masks.append(mask_targets(target.masks, owner, own, bins))
         object_px.append(target.masks.sum(dim=(1, 2))[owner].float())
         box_px.append(box_ops.area(own))
-    return torch.cat(wanted), torch.cat(object_px), torch.cat(box_px)
+    return torch.cat(target_masks), torch.cat(object_px), torch.cat(box_px)
 
 
-def _smooth_l1(found: Tensor, wanted: Tensor, count: int) -> Tensor:
+def _smooth_l1(found: Tensor, target: Tensor, count: int) -> Tensor:
     """Sum over the boxes' offsets, divided by the number of all sampled boxes."""
-    total = F.smooth_l1_loss(found.float(), wanted.float(), beta=SMOOTH_L1_BETA, reduction="sum")
+    total = F.smooth_l1_loss(found.float(), target.float(), beta=SMOOTH_L1_BETA, reduction="sum")
     return total / max(count, 1)

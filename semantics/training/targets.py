@@ -124,7 +124,7 @@ def _bilinear(images: Tensor, which: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return upper * (1 - fy) + lower * fy
 
 
-def iou_targets(predicted: Tensor, wanted: Tensor, object_px: Tensor, box_px: Tensor) -> Tensor:
+def iou_targets(predicted: Tensor, target: Tensor, object_px: Tensor, box_px: Tensor) -> Tensor:
     """IoU (R,) of predicted masks with the WHOLE objects (Huang et al. 2019, section 3.2).
 
     Args:
@@ -133,7 +133,7 @@ def iou_targets(predicted: Tensor, wanted: Tensor, object_px: Tensor, box_px: Te
         object_px: (R,) area of the whole object, also outside the box.
         box_px: (R,) area of the box, from which that of a cell follows.
     """
-    mask, inside = (predicted > 0.5).float(), (wanted > 0.5).float()
+    mask, inside = (predicted > 0.5).float(), (target > 0.5).float()
     cell_px = box_px / predicted.shape[1] ** 2
     intersection = (mask * inside).sum(dim=(1, 2)) * cell_px
     union = mask.sum(dim=(1, 2)) * cell_px + object_px - intersection

@@ -88,14 +88,16 @@ def load_mobilenet(model: MaskRCNN, path: Path) -> None:
         InputError: the file is not a MobileNetV2 with batch norm folded into its weights.
     """
     state, _ = read_state(path)
-    wanted = model.backbone.body.state_dict()
-    different = sorted(k for k, v in wanted.items() if k not in state or state[k].shape != v.shape)
+    expected = model.backbone.body.state_dict()
+    different = sorted(
+        k for k, v in expected.items() if k not in state or state[k].shape != v.shape
+    )
     if different:
         raise InputError(
-            f"{path}: not a folded MobileNetV2; {len(different)} of {len(wanted)} parameters are "
+            f"{path}: not a folded MobileNetV2; {len(different)} of {len(expected)} parameters are "
             f"missing or of another shape, such as {different[0]}"
         )
-    model.backbone.body.load_state_dict({k: state[k] for k in wanted})
+    model.backbone.body.load_state_dict({k: state[k] for k in expected})
 
 
 def save_network(network: TrainedNetwork, path: Path, half: bool = True) -> None:
@@ -174,12 +176,12 @@ def _names(config: NetworkConfig) -> set[str]:
 
 def _check(path: Path, state: State, model: MaskRCNN) -> None:
     """Raise InputError with the differences unless the weights are exactly the model's."""
-    wanted = model.state_dict()
-    missing, extra = sorted(wanted.keys() - state.keys()), sorted(state.keys() - wanted.keys())
+    expected = model.state_dict()
+    missing, extra = sorted(expected.keys() - state.keys()), sorted(state.keys() - expected.keys())
     shaped = [
-        f"{k} {tuple(state[k].shape)} instead of {tuple(wanted[k].shape)}"
-        for k in sorted(wanted.keys() & state.keys())
-        if state[k].shape != wanted[k].shape
+        f"{k} {tuple(state[k].shape)} instead of {tuple(expected[k].shape)}"
+        for k in sorted(expected.keys() & state.keys())
+        if state[k].shape != expected[k].shape
     ]
     kinds = (("missing", missing), ("not known", extra), ("of another shape", shaped))
     parts = [

@@ -42,11 +42,11 @@ class FactorSelector:
         self._removed: list[Ints] = []
         self._removed_keyframes: list[int] = []
 
-    def forget_landmarks(self, ids: Ints) -> None:
+    def remove_landmarks(self, ids: Ints) -> None:
         """These landmarks were culled or fused: their factors go with the next update."""
         self._removed.append(ids)
 
-    def forget_keyframe(self, keyframe_id: int) -> None:
+    def remove_keyframe(self, keyframe_id: int) -> None:
         """This keyframe was culled: its factors go with the next update."""
         self._removed_keyframes.append(keyframe_id)
 
@@ -86,7 +86,7 @@ class FactorSelector:
 
         Marginalised landmarks that were given observations enter the graph again.
         """
-        again = np.flatnonzero(was_sent(world) & ~world.landmarks.in_graph & world.landmarks.alive)
+        again = np.flatnonzero(was_sent(world) & ~world.landmarks.in_graph & world.landmarks.in_map)
         unsent = [k.landmark_ids[k.sent_ids != k.landmark_ids] for k in world.keyframes.values()]
         again = np.intersect1d(again, np.concatenate([np.zeros(0, np.int64), *unsent]))
         world.landmarks.in_graph[again] = True
@@ -107,7 +107,7 @@ class FactorSelector:
         self._removed, self._removed_keyframes = [], []
         keyframes = list(world.keyframes.values())
         landmarks = world.landmarks
-        landmarks.in_graph[:] = (landmarks.in_graph | was_sent(world)) & landmarks.alive
+        landmarks.in_graph[:] = (landmarks.in_graph | was_sent(world)) & landmarks.in_map
         first = {k.segment: k for k in reversed(keyframes)}
         for keyframe in keyframes:
             keyframe.sent_ids[:] = -1
@@ -133,7 +133,7 @@ class FactorSelector:
         bucket = (pixels[:, 1] * 1000 + pixels[:, 0]).astype(np.int64)
         return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
 
-    def _outside_window(self, world: WorldMap, seen_ids: Ints) -> Ints:
+    def _outside_window(self, world: WorldMap, observed_ids: Ints) -> Ints:
         """Landmarks in the graph that no keyframe of the active window sees, if they are enough.
 
         Those that were not seen for longest come first.
@@ -141,12 +141,12 @@ class FactorSelector:
         count, landmarks = self.config.window_keyframes, world.landmarks
         if not count or len(world.keyframes) <= self.config.full_keyframes:
             return np.zeros(0, np.int64)
-        near = [k for _, k in world.covisible(seen_ids, self.config.window_min_shared)[:count]]
+        near = [k for _, k in world.covisible(observed_ids, self.config.window_min_shared)[:count]]
         active = np.zeros(len(landmarks) + 1, bool)  # the last entry is for id -1
-        active[seen_ids] = True
+        active[observed_ids] = True
         for keyframe in near:
             active[keyframe.landmark_ids] = True
-        waiting = np.flatnonzero(landmarks.in_graph & landmarks.alive & ~active[:-1])
+        waiting = np.flatnonzero(landmarks.in_graph & landmarks.in_map & ~active[:-1])
         batch = self.config.marginalise_batch
         if len(waiting) < batch:
             return waiting[:0]
@@ -211,18 +211,18 @@ def read_back(world: WorldMap, estimate: GraphEstimate) -> None:
     """
     landmarks = world.landmarks
     before = landmarks.in_graph.copy()
-    inside = estimate.landmark_ids[landmarks.alive[estimate.landmark_ids]]
+    inside = estimate.landmark_ids[landmarks.in_map[estimate.landmark_ids]]
     landmarks.in_graph[:] = False  # nor those that were sent and refused
     landmarks.in_graph[inside] = True
-    left_out = np.append(before & ~landmarks.in_graph, False)
-    if left_out.any():  # their observations may be sent again later
+    excluded = np.append(before & ~landmarks.in_graph, False)
+    if excluded.any():  # their observations may be sent again later
         for keyframe in world.keyframes.values():
-            keyframe.sent_ids[left_out[keyframe.sent_ids]] = -1
+            keyframe.sent_ids[excluded[keyframe.sent_ids]] = -1
     known = np.array([i in world.keyframes for i in estimate.keyframe_ids], bool)
     ids, T_new = estimate.keyframe_ids[known], estimate.poses_world_camera[known]
     T_old = np.array([world.keyframes[i].T_world_camera for i in ids]).reshape(-1, 4, 4)
     moved = np.abs(T_new - T_old).max(axis=(1, 2)) > 1e-9
-    outside = np.flatnonzero(landmarks.alive & ~landmarks.in_graph)
+    outside = np.flatnonzero(landmarks.in_map & ~landmarks.in_graph)
     if moved.any():
         landmarks.move_with_hosts(outside, ids[moved], T_old[moved], T_new[moved])
     for i, T in zip(ids, T_new, strict=True):

@@ -69,13 +69,13 @@ def fuse_into(
     """
     removed = [np.zeros(0, np.int64)]
     for keyframe in keyframes:
-        living = world.landmarks.living(ids)
-        visible, matches = consistent_matches(world, keyframe, living, tracker, radius_px)
-        here, there = visible[matches.query], keyframe.landmark_ids[matches.train]
-        old = there >= 0
-        old[old] = world.landmarks.alive[there[old]]
-        world.attach(keyframe, matches.train[~old], here[~old])
-        pairs = np.sort(np.stack([here[old], there[old]], axis=1), axis=1)
+        candidates = world.landmarks.remaining(ids)
+        visible, matches = consistent_matches(world, keyframe, candidates, tracker, radius_px)
+        matched, old_ids = visible[matches.query], keyframe.landmark_ids[matches.train]
+        old = old_ids >= 0
+        old[old] = world.landmarks.in_map[old_ids[old]]
+        world.attach(keyframe, matches.train[~old], matched[~old])
+        pairs = np.sort(np.stack([matched[old], old_ids[old]], axis=1), axis=1)
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
         if len(pairs):
             removed.append(world.replace_landmarks(pairs[:, 1], pairs[:, 0]))
@@ -101,7 +101,7 @@ def consistent_matches(
 def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> Ints:
     """Remove the candidates that are rarely found again or seen by few keyframes; their ids."""
     landmarks = world.landmarks
-    ids = landmarks.living(candidates)
+    ids = landmarks.remaining(candidates)
     age, views = world.next_keyframe_id - 1 - landmarks.host[ids], landmarks.observations[ids]
     rarely = landmarks.found[ids] < config.min_found_ratio * landmarks.visible[ids]
     few = (age >= config.probation_keyframes) & (views < config.min_observations)

@@ -136,8 +136,8 @@ class Mapper:
         triangulate_landmarks(world, keyframe, self.camera, self._mapping.triangulation)
         world.renew_patches(keyframe, self._tracker.config.subpixel)
         keyframe.features = without_image(keyframe.features)
-        self._factor_selector.forget_landmarks(fused)
-        self._factor_selector.forget_landmarks(cull_landmarks(world, local_ids, self._mapping))
+        self._factor_selector.remove_landmarks(fused)
+        self._factor_selector.remove_landmarks(cull_landmarks(world, local_ids, self._mapping))
         self.loops.add(keyframe)
         return keyframe
 
@@ -206,11 +206,13 @@ class Mapper:
         if keyframe is None or not len(keypoints):
             return
         world.unmask(keyframe, keypoints)
-        _, seen = world.observed(keyframe)
-        known = np.setdiff1d(local_landmarks(world, seen, self._mapping.local_map), seen)
+        _, landmark_ids = world.observed(keyframe)
+        known = np.setdiff1d(
+            local_landmarks(world, landmark_ids, self._mapping.local_map), landmark_ids
+        )
         radius_px = self._mapping.fuse_radius_px
         fused = fuse_into(world, [keyframe], known, self._tracker, radius_px)
-        self._factor_selector.forget_landmarks(fused)
+        self._factor_selector.remove_landmarks(fused)
         create_landmarks(world, keyframe, self.camera)
         ids = keyframe.landmark_ids[keypoints]
         world.landmarks.give_patches(ids[ids >= 0], patches[ids >= 0])
@@ -240,8 +242,8 @@ class Mapper:
         if not refuted:
             return
         logger.info("loops refuted by the graph: %s", sorted(refuted))
-        gone = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
-        self._change_graph(remove_relative_poses=gone)
+        removed_loops = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
+        self._change_graph(remove_relative_poses=removed_loops)
         for a, b in sorted(refuted - fresh):
             self.pruner().prune_loop(a, b)
         for ends in refuted:
@@ -253,11 +255,11 @@ class Mapper:
         old_ids, new_side = self._sides(loops)
         for loop in loops:
             pairs = np.sort(loop.landmark_pairs, axis=1)
-            pairs = pairs[world.landmarks.alive[pairs].all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
-            self._factor_selector.forget_landmarks(
+            pairs = pairs[world.landmarks.in_map[pairs].all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
+            self._factor_selector.remove_landmarks(
                 world.replace_landmarks(pairs[:, 1], pairs[:, 0])
             )
-        self._factor_selector.forget_landmarks(
+        self._factor_selector.remove_landmarks(
             fuse_into(world, new_side, old_ids, self._tracker, self._mapping.fuse_radius_px)
         )
         self._change_graph()
@@ -267,10 +269,10 @@ class Mapper:
         world, count = self.world, self.loops.config.fuse_keyframes
         old_ids, new_side = [], {}
         for loop in loops:
-            _, seen = world.observed(world.keyframes[loop.keyframe_a])
-            old_ids.append(local_landmarks(world, seen, self._mapping.local_map))
-            _, seen = world.observed(world.keyframes[loop.keyframe_b])
-            near = world.covisible(seen, self._mapping.local_map.min_shared)[:count]
+            _, landmark_ids = world.observed(world.keyframes[loop.keyframe_a])
+            old_ids.append(local_landmarks(world, landmark_ids, self._mapping.local_map))
+            _, landmark_ids = world.observed(world.keyframes[loop.keyframe_b])
+            near = world.covisible(landmark_ids, self._mapping.local_map.min_shared)[:count]
             new_side.update({k.id: k for _, k in near})
         return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
 
@@ -280,9 +282,9 @@ class Mapper:
         Landmarks that too few others see are removed with it. Older keyframes are kept: the map
         would drift if newer views replaced them.
         """
-        _, seen = self.world.observed(newest)
+        _, landmark_ids = self.world.observed(newest)
         kept = self.loops.ends | {0}  # culling the end of a loop would remove its factor
-        near = {k.id: k for _, k in self.world.covisible(seen, 15)}
+        near = {k.id: k for _, k in self.world.covisible(landmark_ids, 15)}
         old = [near[i] for i in sorted(near.keys() - kept, reverse=True) if i < newest.id - 2]
         redundant = redundant_keyframe(self.world, old, self._mapping)
         if redundant is None:
@@ -292,6 +294,6 @@ class Mapper:
         T_parent_keyframe = inverse(parent.T_world_camera) @ redundant.T_world_camera
         self.history.hand_over(redundant.id, parent.id, T_parent_keyframe)
         self.world.remove_keyframe(redundant, parent)
-        self._factor_selector.forget_keyframe(redundant.id)
-        self._factor_selector.forget_landmarks(cull_landmarks(self.world, ids, self._mapping))
+        self._factor_selector.remove_keyframe(redundant.id)
+        self._factor_selector.remove_landmarks(cull_landmarks(self.world, ids, self._mapping))
         self.loops.remove(redundant.id)

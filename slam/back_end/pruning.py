@@ -104,7 +104,7 @@ class MapPruner:
         landmarks = self.world.landmarks
         known = ids[(ids >= 0) & (ids < len(landmarks))]
         current = np.unique(landmarks.current(known))
-        return self._remove(current[landmarks.alive[current]], np.zeros((0, 2), np.int64))
+        return self._remove(current[landmarks.in_map[current]], np.zeros((0, 2), np.int64))
 
     def prune_loop(self, keyframe_a: int, keyframe_b: int) -> PruneReport:
         """Remove a loop: its relative poses, and the fusions of landmarks that it caused.
@@ -118,7 +118,7 @@ class MapPruner:
         if missing:
             return PruneReport(refused=f"keyframe {missing[0]} is not in the map")
         old_side, new_side = (self._side(end, ends) for end in ends)
-        fused = np.intersect1d(self._seen_from(old_side), self._seen_from(new_side))
+        fused = np.intersect1d(self._observed_from(old_side), self._observed_from(new_side))
         fused = fused[self._longest_pause(fused) >= np.ptp(self._position(ends)) / 2]
         pairs = [
             np.stack([np.full(len(ids), k.id), ids], axis=1)
@@ -140,8 +140,8 @@ class MapPruner:
     def _side(self, end: int, ends: list[int]) -> list[Keyframe]:
         """Keyframes covisible with one end of a loop and nearer to it than to the other."""
         (other,) = (k for k in ends if k != end)
-        _, seen = self.world.observed(self.world.keyframes[end])
-        near = [k for _, k in self.world.covisible(seen, 1)]
+        _, observed_ids = self.world.observed(self.world.keyframes[end])
+        near = [k for _, k in self.world.covisible(observed_ids, 1)]
         return [k for k in near if abs(k.id - end) < abs(k.id - other)]
 
     def _position(self, keyframe_ids: list[int]) -> Ints:
@@ -151,9 +151,9 @@ class MapPruner:
     def _longest_pause(self, ids: Ints) -> Ints:
         """Largest number (N,) of keyframes between two views of each landmark; ids are sorted."""
         views = [
-            np.stack([np.searchsorted(ids, mine), np.full(len(mine), place)])
+            np.stack([np.searchsorted(ids, common), np.full(len(common), place)])
             for place, k in enumerate(sorted(self.world.keyframes))
-            if len(mine := np.intersect1d(self.world.observed(self.world.keyframes[k])[1], ids))
+            if len(common := np.intersect1d(self.world.observed(self.world.keyframes[k])[1], ids))
         ]
         row, place = np.concatenate([np.zeros((2, 0), np.int64), *views], axis=1)
         order = np.lexsort((place, row))
@@ -163,16 +163,16 @@ class MapPruner:
         np.maximum.at(longest, row[~first], step[~first])
         return longest
 
-    def _seen_from(self, keyframes: list[Keyframe]) -> Ints:
+    def _observed_from(self, keyframes: list[Keyframe]) -> Ints:
         ids = [self.world.observed(keyframe)[1] for keyframe in keyframes]
         return np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))
 
     def _prune_observations(self, keyframe: Keyframe, keypoints: Ints) -> PruneReport:
         """Take out what keypoints (N,) observe; landmarks that nothing else observes go too."""
         ids = keyframe.landmark_ids[keypoints]
-        alive = (ids >= 0) & self.world.landmarks.alive[ids]
-        alone = alive & (self.world.landmarks.observations[ids] <= 1)
-        shared = ids[alive & ~alone]
+        existing = (ids >= 0) & self.world.landmarks.in_map[ids]
+        alone = existing & (self.world.landmarks.observations[ids] <= 1)
+        shared = ids[existing & ~alone]
         pairs = np.stack([np.full(len(shared), keyframe.id), shared], axis=1)
         report = self._remove(np.unique(ids[alone]), pairs)
         self.world.mask(keyframe, keypoints)

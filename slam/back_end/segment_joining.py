@@ -40,7 +40,7 @@ def move_segment(world: WorldMap, segment: int, T_other_segment: Array, target: 
     landmarks = world.landmarks
     moving = world.in_segment(segment)
     hosts = np.array([k.id for k in moving])
-    ids = np.flatnonzero(np.isin(landmarks.host, hosts) & landmarks.alive)
+    ids = np.flatnonzero(np.isin(landmarks.host, hosts) & landmarks.in_map)
     landmarks.points_world[ids] = transform(T_other_segment, landmarks.points_world[ids])
     R_other_segment = T_other_segment[:3, :3]
     landmarks.directions[ids] = landmarks.directions[ids] @ R_other_segment.T

@@ -28,20 +28,23 @@ def triangulate_landmarks(
     world: WorldMap, keyframe: Keyframe, camera: Camera, config: TriangulationConfig
 ) -> Ints:
     """Landmarks from keypoints without depth that match in a covisible keyframe; returns ids."""
-    _, seen = world.observed(keyframe)
-    neighbours = [k for _, k in world.covisible(seen, 15) if k is not keyframe]
+    _, observed_ids = world.observed(keyframe)
+    neighbours = [k for _, k in world.covisible(observed_ids, 15) if k is not keyframe]
     made = [np.zeros(0, np.int64)]
     for neighbour in neighbours[: config.neighbours]:
-        here, there = _free_without_depth(keyframe), _free_without_depth(neighbour)
-        a, b = keyframe.features.descriptors[here], neighbour.features.descriptors[there]
+        rows, neighbour_rows = _free_without_depth(keyframe), _free_without_depth(neighbour)
+        a, b = keyframe.features.descriptors[rows], neighbour.features.descriptors[neighbour_rows]
         matches = match_brute_force(a, b, config.match)
-        here, there = here[matches.query], there[matches.train]
-        pixels = (keyframe.features.pixels[here], neighbour.features.pixels[there])
-        sigmas = (keyframe.features.sigmas_px[here, 0], neighbour.features.sigmas_px[there, 0])
+        rows, neighbour_rows = rows[matches.query], neighbour_rows[matches.train]
+        pixels = (keyframe.features.pixels[rows], neighbour.features.pixels[neighbour_rows])
+        sigmas = (
+            keyframe.features.sigmas_px[rows, 0],
+            neighbour.features.sigmas_px[neighbour_rows, 0],
+        )
         poses = (keyframe.T_world_camera, neighbour.T_world_camera)
         points_world, good = triangulate(pixels, sigmas, poses, camera, config)
-        ids = world.make_landmarks(keyframe, here[good], points_world[good])
-        world.attach(neighbour, there[good], ids)
+        ids = world.make_landmarks(keyframe, rows[good], points_world[good])
+        world.attach(neighbour, neighbour_rows[good], ids)
         made.append(ids)
     return np.concatenate(made)
 

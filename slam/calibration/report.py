@@ -45,11 +45,11 @@ def parameter_named(name: str) -> str | None:
 
     Units, and whether words are joined by spaces, hyphens or underscores, do not matter.
     """
-    wanted = _plain(name)
+    text = _plain(name)
     for parameter in PARAMETERS:
         label, unit, _ = UNITS.get(parameter, (parameter, "", 1.0))
         names = (parameter, label, f"{label} {unit}", *ALSO.get(parameter, ()))
-        if wanted in map(_plain, names):
+        if text in map(_plain, names):
             return parameter
     return None
 

@@ -160,8 +160,8 @@ def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:
     NaN where the surface changed, and everywhere if an image is missing or too far in time.
     """
     before, after = max(index - 1, 0), min(index + 1, len(sequence) - 1)
-    taken_s = sequence.pairs.timestamps_s + sequence.pairs.lags_s
-    step_s = float(taken_s[after] - taken_s[before])
+    depth_stamps_s = sequence.pairs.timestamps_s + sequence.pairs.lags_s
+    step_s = float(depth_stamps_s[after] - depth_stamps_s[before])
     first, last = (_raw_inverse_depth(sequence, i) for i in (before, after))
     change = last - first
     change[np.abs(change) > SURFACE_STEP * first] = np.nan

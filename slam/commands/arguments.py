@@ -122,8 +122,8 @@ def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
     """What was asked for; ``window``: Rerun's own window, if nothing else was."""
     from bmask_slam.viewer.scene import ViewOptions
 
-    elsewhere = arguments.record is not None or arguments.serve > 0
-    return ViewOptions(arguments.record, arguments.serve, window and not elsewhere)
+    other_output = arguments.record is not None or arguments.serve > 0
+    return ViewOptions(arguments.record, arguments.serve, window and not other_output)
 
 
 def format_summary(rows: list[Row]) -> str:

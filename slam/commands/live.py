@@ -134,5 +134,5 @@ def _print_summary(slam: LiveSlam, source: Source) -> None:
     print(f"{format_summary(slam.rows)}\n\nRun folder  {slam.options.out}")
     if slam.dense is not None:
         print(f"Dense map   {slam.options.out}/dense, {slam.dense.points} points")
-    if left_out := source.counts.line():
-        print(f"Source      {left_out}")
+    if counts := source.counts.line():
+        print(f"Source      {counts}")

@@ -118,8 +118,8 @@ def _render(pool: Pool, jobs: list[Job], bar: JobBar) -> dict[str, Outcome]:
 # --- Cells ---------------------------------------------------------------------------------------
 
 
-def _cell(key: CellKey, status: CellStatus, **values: str) -> Cell:
-    return Cell(key.sequence, key.configuration, key.seed, status, **values)
+def _cell(key: CellKey, status: CellStatus, log: str = "", error: str = "") -> Cell:
+    return Cell(key.sequence, key.configuration, key.seed, status, log=log, error=error)
 
 
 def _pending(plan: Plan, key: CellKey) -> Cell:
@@ -158,7 +158,7 @@ def _run_cell(plan: Plan, key: CellKey, outcome: Outcome) -> Cell:
 
 
 def _other_cells(plan: Plan) -> Iterator[Cell]:
-    yield from trajectory_cells(plan.experiment, plan.place, plan.files)
+    yield from trajectory_cells(plan.experiment, plan.sequence, plan.files)
     yield from published_cells(plan.experiment)
 
 

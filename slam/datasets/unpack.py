@@ -41,12 +41,12 @@ def _unpack_tar(archive: Path, folder: Path, progress: Progress) -> None:
 
 
 def _unpack_zip(archive: Path, folder: Path, progress: Progress) -> None:
-    with zipfile.ZipFile(archive) as held:
-        total, done = sum(info.compress_size for info in held.infolist()), 0
-        for info in held.infolist():
+    with zipfile.ZipFile(archive) as zipped:
+        total, done = sum(info.compress_size for info in zipped.infolist()), 0
+        for info in zipped.infolist():
             kind = stat.S_IFMT(info.external_attr >> 16)
             _check(archive, info.filename, kind in (0, stat.S_IFREG, stat.S_IFDIR), folder)
-            held.extract(info, folder)
+            zipped.extract(info, folder)
             done += info.compress_size
             progress(done, total)
 

@@ -115,10 +115,10 @@ class KeyframeFusion:
         completed = self.finish() if segment != self._segment else []
         self._segment = segment
         excluded = instances.excluded
-        wanted = not self._folder.is_done(keyframe.id)
-        self.counts.reused += not wanted
+        to_fuse = not self._folder.is_done(keyframe.id)
+        self.counts.reused += not to_fuse
         keyframe = replace(keyframe, instances=instances.numbers)
-        if wanted:
+        if to_fuse:
             self._evidence[keyframe.id] = instances.evidence
             if self._options.keep_excluded and excluded.any():
                 self._save_excluded(keyframe, excluded)
@@ -127,7 +127,7 @@ class KeyframeFusion:
         keyframe = replace(keyframe, depth_m=depth_m, unmatched=hidden)
         self._mapper.update_poses(poses)
         started_s = time.perf_counter()
-        return completed + self._save(self._mapper.add(keyframe, wanted), started_s)
+        return completed + self._save(self._mapper.add(keyframe, to_fuse), started_s)
 
     def update_poses(self, poses: Mapping[int, Array]) -> None:
         """Replace the poses of waiting keyframes by T_world_camera (4, 4), by id."""

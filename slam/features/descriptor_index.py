@@ -94,8 +94,8 @@ class DescriptorIndex:
         descriptors = self._descriptors.pop(keyframe_id, None)
         if descriptors is None:
             return
-        self._dead += len(descriptors)
-        if 2 * self._dead > self._rows:
+        self._removed += len(descriptors)
+        if 2 * self._removed > self._rows:
             self.rebuild()
 
     def votes(self, descriptors: Bits, excluded: Collection[int] = ()) -> Votes:
@@ -147,7 +147,7 @@ class DescriptorIndex:
     def _clear(self) -> None:
         self._index: faiss.IndexBinary = faiss.IndexBinaryFlat(BITS)
         self._partitioned = False
-        self._rows = self._dead = 0
+        self._rows = self._removed = 0
         self._starts: list[int] = []  # first row of each block of rows
         self._owners: list[int] = []  # and the keyframe whose block it is
 

@@ -56,9 +56,9 @@ class VisibleLandmarks:
     T_world_camera: Array
     segment: int
 
-    def among(self, wanted: Mask) -> VisibleLandmarks:
+    def among(self, selected: Mask) -> VisibleLandmarks:
         """Those that are ``wanted``, a mask over all landmarks."""
-        keep = wanted[self.landmark_ids]
+        keep = selected[self.landmark_ids]
         kept = self.pixels[keep], self.z_m[keep], self.landmark_ids[keep]
         return VisibleLandmarks(*kept, self.T_world_camera, self.segment)
 
@@ -67,7 +67,7 @@ class VisibleLandmarks:
         depth_m: Floats,
         camera: Camera,
         world: WorldMap,
-        wanted: Mask | None = None,
+        selected: Mask | None = None,
     ) -> VisibleLandmarks:
         """These and others of the segment on the surface that the keyframe's depth image shows.
 
@@ -76,7 +76,7 @@ class VisibleLandmarks:
         a pixel or two. ``wanted`` is a mask over all landmarks; without it all in the map are used.
         """
         landmarks = world.landmarks
-        others = (landmarks.alive if wanted is None else wanted).copy()
+        others = (landmarks.in_map if selected is None else selected).copy()
         others[self.landmark_ids] = False
         ids = np.flatnonzero(others)
         hosts = [k.id for k in world.in_segment(self.segment)]
@@ -92,11 +92,11 @@ class VisibleLandmarks:
         nearest = whole[inside, ::-1].astype(np.int64) // step
         v, u = np.moveaxis(np.clip(nearest[:, None] + _NINE, 0, limits), -1, 0)
         z_m = local[rows, 2]
-        there = (np.abs(depth_m[v, u] - z_m[:, None]) < _REACH * z_m[:, None]).any(axis=1)
+        on_surface = (np.abs(depth_m[v, u] - z_m[:, None]) < _REACH * z_m[:, None]).any(axis=1)
         return VisibleLandmarks(
-            np.concatenate([self.pixels, pixels[there]]),
-            np.concatenate([self.z_m, z_m[there]]),
-            np.concatenate([self.landmark_ids, ids[rows[there]]]),
+            np.concatenate([self.pixels, pixels[on_surface]]),
+            np.concatenate([self.z_m, z_m[on_surface]]),
+            np.concatenate([self.landmark_ids, ids[rows[on_surface]]]),
             self.T_world_camera,
             self.segment,
         )
@@ -116,5 +116,5 @@ def observed_by(keyframe_id: int, map_reader: MapReader) -> Observed | None:
         return None
     rows = np.flatnonzero(culled.landmark_ids >= 0)
     ids = world.landmarks.current(culled.landmark_ids[rows])
-    alive = world.landmarks.alive[ids]
-    return Observed(culled.image_pixels[rows[alive]], ids[alive], parent, T_parent_keyframe)
+    existing = world.landmarks.in_map[ids]
+    return Observed(culled.image_pixels[rows[existing]], ids[existing], parent, T_parent_keyframe)

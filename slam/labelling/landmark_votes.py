@@ -42,12 +42,12 @@ class LabelVotes:
     ) -> Ints:
         """Let a keyframe's instances vote on all visible landmarks; returns their ids (N,)."""
         world = self._map.world
-        new = world.landmarks.alive.copy()
+        new = world.landmarks.in_map.copy()
         new[store.known()] = False
         for earlier_id, earlier in self._recent.items():
-            seen = observed_by(earlier_id, self._map)
-            if seen is not None:
-                matched = seen.located(world).among(new)
+            visible = observed_by(earlier_id, self._map)
+            if visible is not None:
+                matched = visible.located(world).among(new)
                 located = matched.with_visible(earlier.depth_m, self._camera, world, new)
                 self._vote(earlier, located, store)
         located = observed.located(world).with_visible(assignment.depth_m, self._camera, world)
@@ -58,9 +58,11 @@ class LabelVotes:
             del self._recent[min(self._recent)]
         return ids
 
-    def _vote(self, assignment: PixelAssignment, seen: VisibleLandmarks, store: LabelStore) -> Ints:
-        votes = vote(assignment, seen.pixels, seen.z_m, store.classes, self._config)
-        ids, hit = seen.landmark_ids[votes.rows], ~votes.missed
+    def _vote(
+        self, assignment: PixelAssignment, visible: VisibleLandmarks, store: LabelStore
+    ) -> Ints:
+        votes = vote(assignment, visible.pixels, visible.z_m, store.classes, self._config)
+        ids, hit = visible.landmark_ids[votes.rows], ~votes.missed
         store.update(ids[hit], votes.distributions[hit], votes.weights[hit])
         store.miss(ids[~hit], votes.weights[~hit])
         return ids
@@ -95,10 +97,10 @@ class LabelVotes:
         instances, ends = _instances(state), np.cumsum(state["counts"])
         self._recent = {}
         for k, keyframe_id in enumerate(state["keyframes"].tolist()):
-            mine = slice(ends[k] - state["counts"][k], ends[k])
+            rows = slice(ends[k] - state["counts"][k], ends[k])
             owner, under, inner = (images[n][k] for n in ("owner", "under", "inner"))
             self._recent[keyframe_id] = PixelAssignment(
-                tuple(instances[mine]), owner, under, inner, depths_m[k], ranges_m[mine]
+                tuple(instances[rows]), owner, under, inner, depths_m[k], ranges_m[rows]
             )
 
 

@@ -149,8 +149,8 @@ class SemanticMapper:
         waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
         strong = [i for i in instances if i.class_score >= self.config.object_score]
         assignment = assign_pixels(strong, waiting.depth_m, size, self.config.votes)
-        seen = observed.located(self._map.world)
-        votes = vote(assignment, seen.pixels, seen.z_m, len(self.names), self.config.votes)
+        visible = observed.located(self._map.world)
+        votes = vote(assignment, visible.pixels, visible.z_m, len(self.names), self.config.votes)
         ids = observed.landmark_ids[votes.rows[votes.sure]]
         on = votes.instances[votes.sure]
         everything = assign_pixels(instances, waiting.depth_m, size, self.config.votes, True)
@@ -173,13 +173,13 @@ class SemanticMapper:
         """
         landmarks, keyframes = self._map.world.landmarks, self._map.world.keyframes
         known = np.union1d(self.labels.known(), self.objects.points.landmarks())
-        gone = known[~landmarks.alive[known]]
-        if len(gone):
-            parents = landmarks.current(gone)
-            alive = landmarks.alive[parents]
-            self.labels.move(gone[alive], parents[alive])
-            self.labels.drop(gone[~alive])
-            self.objects.points.rename_landmarks(gone, np.where(alive, parents, -1))
+        removed = known[~landmarks.in_map[known]]
+        if len(removed):
+            parents = landmarks.current(removed)
+            kept = landmarks.in_map[parents]
+            self.labels.move(removed[kept], parents[kept])
+            self.labels.drop(removed[~kept])
+            self.objects.points.rename_landmarks(removed, np.where(kept, parents, -1))
         for keyframe_id in self.objects.points.anchors():
             if keyframe_id not in keyframes:
                 self.objects.points.reanchor(keyframe_id, *self._map.history.parent(keyframe_id))

@@ -58,9 +58,9 @@ class Display:
         A submap whose keyframe is not in the largest map segment waits until the two are joined.
         """
         if has_changed:
-            for gone in self._placed.keys() - world.keyframes.keys():
-                del self._placed[gone]
-                self._scene.remove_submap(gone)
+            for removed in self._placed.keys() - world.keyframes.keys():
+                del self._placed[removed]
+                self._scene.remove_submap(removed)
             self._to_move = self._moved(world)
         for number in self._to_move[:at_once]:
             if number in self._placed and number in world.keyframes:
@@ -78,9 +78,9 @@ class Display:
         ids = list(self._placed)
         if not ids:
             return []
-        there = np.array([self._placed[i] for i in ids])
-        here = np.array([world.keyframes[i].T_world_camera for i in ids])
-        off = np.abs(here - there)[:, :3]
+        shown_poses = np.array([self._placed[i] for i in ids])
+        poses = np.array([world.keyframes[i].T_world_camera for i in ids])
+        off = np.abs(poses - shown_poses)[:, :3]
         moved = np.maximum(
             off[..., 3].max(axis=1) / MOVED_M, off[..., :3].max(axis=(1, 2)) / TURNED
         )

@@ -58,7 +58,7 @@ class LostKeyframe:
     Attributes:
         id: of the keyframe.
         parent_id: keyframe to which its frames are attached. A keyframe that began a segment has
-            none (NOBODY): the segment begins anew.
+            none (NO_KEYFRAME): the segment begins anew.
         T_parent_lost: (4, 4) the pose of the keyframe relative to its parent.
         history: as of the ``NewKeyframe``.
         landmarks: number of landmarks ever made that tracking knows; their ids are not used again.

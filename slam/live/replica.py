@@ -43,7 +43,7 @@ class WorldDelta:
 
     Attributes:
         size: number of landmarks ever made.
-        alive: (size,) flags as packed bits.
+        in_map: (size,) flags as packed bits.
         points_world: (A, 3) of the valid landmarks, in the order of their ids.
         ids: (R,) valid landmarks of which another column changed.
         columns: the rows of these, by the name of the column.
@@ -57,7 +57,7 @@ class WorldDelta:
     """
 
     size: int
-    alive: Bytes
+    in_map: Bytes
     points_world: Array
     ids: Ints
     columns: Arrays
@@ -104,8 +104,8 @@ class DeltaMaker:
             del self._sent.observations[culled], self._sent.masked[culled]
         return WorldDelta(
             size=len(table),
-            alive=np.packbits(table.alive),
-            points_world=table.points_world[table.alive],
+            in_map=np.packbits(table.in_map),
+            points_world=table.points_world[table.in_map],
             ids=ids,
             columns={name: getattr(table, name)[ids] for name in COLUMNS},
             replaced_by=replaced_by,
@@ -120,16 +120,16 @@ class DeltaMaker:
     def _changed_landmarks(self, world: WorldMap) -> Ints:
         """Valid landmarks whose compared columns differ from what was sent before."""
         table, sent = world.landmarks, self._sent
-        ids = np.flatnonzero(table.alive)
+        ids = np.flatnonzero(table.in_map)
         columns = {name: getattr(table, name)[ids] for name in COMPARED}
-        _, here, there = np.intersect1d(ids, sent.ids, assume_unique=True, return_indices=True)
-        same = np.ones(len(here), bool)
-        for name in COMPARED if len(here) else ():
-            a, b = columns[name][here], sent.landmarks[name][there]
-            bytes_a, bytes_b = (rows.reshape(len(here), -1).view(np.uint8) for rows in (a, b))
+        _, now, sent_rows = np.intersect1d(ids, sent.ids, assume_unique=True, return_indices=True)
+        same = np.ones(len(now), bool)
+        for name in COMPARED if len(now) else ():
+            a, b = columns[name][now], sent.landmarks[name][sent_rows]
+            bytes_a, bytes_b = (rows.reshape(len(now), -1).view(np.uint8) for rows in (a, b))
             same &= (bytes_a == bytes_b).all(axis=1)  # NaN is equal to itself
         sent.ids, sent.landmarks = ids, columns
-        return np.delete(ids, here[same])
+        return np.delete(ids, now[same])
 
     def _has_changed(self, keyframe: Keyframe) -> bool:
         sent = self._sent
@@ -182,8 +182,8 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
 def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
     table = world.landmarks
     table.extend_to(delta.size)
-    table.set_alive(np.unpackbits(delta.alive, count=delta.size).view(bool))
-    table.points_world[table.alive] = delta.points_world
+    table.set_in_map(np.unpackbits(delta.in_map, count=delta.size).view(bool))
+    table.points_world[table.in_map] = delta.points_world
     for name, rows in delta.columns.items():
         getattr(table, name)[delta.ids] = rows
     if delta.replaced_by is not None:

@@ -29,7 +29,7 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, Tracked
-from bmask_slam.world.frame_history import NOBODY
+from bmask_slam.world.frame_history import NO_KEYFRAME
 from bmask_slam.world.world_map import Keyframe
 
 FIRST_MAP_S = 5.0
@@ -126,7 +126,7 @@ class LiveSystem(SlamSystem):
         """
         tracker = self.camera_tracker
         parent_id, T_parent_reference = self.remote.history.parent(reference.id)
-        if parent_id == NOBODY:
+        if parent_id == NO_KEYFRAME:
             tracker.reference = None
             tracker.reset(0)
             return

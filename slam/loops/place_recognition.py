@@ -105,15 +105,15 @@ class PlaceRecogniser:
         """(members, best member, its votes, all votes), most votes first, each keyframe's once."""
         counts = dict(zip(votes.keyframe_ids.tolist(), votes.scores.tolist(), strict=True))
         groups: list[tuple[frozenset[int], int, float, float]] = []
-        taken: set[int] = set()
+        used: set[int] = set()
         for best, own in counts.items():  # most votes first
             if own < self.config.min_votes:
                 break
-            if best in taken:
+            if best in used:
                 continue
             members = frozenset({best, *covisible(best)})
-            total = sum(counts.get(member, 0.0) for member in sorted(members - taken))
-            taken |= members
+            total = sum(counts.get(member, 0.0) for member in sorted(members - used))
+            used |= members
             groups.append((members, best, own, total))
         groups.sort(key=lambda group: (-group[3], group[1]))
         limit = self.config.group_share * groups[0][3] if groups else 0.0

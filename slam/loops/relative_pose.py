@@ -47,8 +47,8 @@ def refine_relative_pose(
         r, J, W, gate = _linearised(views, pairs, T_a_b, camera)
         chi2 = np.einsum("wni,wnij,wnj->n", r, W, r)
         if kernel is None or kernel == 1.0:
-            asked = np.sqrt(np.median(chi2 / gate) / MEDIAN_TO_GATE)
-            scale = float(np.clip(asked, 1.0, MAX_NOISE_SCALE))
+            factor = np.sqrt(np.median(chi2 / gate) / MEDIAN_TO_GATE)
+            scale = float(np.clip(factor, 1.0, MAX_NOISE_SCALE))
         active = chi2 < gate * scale**2
         w = active if kernel is None else 1 / (1 + chi2 / (kernel * gate))
         H = np.einsum("n,wnia,wnij,wnjb->ab", w, J, W, J)

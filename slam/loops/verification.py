@@ -108,12 +108,12 @@ class LoopConstraint:
 def loop_view(keyframe: Keyframe, world: WorldMap) -> LoopView:
     """A keyframe with the landmarks that it observes, as they are now."""
     points = np.full((len(keyframe.features), 3), np.nan)
-    living = np.full(len(keyframe.features), -1, np.int64)
+    landmark_ids = np.full(len(keyframe.features), -1, np.int64)
     rows, ids = world.observed(keyframe)
-    living[rows] = ids
+    landmark_ids[rows] = ids
     points[rows] = transform(inverse(keyframe.T_world_camera), world.landmarks.points_world[ids])
     points[~np.isfinite(keyframe.features.disparity_px) | ~(points[:, 2] > NEAREST_M)] = np.nan
-    return LoopView(keyframe.id, keyframe.features, points, living)
+    return LoopView(keyframe.id, keyframe.features, points, landmark_ids)
 
 
 def verify_loop(
@@ -205,13 +205,13 @@ def _guided_pairs(
     views: Views, T_a_b: Array, camera: Camera, radius_px: float
 ) -> tuple[Ints, Ints, int]:
     """Keypoints (a, b) that match at the pose in both directions, and how many are in view."""
-    query_a, train_b, seen_in_b = _guided(views, inverse(T_a_b), camera, radius_px)
-    query_b, train_a, seen_in_a = _guided(views[::-1], T_a_b, camera, radius_px)
+    query_a, train_b, visible_in_b = _guided(views, inverse(T_a_b), camera, radius_px)
+    query_b, train_a, visible_in_a = _guided(views[::-1], T_a_b, camera, radius_px)
     pairs = np.unique(np.c_[np.r_[query_a, train_a], np.r_[train_b, query_b]], axis=0)
     once_a = np.bincount(pairs[:, 0], minlength=1)[pairs[:, 0]] == 1
     once_b = np.bincount(pairs[:, 1], minlength=1)[pairs[:, 1]] == 1
     a, b = pairs[once_a & once_b].T
-    return a, b, max(min(seen_in_a, seen_in_b), 1)
+    return a, b, max(min(visible_in_a, visible_in_b), 1)
 
 
 def _guided(

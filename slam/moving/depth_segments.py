@@ -87,9 +87,9 @@ class DepthSegments:
         pieces = _joined_up(self.depth_m, moving | free_to_go, self.config.held_jump)
         count = int(pieces.max()) + 1
         holder, load = (np.bincount(pieces[k], minlength=count) for k in (moving, free_to_go))
-        takes = (load <= self.config.load * holder) & (load > 0)
-        takes &= holder + load <= self.config.largest * pieces.size
-        return np.asarray(free_to_go & takes[pieces])
+        carries = (load <= self.config.load * holder) & (load > 0)
+        carries &= holder + load <= self.config.largest * pieces.size
+        return np.asarray(free_to_go & carries[pieces])
 
     def space(self, moving: Mask) -> MovingSpace:
         """The depth ranges of moving samples (h, w)."""

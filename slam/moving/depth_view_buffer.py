@@ -63,11 +63,11 @@ class DepthViewBuffer:
         if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.interval_s:
             return
         seen = view.thinned(THINNED)
-        told = seen.thinned(1)
+        thin = seen.thinned(1)
         if moving is not None:
-            _clear(told, moving.covers(told.nearest_m, told.step))
+            _clear(thin, moving.covers(thin.nearest_m, thin.step))
         pose = np.eye(4) if T_keyframe_camera is None else T_keyframe_camera
-        self.views.append(BufferedView(keyframe_id, timestamp_s, told, seen, pose))
+        self.views.append(BufferedView(keyframe_id, timestamp_s, thin, seen, pose))
         del self.views[: -self.count]
 
     def posed(self, segment: int, map_reader: MapReader) -> list[PosedView]:
@@ -119,15 +119,15 @@ class DepthViewBuffer:
         size = len(ids), *(state["shape"].tolist() or [0, 0])
         stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
         poses = state["T_keyframe_camera"].reshape(len(ids), 4, 4).copy()
-        speak = np.unpackbits(state["speak"], count=np.prod(size)).reshape(size).astype(bool)
+        known_pixels = np.unpackbits(state["speak"], count=np.prod(size)).reshape(size).astype(bool)
         depths = (state[name].reshape(size) for name in ("nearest_m", "farthest_m"))
         self.views = []
-        for i, stamp_s, T, step, told, near, far in zip(
-            ids, stamps_s, poses, steps, speak, *depths, strict=True
+        for i, stamp_s, T, step, known, near, far in zip(
+            ids, stamps_s, poses, steps, known_pixels, *depths, strict=True
         ):
             seen = DepthView(near.copy(), far.copy(), step)
             view = seen.thinned(1)
-            _clear(view, ~told)
+            _clear(view, ~known)
             self.views.append(BufferedView(i, stamp_s, view, seen, T))
 
     def _of(self, keyframe_id: int) -> list[BufferedView]:

@@ -118,7 +118,7 @@ class FreeSpaceCheck:
 
         The views have one size and step.
         """
-        z, ahead, nearest, farthest = self._seen(points_world, views)
+        z, ahead, nearest, farthest = self._observed(points_world, views)
         margin = self._margin_m(z)
         point_motions = ((np.abs(nearest - z) < margin) | (np.abs(farthest - z) < margin)).view(
             np.int8
@@ -136,7 +136,7 @@ class FreeSpaceCheck:
         of view, where a depth is missing, and where the point is not on the surface. Views come
         with T_world_camera (4, 4); the visibility (K, N) tells which points are in view.
         """
-        z, ahead, nearest, farthest = self._seen(points_world, views)
+        z, ahead, nearest, farthest = self._observed(points_world, views)
         off_m = np.clip(z, nearest, farthest) - z
         off_m[~ahead | (nearest == 0) | (np.abs(off_m) > self._margin_m(z))] = np.nan
         return off_m, ahead
@@ -151,9 +151,9 @@ class FreeSpaceCheck:
         A view that knows the motion of fewer than ``at_least`` points does not count.
         """
         known = np.count_nonzero(point_motions, axis=1)
-        asked = (np.abs(apart_s) >= self.config.still_s) & (known >= at_least)
-        there = np.count_nonzero(point_motions == PointMotion.STATIC, axis=1)
-        good = there[asked] >= self.config.still_share * known[asked]
+        checked = (np.abs(apart_s) >= self.config.still_s) & (known >= at_least)
+        static_views = np.count_nonzero(point_motions == PointMotion.STATIC, axis=1)
+        good = static_views[checked] >= self.config.still_share * known[checked]
         return bool(len(good) >= 2 and good.all())
 
     def spread(self, pixels: Array, depth_m: Array, point_motions: PointMotions) -> PointMotions:
@@ -172,15 +172,15 @@ class FreeSpaceCheck:
             pixels[open_], count, distance_upper_bound=self.config.neighbour_px
         )
         distance, near = distance.reshape(len(open_), -1), near.reshape(len(open_), -1)
-        there = known[np.minimum(near, len(known) - 1)]
-        apart = np.abs(depth_m[there] - depth_m[open_, None])
+        nearest_known = known[np.minimum(near, len(known) - 1)]
+        apart = np.abs(depth_m[nearest_known] - depth_m[open_, None])
         differs = apart > self.config.same_depth * depth_m[open_, None]
         speaks = np.isfinite(distance) & ~differs
         spread = point_motions.copy()
-        spread[open_] = np.sign((point_motions[there] * speaks).sum(axis=1))
+        spread[open_] = np.sign((point_motions[nearest_known] * speaks).sum(axis=1))
         return spread
 
-    def _seen(
+    def _observed(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
     ) -> tuple[Floats, Mask, Floats, Floats]:
         """Depth, visibility, nearest and farthest depth (K, N) of points (N, 3) in views."""

@@ -54,8 +54,8 @@ def motion_state(
     seen = check.judge_all(points_world, [(v.seen, v.T_world_camera) for v in views])
     if check.stood_still(seen, apart_s, at_least):
         return MotionState.STILL
-    told = check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
-    point_motions = check.agree(told)
+    motions = check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
+    point_motions = check.agree(motions)
     known = np.count_nonzero(point_motions)
     if known < at_least:
         return MotionState.UNKNOWN
@@ -115,8 +115,8 @@ class InstanceMotion:
             return False
         depth_m, step = masks.depth_m, masks.step
         height, width = depth_m.shape
-        there_m = depth_m[min(int(row / step), height - 1), min(int(column / step), width - 1)]
-        return bool(there_m > centre[2] - track.half_size[2] - self.check.config.margin_m)
+        measured_m = depth_m[min(int(row / step), height - 1), min(int(column / step), width - 1)]
+        return bool(measured_m > centre[2] - track.half_size[2] - self.check.config.margin_m)
 
     def _sighting(
         self, k: int, surface: Surface, masks: KeyframeMasks, found: MotionState

@@ -52,13 +52,13 @@ class LandmarkMotion:
             return ids[self.movability.moving(ids)]
         landmarks = self._map.world.landmarks
         motions = self._check.judge(landmarks.points_world[ids], view, tracked.T_world_camera)
-        gone = motions == PointMotion.MOVING
+        removed = motions == PointMotion.MOVING
         tracked_now = np.zeros(len(landmarks), bool)
         tracked_now[tracked.landmark_ids] = True
         found = tracked_now[ids]
-        gone &= ~found
-        judged = found | gone
-        self.movability.update(ids[judged], gone[judged], self._config.frame_power)
+        removed &= ~found
+        judged = found | removed
+        self.movability.update(ids[judged], removed[judged], self._config.frame_power)
         return ids[self.movability.moving(ids)]
 
     def observe_masks(
@@ -76,12 +76,12 @@ class LandmarkMotion:
         evidence = np.array([0.0 if s is None else s.evidence for s in sightings] + [0.0])
         priors[still[instances]] = np.minimum(priors[still[instances]], self._priors.unknown)
         self.movability.set_priors(ids, np.clip(priors, 0.01, 0.99))
-        told = evidence[instances] != 0
-        self.movability.update(ids[told], evidence[instances[told]] > 0)
+        judged = evidence[instances] != 0
+        self.movability.update(ids[judged], evidence[instances[judged]] > 0)
 
     def remove_moving(self, ids: Ints) -> None:
         """Take the landmarks among these (N,) that move out of map and graph."""
-        ids = self._map.world.landmarks.living(ids)
+        ids = self._map.world.landmarks.remaining(ids)
         ids = ids[self.movability.moving(ids)]
         if len(ids):
             self._map.prune_landmarks(ids)
@@ -90,8 +90,8 @@ class LandmarkMotion:
     def follow_map(self) -> None:
         """Move the filters of fused landmarks to their successors; drop those of removed ones."""
         landmarks, known = self._map.world.landmarks, self.movability.known()
-        gone = known[~landmarks.alive[known]]
-        current = landmarks.current(gone)
-        alive = landmarks.alive[current]
-        self.movability.move(gone[alive], current[alive])
-        self.movability.drop(gone[~alive])
+        removed = known[~landmarks.in_map[known]]
+        current = landmarks.current(removed)
+        kept = landmarks.in_map[current]
+        self.movability.move(removed[kept], current[kept])
+        self.movability.drop(removed[~kept])

@@ -138,7 +138,7 @@ class MovingObjectFilter:
             self._camera_tracker.refer_to(reference)
         return restored
 
-    def remember_keyframe(self, keyframe: Keyframe, static: StaticFeatures) -> None:
+    def store_keyframe(self, keyframe: Keyframe, static: StaticFeatures) -> None:
         """A keyframe was made: remove landmarks that move, and keep the keyframe's depth.
 
         Depth on moving things is not kept: the same thing would be judged by it later.
@@ -159,9 +159,11 @@ class MovingObjectFilter:
             views = self.keyframe_views.posed(keyframe.segment, self._map)
             recent = self.recent_views.posed(keyframe.segment, self._map)
         now_s = np.nan if keyframe is None else keyframe.timestamp_s
-        seen = surfaces(self.camera, masks, self.config.check.window_px, self.config.min_judged)
-        stood = self.static_verification.stood(masks, seen, recent, now_s)
-        sightings = self._instance_motion.sightings(masks, seen, stood, views, now_s)
+        visible_surfaces = surfaces(
+            self.camera, masks, self.config.check.window_px, self.config.min_judged
+        )
+        stood = self.static_verification.stood(masks, visible_surfaces, recent, now_s)
+        sightings = self._instance_motion.sightings(masks, visible_surfaces, stood, views, now_s)
         moving, tracks = self._tracked_instances(masks, sightings, now_s)
         still = [
             s is not None and (s.still or (track is not None and track.stood))
@@ -176,7 +178,7 @@ class MovingObjectFilter:
         self.keyframe_views.clear_depth(masks.keyframe_id, moves)
         if keyframe is not None and self.config.geometry:
             by_class = [t if _by_class(t) else None for t in tracks]
-            self.static_verification.add(masks, seen, by_class, self._map.world)
+            self.static_verification.add(masks, visible_surfaces, by_class, self._map.world)
         self._map.prune_mask(masks.keyframe_id, moves, self.config.mask_border_px)
         self.landmarks.remove_moving(masks.landmark_ids)
 

@@ -53,9 +53,9 @@ class StaticVerificationConfig:
         if self.recent < 1 or self.interval_s <= 0:
             raise ValueError("recent must be 1 or more, interval_s positive")
 
-    def stands(self, there: int, gone: int) -> bool:
+    def stands(self, static_views: int, moved_views: int) -> bool:
         """Whether an instance with these numbers of frames is static."""
-        return there >= max(self.frames, self.share * (there + gone))
+        return static_views >= max(self.frames, self.share * (static_views + moved_views))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class PendingMovable:
         keyframe_id, time_s: of the keyframe that saw it first.
         points: (N, 3) on its surface, m, in the keyframe's camera frame.
         removed: what was removed for it, from this and later keyframes.
-        there, gone: number of later frames that found it in place, and that did not.
+        static_views, moved_views: number of later frames that found it in place, and that did not.
     """
 
     track_id: int
@@ -92,8 +92,8 @@ class PendingMovable:
     time_s: float
     points: Array
     removed: tuple[Removed, ...]
-    there: int = 0
-    gone: int = 0
+    static_views: int = 0
+    moved_views: int = 0
 
 
 class StaticVerification:
@@ -133,7 +133,11 @@ class StaticVerification:
             points = surface.points[surface.complete]
             when = keyframe.id, keyframe.timestamp_s
             pending = PendingMovable(track.id, *when, points, (removed,))
-            before = [s for s in self.pending if s.track_id == track.id and s.gone <= s.there]
+            before = [
+                s
+                for s in self.pending
+                if s.track_id == track.id and s.moved_views <= s.static_views
+            ]
             if before:
                 pending = replace(before[0], removed=(*before[0].removed, removed))
             self.pending = [s for s in self.pending if s.track_id != track.id] + [pending]
@@ -145,7 +149,7 @@ class StaticVerification:
         recent: Sequence[PosedView],
         now_s: float,
     ) -> list[bool]:
-        """Which of a keyframe's instances (K,), seen at ``now_s``, stood there for long enough.
+        """Which of a keyframe's instances (K,), seen at ``now_s``, were static for long enough.
 
         Decided by recent frames before the keyframe, and after it if the masks come late.
         """
@@ -158,7 +162,7 @@ class StaticVerification:
         for surface in seen:
             points = np.zeros((0, 3)) if surface is None else surface.points[surface.complete]
             points_world = transform(masks.T_world_camera, points)
-            stood.append(self.config.stands(*self._there_or_gone(points_world, views)))
+            stood.append(self.config.stands(*self._count_views(points_world, views)))
         return stood
 
     def verify(
@@ -168,15 +172,15 @@ class StaticVerification:
         oldest_s = time_s - self.config.patience_s
         recent = [s for s in self.pending if s.time_s >= oldest_s]
         kept = [s for s in recent if s.keyframe_id in world.keyframes]
-        told = [
+        judged = [
             self._updated(s, view, T_world_camera, world)
             if time_s - s.time_s >= self.config.stands_s
             else s
             for s in kept
         ]
-        stand = [self.config.stands(s.there, s.gone) for s in told]
-        self.pending = [s for s, stands in zip(told, stand, strict=True) if not stands]
-        return [s for s, stands in zip(told, stand, strict=True) if stands]
+        stand = [self.config.stands(s.static_views, s.moved_views) for s in judged]
+        self.pending = [s for s, stands in zip(judged, stand, strict=True) if not stands]
+        return [s for s, stands in zip(judged, stand, strict=True) if stands]
 
     def not_pending(self, removed: Removed) -> Mask:
         """Mask (N,) of the removed keypoints that no other pending instance covers."""
@@ -193,7 +197,10 @@ class StaticVerification:
         removed = [r for s in every for r in s.removed]
         no_patches = LandmarkTable().patches_of(np.zeros(0, np.int64))
         points, keypoints = [s.points for s in every], [r.keypoints for r in removed]
-        counts = [(s.track_id, s.keyframe_id, s.there, s.gone, len(s.removed)) for s in every]
+        counts = [
+            (s.track_id, s.keyframe_id, s.static_views, s.moved_views, len(s.removed))
+            for s in every
+        ]
         return {
             "counts": np.array(counts, np.int64).reshape(-1, 5),
             "times_s": np.array([s.time_s for s in every], float),
@@ -223,10 +230,12 @@ class StaticVerification:
         self.pending = []
         counts = state["counts"].tolist()
         rows = zip(counts, state["times_s"].tolist(), points, strict=True)
-        for (track_id, keyframe_id, there, gone, count), time_s, of_one in rows:
-            mine, removed = tuple(removed[:count]), removed[count:]
+        for (track_id, keyframe_id, static_views, moved_views, count), time_s, of_one in rows:
+            own_removed, removed = tuple(removed[:count]), removed[count:]
             self.pending.append(
-                PendingMovable(track_id, keyframe_id, time_s, of_one, mine, there, gone)
+                PendingMovable(
+                    track_id, keyframe_id, time_s, of_one, own_removed, static_views, moved_views
+                )
             )
 
     def _updated(
@@ -236,10 +245,12 @@ class StaticVerification:
         pose = world.keyframes[pending.keyframe_id].T_world_camera
         points_world = transform(pose, pending.points)
         now = [(view, T_world_camera)]
-        there, gone = self._there_or_gone(points_world, now)
-        return replace(pending, there=pending.there + there, gone=pending.gone + gone)
+        static_views, moved_views = self._count_views(points_world, now)
+        static_views += pending.static_views
+        moved_views += pending.moved_views
+        return replace(pending, static_views=static_views, moved_views=moved_views)
 
-    def _there_or_gone(
+    def _count_views(
         self, points_world: Array, views: Sequence[tuple[DepthView, Array]]
     ) -> tuple[int, int]:
         """Numbers of views, each with T_world_camera, with and without a surface at points (N, 3).
@@ -248,11 +259,11 @@ class StaticVerification:
         """
         off_m, inside = self._check.offsets(points_world, views)
         in_view, found = inside.sum(axis=1), np.isfinite(off_m)
-        told = in_view >= self._at_least
-        stays = told & (found.sum(axis=1) >= self.config.share * in_view)
+        judged = in_view >= self._at_least
+        stays = judged & (found.sum(axis=1) >= self.config.share * in_view)
         shift_m = [np.median(off_m[k, found[k]]) for k in np.flatnonzero(stays)]
-        there = int(np.count_nonzero(np.abs(shift_m) < self.config.shift_m))
-        return there, int(np.count_nonzero(told)) - there
+        static_views = int(np.count_nonzero(np.abs(shift_m) < self.config.shift_m))
+        return static_views, int(np.count_nonzero(judged)) - there
 
 
 def _about_to_be_removed(

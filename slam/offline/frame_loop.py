@@ -151,8 +151,8 @@ def finish_run(run: ActiveRun) -> RunSummary:
         run.folder.complete()
     skipped = sum(index < counters.next_index for index, _ in run.sequence.skipped)
     resumable = stopped_by is not None and options.checkpoint_every is not None
-    told = run.calibration.text
-    return RunSummary(run.folder.path, rows, counters.frames, skipped, stopped_by, resumable, told)
+    text = run.calibration.text
+    return RunSummary(run.folder.path, rows, counters.frames, skipped, stopped_by, resumable, text)
 
 
 def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:

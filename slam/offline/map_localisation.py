@@ -73,8 +73,8 @@ class MapLocalisation(SlamSystem):
         self.camera_tracker.update_motion(T, T, ids)
         self._located.append((frame.timestamp_s, T))
         self._frames_since_refresh += 1
-        elsewhere = not np.isin(ids, self.camera_tracker.local_ids).all()
-        if elsewhere or self._frames_since_refresh >= REFRESH_FRAMES:
+        outside = not np.isin(ids, self.camera_tracker.local_ids).all()
+        if outside or self._frames_since_refresh >= REFRESH_FRAMES:
             self._frames_since_refresh = 0
             self.camera_tracker.refer_to(world.covisible(ids, 1)[0][1])
         return T

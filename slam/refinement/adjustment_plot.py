@@ -118,8 +118,8 @@ def _draw(axes: Any, view: View) -> None:
     for edges, colour, width in view.edges:
         if len(edges):
             axes.add_collection(lines(points[edges], colors=colour, linewidths=width))
-    seen = np.vstack([points, view.cloud]) if len(view.cloud) else points
-    low, high = np.percentile(seen, (0, 100) if seen is points else (1, 99), axis=0)
+    shown = np.vstack([points, view.cloud]) if len(view.cloud) else points
+    low, high = np.percentile(shown, (0, 100) if shown is points else (1, 99), axis=0)
     low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     centre, half = (low + high) / 2, 0.55 * max(float(np.max(high - low)), 1e-3)
     count = len(centre)

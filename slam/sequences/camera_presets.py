@@ -127,7 +127,7 @@ def nominal_camera(name: str) -> Camera:
     return replace(preset.nominal, depth_scale=preset.depth_unit)
 
 
-def completed(camera: Camera, said: Container[str], name: str | None) -> tuple[Camera, str]:
+def completed(camera: Camera, keys_in_file: Container[str], name: str | None) -> tuple[Camera, str]:
     """The camera with what a preset knows and nothing else said, and that as text.
 
     ``said`` are the keys of camera.yaml that are known already; a value there, also 0, stays.
@@ -135,10 +135,10 @@ def completed(camera: Camera, said: Container[str], name: str | None) -> tuple[C
     if name is None:
         return camera, ""
     preset, values, parts = PRESETS[name], camera, []
-    if preset.rolling_shutter_s is not None and "rolling_shutter" not in said:
+    if preset.rolling_shutter_s is not None and "rolling_shutter" not in keys_in_file:
         values = replace(values, rolling_shutter_s=preset.rolling_shutter_s)
         parts.append(f"rolling_shutter {1e3 * preset.rolling_shutter_s:g} ms")
-    if preset.depth_time_offset_s is not None and "depth_time_offset" not in said:
+    if preset.depth_time_offset_s is not None and "depth_time_offset" not in keys_in_file:
         values = replace(values, depth_time_offset_s=preset.depth_time_offset_s)
         parts.append(f"depth_time_offset {1e3 * preset.depth_time_offset_s:g} ms")
     return values, f"{', '.join(parts)} of {name}" if parts else ""

@@ -67,9 +67,9 @@ def find_camera(folder: Path, given: Path | None = None) -> tuple[Camera, str]:
     preset = str(given) if is_preset(given) else preset_of_folder(folder)
     path = folder / "camera.yaml" if given is None or is_preset(given) else given
     match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", folder.resolve().name.lower())
-    said: Container[str] = ()
+    keys_in_file: Container[str] = ()
     if path == given or path.is_file():
-        camera, said = _read(path)
+        camera, keys_in_file = _read(path)
         source = str(path)
     elif match:
         name = f"freiburg{match.group(1)}"
@@ -84,7 +84,7 @@ def find_camera(folder: Path, given: Path | None = None) -> tuple[Camera, str]:
             f"TUM's (freiburg1, 2, 3); write a camera.yaml such as {CAMERA_EXAMPLE}, or give "
             "--camera NAME"
         )
-    camera, added = completed(camera, said, preset)
+    camera, added = completed(camera, keys_in_file, preset)
     source = ", ".join(filter(None, (source, added)))
     logger.info(
         "camera: %s; fx %.3f fy %.3f cx %.3f cy %.3f, depth scale %g to the metre, offsets %g m "

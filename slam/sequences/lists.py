@@ -128,12 +128,12 @@ def _neighbours(depth_s: Array, chosen: Ints, lags_s: Array) -> tuple[Ints, Arra
     Returns indices, -1 where it is missing or too far in time, and the position between the two.
     """
     other = chosen - np.sign(lags_s).astype(np.int64)
-    there = (other >= 0) & (other < len(depth_s)) & (lags_s != 0)
-    other = np.where(there, other, chosen)
+    in_range = (other >= 0) & (other < len(depth_s)) & (lags_s != 0)
+    other = np.where(in_range, other, chosen)
     step_s = np.abs(depth_s[other] - depth_s[chosen])
-    there &= (step_s < MAX_DEPTH_STEP_S) & (np.abs(lags_s) < step_s)
-    shares = np.divide(np.abs(lags_s), step_s, out=np.zeros(len(other)), where=there)
-    return np.where(there, other, -1), shares
+    in_range &= (step_s < MAX_DEPTH_STEP_S) & (np.abs(lags_s) < step_s)
+    shares = np.divide(np.abs(lags_s), step_s, out=np.zeros(len(other)), where=in_range)
+    return np.where(in_range, other, -1), shares
 
 
 def read_list(path: Path) -> ImageList:

@@ -114,7 +114,7 @@ class CameraTracker:
 
     def preview(self, features: Features) -> Array | None:
         """The pose that ``track`` would find, None if it would find none; no state is changed."""
-        tracked = self._tracked(features, self._map.world.landmarks.living(self._local_ids))
+        tracked = self._tracked(features, self._map.world.landmarks.remaining(self._local_ids))
         return None if tracked.status is TrackingStatus.LOST else tracked.T_world_camera
 
     def exclude_landmarks(self, landmark_ids: Ints) -> None:
@@ -152,7 +152,7 @@ class CameraTracker:
         if self.reference is None:
             raise ValueError("no map has been begun")
         world = self._map.world
-        self._local_ids = world.landmarks.living(self._local_ids)
+        self._local_ids = world.landmarks.remaining(self._local_ids)
         tracked = self._tracked(features, self._local_ids)
         if tracked.status is TrackingStatus.LOST:
             tracked = self.recognise(features, world.in_segment(self.reference.segment)) or tracked
@@ -201,7 +201,7 @@ class CameraTracker:
         landmarks = self._map.world.landmarks
         self._T_world_last = carried_along(self._T_world_last, T_old, T_new)
         known = self._recent_ids[self._recent_ids < len(landmarks)]
-        self._recent_ids = landmarks.living(landmarks.current(known))
+        self._recent_ids = landmarks.remaining(landmarks.current(known))
 
     def refer_to(self, keyframe: Keyframe) -> None:
         """Make a keyframe the reference, and track against its surroundings from now on."""

@@ -80,7 +80,7 @@ class Tracker:
 
         The previous pose gives the camera's velocity, for a rolling shutter.
         """
-        recent_ids = world.landmarks.living(recent_ids)
+        recent_ids = world.landmarks.remaining(recent_ids)
         motion = motion_since(previous, T_predicted, self.camera)
         estimate = self._first_estimate(
             at_one_moment(features, self.camera, motion),

@@ -16,7 +16,7 @@ ENTRY = np.dtype(
 )
 """A frame's stamp and its pose as seen from its reference keyframe."""
 Entries = NDArray[np.void]
-NOBODY = -1
+NO_KEYFRAME = -1
 """Parent of a keyframe whose pose was lost: its frames have no pose."""
 
 
@@ -64,10 +64,10 @@ class FrameHistory:
         ids, which = np.unique(entries["keyframe_id"], return_inverse=True)
         order = np.argsort(which, kind="stable")
         groups = split_rows(order, np.bincount(which, minlength=len(ids)))
-        poses, segments = np.empty((len(entries), 4, 4)), np.full(len(entries), NOBODY)
+        poses, segments = np.empty((len(entries), 4, 4)), np.full(len(entries), NO_KEYFRAME)
         for keyframe_id, rows in zip(ids.tolist(), groups, strict=True):
             owner, T = self._resolve(keyframe_id, entries["T_keyframe_camera"][rows])
-            if owner == NOBODY:
+            if owner == NO_KEYFRAME:
                 continue
             keyframe = world.keyframes[owner]
             poses[rows], segments[rows] = keyframe.T_world_camera @ T, keyframe.segment
@@ -75,11 +75,11 @@ class FrameHistory:
             segment: Trajectory(
                 entries["timestamp_s"][segments == segment], poses[segments == segment]
             )
-            for segment in np.unique(segments[segments != NOBODY]).tolist()
+            for segment in np.unique(segments[segments != NO_KEYFRAME]).tolist()
         }
 
     def parent(self, keyframe_id: int) -> tuple[int, Array]:
-        """The keyframe of the map that replaces one, or NOBODY, and T_parent_keyframe (4, 4).
+        """The keyframe of the map that replaces one, or NO_KEYFRAME, and T_parent_keyframe (4, 4).
 
         A keyframe that was not culled is its own parent.
         """

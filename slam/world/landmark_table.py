@@ -35,7 +35,7 @@ _OF_ALL: _Columns = {
     "visible": ((), np.int64, 0),
     "found": ((), np.int64, 0),
     "replaced_by": ((), np.int64, -1),
-    "alive": ((), np.bool_, False),
+    "in_map": ((), np.bool_, False),
     "in_graph": ((), np.bool_, False),
 }
 _COLUMNS = _OF_ALL | _APPEARANCE
@@ -103,7 +103,7 @@ class LandmarkTable:
         observations: (N,) keyframes that observe it.
         visible, found: (N,) frames in which it should have been, and was, matched.
         replaced_by: (N,) the landmark that this one was fused into, -1 for none.
-        alive, in_graph: (N,) bool.
+        in_map, in_graph: (N,) bool.
         place: (N,) row of its appearance, 0 for removed landmarks.
 
     Descriptors, directions, extent, angles, colours and patches are kept for landmarks in the map
@@ -124,7 +124,7 @@ class LandmarkTable:
     visible: Ints
     found: Ints
     replaced_by: Ints
-    alive: Mask
+    in_map: Mask
     in_graph: Mask
     place: Ints
 
@@ -146,14 +146,14 @@ class LandmarkTable:
         self._settle(ids)
         for name, values in columns.items():
             getattr(self, name)[ids] = values
-        self.alive[ids] = True
+        self.in_map[ids] = True
         self.visible[ids] = self.found[ids] = 1
         return ids
 
     def extend_to(self, size: int) -> None:
-        """Add rows up to a size, not alive, to be filled from another table."""
+        """Add rows up to a size, not in the map, to be filled from another table."""
         self._vacate(np.arange(size, self._size))
-        capacity, old = len(self._store["alive"]), self._size
+        capacity, old = len(self._store["in_map"]), self._size
         for name, (shape, dtype, fill) in (_OF_ALL | _PLACE).items():
             if size > capacity:
                 bigger: NDArray = np.empty((max(2 * capacity, size), *shape), dtype)
@@ -163,21 +163,21 @@ class LandmarkTable:
         self._size = size
         self._make_views()
 
-    def set_alive(self, alive: Mask) -> None:
-        """Set which of all landmarks (N,) are alive; the appearance of new ones is zero."""
-        self._vacate(np.flatnonzero((self.place > 0) & ~alive))
-        self._settle(np.flatnonzero((self.place == 0) & alive))
-        self.alive[:] = alive
+    def set_in_map(self, in_map: Mask) -> None:
+        """Set which of all landmarks (N,) are in the map; the appearance of new ones is zero."""
+        self._vacate(np.flatnonzero((self.place > 0) & ~in_map))
+        self._settle(np.flatnonzero((self.place == 0) & in_map))
+        self.in_map[:] = in_map
 
-    def living(self, ids: Ints) -> Ints:
+    def remaining(self, ids: Ints) -> Ints:
         """Those of the ids that are in the map."""
         ids = ids[ids >= 0]
-        return ids[self.alive[ids]]
+        return ids[self.in_map[ids]]
 
     def current(self, ids: Ints) -> Ints:
         """The present ids (N,) of landmarks (N,) that may have been fused since, in the same order.
 
-        Ids are >= 0. Those that were removed stay as they are, and are not alive.
+        Ids are >= 0. Ids of removed landmarks are returned unchanged.
         """
         ids = ids.copy()
         while len(fused := np.flatnonzero(self.replaced_by[ids] >= 0)):
@@ -186,7 +186,7 @@ class LandmarkTable:
 
     def remove(self, ids: Ints) -> None:
         """Remove landmarks from the map; keyframes drop them when they are next read."""
-        self.alive[ids] = False
+        self.in_map[ids] = False
         self.in_graph[ids] = False
         self._vacate(np.unique(ids))
 
@@ -197,10 +197,10 @@ class LandmarkTable:
         counts. Infinite where there is no patch.
         """
         max_turn_rad, max_zoom = limits
-        there = self.patch_views[ids]
-        distance_there = np.linalg.norm(there, axis=-1)
+        view_vectors = self.patch_views[ids]
+        distance_there = np.linalg.norm(view_vectors, axis=-1)
         distance_here = np.linalg.norm(views, axis=-1)[:, None]
-        cosine = np.einsum("nj,nvj->nv", views, there) / (distance_here * distance_there)
+        cosine = np.einsum("nj,nvj->nv", views, view_vectors) / (distance_here * distance_there)
         turn = np.arccos(np.clip(cosine, -1, 1)) / max_turn_rad
         zoom = np.abs(np.log(distance_here / distance_there)) / np.log(max_zoom)
         return np.nan_to_num(np.maximum(turn, zoom), nan=np.inf, posinf=np.inf)
@@ -214,8 +214,8 @@ class LandmarkTable:
         """
         views = centre_world - self.points_world[ids]
         nearest = self.patch_distances(ids, views, limits).argmin(axis=1)
-        there = self.patch_views.pick(ids, nearest)
-        zooms = np.linalg.norm(there, axis=1) / np.linalg.norm(views, axis=1)
+        view_vectors = self.patch_views.pick(ids, nearest)
+        zooms = np.linalg.norm(view_vectors, axis=1) / np.linalg.norm(views, axis=1)
         return self.patches.pick(ids, nearest), np.nan_to_num(zooms, nan=1.0)
 
     def patches_of(self, ids: Ints) -> Patches:
@@ -249,8 +249,8 @@ class LandmarkTable:
 
     def state(self) -> Arrays:
         """The landmarks in the map; of removed ones only the number is kept."""
-        ids = np.flatnonzero(self.alive)
-        columns = {name: getattr(self, name)[ids] for name in _COLUMNS if name != "alive"}
+        ids = np.flatnonzero(self.in_map)
+        columns = {name: getattr(self, name)[ids] for name in _COLUMNS if name != "in_map"}
         return {"size": np.array(self._size), "ids": ids, **columns}
 
     def restore(self, state: Arrays) -> None:
@@ -258,7 +258,7 @@ class LandmarkTable:
         self.extend_to(int(state["size"]))
         self._settle(state["ids"])
         for name in _COLUMNS:
-            getattr(self, name)[state["ids"]] = True if name == "alive" else state[name]
+            getattr(self, name)[state["ids"]] = True if name == "in_map" else state[name]
 
     def _settle(self, ids: Ints) -> None:
         """Assign rows of the appearance to landmarks (N,) that have none."""

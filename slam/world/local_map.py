@@ -29,4 +29,4 @@ def local_landmarks(world: WorldMap, observed_ids: Ints, config: LocalMapConfig)
     chosen = np.zeros(len(world.landmarks) + 1, bool)  # the last entry is for id -1
     for ids in (*(keyframe.landmark_ids for _, keyframe in strong), observed_ids):
         chosen[ids] = True
-    return np.flatnonzero(chosen[:-1] & world.landmarks.alive)
+    return np.flatnonzero(chosen[:-1] & world.landmarks.in_map)

@@ -102,7 +102,7 @@ class WorldMap:
     def observed(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
         """Keypoint indices and ids of the landmarks in the map that a keyframe observes."""
         keypoints = np.flatnonzero(keyframe.landmark_ids >= 0)
-        keypoints = keypoints[self.landmarks.alive[keyframe.landmark_ids[keypoints]]]
+        keypoints = keypoints[self.landmarks.in_map[keyframe.landmark_ids[keypoints]]]
         return keypoints, keyframe.landmark_ids[keypoints]
 
     def make_landmarks(self, keyframe: Keyframe, keypoints: Ints, points_world: Array) -> Ints:
@@ -147,7 +147,7 @@ class WorldMap:
         """
         landmarks, ids = self.landmarks, keyframe.landmark_ids[keypoints]
         keyframe.landmark_ids[keypoints] = keyframe.sent_ids[keypoints] = -1
-        ids = landmarks.living(ids)
+        ids = landmarks.remaining(ids)
         landmarks.observations[ids] -= 1
         stale = ids[landmarks.last_keyframe[ids] == keyframe.id]
         landmarks.last_keyframe[stale] = -1
@@ -178,10 +178,10 @@ class WorldMap:
 
     def mask_landmarks(self, landmark_ids: Ints) -> None:
         """Remove landmarks, and mask the keypoints that observe them."""
-        gone = np.zeros(len(self.landmarks) + 1, bool)  # the last entry is for id -1
-        gone[landmark_ids] = True
+        removed = np.zeros(len(self.landmarks) + 1, bool)  # the last entry is for id -1
+        removed[landmark_ids] = True
         for keyframe in self.keyframes.values():
-            rows = gone[keyframe.landmark_ids]
+            rows = removed[keyframe.landmark_ids]
             keyframe.masked |= rows
             keyframe.landmark_ids[rows] = keyframe.sent_ids[rows] = -1
         self.landmarks.observations[landmark_ids] = 0
@@ -229,9 +229,11 @@ class WorldMap:
 
     def covisible(self, landmark_ids: Ints, minimum: int) -> list[tuple[int, Keyframe]]:
         """(shared landmarks, keyframe) of all that share at least a minimum, by falling number."""
-        seen = np.zeros(len(self.landmarks) + 1, bool)  # the last entry is for id -1
-        seen[landmark_ids] = True
-        shared = [(int(np.count_nonzero(seen[k.landmark_ids])), k) for k in self.keyframes.values()]
+        observed = np.zeros(len(self.landmarks) + 1, bool)  # the last entry is for id -1
+        observed[landmark_ids] = True
+        shared = [
+            (int(np.count_nonzero(observed[k.landmark_ids])), k) for k in self.keyframes.values()
+        ]
         strong = [pair for pair in shared if pair[0] >= minimum]
         return sorted(strong, key=lambda pair: (-pair[0], -pair[1].id))
 
@@ -254,11 +256,11 @@ class WorldMap:
             if len(rows) == 0:
                 continue
             targets = remap[keyframe.landmark_ids[rows]]
-            taken = np.isin(targets, keyframe.landmark_ids)
+            occupied = np.isin(targets, keyframe.landmark_ids)
             _, first = np.unique(targets, return_index=True)
             repeated = np.ones(len(targets), bool)
             repeated[first] = False
-            keep = ~(taken | repeated)
+            keep = ~(occupied | repeated)
             keyframe.landmark_ids[rows[~keep]] = -1
             self.attach(keyframe, rows[keep], targets[keep])
         np.add.at(self.landmarks.found, new_ids, self.landmarks.found[old_ids])

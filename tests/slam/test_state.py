@@ -82,7 +82,7 @@ def system() -> SlamSystem:
     smoother.update(GraphUpdate(relative_poses=(loop,), marginalise_landmarks=old))
     smoother.update(GraphUpdate(landmark_ids=old[:5], points_world=np.zeros((5, 3))))
     smoother.restart()
-    system.mapper._factor_selector.forget_landmarks(
+    system.mapper._factor_selector.remove_landmarks(
         np.array([5, 8])
     )  # none wait between two frames so far
     loops, pairs = system.mapper.loops, np.array([[3, 7], [4, 9]])
@@ -225,4 +225,4 @@ def test_compared_classes_have_only_compared_attributes(system: SlamSystem) -> N
     assert vars(tables.observations).keys() == rows
     columns = table._store.keys() | table._appearance.keys()
     assert vars(table).keys() == {"_size", "_store", "_appearance", "_free", *columns}
-    assert columns - {"alive", "place"} == table.state().keys() - {"size", "ids"}
+    assert columns - {"in_map", "place"} == table.state().keys() - {"size", "ids"}

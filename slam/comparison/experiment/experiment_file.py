@@ -232,8 +232,8 @@ def _check_sequences(
     ]
     for where, key in named:
         if key.partition("@")[0] not in known:
-            there = ", ".join(sorted(known))
-            raise InputError(f"{file}: {where}: no sequence {key!r}; there are: {there}")
+            listed = ", ".join(sorted(known))
+            raise InputError(f"{file}: {where}: no sequence {key!r}; there are: {listed}")
 
 
 def slug(name: str) -> str:

@@ -27,9 +27,9 @@ def trajectory_cells(
         rules = Rules(experiment.max_time_difference_s, experiment.systems[method].with_scale)
         cell = Cell(name, method, data.seed, CellStatus.PENDING)
         if file is None:
-            wanted = experiment.systems[method].trajectories[key]
+            name_in_file = experiment.systems[method].trajectories[key]
             cure = f"give it by --trajectory '{method}:{key}=FILE', or its folder by --data"
-            yield replace(cell, error=f"{wanted}: not found; {cure}")
+            yield replace(cell, error=f"{name_in_file}: not found; {cure}")
         else:
             yield _evaluated_cell(cell, file, data, rules)
 

@@ -164,5 +164,5 @@ def _as_text(value: Any) -> str:
     return format_yaml(value).strip()
 
 
-def _count(things: tuple[object, ...], name: str) -> str:
-    return f"{len(things)} {name}{'' if len(things) == 1 else 's'}"
+def _count(items: tuple[object, ...], name: str) -> str:
+    return f"{len(items)} {name}{'' if len(items) == 1 else 's'}"

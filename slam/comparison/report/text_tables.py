@@ -123,8 +123,8 @@ def _latex_label(row: TableRow) -> str:
 
 def _latex_entry(entry: Entry, with_spread: bool) -> str:
     text = rf"\textbf{{{latex(entry.text)}}}" if entry.best else latex(entry.text)
-    beside = [entry.spread.replace(" to ", "–")] * with_spread + [entry.note]
-    return text + "".join(rf" {{\scriptsize {latex(note)}}}" for note in beside if note)
+    small = [entry.spread.replace(" to ", "–")] * with_spread + [entry.note]
+    return text + "".join(rf" {{\scriptsize {latex(note)}}}" for note in small if note)
 
 
 def _label(row: TableRow) -> str:

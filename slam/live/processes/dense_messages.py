@@ -74,11 +74,11 @@ class FinishMap:
 
     Attributes:
         poses: T_world_camera (4, 4) of all keyframes, by id.
-        left_out: keyframes that were not sent, and why.
+        skipped: keyframes that were not sent, and why.
     """
 
     poses: dict[int, Array]
-    left_out: dict[int, str]
+    skipped: dict[int, str]
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ class DenseServer:
             if not fused.keyframes():
                 return MapWritten(missing=missing, failure="no keyframe has a submap")
             products = write_clouds(fused)
-            counts = self._counts(missing, message.left_out)
+            counts = self._counts(missing, message.skipped)
             products_s = time.perf_counter() - started_s
             write_summary(self._folder, MapSummary(self._folder.path, counts, products, products_s))
         except (InputError, OSError) as error:
@@ -145,9 +145,9 @@ class DenseServer:
             return MapWritten(failure=str(error))
         return MapWritten(products.points, missing)
 
-    def _counts(self, missing: list[int], left_out: dict[int, str]) -> FusionCounts:
+    def _counts(self, missing: list[int], skipped: dict[int, str]) -> FusionCounts:
         """Counts of the keyframes, with those that were not sent to this process."""
-        reasons = self._folder.unwritten | left_out
+        reasons = self._folder.unwritten | skipped
         counts = self._fusion.counts
         counts.skipped = {number: reasons.get(number, "") for number in missing}
         return counts

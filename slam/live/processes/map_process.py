@@ -46,7 +46,7 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import Tracked
-from bmask_slam.world.frame_history import NOBODY
+from bmask_slam.world.frame_history import NO_KEYFRAME
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class MapServer:
             case Masks():
                 self.add_masks(message)
             case PruneLandmarks():
-                ids = self.system.mapper.world.landmarks.living(message.ids)
+                ids = self.system.mapper.world.landmarks.remaining(message.ids)
                 if len(ids):
                     self.system.map.prune_landmarks(ids)
             case PruneMask():
@@ -144,7 +144,7 @@ class MapServer:
         started_s = time.perf_counter()
         system = self.system
         if not self._has_reference(message):
-            self.skip_keyframe(LostKeyframe(message.id, NOBODY, np.eye(4), message.history))
+            self.skip_keyframe(LostKeyframe(message.id, NO_KEYFRAME, np.eye(4), message.history))
             return
         self._count_visibility(message.visibility)
         system.mapper.history.extend(message.history)
@@ -180,7 +180,7 @@ class MapServer:
     def _has_reference(self, message: NewKeyframe) -> bool:
         """Whether the reference of its pose is in the map; not if that began a lost segment."""
         reference, history = message.reference, self.system.mapper.history
-        return reference is None or history.parent(reference[0])[0] != NOBODY
+        return reference is None or history.parent(reference[0])[0] != NO_KEYFRAME
 
     def add_masks(self, message: Masks) -> None:
         """Use a keyframe's masks; those that cannot be used are skipped."""
@@ -214,11 +214,11 @@ class MapServer:
         landmarks = mapper.world.landmarks
         ids = landmarks.current(tracked.landmark_ids)
         _, first = np.unique(ids, return_index=True)
-        first = np.sort(first[landmarks.alive[ids[first]]])
+        first = np.sort(first[landmarks.in_map[ids[first]]])
         return replace(
             tracked,
             T_world_camera=carried_along(tracked.T_world_camera, T_world_reference, T_now),
             keypoints=tracked.keypoints[first],
             landmark_ids=ids[first],
-            visible_ids=landmarks.living(tracked.visible_ids),
+            visible_ids=landmarks.remaining(tracked.visible_ids),
         ), parent.segment

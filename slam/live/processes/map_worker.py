@@ -1,4 +1,4 @@
-"""The map's process as its owner sees it: restarted from a saved state and a journal if it dies.
+"""Owner of the map process, which is restarted from a saved state and a journal if it dies.
 
 Messages are kept in the journal until the process has saved a state that contains them. If it dies,
 a new process starts from that state and gets the later messages again; tracking goes on meanwhile.
@@ -20,15 +20,15 @@ from bmask_slam.live.processes.worker import Failure, Worker
 logger = logging.getLogger(__name__)
 
 TARGET = "bmask_slam.live.processes.map_process:serve_map"
-MAX_DEATHS = 3
-"""Deaths of the process without a saved state between them after which it is not restarted."""
+MAX_CRASHES = 3
+"""Number of crashes without a saved state in between after which it is not restarted."""
 
 
 class MapWorker:
     """Sends numbered messages to the map's process, and restarts it when it dies.
 
     Attributes:
-        deaths: how often the process has died.
+        crashes: how often the process has died.
     """
 
     def __init__(self, arguments: tuple[Any, ...], replacement: Callable[[Any], Any]) -> None:
@@ -39,14 +39,14 @@ class MapWorker:
             replacement: called with a message of which two processes died; returns the message to
                 send instead, or None.
         """
-        self.deaths = 0
+        self.crashes = 0
         self._arguments, self._replacement = arguments, replacement
         self._state: Path | None = None
         self._journal: dict[int, Any] = {}
         self._number = 0
-        self._deaths_in_a_row = 0
+        self._crashes_in_a_row = 0
         self._is_ready = False
-        self._started = self._died_at = 0  # numbers of messages
+        self._started = self._crashed_at = 0  # numbers of messages
         self._worker = self._start()
 
     @property
@@ -57,7 +57,7 @@ class MapWorker:
     @property
     def given_up(self) -> bool:
         """Whether the process died too often to be restarted."""
-        return self._deaths_in_a_row >= MAX_DEATHS
+        return self._crashes_in_a_row >= MAX_CRASHES
 
     @property
     def busy(self) -> bool:
@@ -71,9 +71,9 @@ class MapWorker:
         self._worker.send((self._number, message))
 
     @property
-    def died(self) -> bool:
+    def has_crashed(self) -> bool:
         """Whether the process has died and is to be restarted."""
-        return not self._worker.alive and not self.given_up
+        return not self._worker.is_running and not self.given_up
 
     def receive(self, timeout_s: float = 0.0) -> list[Any]:
         """The answers that are not about the process itself; waits so long for the first."""
@@ -99,24 +99,24 @@ class MapWorker:
                 self.kill()
                 raise InputError(late_start_text("map", timeout_s))
             self.receive(0.1)
-            if self.died:
+            if self.has_crashed:
                 self.receive_last()
                 self.restart()
 
     def restart(self) -> None:
         """Start a new process from the last saved state, and send the later messages again."""
-        self.deaths += 1
-        self._deaths_in_a_row += 1
+        self.crashes += 1
+        self._crashes_in_a_row += 1
         if self.given_up:
             logger.error(
-                "the map's process died %d times in a row; it is not restarted", MAX_DEATHS
+                "the map's process died %d times in a row; it is not restarted", MAX_CRASHES
             )
             return
         count = len(self._journal)
         logger.warning("the map's process died; restarted, %d messages are sent again", count)
-        if self._died_at == self._started > 0:
+        if self._crashed_at == self._started > 0:
             self._skip(self._started)
-        self._died_at = self._started
+        self._crashed_at = self._started
         self._worker = self._start()
         for number, message in sorted(self._journal.items()):
             self._worker.send((number, message))
@@ -141,7 +141,7 @@ class MapWorker:
                     self._started = message.number
                 case StateSaved():
                     self._journal = {n: m for n, m in self._journal.items() if n > message.number}
-                    self._state, self._deaths_in_a_row = message.path, 0
+                    self._state, self._crashes_in_a_row = message.path, 0
                 case Ready():
                     self._is_ready = True
                 case Failure():

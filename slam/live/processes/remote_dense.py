@@ -41,7 +41,7 @@ MAX_WAITING, CROWDED = 6, 4
 MASKS_S = 3.0
 AROUND = 32
 """Number of neighbouring keyframes whose poses are sent: more than the fusion holds."""
-MAX_KEYFRAME_DEATHS = 2
+MAX_KEYFRAME_CRASHES = 2
 LATE = "newer keyframes came first"
 
 
@@ -60,7 +60,7 @@ class RemoteDenseMapper:
     Attributes:
         submaps: ids of keyframes that have a submap.
         previews: of finished submaps, which the viewer removes from here.
-        left_out: keyframes of the map that will get no submap, and why.
+        skipped: keyframes of the map that will get no submap, and why.
         dropped: how many of those were dropped because newer ones came.
         unwritten: how many could not be written because the disk was full.
     """
@@ -69,13 +69,13 @@ class RemoteDenseMapper:
         """Start the process; call ``wait_until_ready`` before the first keyframe."""
         self.submaps: set[int] = set()
         self.previews: dict[int, Preview] = {}
-        self.left_out: dict[int, str] = {}
+        self.skipped: dict[int, str] = {}
         self.dropped = self.unwritten = 0
         self._waiting: dict[int, _Waiting] = {}
         self._sent: dict[int, KeyframeToMap] = {}
         self._to_resend: list[int] = []  # of those sent, after a restart
         self._working: int | None = None
-        self._deaths_with: Counter[int] = Counter()
+        self._crashes_with: Counter[int] = Counter()
         self._written: MapWritten | None = None
         target = "bmask_slam.live.processes.dense_process:serve_dense"
         self._worker = SupervisedWorker("dense mapper", target, (setup,), policy or RestartPolicy())
@@ -86,9 +86,9 @@ class RemoteDenseMapper:
         return self._worker.pid
 
     @property
-    def deaths(self) -> int:
+    def crashes(self) -> int:
         """How often a process died or hung."""
-        return self._worker.deaths
+        return self._worker.crashes
 
     @property
     def waiting(self) -> int:
@@ -107,7 +107,7 @@ class RemoteDenseMapper:
     def add_keyframe(self, keyframe_id: int, frame: Frame) -> None:
         """Queue a keyframe; its images are copied."""
         if self._worker.given_up:
-            self.left_out[keyframe_id] = "dense mapping was given up"
+            self.skipped[keyframe_id] = "dense mapping was given up"
             return
         own = replace(frame, rgb=frame.rgb.copy(), depth_m=frame.depth_m.copy())
         self._waiting[keyframe_id] = _Waiting(own, time.monotonic())
@@ -156,18 +156,18 @@ class RemoteDenseMapper:
 
     def remove_culled(self, world: WorldMap, is_new: Callable[[int], bool]) -> None:
         """Drop the keyframes that are no longer in the map, and their submaps."""
-        known = self._waiting.keys() | self._sent.keys() | self.submaps | self.left_out.keys()
-        gone = [number for number in known - world.keyframes.keys() if not is_new(number)]
-        if not gone:
+        known = self._waiting.keys() | self._sent.keys() | self.submaps | self.skipped.keys()
+        removed = [number for number in known - world.keyframes.keys() if not is_new(number)]
+        if not removed:
             return
-        for number in gone:
+        for number in removed:
             self._waiting.pop(number, None)
             self._sent.pop(number, None)
-            self.left_out.pop(number, None)
+            self.skipped.pop(number, None)
             self.previews.pop(number, None)
             self.submaps.discard(number)
         self._to_resend = [number for number in self._to_resend if number in self._sent]
-        self._worker.send(RemoveKeyframes(sorted(gone)))
+        self._worker.send(RemoveKeyframes(sorted(removed)))
 
     def finish(self, world: WorldMap, timeout_s: float) -> MapWritten:
         """Map what waits and write the clouds; the run folder must hold the map by now."""
@@ -177,14 +177,14 @@ class RemoteDenseMapper:
 
         self.remove_culled(world, never)
         poses = {k.id: k.T_world_camera for k in world.keyframes.values()}
-        deadline_s, deaths_at_request = time.monotonic() + timeout_s, -1
+        deadline_s, crashes_at_request = time.monotonic() + timeout_s, -1
         while self._written is None:
             if self._worker.given_up or time.monotonic() > deadline_s:
                 return MapWritten(failure="the dense map's process did not finish")
             self.update(world, never, never)
-            if not self.waiting and deaths_at_request != self.deaths:
-                deaths_at_request = self.deaths
-                self._worker.send(FinishMap(poses, self.left_out), begins=True)
+            if not self.waiting and crashes_at_request != self.crashes:
+                crashes_at_request = self.crashes
+                self._worker.send(FinishMap(poses, self.skipped), begins=True)
             time.sleep(0.005)
         return self._written
 
@@ -233,8 +233,8 @@ class RemoteDenseMapper:
     def _resend_all(self) -> None:
         """Queue what was sent for the new process, but for a keyframe that killed two."""
         if self._working is not None:
-            self._deaths_with[self._working] += 1
-            if self._deaths_with[self._working] >= MAX_KEYFRAME_DEATHS:
+            self._crashes_with[self._working] += 1
+            if self._crashes_with[self._working] >= MAX_KEYFRAME_CRASHES:
                 self._sent.pop(self._working, None)
                 self._skip(self._working, "the process died of it twice")
         self._working = None
@@ -242,5 +242,5 @@ class RemoteDenseMapper:
 
     def _skip(self, number: int, reason: str) -> None:
         self._waiting.pop(number, None)
-        self.left_out[number] = reason
+        self.skipped[number] = reason
         logger.info("keyframe %d is not in the dense map: %s", number, reason)

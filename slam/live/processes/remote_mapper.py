@@ -33,7 +33,7 @@ from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import Tracked
-from bmask_slam.world.frame_history import NOBODY, Entries, FrameHistory
+from bmask_slam.world.frame_history import NO_KEYFRAME, Entries, FrameHistory
 from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -100,9 +100,9 @@ class RemoteMapper:
         return self._process.given_up
 
     @property
-    def deaths(self) -> int:
+    def crashes(self) -> int:
         """How often the process has died."""
-        return self._process.deaths
+        return self._process.crashes
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Add a tracked frame to the copy as a keyframe, and send it to the process.
@@ -144,7 +144,7 @@ class RemoteMapper:
 
     def prune_landmarks(self, landmark_ids: Ints) -> None:
         """As ``Mapper.prune_landmarks``; tracking drops them at once."""
-        self.world.landmarks.alive[landmark_ids] = False
+        self.world.landmarks.in_map[landmark_ids] = False
         self.send(PruneLandmarks(landmark_ids))
 
     def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
@@ -162,7 +162,7 @@ class RemoteMapper:
         Returns the messages that are not about the map: masks, for the moving-object filter.
         """
         others = self._apply_answers(self._process.receive(timeout_s))
-        if self._process.died:
+        if self._process.has_crashed:
             others += self._apply_answers(self._process.receive_last())
             self._process.restart()
         return others
@@ -183,7 +183,7 @@ class RemoteMapper:
         deadline_s = time.monotonic() + timeout_s
         while len(self.world.observed(keyframe)[1]) == 0 and not self.given_up:
             left_s = deadline_s - time.monotonic()
-            if left_s <= 0 or self.history.parent(keyframe.id)[0] == NOBODY:
+            if left_s <= 0 or self.history.parent(keyframe.id)[0] == NO_KEYFRAME:
                 return False
             self.catch_up(min(left_s, 0.05))
         return True
@@ -221,10 +221,10 @@ class RemoteMapper:
 
     def _apply(self, message: MapChanged) -> None:
         apply_delta(message.delta, self.world, self.history)
-        held = set(self.places.keyframe_ids)
-        for keyframe_id in held - self.world.keyframes.keys():
+        known_ids = set(self.places.keyframe_ids)
+        for keyframe_id in known_ids - self.world.keyframes.keys():
             self.places.remove(keyframe_id)
-        for keyframe_id in sorted(self.world.keyframes.keys() - held):
+        for keyframe_id in sorted(self.world.keyframes.keys() - known_ids):
             self.places.add(keyframe_id, self.world.keyframes[keyframe_id].features.descriptors)
         self.changes += 1
         self.loops_closed = message.loops_closed
@@ -252,6 +252,6 @@ class RemoteMapper:
 def _parent(lost: NewKeyframe) -> tuple[int, Array]:
     """The keyframe to which a lost keyframe's frames are attached, and T_parent_lost (4, 4)."""
     if lost.reference is None:
-        return NOBODY, np.eye(4)
+        return NO_KEYFRAME, np.eye(4)
     parent_id, T_world_parent = lost.reference
     return parent_id, inverse(T_world_parent) @ lost.tracked.T_world_camera

@@ -72,9 +72,9 @@ class RemoteSegmenter:
         return self._worker.pid
 
     @property
-    def deaths(self) -> int:
+    def crashes(self) -> int:
         """How often a process died or hung."""
-        return self._worker.deaths
+        return self._worker.crashes
 
     @property
     def waiting(self) -> int:

@@ -42,14 +42,14 @@ class SupervisedWorker:
 
     Attributes:
         name: of the worker, for messages.
-        deaths: how often a process died or hung.
+        crashes: how often a process died or hung.
     """
 
     def __init__(
         self, name: str, target: str, arguments: tuple[Any, ...], policy: RestartPolicy
     ) -> None:
         self.name = name
-        self.deaths = 0
+        self.crashes = 0
         self._target, self._arguments, self._policy = target, arguments, policy
         self._heard_s = time.monotonic()
         self._is_ready = False
@@ -63,7 +63,7 @@ class SupervisedWorker:
     @property
     def given_up(self) -> bool:
         """Whether it died too often to be restarted."""
-        return self.deaths > self._policy.restarts
+        return self.crashes > self._policy.restarts
 
     def wait_until_ready(self) -> Ready:
         """Wait for its first message.
@@ -73,7 +73,7 @@ class SupervisedWorker:
         """
         deadline_s = time.monotonic() + self._policy.start_s
         while True:
-            alive = self._worker.alive
+            is_running = self._worker.is_running
             for message in self._worker.receive(0.1):
                 match message:
                     case Ready():
@@ -82,7 +82,7 @@ class SupervisedWorker:
                     case Failure():
                         self.close()
                         raise InputError(message.text.strip().splitlines()[-1])
-            if not alive:
+            if not is_running:
                 self.close()
                 raise InputError(f"the {self.name}'s process did not start; see the lines above")
             if time.monotonic() > deadline_s:
@@ -112,13 +112,13 @@ class SupervisedWorker:
             return False
         silent_s = time.monotonic() - self._heard_s
         limit_s = self._policy.answer_s if self._is_ready else self._policy.start_s
-        if self._worker.alive and not (busy and silent_s > limit_s):
+        if self._worker.is_running and not (busy and silent_s > limit_s):
             return False
-        self.deaths += 1
+        self.crashes += 1
         self._heard_s, self._is_ready = time.monotonic(), False
         self._worker.kill()
         if self.given_up:
-            logger.error("the %s died %d times; it is not restarted", self.name, self.deaths)
+            logger.error("the %s died %d times; it is not restarted", self.name, self.crashes)
             return False
         logger.warning("the %s died or hangs; restarted", self.name)
         self._worker = self._start()

@@ -48,9 +48,9 @@ class Worker:
 
     def __init__(self, name: str, target: str, *arguments: Any) -> None:
         self.name = name
-        ours, theirs = socket.socketpair()
+        parent_end, child_socket = socket.socketpair()
         files = [anonymous_file(SIZE) for _ in range(2)]
-        descriptors = [theirs.fileno(), *files]
+        descriptors = [child_socket.fileno(), *files]
         code = f"from {__name__} import serve; serve(*{descriptors})"
         try:
             self._process = subprocess.Popen(
@@ -60,9 +60,11 @@ class Worker:
                 env=os.environ | ONE_THREAD | safe_import_path(),
                 process_group=0,  # Ctrl-C in a terminal must reach only the owner
             )
-            self._channel = Channel(Connection(ours.detach()), (Ring(files[0]), Ring(files[1])))
+            self._channel = Channel(
+                Connection(parent_end.detach()), (Ring(files[0]), Ring(files[1]))
+            )
         finally:
-            theirs.close()
+            child_socket.close()
             for file in files:
                 os.close(file)
         self.send((target, arguments))
@@ -73,7 +75,7 @@ class Worker:
         return self._process.pid
 
     @property
-    def alive(self) -> bool:
+    def is_running(self) -> bool:
         """Whether the process runs and its connection is open."""
         return self._channel.open and self._process.poll() is None
 
@@ -113,12 +115,12 @@ def safe_import_path() -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(folders), "PYTHONSAFEPATH": "1"}
 
 
-def serve(connection: int, theirs: int, ours: int) -> None:
+def serve(connection: int, child_socket: int, parent_end: int) -> None:
     """Main function of the child, given descriptors; the first message says what to run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    channel = Channel(Connection(connection), (Ring(ours), Ring(theirs)))
-    os.close(theirs)
-    os.close(ours)
+    channel = Channel(Connection(connection), (Ring(parent_end), Ring(child_socket)))
+    os.close(child_socket)
+    os.close(parent_end)
     logging.getLogger().addHandler(ForwardedLog(channel))
     logging.getLogger().setLevel(logging.INFO)
 

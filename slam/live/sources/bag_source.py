@@ -113,7 +113,7 @@ class BagSource:
         yield from pairer.finish()
 
 
-def find_topics(bag: Bag, wanted: BagTopics) -> BagTopics:
+def find_topics(bag: Bag, requested: BagTopics) -> BagTopics:
     """The topics' names in the bag; an image topic may exist in a compressed form only.
 
     Raises:
@@ -122,19 +122,19 @@ def find_topics(bag: Bag, wanted: BagTopics) -> BagTopics:
     found = {topic.name: topic.type for topic in bag.topics if topic.messages}
     images = [name for name, kind in found.items() if kind in IMAGE_TYPES]
     names = []
-    for wish, option in ((wanted.rgb, "--rgb-topic"), (wanted.depth, "--depth-topic")):
+    for wish, option in ((requested.rgb, "--rgb-topic"), (requested.depth, "--depth-topic")):
         forms = [wish, f"{wish}/compressed", f"{wish}/compressedDepth"]
-        there = [name for name in forms if name in images]
-        if not there:
+        available = [name for name in forms if name in images]
+        if not available:
             raise InputError(
                 f"{bag.path}: no images on {wish}; give {option}, one of: "
                 f"{', '.join(images) or 'none, the bag has no images'}"
             )
-        names.append(there[0])
-    return BagTopics(names[0], names[1], wanted.camera_info or _info_beside(wanted.rgb))
+        names.append(available[0])
+    return BagTopics(names[0], names[1], requested.camera_info or _info_topic(requested.rgb))
 
 
-def _info_beside(rgb: str) -> str:
+def _info_topic(rgb: str) -> str:
     """The camera_info topic of an image topic, where image_transport puts it."""
     base = rgb.removesuffix("/compressed")
     return f"{base.rpartition('/')[0]}/camera_info"
@@ -164,11 +164,11 @@ def _find_camera(bag: Bag, topics: BagTopics, given: Path | None) -> Camera:
 
 
 def _camera_info(bag: Bag, name: str) -> Any:
-    there = [topic.name for topic in bag.topics if topic.type == INFO_TYPE and topic.messages]
-    if name not in there:
+    available = [topic.name for topic in bag.topics if topic.type == INFO_TYPE and topic.messages]
+    if name not in available:
         raise InputError(
             f"{bag.path}: no camera_info on {name}; give --camera F or --camera-info-topic, one "
-            f"of: {', '.join(there) or 'none'}"
+            f"of: {', '.join(available) or 'none'}"
         )
     return _first(bag, name)
 

@@ -53,8 +53,8 @@ class RealSenseSource(CameraSource):
             raise
 
     def _capture_images(self) -> CameraImages | None:
-        came, images = self._pipeline.try_wait_for_frames(POLL_MS)
-        if not came:
+        received, images = self._pipeline.try_wait_for_frames(POLL_MS)
+        if not received:
             return None
         aligned = self._align.process(images)
         colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()

@@ -74,7 +74,7 @@ def _seats(b: SceneBuilder) -> None:
     with b.at(pose(1.9, 1.75)):
         f.table(b, 1.1, 0.6, 0.42, f.WALNUT)
         with b.at(pose(0, 0, 0.42)):
-            _coffee_things(b)
+            _coffee_table_objects(b)
     b.quad((3.0, 0.01, 2.1), (-1.0, 0, 0), (0, 0, -0.7), painting(), 800)
     b.quad((1.6, 0.01, 2.2), (-0.6, 0, 0), (0, 0, -0.8), poster(), 800)
     with b.at(pose(3.3, 0.35)):
@@ -85,7 +85,7 @@ def _seats(b: SceneBuilder) -> None:
         o.umbrella(b, (150, 40, 60))
 
 
-def _coffee_things(b: SceneBuilder) -> None:
+def _coffee_table_objects(b: SceneBuilder) -> None:
     for x, y, yaw in ((-0.35, 0.1, 15), (-0.33, 0.09, 40)):
         with b.at(pose(x, y, 0.05 if yaw > 30 else 0, yaw), "book"):
             f.lying_book(b)

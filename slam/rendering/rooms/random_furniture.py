@@ -28,7 +28,17 @@ DEVICES: dict[str, Callable[[SceneBuilder], None]] = {
 """Devices on walls, by the name of their class."""
 
 _WOODS: tuple[Colour, ...] = (f.OAK, f.WALNUT, (206, 196, 180), (142, 104, 70), (88, 66, 52))
-_THINGS = ("cup", "bottle", "cell phone", "book", "books", "trophy", "plant", "drone", "sheet")
+_SMALL_OBJECTS = (
+    "cup",
+    "bottle",
+    "cell phone",
+    "book",
+    "books",
+    "trophy",
+    "plant",
+    "drone",
+    "sheet",
+)
 _ODDS = np.array([0.18, 0.15, 0.14, 0.15, 0.09, 0.08, 0.06, 0.06, 0.09])
 _RADIUS_M = {
     "cup": 0.075, "bottle": 0.05, "cell phone": 0.09, "book": 0.15, "books": 0.17, "trophy": 0.13,
@@ -69,10 +79,10 @@ def add_hanging(b: SceneBuilder, hanging: Hanging) -> None:
 # --- small things --------------------------------------------------------------------------------
 
 
-def scatter(b: SceneBuilder, width: float, depth: float, count: int, taken: list[_Disc]) -> None:
+def scatter(b: SceneBuilder, width: float, depth: float, count: int, occupied: list[_Disc]) -> None:
     """Lay up to ``count`` things on a table top of the given size, outside the ``taken`` discs."""
-    discs = list(taken)
-    for name in b.rng.choice(_THINGS, count, p=_ODDS):
+    discs = list(occupied)
+    for name in b.rng.choice(_SMALL_OBJECTS, count, p=_ODDS):
         radius = _RADIUS_M[name]
         half = np.array([width, depth]) / 2 - radius
         if half.min() <= 0:
@@ -82,11 +92,11 @@ def scatter(b: SceneBuilder, width: float, depth: float, count: int, taken: list
             if all(np.hypot(x - u, y - v) > radius + r for u, v, r in discs):
                 discs.append((x, y, radius))
                 with b.at(pose(x, y, 0, b.rng.uniform(0, 360))):
-                    _thing(b, str(name))
+                    _small_object(b, str(name))
                 break
 
 
-def _thing(b: SceneBuilder, name: str) -> None:
+def _small_object(b: SceneBuilder, name: str) -> None:
     """One small thing on z = 0; its front looks along -y."""
     if name == "books":
         for k in range(int(b.rng.integers(2, 4))):
@@ -129,8 +139,8 @@ def _workplace(b: SceneBuilder, width: float) -> None:
         with b.at(pose(0, 0), "desk"):
             f.desk(b, width, 0.75, _wood(b))
         with b.at(pose(0, 0, 0.74)):
-            taken = _computer(b)
-            scatter(b, width, 0.75, int(rng.integers(5, 11)), taken)
+            occupied = _computer(b)
+            scatter(b, width, 0.75, int(rng.integers(5, 11)), occupied)
     with b.at(pose(*SEAT_M, 0, 180 + rng.uniform(-35, 35)), "chair"):
         _chair(b, 0.75)
 
@@ -140,19 +150,19 @@ def _computer(b: SceneBuilder) -> list[_Disc]:
     rng = b.rng
     count = int(rng.integers(1, 3))
     shift = rng.uniform(-0.1, 0.1)
-    taken = []
+    occupied = []
     for k in range(count):
         x = shift + (k - (count - 1) / 2) * 0.57
         with b.at(pose(x, 0.18, 0, -14 * np.sign(x) * (count - 1) + rng.normal(0, 4)), "screen"):
             o.screen(b, rng.uniform(0.44, 0.53), rng.uniform(0.28, 0.33))
-        taken += [(x + step, 0.18, 0.13) for step in (-0.19, 0.0, 0.19)]
+        occupied += [(x + step, 0.18, 0.13) for step in (-0.19, 0.0, 0.19)]
     x, y = rng.uniform(-0.12, 0.12), rng.uniform(-0.22, -0.12)
     with b.at(pose(x, y, 0, rng.normal(0, 5)), "keyboard"):
         o.keyboard(b)
     with b.at(pose(x + 0.32, y, 0, rng.normal(0, 15)), "mouse"):
         o.mouse(b)
-    taken += [(x + step, y, 0.1) for step in (-0.15, 0.0, 0.15)]
-    return [*taken, (x + 0.32, y, 0.07)]
+    occupied += [(x + step, y, 0.1) for step in (-0.15, 0.0, 0.15)]
+    return [*occupied, (x + 0.32, y, 0.07)]
 
 
 def _bookcase(b: SceneBuilder, width: float) -> None:
@@ -188,8 +198,8 @@ def _television(b: SceneBuilder, _: float) -> None:
         with b.at(pose(0, 0, height)):
             with b.at(pose(0, 0, 0), "tv"):
                 o.tv(b, size)
-            taken = [(x, 0.0, 0.22) for x in np.linspace(-size / 2, size / 2, 5)]
-            scatter(b, 1.75, 0.42, 4, taken)
+            occupied = [(x, 0.0, 0.22) for x in np.linspace(-size / 2, size / 2, 5)]
+            scatter(b, 1.75, 0.42, 4, occupied)
 
 
 def _dining(b: SceneBuilder, width: float) -> None:

@@ -170,5 +170,5 @@ class Layout:
                 return False
             if distance_m(rect, self.path_world).min() < _CAMERA_GAP_M:
                 return False
-        taken = [other for piece in self.pieces for other in piece.rects_world] + self.kept_free
-        return not any(overlap(rect, other, _GAP_M) for rect in rects for other in taken)
+        occupied = [other for piece in self.pieces for other in piece.rects_world] + self.kept_free
+        return not any(overlap(rect, other, _GAP_M) for rect in rects for other in occupied)

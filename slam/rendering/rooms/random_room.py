@@ -57,11 +57,11 @@ def draw_room(seed: int) -> RandomRoom:
     room = Room(rng.uniform(5.2, 7.2), rng.uniform(5.0, 6.6), rng.uniform(2.45, 2.9))
     eyes = _ring(room, rng)
     layout = Layout(room, _walked(eyes), rng)
-    _stand_large_things(layout)
+    _place_large_furniture(layout)
     rounds = [layout.keep_free(1.4, 0.9)]
     stands = [layout.keep_free(0.7, 0.7) for _ in range(2)]
-    _stand_small_things(layout)
-    _hang_things(layout)
+    _place_small_furniture(layout)
+    _place_wall_objects(layout)
     path = CameraPath(eyes, _targets(layout, eyes, rng), speed_m_s=0.42, turn_deg_s=24.0)
     return RandomRoom(layout, path, _roles(layout, rounds, stands), _lighting(room, rng))
 
@@ -174,7 +174,7 @@ _COFFEE = Kind("low table", ((-0.52, -0.32, 0.52, 0.32),), 0.5, 0.45)
 _OPEN = Kind("open umbrella", ((-0.52, -0.64, 0.52, 0.24),), 0.9, 0.3)
 
 
-def _stand_large_things(layout: Layout) -> None:
+def _place_large_furniture(layout: Layout) -> None:
     rng = layout.rng
     layout.stand_at_wall(_workplace(rng))
     layout.stand_at_wall(_DOOR)
@@ -188,7 +188,7 @@ def _stand_large_things(layout: Layout) -> None:
             layout.stand_at_wall(kind)
 
 
-def _stand_small_things(layout: Layout) -> None:
+def _place_small_furniture(layout: Layout) -> None:
     rng = layout.rng
     at_wall = [(0.7, _plant(rng)), (0.4, _plant(rng)), (0.6, _SUITCASE), (0.25, _SUITCASE),
                (0.6, _UMBRELLA), (0.3, _UMBRELLA), (0.6, _ROBOT), (0.25, _ROBOT), (0.3, _LAMP),
@@ -203,7 +203,7 @@ def _stand_small_things(layout: Layout) -> None:
             layout.stand_at_wall(kind)
 
 
-def _hang_things(layout: Layout) -> None:
+def _place_wall_objects(layout: Layout) -> None:
     rng = layout.rng
     devices = [(0.6, "air conditioner", (0.92, 0.3), (2.05, 2.3)),
                (0.6, "switchbox", (0.42, 0.57), (1.15, 1.45)),

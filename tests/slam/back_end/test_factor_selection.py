@@ -194,9 +194,9 @@ def test_landmarks_in_the_graph_count_towards_the_cap() -> None:
 def test_removed_landmarks_are_removed_once() -> None:
     world, _ = make_world(3)
     factor_selection = FactorSelector(EVERYTHING)
-    factor_selection.forget_landmarks(np.array([4, 5]))
-    factor_selection.forget_landmarks(np.array([8]))
-    factor_selection.forget_keyframe(1)
+    factor_selection.remove_landmarks(np.array([4, 5]))
+    factor_selection.remove_landmarks(np.array([8]))
+    factor_selection.remove_keyframe(1)
     update = factor_selection.keyframe_update(world, world.keyframes[2])
     assert update.remove_landmarks.tolist() == [4, 5, 8]
     assert update.remove_keyframes.tolist() == [1]
@@ -333,7 +333,7 @@ def test_landmarks_outside_the_window_are_marginalised_and_restored() -> None:
     old, new = np.arange(COUNT), COUNT + np.arange(COUNT)
     assert not world.landmarks.in_graph[old].any()
     assert world.landmarks.in_graph[new].all()
-    assert world.landmarks.alive.all()
+    assert world.landmarks.in_map.all()
     assert smoother.estimate().landmark_ids.tolist() == new.tolist()
     features = make_features(
         pose_of(6), world.landmarks.points_world[old], random_descriptors(COUNT, RNG)
@@ -356,7 +356,7 @@ def test_a_marginalised_landmark_with_new_observations_is_restored() -> None:
     """As fusing after a loop does: observations of a newer landmark go to an old one."""
     world, factor_selection, _ = windowed_world(WINDOWED)
     gone = world.replace_landmarks(np.array([COUNT + 3]), np.array([4]))
-    factor_selection.forget_landmarks(gone)
+    factor_selection.remove_landmarks(gone)
     update = factor_selection.map_update(world)
     assert update.landmark_ids.tolist() == [4]
     assert pairs(update) == {(6, 4), (7, 4), (8, 4)}

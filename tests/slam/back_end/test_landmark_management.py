@@ -83,7 +83,7 @@ def test_landmarks_rarely_matched_or_observed_once_are_culled() -> None:
     world.landmarks.found[ids[:5]] = 10
     culled = cull_landmarks(world, ids, CONFIG)
     assert sorted(culled) == sorted([*ids[:5], *ids[40:]])
-    assert not world.landmarks.alive[culled].any()
+    assert not world.landmarks.in_map[culled].any()
 
 
 def test_a_new_landmark_is_not_culled_yet() -> None:

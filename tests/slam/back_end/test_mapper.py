@@ -62,6 +62,6 @@ def test_landmarks_of_only_a_culled_keyframe_are_removed() -> None:
     mapper = row_of_keyframes(10, MappingConfig())
     world = mapper.world
     held = {i for k in world.keyframes.values() for i in world.observed(k)[1].tolist()}
-    assert set(np.flatnonzero(world.landmarks.alive).tolist()) == held
+    assert set(np.flatnonzero(world.landmarks.in_map).tolist()) == held
     estimate = mapper.smoother.update(mapper._factor_selector.map_update(world))
     assert set(estimate.keyframe_ids.tolist()) == set(world.keyframes)

@@ -83,14 +83,14 @@ class Session:
         ids = np.flatnonzero(point >= 0)
         _, first, which = np.unique(point[ids], return_index=True, return_inverse=True)
         old, new = ids, ids[first][which]
-        self.factor_selection.forget_landmarks(
+        self.factor_selection.remove_landmarks(
             self.world.replace_landmarks(old[old != new], new[old != new])
         )
 
     def cull_keyframe(self, keyframe_id: int, parent_id: int) -> None:
         keyframes = self.world.keyframes
         self.world.remove_keyframe(keyframes[keyframe_id], keyframes[parent_id])
-        self.factor_selection.forget_keyframe(keyframe_id)
+        self.factor_selection.remove_keyframe(keyframe_id)
 
 
 def mask_of(session: Session, keyframe_id: int, keypoints: Array) -> Array:
@@ -130,8 +130,8 @@ def assert_consistent(world: WorldMap, smoother: Smoother) -> None:
         assert (keyframe.landmark_ids[keyframe.masked] == -1).all()
         assert (keyframe.sent_ids[keyframe.masked] == -1).all()
         np.add.at(views, world.observed(keyframe)[1], 1)
-    alive = landmarks.alive
-    np.testing.assert_array_equal(landmarks.observations[alive], views[alive])
+    existing = landmarks.in_map
+    np.testing.assert_array_equal(landmarks.observations[existing], views[existing])
 
 
 def test_a_mask_covers_raw_pixels_without_its_border() -> None:
@@ -165,7 +165,7 @@ def test_observations_are_removed_and_landmarks_kept() -> None:
     covered_ids = report.observations[:, 1]
     assert set(chosen) <= set(covered_ids.tolist())
     assert before - in_graph(session.smoother) == {(3, i) for i in covered_ids.tolist()}
-    assert session.world.landmarks.alive.all()
+    assert session.world.landmarks.in_map.all()
     assert len(report.landmark_ids) == 0
     assert newest.masked.sum() == len(covered_ids)
     assert_consistent(session.world, session.smoother)
@@ -181,7 +181,7 @@ def test_landmarks_are_removed_with_all_their_observations() -> None:
     asked = np.array([5, 17])
     gone = session.pruner().prune_landmarks(np.array([17, 5, -1, 10**6])).landmark_ids
     assert gone.tolist() == asked.tolist()
-    assert not session.world.landmarks.alive[gone].any()
+    assert not session.world.landmarks.in_map[gone].any()
     assert all(k.masked[gone].all() for k in session.world.keyframes.values())
     assert not {i for _, i in in_graph(session.smoother)} & set(gone.tolist())
     assert_consistent(session.world, session.smoother)
@@ -204,11 +204,11 @@ def test_a_late_mask_applies_after_fusing_and_culling() -> None:
     first = session.add_keyframe(np.arange(COUNT), anew=np.arange(20))
     mask = mask_of(session, first.id, np.array([3, 8, 12]))
     old = first.landmark_ids[[3, 8]].copy()
-    session.factor_selection.forget_landmarks(
+    session.factor_selection.remove_landmarks(
         session.world.replace_landmarks(old, np.array([3, 8]))
     )
     session.world.landmarks.remove(first.landmark_ids[[12]])
-    session.factor_selection.forget_landmarks(first.landmark_ids[[12]])
+    session.factor_selection.remove_landmarks(first.landmark_ids[[12]])
     culled = first.landmark_ids[12]
     session.add_keyframe(np.arange(20, COUNT))
     report = session.pruner().prune_mask(first.id, mask)
@@ -287,9 +287,9 @@ def test_map_and_graph_agree_in_any_order_of_events(
         if event == "fuse":
             session.fuse()
         if event == "cull landmark":
-            victims = rng.permutation(np.flatnonzero(world.landmarks.alive))[:3]
+            victims = rng.permutation(np.flatnonzero(world.landmarks.in_map))[:3]
             world.landmarks.remove(victims)
-            session.factor_selection.forget_landmarks(victims)
+            session.factor_selection.remove_landmarks(victims)
         if event == "cull keyframe" and len(keyframes) > 3:
             session.cull_keyframe(int(rng.choice(keyframes[1:-1])), parent_id=keyframes[-1])
         if event == "mask":
@@ -301,7 +301,7 @@ def test_map_and_graph_agree_in_any_order_of_events(
             if entirely:
                 ids = np.flatnonzero(rng.random(len(world.landmarks)) < 0.05)
                 report = session.pruner().prune_landmarks(ids)
-            assert not world.landmarks.alive[report.landmark_ids].any()
+            assert not world.landmarks.in_map[report.landmark_ids].any()
             assert_consistent(world, session.smoother)
     session.add_keyframe(np.arange(COUNT))
     assert_consistent(world, session.smoother)
@@ -369,7 +369,7 @@ def test_a_wrong_loop_is_removed_with_its_fusions() -> None:
     new_ids = ends[1].landmark_ids[:30].copy()
     T_a_b = np.eye(4)
     T_a_b[0, 3] = -0.5
-    session.factor_selection.forget_landmarks(
+    session.factor_selection.remove_landmarks(
         session.world.replace_landmarks(new_ids[:10], np.arange(10))
     )
     session.add_keyframe(np.arange(COUNT))

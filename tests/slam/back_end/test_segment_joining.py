@@ -51,9 +51,9 @@ def test_keyframes_and_landmarks_move_to_the_joined_frame() -> None:
     world, points_world, _ = joined_map()
     assert [k.segment for k in world.keyframes.values()] == [0, 0]
     assert np.allclose(world.keyframes[1].T_world_camera, T_WORLD_SECOND)
-    alive = np.flatnonzero(world.landmarks.alive)
-    number = np.where(alive < 30, alive, alive - 20)
-    assert np.allclose(world.landmarks.points_world[alive], points_world[number])
+    in_map = np.flatnonzero(world.landmarks.in_map)
+    number = np.where(in_map < 30, in_map, in_map - 20)
+    assert np.allclose(world.landmarks.points_world[in_map], points_world[number])
 
 
 def test_viewing_directions_rotate_with_the_segment() -> None:
@@ -65,7 +65,7 @@ def test_viewing_directions_rotate_with_the_segment() -> None:
 
 def test_landmarks_at_one_keypoint_are_fused() -> None:
     world, _, joined = joined_map()
-    assert world.landmarks.alive.sum() == 40
+    assert world.landmarks.in_map.sum() == 40
     assert (world.landmarks.observations[10:30] == 2).all()
     assert sorted(joined.keypoints) == list(range(40))
     by_keypoint = dict(zip(joined.keypoints.tolist(), joined.landmark_ids.tolist(), strict=True))

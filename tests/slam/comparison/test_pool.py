@@ -34,7 +34,7 @@ def endless(folder: Path, name: str = "endless") -> Job:
     return job(folder, name, "live", str(folder), "--follow", "--silence", "1000")
 
 
-def alive(pid: int) -> bool:
+def is_running(pid: int) -> bool:
     """Whether a process runs; a zombie does not."""
     try:
         status = Path(f"/proc/{pid}/stat").read_text()
@@ -111,7 +111,7 @@ def test_closing_a_pool_kills_running_jobs(tmp_path):
     assert next(jobs)[0].name == "one"
     wait_for(lambda: len(pids) == 2)
     jobs.close()
-    wait_for(lambda: not any(alive(pid) for pid in pids))
+    wait_for(lambda: not any(is_running(pid) for pid in pids))
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
@@ -127,9 +127,9 @@ def test_a_job_ends_when_the_process_that_started_it_is_killed(tmp_path):
     starter = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment(1), cwd=ROOT)
     with starter:
         pid = int(starter.stdout.readline())
-        assert alive(pid)
+        assert is_running(pid)
         starter.send_signal(signal.SIGKILL)
-    wait_for(lambda: not alive(pid))
+    wait_for(lambda: not is_running(pid))
 
 
 def test_jobs_on_a_local_ray(tmp_path):

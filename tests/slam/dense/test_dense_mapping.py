@@ -138,7 +138,7 @@ def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_
     old = int(np.bincount(np.concatenate(seen)).argmax())
     new = names.number("cup")
     assert old not in (0, new)
-    store, ids = LabelStore(len(names)), np.flatnonzero(opened.world.landmarks.alive)
+    store, ids = LabelStore(len(names)), np.flatnonzero(opened.world.landmarks.in_map)
     table = np.zeros((len(ids), len(names)), np.float32)
     table[:, new] = 1.0
     store.update(ids, table, np.full(len(ids), 0.9, np.float32))

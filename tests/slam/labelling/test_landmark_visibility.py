@@ -17,10 +17,10 @@ POSE = se3_exp(np.array([0.1, -0.3, 0.05, 0.4, -0.2, 0.3]))
 def world(points_world: np.ndarray) -> Any:
     """A map with landmarks of keyframe 4 in segment 2, except the last two (removed, other)."""
     count = len(points_world)
-    alive, host = np.ones(count, bool), np.full(count, 4)
-    alive[-2], host[-1] = False, 7
+    in_map, host = np.ones(count, bool), np.full(count, 4)
+    in_map[-2], host[-1] = False, 7
     keyframe = SimpleNamespace(id=4)
-    landmarks = SimpleNamespace(points_world=points_world, alive=alive, host=host)
+    landmarks = SimpleNamespace(points_world=points_world, in_map=in_map, host=host)
     in_segment = {2: [keyframe]}.get
     return SimpleNamespace(landmarks=landmarks, in_segment=in_segment)
 

@@ -158,7 +158,7 @@ def test_labels_follow_fused_and_culled_landmarks(at_once: SlamSystem) -> None:
     """Labels of removed landmarks are removed."""
     semantics, landmarks = at_once.semantics, at_once.mapper.world.landmarks
     semantics.follow_map()
-    assert landmarks.alive[semantics.labels.known()].all()
+    assert landmarks.in_map[semantics.labels.known()].all()
     a, b, gone = semantics.labels.known()[[3, 8, 12]]
     both = semantics.labels.estimates(np.array([a, b])).views.sum()
     world = at_once.mapper.world
@@ -248,7 +248,7 @@ def test_the_two_sides_are_two_objects_with_their_landmarks(at_once: SlamSystem)
         assert o.centroid_world[2] == pytest.approx(2.0, abs=0.01)
         assert len(o.keyframe_ids) == len(FRAMES)  # culled ones did see it, too
         own = at_once.mapper.world.landmarks
-        assert own.alive[o.landmark_ids].all()
+        assert own.in_map[o.landmark_ids].all()
         side = own.points_world[o.landmark_ids, 0] < EDGE_M
         assert (side == (o is left)).mean() > 0.99
 

@@ -38,13 +38,13 @@ FRAMES = [
 ]
 
 
-def wait_for(slam: LiveSlam, deaths: int) -> None:
+def wait_for(slam: LiveSlam, crashes: int) -> None:
     """Wait until the dense map's process has crashed this often and nothing waits for it."""
     deadline_s = time.monotonic() + 60
     while time.monotonic() < deadline_s:
         slam.catch_up()
         health = slam.health()
-        if health.dense_deaths >= deaths and not health.submaps_waiting:
+        if health.dense_deaths >= crashes and not health.submaps_waiting:
             return
         time.sleep(0.02)
     raise AssertionError(slam.health())
@@ -78,7 +78,7 @@ def test_a_killed_process_is_restarted_without_losing_keyframes(tmp_path) -> Non
         track_frames(slam, FRAMES[:10], 0)
         os.kill(slam.processes()["dense"], signal.SIGKILL)
         assert set(track_frames(slam, FRAMES[10:], 0)) == {TrackingStatus.OK}
-        wait_for(slam, deaths=1)
+        wait_for(slam, crashes=1)
         pids = list(slam.processes().values())
     assert set(keyframes_without(run).values()) <= {LATE}  # busy machines restart it slowly
     assert off_the_plane_m(run) < 0.01
@@ -97,7 +97,7 @@ def test_a_hanging_process_is_restarted(tmp_path, monkeypatch) -> None:
         track_frames(slam, FRAMES[:8], 0)
         os.kill(first, signal.SIGSTOP)
         assert set(track_frames(slam, FRAMES[8:], 0)) == {TrackingStatus.OK}
-        wait_for(slam, deaths=1)
+        wait_for(slam, crashes=1)
         assert slam.processes()["dense"] != first
         pids = [first, *slam.processes().values()]
     assert set(keyframes_without(run).values()) <= {LATE}

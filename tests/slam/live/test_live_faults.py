@@ -166,7 +166,7 @@ def test_a_hanging_segmenter_is_restarted(tmp_path) -> None:
             time.sleep(0.05)
             found = segmenter.receive_masks()
         assert [masks.keyframe_id for masks in found] == [7]
-        assert (segmenter.deaths, segmenter.waiting) == (1, 0)
+        assert (segmenter.crashes, segmenter.waiting) == (1, 0)
         assert segmenter.pid != first
     finally:
         segmenter.close()

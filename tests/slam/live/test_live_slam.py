@@ -108,8 +108,8 @@ def test_repeated_map_failures_keep_the_trajectory(tmp_path) -> None:
         track_frames(slam, FRAMES[:8])
         for _ in range(3):
             os.kill(slam.processes()["map"], signal.SIGKILL)
-            deaths, deadline_s = slam.health().map_deaths, time.monotonic() + 10
-            while slam.health().map_deaths == deaths and time.monotonic() < deadline_s:
+            crashes, deadline_s = slam.health().map_deaths, time.monotonic() + 10
+            while slam.health().map_deaths == crashes and time.monotonic() < deadline_s:
                 slam.catch_up()
         for frame in FRAMES[8:12]:
             assert slam.track(frame.timestamp_s, frame.rgb, frame.depth_m).keyframe_id is None

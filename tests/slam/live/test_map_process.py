@@ -21,7 +21,7 @@ from bmask_slam.live.processes.map_process import MapServer
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.system import SlamSystem
 from bmask_slam.tracking.results import untracked
-from bmask_slam.world.frame_history import ENTRY, NOBODY
+from bmask_slam.world.frame_history import ENTRY, NO_KEYFRAME
 
 NO_IDS = np.zeros(0, np.int64)
 
@@ -54,17 +54,17 @@ def test_a_segment_restarts_after_losing_its_first_keyframe() -> None:
     system = SlamSystem(CAMERA)
     server = MapServer(system, answers.append)
     nothing = np.zeros(0, ENTRY)
-    server.handle(1, LostKeyframe(0, NOBODY, np.eye(4), nothing, 500))
+    server.handle(1, LostKeyframe(0, NO_KEYFRAME, np.eye(4), nothing, 500))
     server.handle(2, keyframe(system, 1, (0, np.eye(4))))  # made while the first was being lost
     seen = VisibilityCounts(np.arange(500), np.ones(500, int), np.ones(500, int))
     server.handle(3, keyframe(system, 2, None, seen))
     world = system.mapper.world
     assert list(world.keyframes) == [2]
-    assert not world.landmarks.alive[:500].any()
-    assert world.landmarks.alive.sum() > 100
+    assert not world.landmarks.in_map[:500].any()
+    assert world.landmarks.in_map.sum() > 100
     deltas = [answer.delta for answer in answers if isinstance(answer, MapChanged)]
     parents = {k: parent for delta in deltas for k, (parent, _) in delta.parents.items()}
-    assert parents == {0: NOBODY, 1: NOBODY}
+    assert parents == {0: NO_KEYFRAME, 1: NO_KEYFRAME}
     trajectory = system.trajectory()
     assert trajectory.timestamps_s.tolist() == [2 / 30]  # those of the lost ones have no pose
 
@@ -87,7 +87,7 @@ def test_observations_removed_under_a_mask_are_restored() -> None:
     back = one.landmark_ids[under]
     with_depth = np.isfinite(one.features.depth_m[under])
     assert (back[with_depth] >= 0).all()
-    assert landmarks.alive[back[back >= 0]].all()
+    assert landmarks.in_map[back[back >= 0]].all()
     made = back >= next_id
     assert made.any()
     np.testing.assert_array_equal(landmarks.patches[back[made]], all_patches.images[under[made]])

@@ -39,7 +39,7 @@ class StandIn:
     def __init__(self, *arguments: Any) -> None:
         self.sent: list[Any] = []
         self.answers: list[Any] = []
-        self.deaths, self.given_up, self.dies = 0, False, False
+        self.crashes, self.given_up, self.crashes_next = 0, False, False
 
     def send(self, message: Any, begins: bool = False) -> None:
         self.sent.append(message)
@@ -49,9 +49,9 @@ class StandIn:
         return found
 
     def restart_if_needed(self, busy: bool) -> bool:
-        died, self.dies = self.dies, False
-        self.deaths += died
-        return died
+        has_crashed, self.crashes_next = self.crashes_next, False
+        self.crashes += has_crashed
+        return has_crashed
 
     def keyframes(self) -> list[int]:
         return [m.id for m in self.sent if isinstance(m, KeyframeToMap)]
@@ -116,7 +116,7 @@ def test_too_many_keyframes_drop_the_oldest_that_was_not_sent(dense) -> None:
     assert dense.full
     assert dense.dropped == 0
     ask(dense, MAX_WAITING + 1, MAX_WAITING + 2)
-    assert list(dense.left_out) == [1, 2]
+    assert list(dense.skipped) == [1, 2]
     assert (dense.dropped, dense.waiting) == (2, MAX_WAITING + 1)
     worker.answers = [Accepted(0), Mapped(0, None)]
     dense.update(world, no, no)
@@ -176,15 +176,15 @@ def test_sent_keyframes_are_resent_and_skipped_after_two_crashes(dense) -> None:
     worker.answers = [Accepted(0)]
     ask(dense, 1)
     dense.update(world, no, no)
-    worker.dies = True
+    worker.crashes_next = True
     dense.update(world, no, no)
     assert worker.keyframes() == [0, 1, 0]
     worker.answers = [Accepted(0)]
     dense.update(world, no, no)
-    worker.dies = True
+    worker.crashes_next = True
     dense.update(world, no, no)
     assert worker.keyframes() == [0, 1, 0, 1, 0]
-    assert list(dense.left_out) == [1]
+    assert list(dense.skipped) == [1]
     worker.answers = [Accepted(0), Mapped(0, None)]
     dense.update(world, no, no)
     assert (dense.submaps, dense.waiting) == ({0}, 0)
@@ -199,8 +199,8 @@ def test_finish_sends_all_waiting_keyframes_despite_a_crash(dense, monkeypatch) 
         worker.sent.append(message)
         if isinstance(message, KeyframeToMap):
             worker.answers.append(Accepted(message.id))
-        elif not worker.deaths:
-            worker.dies = True
+        elif not worker.crashes:
+            worker.crashes_next = True
         else:
             full = NotMapped(1, "full", disk_full=True)
             worker.answers += [Mapped(0, preview), full, MapWritten(5, [1, 2])]
@@ -221,7 +221,7 @@ def test_after_giving_up_all_keyframes_are_reported_as_skipped(dense) -> None:
     worker.given_up = True
     dense.update(world, no, no)
     ask(dense, 2)
-    assert sorted(dense.left_out) == [0, 1, 2]
+    assert sorted(dense.skipped) == [0, 1, 2]
     assert not dense.full
     assert dense.finish(world, 5.0) == replace(MapWritten(), failure=dense.finish(world, 0).failure)
     assert dense.finish(world, 5.0).failure

@@ -23,12 +23,12 @@ SETTINGS = [  # a keyframe nearly every frame, and most of them culled again
 
 
 def equal(copy: WorldMap, world: WorldMap) -> None:
-    alive = world.landmarks.alive
+    in_map = world.landmarks.in_map
     assert copy.keyframes.keys() == world.keyframes.keys()
-    np.testing.assert_array_equal(copy.landmarks.alive, alive)
+    np.testing.assert_array_equal(copy.landmarks.in_map, in_map)
     np.testing.assert_array_equal(copy.landmarks.replaced_by, world.landmarks.replaced_by)
     for name in ("points_world", *COLUMNS):
-        here, there = getattr(copy.landmarks, name)[alive], getattr(world.landmarks, name)[alive]
+        here, there = getattr(copy.landmarks, name)[in_map], getattr(world.landmarks, name)[in_map]
         np.testing.assert_array_equal(here, there, err_msg=name)
     for key, keyframe in world.keyframes.items():
         other = copy.keyframes[key]
@@ -73,7 +73,7 @@ def test_an_empty_delta_is_small(followed) -> None:
     maker = DeltaMaker()
     first = maker.delta(system.mapper.world, system.mapper.history)
     second = maker.delta(system.mapper.world, system.mapper.history)
-    assert len(first.ids) == system.mapper.world.landmarks.alive.sum()
+    assert len(first.ids) == system.mapper.world.landmarks.in_map.sum()
     assert len(second.ids) == 0
     assert not second.rows
     assert not second.parents

@@ -76,9 +76,9 @@ def test_messages_of_any_size_are_echoed_in_order(caplog) -> None:
     for (_, found), array in zip(middle, arrays, strict=True):
         np.testing.assert_array_equal(found, array)
         found[:] = 0  # it is the receiver's own
-    assert worker.alive
+    assert worker.is_running
     worker.stop()
-    assert not worker.alive
+    assert not worker.is_running
     assert "a begins" in caplog.text
     worker.stop()
 
@@ -98,7 +98,7 @@ def test_a_workers_error_is_raised() -> None:
     assert isinstance(failure, Failure)
     assert "ValueError: cannot do this" in failure.text
     worker.stop()
-    assert not worker.alive
+    assert not worker.is_running
 
 
 def test_a_killed_worker_is_detected_and_sending_is_safe() -> None:
@@ -107,9 +107,9 @@ def test_a_killed_worker_is_detected_and_sending_is_safe() -> None:
     answers(worker, 1)
     os.kill(worker.pid, signal.SIGKILL)
     deadline_s = time.monotonic() + 5
-    while worker.alive and time.monotonic() < deadline_s:
+    while worker.is_running and time.monotonic() < deadline_s:
         time.sleep(0.01)
-    assert not worker.alive
+    assert not worker.is_running
     for _ in range(20):
         worker.send(np.zeros(100_000))
     assert worker.receive() == []

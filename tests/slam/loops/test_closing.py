@@ -78,8 +78,8 @@ class Ring:
         world, k = self.mapper.world, keyframe.id
         known = {p: self.landmark_of[p] for p in seen.tolist() if p in self.landmark_of}
         now = world.landmarks.current(np.arange(len(world.landmarks)))
-        alive = world.landmarks.alive[now]
-        tracked = {p: now[i] for p, (i, at) in known.items() if k - at <= self.memory and alive[i]}
+        in_map = world.landmarks.in_map[now]
+        tracked = {p: now[i] for p, (i, at) in known.items() if k - at <= self.memory and in_map[i]}
         rows = np.array([row for row, p in enumerate(seen.tolist()) if p in tracked], np.int64)
         ids = np.array([tracked[p] for p in seen[rows].tolist()], np.int64)
         world.attach(keyframe, rows, ids)
@@ -136,7 +136,7 @@ def test_map_and_graph_hold_the_same_landmarks(closed: tuple[Ring, list[LoopCons
     ring, _ = closed
     landmarks = ring.mapper.world.landmarks
     estimate = ring.mapper.smoother.estimate()
-    ids = np.flatnonzero(landmarks.in_graph & landmarks.alive)
+    ids = np.flatnonzero(landmarks.in_graph & landmarks.in_map)
     assert np.array_equal(estimate.landmark_ids, ids)
     assert np.array_equal(estimate.points_world, landmarks.points_world[ids])
 
@@ -264,7 +264,7 @@ def test_a_loop_removed_with_its_keyframe_is_not_rejected() -> None:
     assert refuted(mapper) == set()
     gone = loops[-1].keyframe_a
     mapper.world.remove_keyframe(mapper.world.keyframes[gone], mapper.world.keyframes[gone + 1])
-    mapper._factor_selector.forget_keyframe(gone)
+    mapper._factor_selector.remove_keyframe(gone)
     mapper.loops.remove(gone)
     ring.step()
     in_graph = mapper.smoother.relative_pose_errors("loop")

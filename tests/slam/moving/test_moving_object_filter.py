@@ -105,7 +105,7 @@ def frames() -> list[Frame]:
 def landmarks_on_card(system: SlamSystem) -> int:
     """Landmarks nearer than halfway between the card and the plane."""
     table = system.mapper.world.landmarks
-    return int((table.points_world[table.alive, 2] < 1.65).sum())
+    return int((table.points_world[table.in_map, 2] < 1.65).sum())
 
 
 def position_error_m(system: SlamSystem) -> float:
@@ -166,7 +166,7 @@ def test_a_static_person_label_is_reinstated_within_half_a_second() -> None:
     assert not any(k.masked.any() for k in keyframes)
     assert system.moving_objects.tracks.tracks[0].stood
     table = system.mapper.world.landmarks
-    on_card = table.alive & (table.points_world[:, 2] < 1.65)
+    on_card = table.in_map & (table.points_world[:, 2] < 1.65)
     assert (table.observations[on_card] > 1).mean() > 0.5  # keyframes find each other's again
     assert np.isfinite(table.patch_views[on_card]).any(axis=(1, 2)).all()
     unmasked = run(frames, settings=["moving_objects.static_verification.stands_s=0.3"])

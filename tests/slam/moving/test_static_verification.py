@@ -175,7 +175,7 @@ def test_a_restored_state_continues_identically() -> None:
     other.restore(static_verification.state())
     same(other.state(), static_verification.state())
     assert [s.track_id for s in other.pending] == [7, 9]
-    assert [s.there for s in other.pending] == [2, 0]
+    assert [s.static_views for s in other.pending] == [2, 0]
     view = depth_view(depth(), CHECK.config.window_px)
     for one in (other, static_verification):
         (found,) = one.verify(14 / 30, view, np.eye(4), world)

@@ -114,9 +114,9 @@ def test_killed_in_a_frame_twice_and_resumed(sequence: Path, tmp_path: Path, fra
     deadly = partial(FakeSystem, on_frame=signal_at(frame, signal.SIGKILL))
     out = tmp_path / "out"
     first = options(sequence, out, stride=2, max_frames=9)
-    died = killed(lambda: run(first, deadly))
-    assert died == (frame < 18 and frame % 2 == 0)
-    if died:
+    was_killed = killed(lambda: run(first, deadly))
+    assert was_killed == (frame < 18 and frame % 2 == 0)
+    if was_killed:
         assert killed(lambda: resume(out, make_system=deadly))
         assert resume(out, make_system=FakeSystem) is not None
     assert result(out) == result(tmp_path / "undisturbed")

@@ -127,8 +127,8 @@ def test_a_wrong_map_gives_lost(what: str) -> None:
     else:
         world.landmarks.remove(ids)
     for config in (PLAIN, TrackingConfig()):
-        living = world.landmarks.living(ids)
-        tracked = Tracker(CAMERA, config).track(features, T_WORLD_CAMERA, ids, living, world)
+        in_map = world.landmarks.remaining(ids)
+        tracked = Tracker(CAMERA, config).track(features, T_WORLD_CAMERA, ids, in_map, world)
         assert tracked.status is TrackingStatus.LOST
 
 

@@ -26,14 +26,14 @@ def test_a_table_grows_and_keeps_its_rows() -> None:
         points.append(new["points_world"])
         np.testing.assert_array_equal(table.points_world, np.concatenate(points))
     assert len(table) == 6404
-    for name in ("descriptors", "directions", "patches", "alive", "in_graph", "visible"):
+    for name in ("descriptors", "directions", "patches", "in_map", "in_graph", "visible"):
         assert len(getattr(table, name)) == len(table), name
 
 
 def test_defaults_of_a_new_landmark() -> None:
     table = LandmarkTable()
     table.add(columns(2000, host=7))
-    assert table.alive.all()
+    assert table.in_map.all()
     assert not table.in_graph.any()
     assert (table.visible == 1).all()
     assert (table.found == 1).all()
@@ -59,10 +59,10 @@ def test_ids_of_removed_landmarks_are_not_reused() -> None:
     table.in_graph[ids] = True
     table.remove(np.array([1, 4]))
     asked = np.array([-1, 4, 0, 1, 5, -1, 0])
-    assert table.living(asked).tolist() == [0, 5, 0]
+    assert table.remaining(asked).tolist() == [0, 5, 0]
     assert np.flatnonzero(table.in_graph).tolist() == [0, 2, 3, 5]
     assert table.add(columns(2)).tolist() == [6, 7]
-    assert len(table.living(np.zeros(0, np.int64))) == 0
+    assert len(table.remaining(np.zeros(0, np.int64))) == 0
 
 
 def test_landmarks_move_rigidly_with_their_own_host() -> None:
@@ -117,11 +117,11 @@ def test_a_copy_gets_the_current_landmarks() -> None:
     table = LandmarkTable()
     table.add(columns(6))
     table.extent[np.arange(6)] = np.arange(6.0)
-    table.alive[[1, 2]] = False  # for a moment
-    table.set_alive(np.array([1, 1, 0, 1, 1, 0], bool))
+    table.in_map[[1, 2]] = False  # for a moment
+    table.set_in_map(np.array([1, 1, 0, 1, 1, 0], bool))
     assert table.extent[np.arange(6)].tolist() == [0, 1, 0, 3, 4, 0]
     table.extend_to(4)  # an owner that began anew
     table.extend_to(8)
-    table.set_alive(np.ones(8, bool))
+    table.set_in_map(np.ones(8, bool))
     assert table.extent[np.arange(8)].tolist() == [0, 1, 0, 3, 0, 0, 0, 0]
     assert len(np.unique(table.place)) == 8

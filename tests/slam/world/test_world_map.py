@@ -56,8 +56,8 @@ def assert_counts_are_true(world: WorldMap) -> None:
         _, ids = world.observed(keyframe)
         assert len(ids) == len(np.unique(ids)), f"keyframe {keyframe.id} sees a landmark twice"
         counted[ids] += 1
-    alive = world.landmarks.alive
-    np.testing.assert_array_equal(world.landmarks.observations[alive], counted[alive])
+    in_map = world.landmarks.in_map
+    np.testing.assert_array_equal(world.landmarks.observations[in_map], counted[in_map])
 
 
 def test_a_landmark_has_its_first_and_last_keyframe() -> None:
@@ -117,7 +117,7 @@ def test_fused_landmarks_leave_one_observation_a_keyframe() -> None:
     world.landmarks.visible[old] = 8
     removed = world.replace_landmarks(old, new)
     assert removed.tolist() == old.tolist()
-    assert not world.landmarks.alive[old].any()
+    assert not world.landmarks.in_map[old].any()
     assert [
         np.flatnonzero(k.landmark_ids == new[0]).tolist() for k in world.keyframes.values()
     ] == [
@@ -155,8 +155,8 @@ def test_counts_are_correct_after_random_changes(seed: int) -> None:
         rows = rng.permutation(COUNT)[:20]
         world.attach(keyframe, rows, rng.permutation(ids)[:20])
     for _ in range(4):
-        living = world.landmarks.living(ids)
-        chosen = rng.permutation(living)[:4]
+        in_map = world.landmarks.remaining(ids)
+        chosen = rng.permutation(in_map)[:4]
         world.replace_landmarks(chosen[:2], chosen[2:])
         assert_counts_are_true(world)
     keyframes = list(world.keyframes.values())
