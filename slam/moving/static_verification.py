@@ -263,7 +263,7 @@ class StaticVerification:
         stays = judged & (found.sum(axis=1) >= self.config.share * in_view)
         shift_m = [np.median(off_m[k, found[k]]) for k in np.flatnonzero(stays)]
         static_views = int(np.count_nonzero(np.abs(shift_m) < self.config.shift_m))
-        return static_views, int(np.count_nonzero(judged)) - there
+        return static_views, int(np.count_nonzero(judged)) - static_views
 
 
 def _about_to_be_removed(
