@@ -68,7 +68,7 @@ def main() -> None:
         render_sequence(config, sequence)
     truth = dataclasses.replace(read_camera(sequence / "camera.yaml"), depth_time_offset_s=DELAY_S)
     write_camera(out / "true.yaml", truth)
-    write_camera(out / "wrong.yaml", spoiled(truth))
+    write_camera(out / "wrong.yaml", wrong_camera(truth))
     cameras = ("true", "wrong", "found", "found again")
     errors = {name: errors_of(sequence, out, name) for name in cameras[:2]}
     for before, after in itertools.pairwise(cameras[1:]):
@@ -126,7 +126,7 @@ def repeated(sequence: Path, out: Path, camera: str, keypoints: int) -> Path:
     return path
 
 
-def spoiled(truth: Camera) -> Camera:
+def wrong_camera(truth: Camera) -> Camera:
     """The camera from which the calibration starts."""
     return dataclasses.replace(
         truth,

@@ -115,9 +115,9 @@ def times() -> None:
     _, smoother = session(150, 0, SmootherConfig(), cull=5)
     rng = np.random.default_rng(0)
     for _ in range(3):
-        victims = rng.choice(smoother.estimate().landmark_ids, 100, replace=False)
+        removed_ids = rng.choice(smoother.estimate().landmark_ids, 100, replace=False)
         started_s = time.process_time()
-        estimate = smoother.update(GraphUpdate(remove_landmarks=victims))
+        estimate = smoother.update(GraphUpdate(remove_landmarks=removed_ids))
         cpu_ms = 1e3 * (time.process_time() - started_s)
         own_ms = estimate.update_ms - estimate.solver_ms
         print(

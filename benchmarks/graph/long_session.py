@@ -51,8 +51,8 @@ class FrontEnd:
         self.poses = walk(ROUNDS, args.keyframes // ROUNDS, self.rng)
         self.points, self.on_wall = landmarks(PER_M2, self.rng)
         self.measurements, self.retires = args.measurements, retires
-        self.seen: list[Ints] = []
-        self.last_seen = np.full(len(self.points), -1)
+        self.observed_ids: list[Ints] = []
+        self.last_observed = np.full(len(self.points), -1)
         self.loops: list[tuple[int, int]] = []
         self._in_known_place = False
 
@@ -62,8 +62,8 @@ class FrontEnd:
         known = np.zeros(0, np.int64) if estimate is None else estimate.landmark_ids
         ids, z = self._measure(k)
         loops, ids, z = self._recognise(k, ids, z)
-        self.seen.append(ids)
-        self.last_seen[ids] = k
+        self.observed_ids.append(ids)
+        self.last_observed[ids] = k
         new = ~np.isin(ids, known)
         depth_m = CAMERA.stereo_bf_px_m / np.maximum(z[new, 0] - z[new, 2], 4.0)
         points = transform(T, CAMERA.backproject(z[new, :2], depth_m))
@@ -83,7 +83,7 @@ class FrontEnd:
         ids, z = visible(self.poses[k], self.points, self.on_wall)
         detected = self.rng.random(len(ids)) < FOUND
         ids, z = ids[detected], z[detected]
-        order = np.lexsort((self.rng.random(len(ids)), -self.last_seen[ids]))
+        order = np.lexsort((self.rng.random(len(ids)), -self.last_observed[ids]))
         chosen = np.sort(order[: self.measurements])
         noise = self.rng.normal(0, SIGMAS_PX, (len(chosen), 3))
         noise[:, 2] = noise[:, 0] - noise[:, 2]
@@ -93,12 +93,15 @@ class FrontEnd:
         self, k: int, ids: Ints, z: Array
     ) -> tuple[tuple[RelativePose, ...], Ints, Array]:
         """Where a known place begins, a loop to it; its landmarks are found from then on."""
-        again = (self.last_seen[ids] >= 0) & (self.last_seen[ids] < k - GAP)
+        again = (self.last_observed[ids] >= 0) & (self.last_observed[ids] < k - GAP)
         if self._in_known_place or again.mean() < 0.5:
             self._in_known_place &= bool(again.any())
             return (), ids, z
         self._in_known_place = True
-        shared = [int(np.isin(seen, ids[again]).sum()) for seen in self.seen[: k - GAP]]
+        shared = [
+            int(np.isin(observed_ids, ids[again]).sum())
+            for observed_ids in self.observed_ids[: k - GAP]
+        ]
         old = int(np.argmax(shared))
         noise = se3_exp(self.rng.normal(0, LOOP_SIGMAS))
         T_old_new = inverse(self.poses[old]) @ self.poses[k] @ noise
@@ -108,12 +111,14 @@ class FrontEnd:
 
     def _outside_window(self, in_graph: Ints) -> Ints:
         """As ``back_end.factor_selection.FactorSelector`` chooses what retires."""
-        mine = np.zeros(len(self.points), bool)
-        mine[self.seen[-1]] = True
-        shared = np.array([np.count_nonzero(mine[ids]) for ids in self.seen])
+        estimated = np.zeros(len(self.points), bool)
+        estimated[self.observed_ids[-1]] = True
+        shared = np.array([np.count_nonzero(estimated[ids]) for ids in self.observed_ids])
         near = np.lexsort((-np.arange(len(shared)), -shared))[: FEED.window_keyframes]
-        active = [self.seen[i] for i in near.tolist() if shared[i] >= FEED.window_min_shared]
-        waiting = np.setdiff1d(in_graph, np.concatenate([self.seen[-1], *active]))
+        active = [
+            self.observed_ids[i] for i in near.tolist() if shared[i] >= FEED.window_min_shared
+        ]
+        waiting = np.setdiff1d(in_graph, np.concatenate([self.observed_ids[-1], *active]))
         return waiting if len(waiting) >= FEED.marginalise_batch else waiting[:0]
 
     def _initial_pose(self, k: int, estimate: GraphEstimate | None) -> Array:
@@ -126,9 +131,11 @@ class FrontEnd:
 def ate_m(estimate: GraphEstimate, poses: Array) -> float:
     """RMSE (m) of the keyframes' positions after alignment by a rigid transform."""
     truth = poses[estimate.keyframe_ids, :3, 3]
-    mine = estimate.poses_world_camera[:, :3, 3]
-    T = align(mine, truth).T_reference_estimate
-    return float(np.sqrt(np.mean(np.sum((mine @ T[:3, :3].T + T[:3, 3] - truth) ** 2, axis=1))))
+    estimated = estimate.poses_world_camera[:, :3, 3]
+    T = align(estimated, truth).T_reference_estimate
+    return float(
+        np.sqrt(np.mean(np.sum((estimated @ T[:3, :3].T + T[:3, 3] - truth) ** 2, axis=1)))
+    )
 
 
 def session(

@@ -121,8 +121,8 @@ def compare(sequence: Sequence, focal_error: float, seeds: int) -> None:
             system = SlamSystem(camera, config)
             wrong = WrongLoops(system.mapper.loops, seed, let_in)
             name = "wrong ones let in" if let_in else "wrong beside right"
-            spoiled = go_on(system, sequence, start, f"{name}, seed {seed}")
-            change = spoiled["ate_rmse"] / closed["ate_rmse"] - 1
+            with_wrong_loops = go_on(system, sequence, start, f"{name}, seed {seed}")
+            change = with_wrong_loops["ate_rmse"] / closed["ate_rmse"] - 1
             print(f"  {wrong.count} wrong loops; change of ATE {100 * change:+.1f} %", flush=True)
 
 

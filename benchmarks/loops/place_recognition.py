@@ -98,11 +98,13 @@ def overlaps(made: list[View], camera: Camera) -> Array:
         for j, other in enumerate(made):
             T_other_view = inverse(other.T_world_camera) @ view.T_world_camera
             if np.trace(T_other_view[:3, :3]) > 1 + 2 * np.cos(np.deg2rad(60)):
-                share[i, j] = _seen(transform(T_other_view, points), other.depth_m, camera).mean()
+                share[i, j] = _visible(
+                    transform(T_other_view, points), other.depth_m, camera
+                ).mean()
     return share
 
 
-def _seen(points: Array, depth_m: Floats, camera: Camera) -> Mask:
+def _visible(points: Array, depth_m: Floats, camera: Camera) -> Mask:
     """Whether points (N, 3) of a camera are in its image, where the depth is theirs within 5 %."""
     z = np.maximum(points[:, 2], 0.1)
     pixels = camera.project(np.column_stack([points[:, :2], z])) / DEPTH_STEP_PX
@@ -144,7 +146,7 @@ def query_time(made: list[View], keyframes: int) -> QueryTime:
     config = IndexConfig()
     index, exact = DescriptorIndex(config), DescriptorIndex(IndexConfig(lists=1 << 30))
     for k in range(keyframes):
-        descriptors = elsewhere(made[k % len(made)].features.descriptors, k // len(made))
+        descriptors = changed_descriptors(made[k % len(made)].features.descriptors, k // len(made))
         index.add(k, descriptors)
         exact.add(k, descriptors)
     times_ms, found, expected = [], 0.0, 0.0
@@ -160,7 +162,7 @@ def query_time(made: list[View], keyframes: int) -> QueryTime:
     return QueryTime(keyframes, total, middle, worst, found / max(expected, 1))
 
 
-def elsewhere(descriptors: Bits, seed: int) -> Bits:
+def changed_descriptors(descriptors: Bits, seed: int) -> Bits:
     """The descriptors with 120 of 512 bits changed at random; seed 0: as they are."""
     if seed == 0:
         return descriptors

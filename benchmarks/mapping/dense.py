@@ -58,14 +58,17 @@ def measure(run: MappedRun, options: MapOptions) -> dict[str, Any]:
     cloud = read_ply(summary.folder / "cloud.ply")
     true = surface(truths, run)
     points = open3d_points(run, steps.keyframes)
-    mine = np.stack([cloud[c] for c in "xyz"], axis=1).astype(float)
+    cloud_points = np.stack([cloud[c] for c in "xyz"], axis=1).astype(float)
     return {
         "keyframes": len(run.keyframes),
         "depth": depth,
         "depth_where_measured": shared,
         "depth_of_a_patchy_sensor": patchy(run, truths, config),
         "ms": times,
-        "surface": {"cloud": surface_errors(mine, true), "tsdf": surface_errors(points, true)},
+        "surface": {
+            "cloud": surface_errors(cloud_points, true),
+            "tsdf": surface_errors(points, true),
+        },
         "labels": {
             "truth": label_errors(cloud, true),
             "light network": network_labels(options, true),
@@ -80,10 +83,10 @@ def network_labels(options: MapOptions, true: dict[str, Any]) -> dict[str, float
     shutil.copytree(options.run, copy, dirs_exist_ok=True, ignore=shutil.ignore_patterns("dense"))
     light = SegmenterOptions("light")
     summary = map_run(dataclasses.replace(options, run=copy, masks=light, plan=False))
-    known, wanted = (
+    known, true_labels = (
         make_segmenter(masks, sequence).labels for masks in (light, SegmenterOptions("truth"))
     )
-    numbers = np.array([wanted.number(name) for name in known.names])
+    numbers = np.array([true_labels.number(name) for name in known.names])
     cloud = read_ply(summary.folder / "cloud.ply")
     return label_errors({**cloud, "label": numbers[cloud["label"]]}, true)
 

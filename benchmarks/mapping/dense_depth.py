@@ -36,11 +36,11 @@ def depth_errors(maps: list[Map], truths: list[Truth], where: list[NDArray]) -> 
     for given, truth, mask in zip(maps, truths, where, strict=True):
         possible = np.isfinite(truth.depth_m) & mask
         error = given.depth_m() - truth.depth_m
-        seen = possible & np.isfinite(error)
-        errors.append(error[seen])
-        rho, variance = given.rho.numpy()[seen], given.variance.numpy()[seen]
-        chi2.append((rho - 1 / truth.depth_m[seen]) ** 2 / variance)
-        known.append(seen.sum() / possible.sum())
+        valid = possible & np.isfinite(error)
+        errors.append(error[valid])
+        rho, variance = given.rho.numpy()[valid], given.variance.numpy()[valid]
+        chi2.append((rho - 1 / truth.depth_m[valid]) ** 2 / variance)
+        known.append(valid.sum() / possible.sum())
     e, c = np.concatenate(errors), np.concatenate(chi2)
     inlier = np.abs(e) < OUTLIER_M
     return {

@@ -154,15 +154,15 @@ def session(sequence: Sequence, count: int) -> Iterator[str]:
             _save(finished, folder, sequence.camera)
             fused_s += time.perf_counter() - started_s
             if (number + 1) % (count // 6) == 0:
-                took_ms = 1e3 * fused_s / (count // 6)
-                yield f"{number + 1:9} {rss_mb():10.0f} {in_use_mb():10.0f} {took_ms:14.0f}"
+                keyframe_ms = 1e3 * fused_s / (count // 6)
+                yield f"{number + 1:9} {rss_mb():10.0f} {in_use_mb():10.0f} {keyframe_ms:14.0f}"
                 fused_s = 0.0
         _save(mapper.flush(), folder, sequence.camera)
         started_s = time.perf_counter()
         points = _write_cloud(folder, poses, Path(temporary))
-        took_s = time.perf_counter() - started_s
+        wall_s = time.perf_counter() - started_s
         size_mb = sum(f.stat().st_size for f in folder.path.rglob("*") if f.is_file()) / 1e6
-        yield f"cloud of {points} points: {took_s:.0f} s, {rss_mb():.0f} MB"
+        yield f"cloud of {points} points: {wall_s:.0f} s, {rss_mb():.0f} MB"
         yield f"most memory at any time: {peak_rss_mb():.0f} MB; on disk {size_mb:.0f} MB"
 
 

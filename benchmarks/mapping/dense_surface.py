@@ -33,14 +33,14 @@ class Truth:
     T_world_camera: Array
 
 
-def aligned(mine: Array, true: Array) -> Array:
+def aligned(estimated: Array, true: Array) -> Array:
     """T_mine_true (4, 4) that brings true poses (N, 4, 4) nearest to mine, in turn and place.
 
     By turns first: positions alone leave open the turn about a path that is nearly straight.
     """
-    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", mine[:, :3, :3], true[:, :3, :3]))
+    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", estimated[:, :3, :3], true[:, :3, :3]))
     R = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    return make_pose(R, (mine[:, :3, 3] - true[:, :3, 3] @ R.T).mean(axis=0))
+    return make_pose(R, (estimated[:, :3, 3] - true[:, :3, 3] @ R.T).mean(axis=0))
 
 
 def read_truth(run: MappedRun) -> list[Truth]:
@@ -48,14 +48,14 @@ def read_truth(run: MappedRun) -> list[Truth]:
     assert run.sequence.groundtruth is not None
     poses = run.sequence.groundtruth.poses_world_camera
     true = np.stack([poses[k.frame_index] for k in run.keyframes])
-    mine = np.stack([k.T_world_camera for k in run.keyframes])
-    T_mine_true = aligned(mine, true)
+    estimated = np.stack([k.T_world_camera for k in run.keyframes])
+    T_estimated_true = aligned(estimated, true)
     found = []
     for keyframe, T in zip(run.keyframes, true, strict=True):
         name = run.sequence.pairs.depth_files[keyframe.frame_index].name
         stored = cv2.imread(str(run.sequence.folder / "depth_true" / name), cv2.IMREAD_UNCHANGED)
         depth_m = (stored / run.camera.depth_scale).astype(np.float32)
-        found.append(Truth(np.where(stored > 0, depth_m, np.nan), T_mine_true @ T))
+        found.append(Truth(np.where(stored > 0, depth_m, np.nan), T_estimated_true @ T))
     return found
 
 
@@ -120,7 +120,10 @@ def label_errors(cloud: dict[str, Any], true: dict[str, Any]) -> dict[str, float
     points = np.stack([cloud[c] for c in "xyz"], axis=1).astype(float)
     distance, index = cKDTree(true["points"]).query(points, workers=1)
     near = distance < 0.02
-    mine, real = cloud["label"][near].astype(int), true["labels"][index[near]].astype(int)
+    estimated, real = cloud["label"][near].astype(int), true["labels"][index[near]].astype(int)
     classes = np.unique(real)
-    ious = [np.sum((mine == c) & (real == c)) / np.sum((mine == c) | (real == c)) for c in classes]
-    return {"accuracy": float(np.mean(mine == real)), "mean_iou": float(np.mean(ious))}
+    ious = [
+        np.sum((estimated == c) & (real == c)) / np.sum((estimated == c) | (real == c))
+        for c in classes
+    ]
+    return {"accuracy": float(np.mean(estimated == real)), "mean_iou": float(np.mean(ious))}

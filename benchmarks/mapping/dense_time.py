@@ -50,17 +50,17 @@ def step_times_ms(steps: Steps, run: MappedRun, config: DenseConfig) -> dict[str
     for _ in range(ROUNDS):
         for name, work in {**works, **together}.items():
             torch.set_num_threads(1)
-            processor[name] = min(processor[name], _took_ms(work, time.process_time))
+            processor[name] = min(processor[name], _time_ms(work, time.process_time))
             if name in wall:
                 torch.set_num_threads(2)
-                wall[name] = min(wall[name], _took_ms(work, time.perf_counter))
+                wall[name] = min(wall[name], _time_ms(work, time.perf_counter))
     torch.set_num_threads(threads)
     for times in filter(None, (processor, wall)):
         times["TSDF"] /= len(steps.keyframes)
     return {"processor": processor, "wall": wall, "load": load}
 
 
-def _took_ms(work: Callable[[], Any], clock: Callable[[], float]) -> float:
+def _time_ms(work: Callable[[], Any], clock: Callable[[], float]) -> float:
     started_s = clock()
     work()
     return 1e3 * (clock() - started_s)

@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from benchmarks.moving.dynamic_pairs import CAMERA as MAN_CAMERA
+from benchmarks.moving.dynamic_pairs import CAMERA as PERSON_CAMERA
 from benchmarks.moving.dynamic_pairs import DATA as PAIRS
-from benchmarks.moving.dynamic_pairs import man_in, read_pair
+from benchmarks.moving.dynamic_pairs import person_mask, read_pair
 from benchmarks.pages import table
 from benchmarks.paths import KITCHEN
 from bmask_slam.config.configuration import resolve
@@ -51,7 +51,9 @@ def walk(poses: Array, stamps_s: Array) -> Array:
     return np.asarray(CubicSpline(knots_s, places)(stamps_s))
 
 
-def composed(frame: Frame, man: Frame, place_camera: Array, focal_px: tuple[float, float]) -> Frame:
+def composed(
+    frame: Frame, person: Frame, place_camera: Array, focal_px: tuple[float, float]
+) -> Frame:
     """A frame with the man standing at a place (3,) in its camera's frame.
 
     Args:
@@ -60,9 +62,9 @@ def composed(frame: Frame, man: Frame, place_camera: Array, focal_px: tuple[floa
         place_camera: his middle.
         focal_px: focal length and centre column of the recording's camera.
     """
-    mask = cv2.erode(man_in(man).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    middle_m = float(np.nanmedian(man.depth_m[mask]))
-    scale = focal_px[0] / MAN_CAMERA.fx * middle_m / place_camera[2]
+    mask = cv2.erode(person_mask(person).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    middle_m = float(np.nanmedian(person.depth_m[mask]))
+    scale = focal_px[0] / PERSON_CAMERA.fx * middle_m / place_camera[2]
     columns = np.flatnonzero(mask.any(axis=0))
     u = focal_px[0] * place_camera[0] / place_camera[2] + focal_px[1]
     height, width = frame.depth_m.shape
@@ -70,8 +72,8 @@ def composed(frame: Frame, man: Frame, place_camera: Array, focal_px: tuple[floa
     M = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
     size = (width, height)
     covered = cv2.warpAffine(mask.astype(np.uint8), M, size, flags=cv2.INTER_NEAREST) > 0
-    rgb = cv2.warpAffine(man.rgb, M, size, flags=cv2.INTER_AREA)
-    filled = np.nan_to_num(man.depth_m)
+    rgb = cv2.warpAffine(person.rgb, M, size, flags=cv2.INTER_AREA)
+    filled = np.nan_to_num(person.depth_m)
     depth_m = cv2.warpAffine(filled, M, size, flags=cv2.INTER_NEAREST)
     depth_m = np.where(depth_m > 0, depth_m - middle_m + place_camera[2], np.nan)
     covered &= ~(frame.depth_m < np.where(np.isnan(depth_m), place_camera[2], depth_m))
@@ -90,15 +92,15 @@ def make(folder: Path, frames: int) -> None:
     poses = truth.poses_world_camera[:frames]
     stamps_s = truth.timestamps_s[:frames]
     places = walk(poses, stamps_s)
-    men = [read_pair(PAIRS / "test1")[0], read_pair(PAIRS / "test2")[0]]
+    people = [read_pair(PAIRS / "test1")[0], read_pair(PAIRS / "test2")[0]]
     camera, marks = kitchen.camera, list[list[VisibleInstance]]()
     stamps = [f"{t:.6f}" for t in stamps_s]
     for i in range(frames):
         frame = kitchen.load(i)
         place = transform(inverse(poses[i]), places[i : i + 1])[0]
-        man = men[int(stamps_s[i] / LEG_S) % 2]
+        person = people[int(stamps_s[i] / LEG_S) % 2]
         focal_px = camera.fx, camera.cx
-        new = composed(frame, man, place, focal_px) if place[2] > 0.5 else frame
+        new = composed(frame, person, place, focal_px) if place[2] > 0.5 else frame
         changed: Mask = (new.rgb != frame.rgb).any(axis=2)
         changed |= ~np.isclose(new.depth_m, frame.depth_m, equal_nan=True)
         instances = changed.astype(np.uint16)

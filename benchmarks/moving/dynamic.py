@@ -28,7 +28,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.moving.moving_points import KINDS, NEAR_PX, MovingTruth, WatchedSystem, strip
+from benchmarks.moving.moving_points import KINDS, NEAR_PX, CountingSystem, MovingTruth, strip
 from benchmarks.pages import table
 from bmask_slam.config.configuration import resolve
 from bmask_slam.datasets.weights import find_weights
@@ -61,7 +61,7 @@ VARIANTS = {
 """Name to whether labels and geometry count."""
 FPS_HZ = 15.0
 PICTURES = 8
-ASKED = (0.15, 0.5)
+WANTED_COVERAGE = (0.15, 0.5)
 """How much of a picture people are to cover."""
 
 
@@ -82,13 +82,13 @@ class Outcome:
     variant: str
     ate_mm: float
     tracked_share: float
-    left_out: dict[str, float | None]
+    excluded: dict[str, float | None]
     check_ms: tuple[float, float]
     mostly_moving: int
     covered: list[float]
 
 
-class IdealSystem(WatchedSystem):
+class IdealSystem(CountingSystem):
     """Leaves out what the truth says, in every frame."""
 
     def _without_moving(self, frame: Frame, features: Features) -> StaticFeatures:
@@ -149,8 +149,8 @@ def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespac
     systems = []
     frames = len((folder / "rgb.txt").read_text().splitlines()) - 2
 
-    def make(camera: Camera, config: SystemConfig) -> WatchedSystem:
-        kind = IdealSystem if variant == IDEAL else WatchedSystem
+    def make(camera: Camera, config: SystemConfig) -> CountingSystem:
+        kind = IdealSystem if variant == IDEAL else CountingSystem
         system = kind(camera, config, segmenter)
         systems.append(system.watch(MovingTruth(folder), frames // PICTURES))
         return system
@@ -169,7 +169,7 @@ def measure(folder: Path, scene: str, variant: str, arguments: argparse.Namespac
         variant=variant,
         ate_mm=1e3 * metrics.get("ate_rmse", float("nan")),
         tracked_share=metrics["tracked_share"],
-        left_out={k: None if np.isnan(share) else share for k, share in shares.items()},
+        excluded={k: None if np.isnan(share) else share for k, share in shares.items()},
         check_ms=(float(check_ms[0]), float(check_ms[1])),
         mostly_moving=sum(int(row["mostly_moving"]) for row in rows),
         covered=systems[0].covered,
@@ -187,7 +187,7 @@ def report(outcomes: Sequence[Outcome]) -> str:
         (
             *(o.scene, o.variant, f"{o.ate_mm:.2f}", f"{o.ate_mm / clean_mm:.2f}"),
             f"{100 * o.tracked_share:.0f} %",
-            *("" if s is None else f"{100 * s:.1f} %" for s in o.left_out.values()),
+            *("" if s is None else f"{100 * s:.1f} %" for s in o.excluded.values()),
             "{:.2f}, {:.2f}".format(*o.check_ms),
         )
         for o in outcomes
@@ -202,9 +202,9 @@ def coverage(outcomes: Sequence[Outcome]) -> str:
         if not (there := covered[covered > 0]).size:
             continue
         shares = there.mean(), *np.quantile(there, [0.1, 0.9]), there.max()
-        asked = (there >= ASKED[0]) & (there <= ASKED[1])
-        rows.append((scene, *(f"{100 * s:.0f} %" for s in (*shares, asked.mean()))))
-    low, high = (f"{100 * share:.0f}" for share in ASKED)
+        in_range = (there >= WANTED_COVERAGE[0]) & (there <= WANTED_COVERAGE[1])
+        rows.append((scene, *(f"{100 * s:.0f} %" for s in (*shares, in_range.mean()))))
+    low, high = (f"{100 * share:.0f}" for share in WANTED_COVERAGE)
     header = ("scene", "covered: mean", "10 %", "90 %", "most", f"frames of {low}-{high} %")
     return table(header, rows)
 

@@ -52,7 +52,7 @@ def read_pair(folder: Path) -> list[Frame]:
     return frames
 
 
-def man_in(frame: Frame) -> Mask:
+def person_mask(frame: Frame) -> Mask:
     """(H, W) the pixels of the man."""
     polygon = np.array(json.loads(MASKS.read_text())["man"][frame.name])
     mask = np.zeros(frame.depth_m.shape, np.uint8)
@@ -91,7 +91,7 @@ def main() -> None:
             found = moving_points(
                 pair, config, make_segmenter(options, arguments.data, find_weights)
             )
-            masks = {"man": man_in(pair[1])}
+            masks = {"man": person_mask(pair[1])}
             counts = count(*found, masks)
             total = {kind: total[kind] + counts[kind] for kind in total}
             pictures.append(picture(pair[1], found, masks))

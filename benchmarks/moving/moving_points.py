@@ -65,15 +65,15 @@ class Count:
     """Keypoints on something, and how many of them were left out."""
 
     on: int = 0
-    left_out: int = 0
+    excluded: int = 0
 
     def __add__(self, other: Count) -> Count:
-        return Count(self.on + other.on, self.left_out + other.left_out)
+        return Count(self.on + other.on, self.excluded + other.excluded)
 
     @property
     def share(self) -> float:
         """Of the keypoints on it, those that were left out; NaN without any."""
-        return self.left_out / self.on if self.on else float("nan")
+        return self.excluded / self.on if self.on else float("nan")
 
 
 Counts = Mapping[str, Count]
@@ -102,7 +102,7 @@ def picture(frame: Frame, static: tuple[Array, Mask], masks: Mapping[str, Mask])
     return np.asarray(cv2.resize(drawn, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
-class WatchedSystem(SlamSystem):
+class CountingSystem(SlamSystem):
     """The system; keeps the counts of every frame, and pictures of every ``every``-th.
 
     ``check_ms`` is the processor's time that a frame's dynamic check took, which other programs
@@ -113,7 +113,7 @@ class WatchedSystem(SlamSystem):
     truth: MovingTruth
     every: int
 
-    def watch(self, truth: MovingTruth, every: int) -> WatchedSystem:
+    def watch(self, truth: MovingTruth, every: int) -> CountingSystem:
         """Begin to count."""
         self.truth, self.every = truth, every
         self.counts: list[dict[str, Count]] = []
@@ -131,11 +131,11 @@ class WatchedSystem(SlamSystem):
         static = super()._without_moving(frame, features)
         self.check_ms.append(1e3 * (time.thread_time() - begun_s))
         masks = self.truth.masks(frame)
-        seen = features.image_pixels, static.moving
-        self.counts.append(count(*seen, masks))
+        keypoints = features.image_pixels, static.moving
+        self.counts.append(count(*keypoints, masks))
         self.covered.append(float(np.any(list(masks.values()), axis=0).mean()))
         if frame.index % self.every == self.every // 2:
-            self.pictures.append(picture(frame, seen, masks))
+            self.pictures.append(picture(frame, keypoints, masks))
         return static
 
     def _learn_motion(self, frame: Frame, tracked: Tracked, static: StaticFeatures) -> bool:
@@ -165,14 +165,14 @@ def main() -> None:
     segmenter = make_segmenter(SegmenterOptions(options.segmenter), options.sequence)
     config = resolve(SystemConfig, None, options.set)
     frames = min(options.frames or len(sequence), len(sequence))
-    system = WatchedSystem(sequence.camera, config, segmenter)
+    system = CountingSystem(sequence.camera, config, segmenter)
     system.watch(MovingTruth(options.sequence), max(frames // 12, 1))
     for frame in sequence.frames():
         if frame.index >= frames:
             break
         system.process(frame)
         if frame.index % 10 == 0:
-            print(frame.index, {k: (c.on, c.left_out) for k, c in system.counts[-1].items()})
+            print(frame.index, {k: (c.on, c.excluded) for k, c in system.counts[-1].items()})
     print("check ms: median {:.2f}, 95 % {:.2f}".format(*np.percentile(system.check_ms, [50, 95])))
     for kind in (*KINDS, "rest"):
         total = system.total(kind)

@@ -42,7 +42,7 @@ class ImperfectSegmenter:
     def segment(self, image: Image, name: str) -> list[Instance]:
         """Instances in an image (H, W, 3), best mask score first."""
         rng = np.random.default_rng([self.seed, crc32(name.encode())])
-        found = [self._spoilt(i, rng) for i in self.inner.segment(image, name)]
+        found = [self._with_errors(i, rng) for i in self.inner.segment(image, name)]
         kept = [i for i in found if i is not None and rng.random() >= self.errors.missed]
         for _ in range(rng.poisson(self.errors.invented)):
             kept.append(self._invented(image.shape[:2], rng))
@@ -51,7 +51,7 @@ class ImperfectSegmenter:
                 kept[k] = self._joined(kept[k], kept[k - 1])
         return sorted(kept, key=lambda i: -i.mask_score)
 
-    def _spoilt(self, instance: Instance, rng: np.random.Generator) -> Instance | None:
+    def _with_errors(self, instance: Instance, rng: np.random.Generator) -> Instance | None:
         """With a mask that is too large or small, and perhaps another class."""
         change = int(np.clip(np.rint(rng.normal(0, self.errors.border_px)), -5, 5))
         kernel = np.ones((2 * abs(change) + 1,) * 2, np.uint8)

@@ -79,7 +79,7 @@ class RunCounters:
     sure_best_view: list[Array] = field(default_factory=list)
     correct_best_view: list[Array] = field(default_factory=list)
     objects: int = 0
-    told: int = 0
+    reported: int = 0
     found: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KINDS, 0))
     per_sequence: list[str] = field(default_factory=list)
 
@@ -143,11 +143,11 @@ def measure(system: SlamSystem, sequence: Sequence, counters: RunCounters, verbo
     before = replace(counters)
     measure_landmarks(system, truths, T_truth_world, categories, counters)
     lines = measure_objects(system, sequence, (truths, T_truth_world, categories), counters)
-    told, objects = counters.told - before.told, counters.objects - before.objects
+    reported, objects = counters.reported - before.reported, counters.objects - before.objects
     share = (counters.right - before.right) / max(counters.on_objects - before.on_objects, 1)
     counters.per_sequence.append(
         f"{sequence.name}: {len(keyframes)} keyframes, landmarks on objects right {share:.3f}, "
-        f"{objects} objects, {told} told\n" + ("\n".join(lines) if verbose else "")
+        f"{objects} objects, {reported} told\n" + ("\n".join(lines) if verbose else "")
     )
 
 
@@ -206,20 +206,20 @@ def measure_landmarks(
         rows, (u, v) = ahead[inside], pixels[inside].T
         near = np.abs(truth.depth_m[v, u] - local[rows, 2]) < 0.02 + 0.01 * local[rows, 2] ** 2
         counts[rows[near], categories[truth.instances[v, u]][near]] += 1
-    seen = counts.sum(axis=1) > 0
-    label = counts.argmax(axis=1)[seen]
+    visible = counts.sum(axis=1) > 0
+    label = counts.argmax(axis=1)[visible]
     found = cloud.labels.estimates
-    best = [view_label(system, i) for i in cloud.ids[seen].tolist()]
+    best = [view_label(system, i) for i in cloud.ids[visible].tolist()]
     best_label, best_p = (np.array(column) for column in zip(*best, strict=True))
-    right, best_right = found.labels[seen] == label, best_label == label
+    right, best_right = found.labels[visible] == label, best_label == label
     on = label > 0
     counters.on_objects += int(on.sum())
     counters.right += int(right[on].sum())
     counters.right_best_view += int(best_right[on].sum())
     counters.background += int((~on).sum())
     counters.background_right += int(right[~on].sum())
-    spoken = found.views[seen] > 0
-    counters.sure.append(found.probability[seen][spoken])
+    spoken = found.views[visible] > 0
+    counters.sure.append(found.probability[visible][spoken])
     counters.correct.append(right[spoken])
     counters.sure_best_view.append(best_p[spoken])
     counters.correct_best_view.append(best_right[spoken])
@@ -243,18 +243,18 @@ def measure_objects(
     truths, T_truth_world, categories = truth
     (visible, minor), (measurable, _) = (visible_boxes(system, truths, m) for m in (False, True))
     whole = whole_boxes(sequence.folder)
-    told = [(o, moved(o, T_truth_world)) for o in system.objects().objects if o.label]
+    reported = [(o, moved(o, T_truth_world)) for o in system.objects().objects if o.label]
     lines, ids = [], sorted(visible)
     counters.objects += len(ids)
     ignored: set[int] = set()
     for kind, boxes in (("whole", whole), ("visible", visible), ("measured", measurable)):
-        ious = pair_ious(told, [(categories[i], boxes.get(i)) for i in ids])
+        ious = pair_ious(reported, [(categories[i], boxes.get(i)) for i in ids])
         rows, columns = linear_sum_assignment(-ious)
         good = ious[rows, columns] >= MIN_IOU
         counters.found[kind] += int(good.sum())
     hit = set(rows[good].tolist())
-    extra = pair_ious(told, [(categories[i], b) for i, b in sorted(minor.items())])
-    for k, (o, box) in enumerate(told):
+    extra = pair_ious(reported, [(categories[i], b) for i, b in sorted(minor.items())])
+    for k, (o, box) in enumerate(reported):
         if k in hit:
             continue
         if extra.size and extra[k].max() >= 0.1:
@@ -267,7 +267,7 @@ def measure_objects(
             name = system.semantics.names.names[categories[i]]
             size = visible[i].size_m.round(2)
             lines.append(f"  missed {name} {i} size {size} best iou {ious[:, j].max():.2f}")
-    counters.told += len(told) - len(ignored)
+    counters.reported += len(reported) - len(ignored)
     return lines
 
 
@@ -276,11 +276,11 @@ def moved(o: MapObject, T_truth_world: Array) -> OrientedBox:
 
 
 def pair_ious(
-    told: list[tuple[MapObject, OrientedBox]], true: list[tuple[int, OrientedBox | None]]
+    reported: list[tuple[MapObject, OrientedBox]], true: list[tuple[int, OrientedBox | None]]
 ) -> Array:
     """(N, M), 0 where the labels differ."""
-    ious = np.zeros((len(told), len(true)))
-    for a, (o, box) in enumerate(told):
+    ious = np.zeros((len(reported), len(true)))
+    for a, (o, box) in enumerate(reported):
         for b, (label, other) in enumerate(true):
             if other is None or o.label != label:
                 continue
@@ -359,7 +359,11 @@ def draw_reliability(path: Path, counters: RunCounters) -> None:
 def report(counters: RunCounters) -> str:
     fused = calibration_error(np.concatenate(counters.sure), np.concatenate(counters.correct))[0]
     best = np.concatenate(counters.sure_best_view), np.concatenate(counters.correct_best_view)
-    on, told, objects = max(counters.on_objects, 1), max(counters.told, 1), max(counters.objects, 1)
+    on, reported, objects = (
+        max(counters.on_objects, 1),
+        max(counters.reported, 1),
+        max(counters.objects, 1),
+    )
     behind = max(counters.background, 1)
     rows = [
         f"landmarks on objects           {counters.on_objects}",
@@ -369,10 +373,10 @@ def report(counters: RunCounters) -> str:
         f"  right ('unknown')            {counters.background_right / behind:.3f}",
         f"calibration error              {fused:.3f}",
         f"  of the best view alone       {calibration_error(*best)[0]:.3f}",
-        f"objects to find, told          {counters.objects}, {counters.told}",
+        f"objects to find, reported       {counters.objects}, {counters.reported}",
     ]
     for kind, found in counters.found.items():
-        precision, recall = found / told, found / objects
+        precision, recall = found / reported, found / objects
         rows.append(f"  {kind:8} boxes: precision {precision:.3f}, recall {recall:.3f}")
     return "\n".join(rows)
 

@@ -109,8 +109,8 @@ def true_pixels(first: _View, second: _View, camera: Camera) -> tuple[Ints, Arra
     known, points = known[front], points[front]
     places = camera.project(points)
     there_m = true_depth_at(second.true_depth_m, places)
-    seen = np.abs(there_m - points[:, 2]) < FLAT_SHARE * points[:, 2]
-    return known[seen], places[seen], (depth_m[known] / points[:, 2])[seen]
+    visible = np.abs(there_m - points[:, 2]) < FLAT_SHARE * points[:, 2]
+    return known[visible], places[visible], (depth_m[known] / points[:, 2])[visible]
 
 
 def match_errors(first: _View, second: _View, camera: Camera) -> tuple[Array, Array, Array]:

@@ -79,34 +79,34 @@ class Outcome:
     tracking_ms: float
 
 
-def sequence_of(wanted: Input, into: Path) -> Path:
+def sequence_of(entry: Input, into: Path) -> Path:
     """The folder of an input, made if it is not there."""
-    source = SHARED / wanted.source
+    source = SHARED / entry.source
     if not source.is_dir():
-        source = into / wanted.source
+        source = into / entry.source
         if not source.is_dir():
             render_sequence(RenderConfig("office", frames=300), source)
-    if wanted.hardship is None:
+    if entry.hardship is None:
         return source
-    done = wanted.hardship
+    done = entry.hardship
     name = (
-        f"{wanted.source}-{done.stride}-{done.max_frames}-{done.shutter}-{done.box_px}"
+        f"{entry.source}-{done.stride}-{done.max_frames}-{done.shutter}-{done.box_px}"
         f"-{done.readout_s}-{done.restamp}"
     )
     return make_hard(source, done, into / name)
 
 
-def outcome(wanted: Input, into: Path, settings: list[str]) -> Outcome:
+def outcome(entry: Input, into: Path, settings: list[str]) -> Outcome:
     """Run an input."""
-    sequence = sequence_of(wanted, into)
+    sequence = sequence_of(entry, into)
     config = resolve(SystemConfig, None, settings)
     with TemporaryDirectory() as folder:
         out, camera = Path(folder) / "run", None
-        if wanted.timing:
+        if entry.timing:
             camera = Path(folder) / "camera.yaml"
-            write_camera(camera, replace(read_camera(sequence / "camera.yaml"), **wanted.timing))
-        run(RunOptions(sequence, config, out=out, camera=camera, stride=wanted.stride, quiet=True))
-        return _read(out, sequence, wanted.hand_eye)
+            write_camera(camera, replace(read_camera(sequence / "camera.yaml"), **entry.timing))
+        run(RunOptions(sequence, config, out=out, camera=camera, stride=entry.stride, quiet=True))
+        return _read(out, sequence, entry.hand_eye)
 
 
 def _read(out: Path, sequence: Path, hand_eye: bool) -> Outcome:
@@ -161,13 +161,13 @@ def main() -> None:
     given = parser.parse_args()
     first = True
     for name in given.names or INPUTS:
-        wanted, settings = INPUTS[name], list(given.settings)
+        entry, settings = INPUTS[name], list(given.settings)
         kind = ["semantics.segmenter.name=none"]
-        if given.masks and (given.masks / wanted.source).is_dir():
-            file = given.masks / wanted.source / "annotations.json"
+        if given.masks and (given.masks / entry.source).is_dir():
+            file = given.masks / entry.source / "annotations.json"
             kind = ["semantics.segmenter.name=precomputed", f"semantics.segmenter.masks={file}"]
         outcomes = [
-            outcome(wanted, given.into, [*kind, *settings, other_keypoints(k)])
+            outcome(entry, given.into, [*kind, *settings, other_keypoints(k)])
             for k in range(given.repeats)
         ]
         lines = table(HEADER, [row(name, outcomes)]).splitlines()

@@ -55,12 +55,12 @@ def draw_landmarks(frame: Frame, camera: Camera, T_world_camera: Array, points: 
     inside = (pixels >= 0).all(axis=1) & (pixels <= limit).all(axis=1)
     pixels, depth_m = pixels[inside], depth_m[inside]
     column, row = np.rint(pixels).astype(int).T
-    seen = np.abs(frame.depth_m[row, column] - depth_m) < AGREEMENT * depth_m
+    visible = np.abs(frame.depth_m[row, column] - depth_m) < AGREEMENT * depth_m
     gray = cv2.cvtColor(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     size = (SUPERSAMPLING * camera.width, SUPERSAMPLING * camera.height)
     picture = cv2.resize(cv2.addWeighted(frame.rgb, 0.6, gray, 0.4, 0), size)
     colours = depth_colours(depth_m)
-    for k in np.flatnonzero(seen)[np.argsort(-depth_m[seen])]:
+    for k in np.flatnonzero(visible)[np.argsort(-depth_m[visible])]:
         centre = np.rint(SUPERSAMPLING * (pixels[k] + 0.5) - 0.5).astype(int).tolist()
         radius = int(np.clip(SUPERSAMPLING * 0.0125 * camera.fx / depth_m[k], 4, 14))
         cv2.circle(picture, centre, radius, colours[k].tolist(), 2, cv2.LINE_AA)

@@ -79,7 +79,7 @@ class DepthSegments:
     def held(self, moving: Mask, point_motions: PointMotions) -> Mask:
         """Mask (h, w) of samples that moving ones (h, w) carry, such as a box held by a person.
 
-        Only samples that no view observed: a table that the person touches was seen to be static.
+        Only samples that no view observed: a table that the person touches was observed as static.
         Carried and moving samples are split into connected pieces; in each the load must not be too
         large for what carries it, nor both together too large for one thing.
         """

@@ -15,7 +15,7 @@ from bmask_slam.world.map_editor import MapReader
 
 @dataclass(frozen=True, eq=False)
 class BufferedView:
-    """The depth view of a frame: ``seen`` as recorded, ``view`` without what moved.
+    """The depth view of a frame: ``full`` as recorded, ``view`` without moving parts.
 
     Its pose is ``T_keyframe_camera`` (4, 4) relative to a keyframe, which is mostly itself.
     """
@@ -23,7 +23,7 @@ class BufferedView:
     keyframe_id: int
     timestamp_s: float
     view: DepthView
-    seen: DepthView
+    full: DepthView
     T_keyframe_camera: Array
 
 
@@ -33,7 +33,7 @@ class PosedView(NamedTuple):
     keyframe_id: int
     timestamp_s: float
     view: DepthView
-    seen: DepthView
+    full: DepthView
     T_world_camera: Array
 
 
@@ -62,12 +62,12 @@ class DepthViewBuffer:
         """
         if self.views and abs(timestamp_s - self.views[-1].timestamp_s) < self.interval_s:
             return
-        seen = view.thinned(THINNED)
-        thin = seen.thinned(1)
+        full = view.thinned(THINNED)
+        thin = full.thinned(1)
         if moving is not None:
             _clear(thin, moving.covers(thin.nearest_m, thin.step))
         pose = np.eye(4) if T_keyframe_camera is None else T_keyframe_camera
-        self.views.append(BufferedView(keyframe_id, timestamp_s, thin, seen, pose))
+        self.views.append(BufferedView(keyframe_id, timestamp_s, thin, full, pose))
         del self.views[: -self.count]
 
     def posed(self, segment: int, map_reader: MapReader) -> list[PosedView]:
@@ -79,7 +79,7 @@ class DepthViewBuffer:
             if parent is not None and parent.segment == segment:
                 pose = parent.T_world_camera @ T_parent_keyframe @ kept.T_keyframe_camera
                 when = kept.keyframe_id, kept.timestamp_s
-                found.append(PosedView(*when, kept.view, kept.seen, pose))
+                found.append(PosedView(*when, kept.view, kept.full, pose))
         return found
 
     def clear_depth(self, keyframe_id: int, covered: Mask) -> None:
@@ -91,8 +91,8 @@ class DepthViewBuffer:
         """Restore a keyframe's view where a mask (H, W) shows something static."""
         for kept in self._of(keyframe_id):
             where = _thinned_to(kept.view, covered)
-            kept.view.nearest_m[where] = kept.seen.nearest_m[where]
-            kept.view.farthest_m[where] = kept.seen.farthest_m[where]
+            kept.view.nearest_m[where] = kept.full.nearest_m[where]
+            kept.view.farthest_m[where] = kept.full.farthest_m[where]
 
     def clear(self) -> None:
         """Remove all views: another recording begins."""
@@ -109,8 +109,8 @@ class DepthViewBuffer:
             "step": np.array([v.view.step for v in views], np.int64),
             "shape": np.array([s.shape for s in speak[:1]], np.int64).ravel(),
             "speak": np.packbits(np.array(speak, bool)),
-            "nearest_m": np.array([v.seen.nearest_m for v in views], np.float32).ravel(),
-            "farthest_m": np.array([v.seen.farthest_m for v in views], np.float32).ravel(),
+            "nearest_m": np.array([v.full.nearest_m for v in views], np.float32).ravel(),
+            "farthest_m": np.array([v.full.farthest_m for v in views], np.float32).ravel(),
         }
 
     def restore(self, state: Arrays) -> None:
@@ -125,10 +125,10 @@ class DepthViewBuffer:
         for i, stamp_s, T, step, known, near, far in zip(
             ids, stamps_s, poses, steps, known_pixels, *depths, strict=True
         ):
-            seen = DepthView(near.copy(), far.copy(), step)
-            view = seen.thinned(1)
+            full = DepthView(near.copy(), far.copy(), step)
+            view = full.thinned(1)
             _clear(view, ~known)
-            self.views.append(BufferedView(i, stamp_s, view, seen, T))
+            self.views.append(BufferedView(i, stamp_s, view, full, T))
 
     def _of(self, keyframe_id: int) -> list[BufferedView]:
         return [kept for kept in self.views if kept.keyframe_id == keyframe_id]

@@ -23,10 +23,10 @@ class MotionState(Enum):
     """The motion of an instance, by depth views."""
 
     MOVING = "moving"
-    """Most of it lies in space that was seen to be free."""
+    """Most of it is in space that was observed to be free."""
     UNKNOWN = "unknown"
     STATIC = "static"
-    """Most of it is where a surface was seen."""
+    """Most of it is where a surface was observed."""
     STILL = "still"
     """It stood there for so long that its class is not evidence of motion."""
 
@@ -45,14 +45,14 @@ def motion_state(
 ) -> MotionState:
     """The motion of an instance at points (N, 3) at a time; unknown with too few points.
 
-    STILL is decided with the views as recorded, including what was believed to move: an instance
-    with a wrong class would otherwise remove its own evidence.
+    STILL is decided with the views as recorded, with moving parts: otherwise an instance with
+    a wrong class would remove its own evidence.
     """
     if not views:
         return MotionState.UNKNOWN
     apart_s = np.array([v.timestamp_s - time_s for v in views])
-    seen = check.judge_all(points_world, [(v.seen, v.T_world_camera) for v in views])
-    if check.stood_still(seen, apart_s, at_least):
+    by_full_view = check.judge_all(points_world, [(v.full, v.T_world_camera) for v in views])
+    if check.stood_still(by_full_view, apart_s, at_least):
         return MotionState.STILL
     motions = check.judge_all(points_world, [(v.view, v.T_world_camera) for v in views])
     point_motions = check.agree(motions)
@@ -68,7 +68,7 @@ class InstanceMotion:
     """Evidence of the motion of instances, by masks, class priors and views of other keyframes.
 
     Attributes:
-        step: change of the log odds of an instance that was seen to move, or to be static.
+        step: change of the log odds of an instance that moves, or is static.
         min_judged: least number of pixels by which an instance is judged.
     """
 
@@ -81,7 +81,7 @@ class InstanceMotion:
     def sightings(
         self,
         masks: KeyframeMasks,
-        seen: Sequence[Surface | None],
+        by_full_view: Sequence[Surface | None],
         stood: Sequence[bool],
         views: Sequence[PosedView],
         now_s: float,
@@ -93,7 +93,7 @@ class InstanceMotion:
         """
         others = [v for v in views if v.keyframe_id != masks.keyframe_id]
         found: list[Sighting | None] = []
-        for k, surface in enumerate(seen):
+        for k, surface in enumerate(by_full_view):
             if surface is None:
                 found.append(None)
                 continue

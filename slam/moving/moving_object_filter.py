@@ -46,7 +46,7 @@ class MovingObjectFilter:
         landmarks: which of them move.
         tracks: instances that may move, over time.
         keyframe_views: depth that the last keyframes saw; recent_views: that of the last frames.
-        static_verification: instances left out for their class alone, until seen to be static.
+        static_verification: instances excluded by class only, until verified as static.
     """
 
     def __init__(

@@ -114,7 +114,7 @@ class StaticVerification:
     def add(
         self,
         masks: KeyframeMasks,
-        seen: Sequence[Surface | None],
+        observed_surfaces: Sequence[Surface | None],
         tracks: Sequence[Track | None],
         world: WorldMap,
     ) -> None:
@@ -125,7 +125,7 @@ class StaticVerification:
         if self.config.stands_s == 0:
             return
         keyframe = world.keyframes[masks.keyframe_id]
-        for k, (surface, track) in enumerate(zip(seen, tracks, strict=True)):
+        for k, (surface, track) in enumerate(zip(observed_surfaces, tracks, strict=True)):
             if surface is None or track is None:
                 continue
             mask = masks.assignment.owner == k
@@ -145,21 +145,21 @@ class StaticVerification:
     def stood(
         self,
         masks: KeyframeMasks,
-        seen: Sequence[Surface | None],
+        observed_surfaces: Sequence[Surface | None],
         recent: Sequence[PosedView],
         now_s: float,
     ) -> list[bool]:
-        """Which of a keyframe's instances (K,), seen at ``now_s``, were static for long enough.
+        """Which of a keyframe's instances (K,), observed at ``now_s``, were static for long enough.
 
         Decided by recent frames before the keyframe, and after it if the masks come late.
         """
         least_s = self.config.stands_s
         apart = [v for v in recent if abs(v.timestamp_s - now_s) >= least_s]
         if least_s == 0 or not apart:
-            return [False] * len(seen)
-        views = [(v.seen, v.T_world_camera) for v in apart]
+            return [False] * len(observed_surfaces)
+        views = [(v.full, v.T_world_camera) for v in apart]
         stood = []
-        for surface in seen:
+        for surface in observed_surfaces:
             points = np.zeros((0, 3)) if surface is None else surface.points[surface.complete]
             points_world = transform(masks.T_world_camera, points)
             stood.append(self.config.stands(*self._count_views(points_world, views)))

@@ -186,12 +186,12 @@ def test_a_prediction_loop_stays_a_rotation_only_if_orthonormalised() -> None:
 def test_orthonormalised_changes_little_and_keeps_the_translation() -> None:
     T = se3_exp(RNG.normal(size=(6, 6)))
     np.testing.assert_allclose(orthonormalised(T), T, atol=1e-14)
-    spoiled = T.copy()
-    spoiled[:, :3, :3] += 1e-6 * RNG.normal(size=(6, 3, 3))
-    fixed = orthonormalised(spoiled)
+    disturbed = T.copy()
+    disturbed[:, :3, :3] += 1e-6 * RNG.normal(size=(6, 3, 3))
+    fixed = orthonormalised(disturbed)
     assert max(deviation(one) for one in fixed) < 1e-14
     assert np.abs(fixed - T).max() < 1e-5
-    np.testing.assert_array_equal(fixed[:, :3, 3], spoiled[:, :3, 3])
+    np.testing.assert_array_equal(fixed[:, :3, 3], disturbed[:, :3, 3])
 
 
 def test_a_pose_composed_a_thousand_times_stays_rigid():

@@ -248,16 +248,16 @@ def test_ate_agrees_with_evo(name, with_scale):
     estimate = copy.deepcopy(estimate)
     estimate.align(reference, correct_scale=with_scale)
     error = absolute_error(e, g, with_scale)
-    for relation, ours in (
+    for relation, computed in (
         (metrics.PoseRelation.translation_part, error.translation_m),
         (metrics.PoseRelation.rotation_angle_rad, error.rotation_rad),
     ):
         ape = metrics.APE(relation)
         ape.process_data((reference, estimate))
-        np.testing.assert_allclose(ours.errors, ape.error, atol=1e-6)
+        np.testing.assert_allclose(computed.errors, ape.error, atol=1e-6)
         for statistic in ("rmse", "mean", "median", "max"):
-            theirs = ape.get_statistic(metrics.StatisticsType[statistic])
-            assert getattr(ours, statistic) == pytest.approx(theirs, abs=1e-6)
+            from_evo = ape.get_statistic(metrics.StatisticsType[statistic])
+            assert getattr(computed, statistic) == pytest.approx(from_evo, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", ["synthetic", "freiburg1_xyz"])
@@ -277,9 +277,9 @@ def test_rpe_agrees_with_evo(name, delta):
         rpe = metrics.RPE(relation, delta, metrics.Unit.frames, all_pairs=True)
         rpe.process_data(pair)
         for pairs in pairings:
-            ours = getattr(relative_error(e, g, pairs), part)
-            np.testing.assert_allclose(ours.errors, rpe.error, atol=1e-6)
-            assert ours.rmse == pytest.approx(
+            computed = getattr(relative_error(e, g, pairs), part)
+            np.testing.assert_allclose(computed.errors, rpe.error, atol=1e-6)
+            assert computed.rmse == pytest.approx(
                 rpe.get_statistic(metrics.StatisticsType.rmse), abs=1e-6
             )
 
@@ -324,8 +324,8 @@ def test_everything_agrees_with_evo(seed):
     e, g = associate(estimate, reference, 0.01)
     np.testing.assert_array_equal(e.timestamps_s, estimate.timestamps_s[i])
     np.testing.assert_array_equal(g.timestamps_s, reference.timestamps_s[j])
-    truth, ours = evo_pair(estimate.select(np.array(i)), reference.select(np.array(j)))
-    aligned = copy.deepcopy(ours)
+    truth, computed = evo_pair(estimate.select(np.array(i)), reference.select(np.array(j)))
+    aligned = copy.deepcopy(computed)
     aligned.align(truth)
     absolute = absolute_error(e, g)
     per_metre = relative_error(e, g, distance_pairs(g.positions_world))
@@ -340,7 +340,7 @@ def test_everything_agrees_with_evo(seed):
             (1.0, metrics.Unit.meters, per_metre),
         ):
             rpe = metrics.RPE(relation, delta, unit, all_pairs=True, pairs_from_reference=True)
-            rpe.process_data((truth, ours))
+            rpe.process_data((truth, computed))
             assert len(rpe.error) == len(error.timestamps_s)
             assert getattr(error, part).rmse == pytest.approx(rmse(rpe), abs=1e-6)
 

@@ -10,25 +10,25 @@ from bmask_slam.graph.whole_file import whole_file, whole_folder
 
 
 def test_a_link_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
-    victim, path = tmp_path / "victim", tmp_path / "trajectory.txt"
-    victim.write_text("precious")
+    other_file, path = tmp_path / "victim", tmp_path / "trajectory.txt"
+    other_file.write_text("precious")
     for name in (path.name, f"{path.name}.tmp", f".part-{path.name}"):
-        (tmp_path / name).symlink_to(victim)
+        (tmp_path / name).symlink_to(other_file)
     with whole_file(path) as temporary:
         temporary.write_text("poses")
-    assert victim.read_text() == "precious"
+    assert other_file.read_text() == "precious"
     assert not path.is_symlink()
     assert path.read_text() == "poses"
 
 
 def test_a_linked_folder_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
-    victim, path = tmp_path / "victim", tmp_path / "dense"
-    victim.mkdir()
-    (victim / "a").write_text("precious")
-    path.symlink_to(victim)
+    other_file, path = tmp_path / "victim", tmp_path / "dense"
+    other_file.mkdir()
+    (other_file / "a").write_text("precious")
+    path.symlink_to(other_file)
     with whole_folder(path) as temporary:
         (temporary / "b").write_text("")
-    assert (victim / "a").read_text() == "precious"
+    assert (other_file / "a").read_text() == "precious"
     assert [p.name for p in path.iterdir()] == ["b"]
 
 

@@ -86,9 +86,9 @@ def _tables(times_s: Array, truth: Camera, used: Camera) -> FactorTables:
     side = rng.integers(0, 3, 1500)
     walls[np.arange(1500), side] = np.sign(walls[np.arange(1500), side])
     points = walls * HALF_ROOM_M
-    seen = transform(inverse(poses), points)
-    in_front = seen[..., 2] > 0.3
-    pixels = truth.project(np.where(in_front[..., None], seen, [0.0, 0.0, 1.0]))
+    points_camera = transform(inverse(poses), points)
+    in_front = points_camera[..., 2] > 0.3
+    pixels = truth.project(np.where(in_front[..., None], points_camera, [0.0, 0.0, 1.0]))
     pixels = pixels if used.rolling_shutter_s else _rolled(pixels, points, times_s, truth)
     limit = np.array([truth.width, truth.height]) - 1.0
     k, landmark = np.nonzero(in_front & ((pixels > 0) & (pixels < limit)).all(axis=2))
@@ -98,7 +98,7 @@ def _tables(times_s: Array, truth: Camera, used: Camera) -> FactorTables:
     tables.keyframes.insert(np.arange(len(poses)), disturbed)
     tables.landmarks.insert(np.arange(1500), points + rng.normal(0, 0.02, points.shape))
     measured = np.column_stack([pixels[k, landmark] + noise, np.full(len(k), np.nan)])
-    measured[:, 2] = measured[:, 0] - used.stereo_bf_px_m / seen[k, landmark, 2]
+    measured[:, 2] = measured[:, 0] - used.stereo_bf_px_m / points_camera[k, landmark, 2]
     sigmas = np.tile([0.2, 0.2, 0.08], (len(k), 1))
     tables.observations.add(Observations(k, landmark, measured, sigmas))
     return tables
@@ -109,9 +109,13 @@ def _rolled(pixels: Array, points_world: Array, times_s: Array, truth: Camera) -
     for _ in range(4 if truth.rolling_shutter_s else 0):
         later_s = truth.rolling_shutter_s * share_of_rows(pixels[..., 1], truth)
         T = camera_path((times_s[:, None] + later_s.clip(-0.1, 0.1)).ravel())
-        seen = transform(inverse(T), np.tile(points_world, (len(times_s), 1))[:, None])[:, 0]
-        in_front = seen[:, 2:] > 0.1
-        pixels = truth.project(np.where(in_front, seen, [0.0, 0.0, 1.0])).reshape(pixels.shape)
+        points_camera = transform(inverse(T), np.tile(points_world, (len(times_s), 1))[:, None])[
+            :, 0
+        ]
+        in_front = points_camera[:, 2:] > 0.1
+        pixels = truth.project(np.where(in_front, points_camera, [0.0, 0.0, 1.0])).reshape(
+            pixels.shape
+        )
     return pixels
 
 

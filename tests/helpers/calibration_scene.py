@@ -70,19 +70,26 @@ def make_problem(
     poses = room.poses_world_camera @ make_pose(roll, np.zeros((keyframes, 3)))
     poses[:, :3, 3] += rng.uniform(-0.5, 0.5, (keyframes, 3))
     velocities = rng.uniform(-1, 1, (keyframes, 6)) * [0.5, 0.5, 0.5, 0.6, 0.6, 0.6]
-    k, seen_points = (i.ravel() for i in np.indices((keyframes, points)))
-    seen = transform(inverse(poses), room.points_world)[k, seen_points]
-    pixels = project(seen, truth)
+    k, point_ids = (i.ravel() for i in np.indices((keyframes, points)))
+    points_camera = transform(inverse(poses), room.points_world)[k, point_ids]
+    pixels = project(points_camera, truth)
     # Planes within 60 degrees of facing the camera.
     normals = rng.normal(0, 1, (points, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    n = np.einsum("mji,mj->mi", poses[k, :3, :3], normals[seen_points])
-    facing = np.abs((n * seen).sum(axis=1)) > 0.5 * np.linalg.norm(seen, axis=1)
-    facing &= np.abs(seen[:, :2]).max(axis=1) < 0.7 * seen[:, 2]  # beyond, distortion folds back
-    inside = (pixels > 0).all(axis=1) & (pixels < SIZE).all(axis=1) & (seen[:, 2] > 0.5) & facing
-    k, seen_points = k[inside], seen_points[inside]
-    seen, pixels, n = seen[inside], pixels[inside], n[inside]
-    seen, pixels, T_row = rolled(seen, pixels, velocities[k], truth)
+    n = np.einsum("mji,mj->mi", poses[k, :3, :3], normals[point_ids])
+    facing = np.abs((n * points_camera).sum(axis=1)) > 0.5 * np.linalg.norm(points_camera, axis=1)
+    facing &= (
+        np.abs(points_camera[:, :2]).max(axis=1) < 0.7 * points_camera[:, 2]
+    )  # beyond, distortion folds back
+    inside = (
+        (pixels > 0).all(axis=1)
+        & (pixels < SIZE).all(axis=1)
+        & (points_camera[:, 2] > 0.5)
+        & facing
+    )
+    k, point_ids = k[inside], point_ids[inside]
+    points_camera, pixels, n = points_camera[inside], pixels[inside], n[inside]
+    points_camera, pixels, T_row = rolled(points_camera, pixels, velocities[k], truth)
     n = np.einsum("mji,mj->mi", T_row[:, :3, :3], n)
     pixels = pixels + noise * 0.3 * rng.standard_normal(pixels.shape)
 
@@ -90,15 +97,15 @@ def make_problem(
         """The depth image at the pixels if it is taken with this delay."""
         T = inverse(se3_exp(velocities * time_s))[k]
         n_then = np.einsum("mij,mj->mi", T[:, :3, :3], n)
-        point = np.einsum("mij,mj->mi", T[:, :3, :3], seen) + T[:, :3, 3]
+        point = np.einsum("mij,mj->mi", T[:, :3, :3], points_camera) + T[:, :3, 3]
         return inverse_depth_of(pixels, n_then, (n_then * point).sum(axis=1), truth)
 
     share = (pixels[:, 1] + 0.5) / SIZE[1] - 0.5
-    point_velocities = -np.cross(velocities[k, :3], seen) - velocities[k, 3:]
+    point_velocities = -np.cross(velocities[k, :3], points_camera) - velocities[k, 3:]
     w = [inverse_depth_at(truth[11] + dt) for dt in (-1 / 30, 0, 1 / 30)]
     views = CalibrationViews(
         keyframes=k,
-        landmarks=seen_points,
+        landmarks=point_ids,
         pixels=pixels,
         inverse_depth=w[1] + noise * 0.002 * rng.standard_normal(len(k)),
         inverse_depth_rate=15 * (w[2] - w[0]),
@@ -107,11 +114,11 @@ def make_problem(
         sigma_inverse=np.full(len(k), 0.002),
         shutter_velocity=share[:, None] * point_velocities,
     )
-    spoiled = poses @ se3_exp(rng.normal(0, [0.002] * 3 + [0.01] * 3, (keyframes, 6)))
-    spoiled[0] = poses[0]
+    disturbed = poses @ se3_exp(rng.normal(0, [0.002] * 3 + [0.01] * 3, (keyframes, 6)))
+    disturbed[0] = poses[0]
     problem = CalibrationProblem(
         views,
-        spoiled,
+        disturbed,
         room.points_world + rng.normal(0, 0.02, room.points_world.shape),
         truth.copy() if start is None else start,
         PRIORS,

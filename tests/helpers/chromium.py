@@ -79,8 +79,8 @@ class Browser:
 
     def requests(self) -> list[str]:
         """Addresses that the page requested, without data URIs."""
-        asked = [e for e in self.events if e.get("method") == "Network.requestWillBeSent"]
-        urls = [event["params"]["request"]["url"] for event in asked]
+        requested = [e for e in self.events if e.get("method") == "Network.requestWillBeSent"]
+        urls = [event["params"]["request"]["url"] for event in requested]
         return [url for url in urls if not url.startswith("data:")]
 
     def screenshot(self, path: Path) -> None:

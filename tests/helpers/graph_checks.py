@@ -22,7 +22,7 @@ def filled(room: Room) -> Smoother:
 def from_scratch(smoother: Smoother, room: Room) -> GraphEstimate:
     """The optimum of a new graph with the same factors, initialised at the room's truth."""
     tables = smoother._tables
-    seen = tables.observations.select(tables.observations.all_rows())
+    observations = tables.observations.select(tables.observations.all_rows())
     factors = [f.factor for f in tables.pose_factors.values()]
     fresh = Smoother(CAMERA)
     fresh.update(
@@ -31,7 +31,7 @@ def from_scratch(smoother: Smoother, room: Room) -> GraphEstimate:
             room.poses_world_camera[tables.keyframes.ids],
             tables.landmarks.ids,
             room.points_world[tables.landmarks.ids],
-            seen,
+            observations,
             priors=tuple(f for f in factors if isinstance(f, PosePrior)),
             relative_poses=tuple(f for f in factors if isinstance(f, RelativePose)),
         )
@@ -44,18 +44,22 @@ def assert_isam_matches_tables(smoother: Smoother) -> None:
     tables, isam = smoother._tables, smoother._solver._isam
     graph = isam.getFactorsUnsafe()
     rows = tables.observations.all_rows()
-    seen = tables.observations.select(rows)
+    observations = tables.observations.select(rows)
     expected = dict(
         zip(
             tables.observations.slots(rows).tolist(),
-            zip(keyframe_keys(seen.keyframe_ids), landmark_keys(seen.landmark_ids), strict=True),
+            zip(
+                keyframe_keys(observations.keyframe_ids),
+                landmark_keys(observations.landmark_ids),
+                strict=True,
+            ),
             strict=True,
         )
     )
     for factor in tables.pose_factors.values():
         expected[factor.slot] = tuple(keyframe_keys(np.array(factor.keyframes)))
-    held = {i: tuple(graph.at(i).keys()) for i in range(graph.size()) if graph.exists(i)}
-    assert held == expected
+    keys_in_graph = {i: tuple(graph.at(i).keys()) for i in range(graph.size()) if graph.exists(i)}
+    assert keys_in_graph == expected
     assert len(expected) == len(rows) + len(tables.pose_factors)
 
 
@@ -69,5 +73,7 @@ def assert_same_optimum(smoother: Smoother, room: Room) -> None:
 def pairs_of(smoother: Smoother) -> set[tuple[int, int]]:
     """(keyframe, landmark) of every observation in the graph."""
     table = smoother._tables.observations
-    seen = table.select(table.all_rows())
-    return set(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))
+    observations = table.select(table.all_rows())
+    return set(
+        zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
+    )

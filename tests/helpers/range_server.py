@@ -28,7 +28,7 @@ class Served:
     cut_after: int | None = None
     cuts: int = 0
     status: int = 0
-    asked: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
     url: str = ""
 
 
@@ -38,16 +38,16 @@ def serve(served: Served) -> Iterator[Served]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            asked = self.headers.get("Range", "")
-            served.asked.append(asked)
+            requests = self.headers.get("Range", "")
+            served.requests.append(requests)
             content = served.files.get(self.path[1:])
             if served.status or content is None:
                 self.send_error(served.status or 404)
                 return
             tag = f'"{hash(content)}"'
             begin = 0
-            if served.ranges and asked and self.headers.get("If-Range", tag) == tag:
-                begin = int(re.findall(r"\d+", asked)[0])
+            if served.ranges and requests and self.headers.get("If-Range", tag) == tag:
+                begin = int(re.findall(r"\d+", requests)[0])
             if begin > len(content):
                 self.send_error(416)
                 return

@@ -26,16 +26,16 @@ class Room:
 
     def update_of(self, keyframe: int) -> GraphUpdate:
         """The update of this keyframe with the landmarks that it is the first to observe."""
-        seen = self.observations
-        mine = np.flatnonzero(seen.keyframe_ids == keyframe)
-        earlier = seen.landmark_ids[seen.keyframe_ids < keyframe]
-        new = np.setdiff1d(seen.landmark_ids[mine], earlier)
+        observations = self.observations
+        rows = np.flatnonzero(observations.keyframe_ids == keyframe)
+        earlier = observations.landmark_ids[observations.keyframe_ids < keyframe]
+        new = np.setdiff1d(observations.landmark_ids[rows], earlier)
         return GraphUpdate(
             np.array([keyframe]),
             self.initial_poses[[keyframe]],
             new,
             self.initial_points[new],
-            seen.select(mine),
+            observations.select(rows),
         )
 
     def updates(self) -> list[GraphUpdate]:
@@ -74,8 +74,8 @@ def make_room(
     keyframe_ids, landmark_ids, measurements = _measure(poses, points_world)
     measurements = noisy(measurements, rng.normal(0, 1, measurements.shape) * sigmas_px)
     measurements[rng.random(len(measurements)) < mono_share, 2] = np.nan
-    spoiled = poses @ se3_exp(rng.normal(0, [0.001] * 3 + [0.005] * 3, (keyframes, 6)))
-    spoiled[0] = poses[0]
+    disturbed = poses @ se3_exp(rng.normal(0, [0.001] * 3 + [0.005] * 3, (keyframes, 6)))
+    disturbed[0] = poses[0]
     return Room(
         poses,
         points_world,
@@ -85,7 +85,7 @@ def make_room(
             measurements,
             np.tile(np.where(sigmas_px > 0, sigmas_px, 1.0), (len(measurements), 1)),
         ),
-        spoiled,
+        disturbed,
         points_world + rng.normal(0, 0.01, points_world.shape),
     )
 

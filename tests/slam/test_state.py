@@ -188,13 +188,13 @@ def test_every_array_of_the_state_matters(system: SlamSystem) -> None:
     empty = sorted(name for name, array in state.items() if array.size == 0)
     assert empty == []
     for name, array in state.items():
-        spoiled = np.where(array == array.flat[0], array.flat[-1:], array.flat[:1]).astype(
+        changed = np.where(array == array.flat[0], array.flat[-1:], array.flat[:1]).astype(
             array.dtype
         )
-        if np.array_equal(spoiled, array, equal_nan=array.dtype.kind == "f"):
-            spoiled = np.ones_like(array) if not array.any() else np.zeros_like(array)
+        if np.array_equal(changed, array, equal_nan=array.dtype.kind == "f"):
+            changed = np.ones_like(array) if not array.any() else np.zeros_like(array)
         try:
-            other = restored({**state, name: spoiled})
+            other = restored({**state, name: changed})
         except (InputError, ValueError, IndexError, KeyError):
             continue
         assert next(differences(system, other), None) is not None, name

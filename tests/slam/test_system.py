@@ -87,14 +87,14 @@ def test_lost_frames_get_no_pose_and_tracking_recovers() -> None:
 
 def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
     system = SlamSystem(CAMERA)
-    here, elsewhere = path(12, start_x_m=-1.6), path(14, start_x_m=1.4)
+    here, other_path = path(12, start_x_m=-1.6), path(14, start_x_m=1.4)
     back = [path(1, start_x_m=x)[0] for x in np.arange(1.4, -1.61, -0.03)]
-    poses = [*here, *[None] * 11, *elsewhere]
+    poses = [*here, *[None] * 11, *other_path]
     results = process_views(system, poses)
     assert results[-1].segment == 1
     apart = system.segments()
     assert [len(apart[0]), len(apart[1])] == [12, sum(r.segment == 1 for r in results)]
-    poses += [*elsewhere[::-1], *back]
+    poses += [*other_path[::-1], *back]
     results += process_views(system, poses[len(results) :], first=len(results))
     assert results[-1].segment == 0
     joined = system.segments()
@@ -114,8 +114,8 @@ def test_a_frame_without_depth_is_tracked_from_the_map() -> None:
     system, poses = SlamSystem(CAMERA), path(6)
     process_views(system, poses[:5])
     frame = render_plane(poses[5], 5)
-    blind = Frame(5, frame.timestamp_s, frame.rgb, np.full((480, 640), np.nan, np.float32))
-    result = system.process(blind)
+    without_depth = Frame(5, frame.timestamp_s, frame.rgb, np.full((480, 640), np.nan, np.float32))
+    result = system.process(without_depth)
     assert result.status is TrackingStatus.OK
     assert np.allclose(result.T_world_camera, inverse(poses[0]) @ poses[5], atol=0.01)
 

@@ -22,9 +22,9 @@ LOOSE = np.diag([0.2] * 3 + [0.5] * 3) ** 2
 def factor_tables_of(room: Room) -> FactorTables:
     """The room as a graph at its noisy initial values with the first pose fixed."""
     tables = FactorTables()
-    seen = np.unique(room.observations.landmark_ids)
+    observations = np.unique(room.observations.landmark_ids)
     tables.keyframes.insert(np.arange(len(room.initial_poses)), room.initial_poses)
-    tables.landmarks.insert(seen, room.initial_points[seen])
+    tables.landmarks.insert(observations, room.initial_points[observations])
     tables.observations.add(room.observations)
     tables.add_pose_factors([PosePrior(0, room.initial_poses[0], 1e-8 * np.eye(6))])
     return tables
@@ -35,9 +35,12 @@ def errors(tables: FactorTables, room: Room) -> Array:
 
 
 def chi_squares(tables: FactorTables) -> Array:
-    seen = tables.observations.select(tables.observations.all_rows())
-    poses, points = tables.keyframes.get(seen.keyframe_ids), tables.landmarks.get(seen.landmark_ids)
-    return reprojection(seen, poses, points, CAMERA)[1]
+    observations = tables.observations.select(tables.observations.all_rows())
+    poses, points = (
+        tables.keyframes.get(observations.keyframe_ids),
+        tables.landmarks.get(observations.landmark_ids),
+    )
+    return reprojection(observations, poses, points, CAMERA)[1]
 
 
 def loop(room: Room, a: int, b: int, error: Array | None = None) -> RelativePose:
@@ -52,8 +55,8 @@ def test_exact_measurements_give_the_truth() -> None:
     steps: list[tuple[int, float]] = []
     done = adjust(tables, CAMERA, progress=lambda k, cost: steps.append((k, cost)))
     assert errors(tables, room).max() < 1e-6
-    seen = tables.landmarks.ids
-    np.testing.assert_allclose(tables.landmarks.values, room.points_world[seen], atol=1e-5)
+    observations = tables.landmarks.ids
+    np.testing.assert_allclose(tables.landmarks.values, room.points_world[observations], atol=1e-5)
     assert done.final_cost < 1e-6 < done.initial_cost
     assert [k for k, _ in steps] == list(range(1, done.iterations + 1))
     assert len(done.wrong_observations) == len(done.wrong_loops) == len(done.dropped_landmarks) == 0
@@ -68,23 +71,25 @@ def test_the_cost_is_half_the_chi_squares_of_observations() -> None:
     assert done.final_cost == pytest.approx(chi_squares(tables).sum() / 2, rel=1e-3)  # the prior
     assert done.final_cost < 0.7 * done.initial_cost
     # measured at sigma: chi-square of as many degrees of freedom as measurements beyond unknowns
-    seen = room.observations.measurements
-    degrees = np.isfinite(seen).sum() - 6 * 11 - 3 * len(tables.landmarks.ids)
+    observations = room.observations.measurements
+    degrees = np.isfinite(observations).sum() - 6 * 11 - 3 * len(tables.landmarks.ids)
     assert 2 * done.final_cost == pytest.approx(degrees, rel=5 / np.sqrt(degrees))
 
 
 def test_wrong_observations_are_removed_and_the_truth_is_found() -> None:
     room = make_room(mono_share=0.2)
     rng = np.random.default_rng(5)
-    seen, measurements = room.observations, room.observations.measurements.copy()
-    _, first, views = np.unique(seen.landmark_ids, return_index=True, return_counts=True)
+    observed, measurements = room.observations, room.observations.measurements.copy()
+    _, first, views = np.unique(observed.landmark_ids, return_index=True, return_counts=True)
     wrong = rng.choice(first[views >= 6], 40, replace=False)  # one view of many
     measurements[wrong, 1] += rng.choice([-1, 1], 40) * rng.uniform(15, 60, 40)
-    tables = factor_tables_of(replace(room, observations=replace(seen, measurements=measurements)))
+    tables = factor_tables_of(
+        replace(room, observations=replace(observed, measurements=measurements))
+    )
     done = adjust(tables, CAMERA)
-    planted = {(int(seen.keyframe_ids[k]), int(seen.landmark_ids[k])) for k in wrong}
+    planted = {(int(observed.keyframe_ids[k]), int(observed.landmark_ids[k])) for k in wrong}
     assert {(a, b) for a, b in done.wrong_observations.tolist()} == planted
-    assert done.observations == len(seen)
+    assert done.observations == len(observed)
     assert [stage.name for stage in done.stages] == ["robust", "inliers"]
     assert errors(tables, room).max() < 1e-6
 
@@ -100,14 +105,16 @@ def test_without_the_last_stage_no_observation_is_removed() -> None:
 def two_rooms() -> tuple[Room, FactorTables]:
     """Cameras 0 to 5 and 6 to 11 have no common landmark; odometry between is 0.4 m off."""
     room = make_room()
-    seen = room.observations
-    late = seen.keyframe_ids >= 6
-    landmarks = np.where(late, seen.landmark_ids + len(room.points_world), seen.landmark_ids)
+    observed = room.observations
+    late = observed.keyframe_ids >= 6
+    landmarks = np.where(
+        late, observed.landmark_ids + len(room.points_world), observed.landmark_ids
+    )
     room = replace(
         room,
         points_world=np.tile(room.points_world, (2, 1)),
         initial_points=np.tile(room.initial_points, (2, 1)),
-        observations=replace(seen, landmark_ids=landmarks),
+        observations=replace(observed, landmark_ids=landmarks),
     )
     off = np.array([0.0, 0.1, 0, 0.3, 0, 0.2])
     odometry = replace(loop(room, 5, 6, off), covariance=LOOSE, robust=None, kind="odometry")

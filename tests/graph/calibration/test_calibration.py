@@ -131,8 +131,8 @@ def test_an_anchor_on_another_body_gives_scale_and_lever_arm() -> None:
     np.testing.assert_allclose(result.body_arm_m, ARM_M, atol=1e-3)
     assert result.anchor_rms_m < 2e-4
     assert result.calibration[FACTOR] == pytest.approx(TRUTH[FACTOR], abs=1e-3)
-    taken_for_camera = dataclasses.replace(problem.anchors, on_body=False)
-    wrong = calibrate(dataclasses.replace(problem, anchors=taken_for_camera))
+    as_camera_positions = dataclasses.replace(problem.anchors, on_body=False)
+    wrong = calibrate(dataclasses.replace(problem, anchors=as_camera_positions))
     errors_px = [np.abs(r.calibration - TRUTH)[:4].max() for r in (result, wrong)]
     assert errors_px[0] < 0.1 and errors_px[1] > 2
     # Its place is one more unknown: the scale is told less surely than by the camera's positions.

@@ -102,9 +102,11 @@ def test_jacobians_equal_finite_differences_of_the_camera_model(mono: bool) -> N
         for e in np.eye(3)
     ]
     assert list(linear.keys()) == keyframe_keys(np.array([7])) + landmark_keys(np.array([9]))
-    ours = np.column_stack([*d_pose, *d_point, -whitened(T_WORLD_CAMERA, POINT_WORLD)])
-    theirs = np.column_stack([J, b])
-    np.testing.assert_allclose(theirs.T @ theirs, ours.T @ ours, rtol=1e-5, atol=1e-2)
+    expected = np.column_stack([*d_pose, *d_point, -whitened(T_WORLD_CAMERA, POINT_WORLD)])
+    from_gtsam = np.column_stack([J, b])
+    np.testing.assert_allclose(
+        from_gtsam.T @ from_gtsam, expected.T @ expected, rtol=1e-5, atol=1e-2
+    )
 
 
 def test_huber_starts_at_the_chi_square_bound() -> None:
@@ -144,14 +146,18 @@ def test_prior_is_T_world_camera() -> None:
 
 def test_factors_keep_the_order_of_mixed_observations() -> None:
     room = make_room(noise_px=1.0, mono_share=0.5)
-    seen = room.observations
-    factors = FactorMaker(CAMERA, SmootherConfig()).observations(seen)
+    observations = room.observations
+    factors = FactorMaker(CAMERA, SmootherConfig()).observations(observations)
     keys = [list(factor.keys()) for factor in factors]
-    expected = zip(keyframe_keys(seen.keyframe_ids), landmark_keys(seen.landmark_ids), strict=True)
+    expected = zip(
+        keyframe_keys(observations.keyframe_ids),
+        landmark_keys(observations.landmark_ids),
+        strict=True,
+    )
     assert keys == [list(pair) for pair in expected]
     is_stereo = [isinstance(factor, gtsam.GenericStereoFactor3D) for factor in factors]
-    assert is_stereo == np.isfinite(seen.measurements[:, 2]).tolist()
-    assert make_graph(factors).size() == len(seen)
+    assert is_stereo == np.isfinite(observations.measurements[:, 2]).tolist()
+    assert make_graph(factors).size() == len(observations)
 
 
 def test_values_are_returned_in_the_order_of_ids() -> None:

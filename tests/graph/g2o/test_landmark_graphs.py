@@ -21,12 +21,15 @@ def room_graph() -> FactorTables:
     """Keyframes 3, 5, 7, ..., landmarks from 0 on; views with and without depth, all factors."""
     rng = np.random.default_rng(7)
     room = make_room(noise_px=0.7, mono_share=0.3, disparity_noise_px=0.1)
-    seen = room.observations
+    observations = room.observations
     tables = FactorTables()
-    ids, landmarks = 3 + 2 * np.arange(len(room.initial_poses)), np.unique(seen.landmark_ids)
+    ids, landmarks = (
+        3 + 2 * np.arange(len(room.initial_poses)),
+        np.unique(observations.landmark_ids),
+    )
     tables.keyframes.insert(ids, room.initial_poses)
     tables.landmarks.insert(landmarks, room.initial_points[landmarks])
-    tables.observations.add(replace(seen, keyframe_ids=ids[seen.keyframe_ids]))
+    tables.observations.add(replace(observations, keyframe_ids=ids[observations.keyframe_ids]))
     root = rng.normal(size=(4, 6, 6))
     covariances = 1e-4 * (root @ root.swapaxes(1, 2) + np.eye(6))
     T_a_b = [
@@ -60,14 +63,18 @@ def test_everything_is_read_back(file: Path) -> None:
         np.testing.assert_allclose(
             getattr(after, name).values, getattr(before, name).values, atol=1e-12
         )
-    seen, wanted = (g.observations.select(g.observations.all_rows()) for g in (after, before))
-    np.testing.assert_array_equal(seen.keyframe_ids, wanted.keyframe_ids)
-    np.testing.assert_array_equal(seen.landmark_ids, wanted.landmark_ids)
-    np.testing.assert_allclose(seen.measurements, wanted.measurements, atol=1e-11)
-    stereo = np.isfinite(wanted.measurements[:, 2])
+    observations, expected = (
+        g.observations.select(g.observations.all_rows()) for g in (after, before)
+    )
+    np.testing.assert_array_equal(observations.keyframe_ids, expected.keyframe_ids)
+    np.testing.assert_array_equal(observations.landmark_ids, expected.landmark_ids)
+    np.testing.assert_allclose(observations.measurements, expected.measurements, atol=1e-11)
+    stereo = np.isfinite(expected.measurements[:, 2])
     assert 0 < stereo.sum() < len(stereo)
-    np.testing.assert_allclose(seen.sigmas_px[:, :2], wanted.sigmas_px[:, :2], rtol=1e-12)
-    np.testing.assert_allclose(seen.sigmas_px[stereo], wanted.sigmas_px[stereo], rtol=1e-12)
+    np.testing.assert_allclose(observations.sigmas_px[:, :2], expected.sigmas_px[:, :2], rtol=1e-12)
+    np.testing.assert_allclose(
+        observations.sigmas_px[stereo], expected.sigmas_px[stereo], rtol=1e-12
+    )
     factors = [[f.factor for f in g.pose_factors.values()] for g in (after, before)]
     for found, given in zip(*factors, strict=True):
         assert type(found) is type(given)
@@ -99,9 +106,12 @@ def test_the_cost_equals_g2os(file: Path) -> None:
         omega[np.triu_indices(3)] = values[3:]
         total += float(e @ (omega + np.triu(omega, 1).T) @ e)
     tables = room_graph()
-    seen = tables.observations.select(tables.observations.all_rows())
-    rows = tables.keyframes.get(seen.keyframe_ids), tables.landmarks.get(seen.landmark_ids)
-    assert total == pytest.approx(reprojection(seen, *rows, CAMERA)[1].sum(), rel=1e-9)
+    observations = tables.observations.select(tables.observations.all_rows())
+    rows = (
+        tables.keyframes.get(observations.keyframe_ids),
+        tables.landmarks.get(observations.landmark_ids),
+    )
+    assert total == pytest.approx(reprojection(observations, *rows, CAMERA)[1].sum(), rel=1e-9)
 
 
 def test_adjusting_the_file_equals_adjusting_the_graph(file: Path) -> None:
@@ -142,11 +152,11 @@ def test_a_file_of_another_program(tmp_path: Path, caplog: pytest.LogCaptureFixt
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500, 510, 320, 240)
     assert (camera.width, camera.height) == (641, 481)
     assert tables.landmarks.ids.tolist() == [2, 3]
-    seen = tables.observations.select(tables.observations.all_rows())
-    disparity_px = seen.measurements[:, 0] - seen.measurements[:, 2]
+    observations = tables.observations.select(tables.observations.all_rows())
+    disparity_px = observations.measurements[:, 0] - observations.measurements[:, 2]
     np.testing.assert_allclose(disparity_px[:3], camera.stereo_bf_px_m * np.array([0.5, 0.4, 0.5]))
     assert np.isnan(disparity_px[3])
-    np.testing.assert_allclose(seen.sigmas_px[0], [0.5, 1, 0.01 * camera.stereo_bf_px_m])
+    np.testing.assert_allclose(observations.sigmas_px[0], [0.5, 1, 0.01 * camera.stereo_bf_px_m])
     edge, prior = (factor.factor for factor in tables.pose_factors.values())
     assert isinstance(edge, RelativePose)
     assert edge.kind == "odometry"
@@ -173,13 +183,13 @@ def test_the_component_with_fixed_keyframes_or_the_largest_is_used(
     """Keyframes 0 and 1 observe landmarks 2 and 3; only keyframe 10 observes landmark 11."""
     other = f"VERTEX_SE3:QUAT 10 {IDENTITY}\nVERTEX_TRACKXYZ 11 0 0 2\n"
     other += "EDGE_PROJECT_DISPARITY 10 11 0 320 240 0.5 4 0 0 1 0 10000\n"
-    held = WITH_PRIOR.replace("PRIOR 0", "PRIOR 10") if prior else ""
-    tables = read_text(tmp_path, WHOLE + other + held)
+    fixed = WITH_PRIOR.replace("PRIOR 0", "PRIOR 10") if prior else ""
+    tables = read_text(tmp_path, WHOLE + other + fixed)
     assert tables.keyframes.ids.tolist() == ([10] if prior else [0, 1])
     assert tables.landmarks.ids.tolist() == ([11] if prior else [2, 3])
     assert "2 parts that no edge connects" in caplog.text
     if prior:  # both held: both stay
-        tables = read_text(tmp_path, WHOLE + other + held + "FIX 0\n")
+        tables = read_text(tmp_path, WHOLE + other + fixed + "FIX 0\n")
         assert tables.keyframes.ids.tolist() == [0, 1, 10]
 
 

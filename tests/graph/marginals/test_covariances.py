@@ -25,13 +25,13 @@ def solved(seed: int, mono_share: float = 0.0, config: SmootherConfig = GAUSSIAN
     error = np.random.default_rng(seed).normal(0, sigmas)
     prior = PosePrior(0, room.poses_world_camera[0] @ se3_exp(error), np.diag(np.square(sigmas)))
     smoother = Smoother(CAMERA, config)
-    seen = np.unique(room.observations.landmark_ids)
+    observations = np.unique(room.observations.landmark_ids)
     smoother.update(
         GraphUpdate(
             np.arange(len(room.poses_world_camera)),
             room.initial_poses,
-            seen,
-            room.initial_points[seen],
+            observations,
+            room.initial_points[observations],
             room.observations,
             priors=(prior,),
         )
@@ -126,12 +126,12 @@ def test_covariances_are_relative_to_the_first_keyframe() -> None:
 def test_an_outlier_has_the_weight_of_its_robust_kernel() -> None:
     """A far outlier has no weight with a robust kernel, and full weight without."""
     room = room_of(3, 0.0)
-    seen = room.observations
-    wrong = np.flatnonzero(seen.keyframe_ids == 5)[::6]
+    observed = room.observations
+    wrong = np.flatnonzero(observed.keyframe_ids == 5)[::6]
     clean = dataclasses.replace(
-        room, observations=seen.select(~np.isin(np.arange(len(seen)), wrong))
+        room, observations=observed.select(~np.isin(np.arange(len(observed)), wrong))
     )
-    seen.measurements[wrong, 1] += 300.0
+    observed.measurements[wrong, 1] += 300.0
 
     def sigma_m(room: Room, robust: bool) -> float:
         smoother = Smoother(CAMERA, SmootherConfig(robust=robust, gate_sigmas=1e3))

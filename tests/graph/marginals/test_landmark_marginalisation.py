@@ -43,32 +43,37 @@ def relative_sigmas(smoother: Smoother, a: int, b: int) -> Array:
 
 
 def test_jacobians_are_finite_differences() -> None:
-    seen, config = ROOM.observations, SmootherConfig(robust=False)
-    poses, points = ROOM.initial_poses[seen.keyframe_ids], ROOM.initial_points[seen.landmark_ids]
-    r, J_pose, J_point = linearise(seen, poses, points, CAMERA, config)
+    observations, config = ROOM.observations, SmootherConfig(robust=False)
+    poses, points = (
+        ROOM.initial_poses[observations.keyframe_ids],
+        ROOM.initial_points[observations.landmark_ids],
+    )
+    r, J_pose, J_point = linearise(observations, poses, points, CAMERA, config)
     for i in range(6):
         moved = poses @ se3_exp(1e-6 * np.eye(6)[i])
-        slope = (linearise(seen, moved, points, CAMERA, config)[0] - r) / 1e-6
+        slope = (linearise(observations, moved, points, CAMERA, config)[0] - r) / 1e-6
         np.testing.assert_allclose(slope, J_pose[:, :, i], rtol=1e-3, atol=1e-2)
     for i in range(3):
         moved = points + 1e-6 * np.eye(3)[i]
-        slope = (linearise(seen, poses, moved, CAMERA, config)[0] - r) / 1e-6
+        slope = (linearise(observations, poses, moved, CAMERA, config)[0] - r) / 1e-6
         np.testing.assert_allclose(slope, J_point[:, :, i], rtol=1e-3, atol=1e-2)
 
 
 def test_the_schur_complement_is_that_of_the_whole_normal_matrix() -> None:
     """Equal to the dense normal equations, and zero for a motion of the whole world."""
-    seen = ROOM.observations.select(np.flatnonzero(ROOM.observations.landmark_ids < 20))
-    ids, kinds = np.unique(seen.landmark_ids), np.arange(10)
+    observations = ROOM.observations.select(np.flatnonzero(ROOM.observations.landmark_ids < 20))
+    ids, kinds = np.unique(observations.landmark_ids), np.arange(10)
     config = SmootherConfig()
     poses, points = ROOM.initial_poses, ROOM.initial_points[ids]
     keyframes, landmarks = ValueTable.of(kinds, poses), ValueTable.of(ids, points)
-    information, left = eliminate_points(seen, keyframes, landmarks, CAMERA, config)
-    column = np.searchsorted(ids, seen.landmark_ids)
-    r, J_pose, J_point = linearise(seen, poses[seen.keyframe_ids], points[column], CAMERA, config)
-    J = np.zeros((len(seen), 3, 60 + 3 * len(ids)))
-    for m in range(len(seen)):
-        k, j = 6 * int(seen.keyframe_ids[m]), 60 + 3 * int(column[m])
+    information, left = eliminate_points(observations, keyframes, landmarks, CAMERA, config)
+    column = np.searchsorted(ids, observations.landmark_ids)
+    r, J_pose, J_point = linearise(
+        observations, poses[observations.keyframe_ids], points[column], CAMERA, config
+    )
+    J = np.zeros((len(observations), 3, 60 + 3 * len(ids)))
+    for m in range(len(observations)):
+        k, j = 6 * int(observations.keyframe_ids[m]), 60 + 3 * int(column[m])
         J[m, :, k : k + 6], J[m, :, j : j + 3] = J_pose[m], J_point[m]
     J = J.reshape(-1, J.shape[2])
     N, g = J.T @ J, J.T @ r.ravel()
@@ -141,7 +146,7 @@ def test_a_restored_landmark_includes_its_marginal_factor() -> None:
     again = old.select(np.flatnonzero(np.isin(old.landmark_ids, ids)))
     marginalised = np.flatnonzero(~_last_view(again.landmark_ids, 5, until=6))
     repeated = again.select(marginalised)
-    seen = Observations(
+    observed = Observations(
         *(
             np.concatenate([getattr(new.observations, n), getattr(repeated, n)])
             for n in ("keyframe_ids", "landmark_ids", "measurements", "sigmas_px")
@@ -149,7 +154,9 @@ def test_a_restored_landmark_includes_its_marginal_factor() -> None:
     )
     back = np.union1d(new.landmark_ids, ids)
     estimate = smoother.update(
-        replace(new, landmark_ids=back, points_world=np.zeros((len(back), 3)), observations=seen)
+        replace(
+            new, landmark_ids=back, points_world=np.zeros((len(back), 3)), observations=observed
+        )
     )
     assert estimate.refused.count(RefusalReason.DUPLICATE) == len(repeated)
     both, at, was = np.intersect1d(estimate.landmark_ids, before.landmark_ids, return_indices=True)
@@ -167,14 +174,14 @@ def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
         full.update(update)
         known = np.zeros(0, np.int64) if estimate is None else estimate.landmark_ids
         away = known[known % 5 == k % 5]
-        seen = _without(update.observations, away)
-        back = np.setdiff1d(seen.landmark_ids, known)
+        observed = _without(update.observations, away)
+        back = np.setdiff1d(observed.landmark_ids, known)
         estimate = smoother.update(
             replace(
                 update,
                 landmark_ids=back,
                 points_world=ROOM.initial_points[back],
-                observations=seen,
+                observations=observed,
                 marginalise_landmarks=away,
             )
         )
@@ -193,23 +200,23 @@ def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
 def test_a_removed_observation_is_removed_from_its_group() -> None:
     """A marginalised outlier is removed afterwards: the result equals that without it."""
     room = make_room(keyframes=2, points=80, noise_px=0.3)
-    seen = room.observations
-    bad = int(np.flatnonzero(seen.keyframe_ids == 1)[5])
-    measurements = seen.measurements.copy()
+    observed = room.observations
+    bad = int(np.flatnonzero(observed.keyframe_ids == 1)[5])
+    measurements = observed.measurements.copy()
     measurements[bad] += [9.0, -7.0, 9.0]
-    pair = np.array([[1, seen.landmark_ids[bad]]])
-    without = seen.select(np.delete(np.arange(len(seen)), bad))
-    spoiled = filled(replace(room, observations=replace(seen, measurements=measurements)))
+    pair = np.array([[1, observed.landmark_ids[bad]]])
+    without = observed.select(np.delete(np.arange(len(observed)), bad))
+    with_outlier = filled(replace(room, observations=replace(observed, measurements=measurements)))
     clean = filled(replace(room, observations=without))
     everything = np.arange(80)
-    for smoother in (spoiled, clean):
+    for smoother in (with_outlier, clean):
         smoother.optimise_batch()
         marginalise_landmarks(smoother, everything)
-    before = spoiled.update(GraphUpdate())
-    after = spoiled.update(GraphUpdate(remove_observations=pair))
-    assert_isam_matches_tables(spoiled)
+    before = with_outlier.update(GraphUpdate())
+    after = with_outlier.update(GraphUpdate(remove_observations=pair))
+    assert_isam_matches_tables(with_outlier)
     expected = clean.update(GraphUpdate())
-    assert (1, int(pair[0, 1])) not in _marginalised(spoiled)
+    assert (1, int(pair[0, 1])) not in _marginalised(with_outlier)
     off = np.abs(pose_differences(before, expected)).max()
     assert np.abs(pose_differences(after, expected)).max() < 0.3 * off
 
@@ -219,19 +226,19 @@ def test_removals_apply_to_marginalised_observations_too(what: str) -> None:
     smoother = filled()
     estimate = smoother.optimise_batch()
     marginalise_landmarks(smoother, estimate.landmark_ids[:100])
-    gone = estimate.landmark_ids[:30] if what == "landmark" else np.array([4, 9])
+    removed = estimate.landmark_ids[:30] if what == "landmark" else np.array([4, 9])
     after = smoother.update(
-        GraphUpdate(remove_landmarks=gone)
+        GraphUpdate(remove_landmarks=removed)
         if what == "landmark"
-        else GraphUpdate(remove_keyframes=gone)
+        else GraphUpdate(remove_keyframes=removed)
     )
     assert_isam_matches_tables(smoother)
     column = 1 if what == "landmark" else 0
-    assert not {pair[column] for pair in _marginalised(smoother)} & set(gone.tolist())
+    assert not {pair[column] for pair in _marginalised(smoother)} & set(removed.tolist())
     assert len(after.anchored_keyframes) == 0
     assert not after.rebuilt
     full = smoother.optimise_batch()
-    left = np.setdiff1d(estimate.landmark_ids, gone if what == "landmark" else [])
+    left = np.setdiff1d(estimate.landmark_ids, removed if what == "landmark" else [])
     assert full.landmark_ids.tolist() == left.tolist()
 
 
@@ -256,14 +263,16 @@ def test_a_saved_graph_keeps_its_marginalised_landmarks(tmp_path: Path) -> None:
     np.testing.assert_allclose(a.poses_world_camera, b.poses_world_camera, atol=1e-9)
 
 
-def _without(seen: Observations, landmarks: Array) -> Observations:
-    return seen.select(np.flatnonzero(~np.isin(seen.landmark_ids, landmarks)))
+def _without(observations: Observations, landmarks: Array) -> Observations:
+    return observations.select(np.flatnonzero(~np.isin(observations.landmark_ids, landmarks)))
 
 
 def _pairs(smoother: Smoother) -> set[tuple[int, int]]:
     table = smoother._tables.observations
-    seen = table.select(table.used_rows())
-    return set(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))
+    observations = table.select(table.used_rows())
+    return set(
+        zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
+    )
 
 
 def _marginalised(smoother: Smoother) -> set[tuple[int, int]]:
@@ -282,6 +291,8 @@ def _marginalised(smoother: Smoother) -> set[tuple[int, int]]:
 
 def _last_view(landmarks: Array, keyframe: int, until: int) -> Array:
     """The landmarks without an observation after this keyframe and before ``until``."""
-    seen = ROOM.observations
-    later = seen.landmark_ids[(seen.keyframe_ids > keyframe) & (seen.keyframe_ids < until)]
+    observations = ROOM.observations
+    later = observations.landmark_ids[
+        (observations.keyframe_ids > keyframe) & (observations.keyframe_ids < until)
+    ]
     return ~np.isin(landmarks, later)

@@ -146,8 +146,8 @@ def test_gnc_finds_the_wrong_loops_and_the_clean_optimum(planar: bool) -> None:
     assert result.is_outlier[wrong].all()
     assert result.is_outlier[~wrong].sum() <= 1
     assert np.abs(result.graph.poses - right)[:, :3, 3].max() < 5e-3
-    spoilt = optimise_pose_graph(wrong_graph).graph.poses
-    assert np.abs(spoilt - right)[:, :3, 3].max() > 0.05
+    with_wrong = optimise_pose_graph(wrong_graph).graph.poses
+    assert np.abs(with_wrong - right)[:, :3, 3].max() > 0.05
 
 
 def test_gnc_without_odometry_keeps_the_graph_connected() -> None:
@@ -181,10 +181,10 @@ def test_the_predicted_cost_of_a_loop_equals_the_increase(planar: bool) -> None:
     graph = far_loops(ring(90, planar, seed=2, sigma=0.01))
     used = graph.is_odometry
     drifted = optimise_pose_graph(graph.with_edges(used)).graph.poses
-    asked = np.flatnonzero(~used)
-    predicted = predicted_chi2(graph.with_poses(drifted), used, asked)
+    unused = np.flatnonzero(~used)
+    predicted = predicted_chi2(graph.with_poses(drifted), used, unused)
     rises = []
-    for k in asked:
+    for k in unused:
         with_one = used.copy()
         with_one[k] = True
         rises.append(2 * optimise_pose_graph(graph.with_edges(with_one)).final_cost)
@@ -193,9 +193,9 @@ def test_the_predicted_cost_of_a_loop_equals_the_increase(planar: bool) -> None:
     assert abs(np.log(predicted / rises).mean()) < 0.2
     alone = graph.with_poses(drifted)
     E = inverse(alone.measurements) @ inverse(drifted[alone.edges[:, 0]])
-    r = se3_log(E @ drifted[alone.edges[:, 1]])[asked]
+    r = se3_log(E @ drifted[alone.edges[:, 1]])[unused]
     r = r[:, [3, 4, 2]] if planar else r
-    plain = np.einsum("mi,mij,mj->m", r, graph.information[asked], r)
+    plain = np.einsum("mi,mij,mj->m", r, graph.information[unused], r)
     assert plain.max() > 10 * predicted.max()
 
 

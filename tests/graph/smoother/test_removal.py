@@ -16,11 +16,13 @@ ROOM = make_room(keyframes=8, points=80, noise_px=0.3)
 def test_a_landmark_is_removed_with_all_its_factors() -> None:
     smoother = filled(ROOM)
     before = smoother.estimate()
-    victims = before.landmark_ids[[3, 10]]
-    views = np.isin(ROOM.observations.landmark_ids, victims).sum()
-    after = smoother.update(GraphUpdate(remove_landmarks=victims))
+    removed_ids = before.landmark_ids[[3, 10]]
+    views = np.isin(ROOM.observations.landmark_ids, removed_ids).sum()
+    after = smoother.update(GraphUpdate(remove_landmarks=removed_ids))
     assert after.factors == before.factors - views
-    np.testing.assert_array_equal(after.landmark_ids, np.setdiff1d(before.landmark_ids, victims))
+    np.testing.assert_array_equal(
+        after.landmark_ids, np.setdiff1d(before.landmark_ids, removed_ids)
+    )
     assert not after.rebuilt
     assert_isam_matches_tables(smoother)
     assert_same_optimum(smoother, ROOM)
@@ -40,16 +42,16 @@ def test_a_keyframe_is_removed_with_all_its_factors() -> None:
 def test_an_observation_is_removed_and_added_again() -> None:
     smoother = filled(ROOM)
     before = smoother.estimate()
-    row = int(np.flatnonzero(seen_often(ROOM))[40])
-    seen = ROOM.observations.select(np.array([row]))
-    pair = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+    row = int(np.flatnonzero(observed_often(ROOM))[40])
+    observed = ROOM.observations.select(np.array([row]))
+    pair = np.stack([observed.keyframe_ids, observed.landmark_ids], axis=1)
     after = smoother.update(GraphUpdate(remove_observations=pair))
     assert after.factors == before.factors - 1
     assert_isam_matches_tables(smoother)
-    again = smoother.update(GraphUpdate(observations=seen))
+    again = smoother.update(GraphUpdate(observations=observed))
     assert again.factors == before.factors
     assert len(again.refused) == 0
-    twice = smoother.update(GraphUpdate(observations=seen))
+    twice = smoother.update(GraphUpdate(observations=observed))
     assert twice.refused.count(RefusalReason.DUPLICATE) == 1
     assert_isam_matches_tables(smoother)
     assert_same_optimum(smoother, ROOM)
@@ -59,8 +61,8 @@ def test_an_observation_is_removed_and_added_again() -> None:
 def test_a_removed_id_can_be_added_again(in_one_update: bool) -> None:
     """Landmark 5 becomes another point, keyframe 7 another keyframe."""
     smoother = filled(ROOM)
-    seen = ROOM.observations
-    rows = (seen.landmark_ids == 5) | (seen.keyframe_ids == 7)
+    observations = ROOM.observations
+    rows = (observations.landmark_ids == 5) | (observations.keyframe_ids == 7)
     assert rows.sum() > 20
     removal = {"remove_landmarks": np.array([5]), "remove_keyframes": np.array([7])}
     if not in_one_update:
@@ -72,7 +74,7 @@ def test_a_removed_id_can_be_added_again(in_one_update: bool) -> None:
             ROOM.initial_poses[[7]],
             np.array([5]),
             ROOM.points_world[[5]] + 0.05,
-            seen.select(rows),
+            observations.select(rows),
             **removal,
         )
     )
@@ -87,8 +89,8 @@ def test_many_random_removals_and_additions() -> None:
     """Slots are reused and always hold the factors of the factor tables."""
     rng = np.random.default_rng(5)
     smoother = filled(ROOM)
-    seen = ROOM.observations
-    pairs = np.stack([seen.keyframe_ids, seen.landmark_ids], axis=1)
+    observations = ROOM.observations
+    pairs = np.stack([observations.keyframe_ids, observations.landmark_ids], axis=1)
     for _ in range(15):
         estimate = smoother.update(
             GraphUpdate(
@@ -107,7 +109,7 @@ def test_many_random_removals_and_additions() -> None:
                 ROOM.poses_world_camera[keyframes],
                 landmarks,
                 ROOM.points_world[landmarks],
-                rng_select(rng, seen),
+                rng_select(rng, observations),
             )
         )
         assert not estimate.rebuilt
@@ -115,11 +117,13 @@ def test_many_random_removals_and_additions() -> None:
     assert_same_optimum(smoother, ROOM)
 
 
-def rng_select(rng: np.random.Generator, seen: Observations) -> Observations:
-    return seen.select(np.sort(rng.permutation(len(seen))[: len(seen) // 2]))
+def rng_select(rng: np.random.Generator, observations: Observations) -> Observations:
+    return observations.select(
+        np.sort(rng.permutation(len(observations))[: len(observations) // 2])
+    )
 
 
-def seen_often(room: Room) -> np.ndarray:
+def observed_often(room: Room) -> np.ndarray:
     """Mask of the observations whose landmark has four views or more."""
     ids, views = np.unique(room.observations.landmark_ids, return_counts=True)
     return np.isin(room.observations.landmark_ids, ids[views >= 4])
@@ -144,32 +148,35 @@ def test_a_landmark_with_one_remaining_monocular_view_is_removed() -> None:
     stereo = make_room(keyframes=8, points=80, noise_px=0.3)
     smoother = filled(stereo)
     new = np.arange(1000, 1080)
-    seen = room.observations
-    seen = Observations(
-        seen.keyframe_ids, 1000 + seen.landmark_ids, seen.measurements, seen.sigmas_px
+    observed = room.observations
+    observed = Observations(
+        observed.keyframe_ids,
+        1000 + observed.landmark_ids,
+        observed.measurements,
+        observed.sigmas_px,
     )
     smoother.update(
-        GraphUpdate(landmark_ids=new, points_world=room.points_world, observations=seen)
+        GraphUpdate(landmark_ids=new, points_world=room.points_world, observations=observed)
     )
     before = smoother.estimate()
-    victim = int(before.landmark_ids[before.landmark_ids >= 1000][0])
-    views = seen.keyframe_ids[seen.landmark_ids == victim]
+    landmark_id = int(before.landmark_ids[before.landmark_ids >= 1000][0])
+    views = observed.keyframe_ids[observed.landmark_ids == landmark_id]
     assert len(views) >= 3
-    all_but_two = np.stack([views[:-2], np.full(len(views) - 2, victim)], axis=1)
+    all_but_two = np.stack([views[:-2], np.full(len(views) - 2, landmark_id)], axis=1)
     kept = smoother.update(GraphUpdate(remove_observations=all_but_two))
-    assert victim in kept.landmark_ids
-    gone = smoother.update(GraphUpdate(remove_observations=np.array([[views[-2], victim]])))
-    assert gone.dropped_landmarks.tolist() == [victim]
-    assert not gone.rebuilt
+    assert landmark_id in kept.landmark_ids
+    report = smoother.update(GraphUpdate(remove_observations=np.array([[views[-2], landmark_id]])))
+    assert report.dropped_landmarks.tolist() == [landmark_id]
+    assert not report.rebuilt
     assert_isam_matches_tables(smoother)
 
 
 def test_a_keyframe_without_landmarks_is_anchored_at_its_pose() -> None:
     smoother = filled(ROOM)
     before = smoother.estimate()
-    seen = ROOM.observations
-    mine = seen.landmark_ids[seen.keyframe_ids == 7]
-    pairs = np.stack([np.full(len(mine) - 2, 7), mine[:-2]], axis=1)
+    observations = ROOM.observations
+    own_ids = observations.landmark_ids[observations.keyframe_ids == 7]
+    pairs = np.stack([np.full(len(own_ids) - 2, 7), own_ids[:-2]], axis=1)
     after = smoother.update(GraphUpdate(remove_observations=pairs))
     assert not after.rebuilt
     assert after.anchored_keyframes.tolist() == [7]
@@ -181,21 +188,21 @@ def test_a_keyframe_without_landmarks_is_anchored_at_its_pose() -> None:
 
 def test_a_disconnected_pair_of_keyframes_is_anchored() -> None:
     """Each has enough common landmarks with the other, but both can rotate against the rest."""
-    smoother, seen = filled(ROOM), ROOM.observations
-    last_two = np.isin(seen.keyframe_ids, [6, 7])
-    inside = np.isin(seen.landmark_ids, seen.landmark_ids[~last_two])
-    both = np.intersect1d(*(seen.landmark_ids[seen.keyframe_ids == k] for k in (6, 7)))
-    shared = np.intersect1d(both, seen.landmark_ids[~last_two])
-    rest = ~last_two & np.isin(seen.landmark_ids, shared[2:])
-    strangers = last_two & inside & ~np.isin(seen.landmark_ids, shared)
-    leaving = seen.select(rest | strangers)
+    smoother, observed = filled(ROOM), ROOM.observations
+    last_two = np.isin(observed.keyframe_ids, [6, 7])
+    inside = np.isin(observed.landmark_ids, observed.landmark_ids[~last_two])
+    both = np.intersect1d(*(observed.landmark_ids[observed.keyframe_ids == k] for k in (6, 7)))
+    shared = np.intersect1d(both, observed.landmark_ids[~last_two])
+    rest = ~last_two & np.isin(observed.landmark_ids, shared[2:])
+    others = last_two & inside & ~np.isin(observed.landmark_ids, shared)
+    leaving = observed.select(rest | others)
     pairs = np.stack([leaving.keyframe_ids, leaving.landmark_ids], axis=1)
     after = smoother.update(GraphUpdate(remove_observations=pairs))
     assert not after.rebuilt
     assert len(after.anchored_keyframes) == 1  # it carries the other
     assert after.keyframe_ids.tolist() == list(range(8))
     again = smoother.update(GraphUpdate(observations=leaving))
-    assert again.factors == len(seen) + 1  # without the anchor: the observations and the prior
+    assert again.factors == len(observed) + 1  # without the anchor: the observations and the prior
     assert_isam_matches_tables(smoother)
 
 

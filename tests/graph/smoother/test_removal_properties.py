@@ -33,10 +33,10 @@ def random_room(seed: int) -> Room:
         mono_share=float(rng.choice([0.0, 0.5, 0.9])),
         seed=seed,
     )
-    seen, reach = room.observations, rng.integers(1, 4)
-    home = rng.integers(0, 10, len(room.points_world))[seen.landmark_ids]
+    observed, reach = room.observations, rng.integers(1, 4)
+    home = rng.integers(0, 10, len(room.points_world))[observed.landmark_ids]
     return dataclasses.replace(
-        room, observations=seen.select(np.abs(home - seen.keyframe_ids) <= reach)
+        room, observations=observed.select(np.abs(home - observed.keyframe_ids) <= reach)
     )
 
 
@@ -50,15 +50,15 @@ def random_removal(smoother: Smoother, kind: str, seed: int) -> GraphUpdate:
         return GraphUpdate(remove_keyframes=some(rng, estimate.keyframe_ids[1:], 3))
     if kind == "observations":
         return GraphUpdate(remove_observations=some(rng, pairs, 3))
-    mine = pairs[pairs[:, 0] == rng.choice(estimate.keyframe_ids)]
-    return GraphUpdate(remove_observations=mine[rng.random(len(mine)) < 0.9])
+    own_pairs = pairs[pairs[:, 0] == rng.choice(estimate.keyframe_ids)]
+    return GraphUpdate(remove_observations=own_pairs[rng.random(len(own_pairs)) < 0.9])
 
 
 def some(rng: np.random.Generator, items: np.ndarray, share: int) -> np.ndarray:
     return rng.permutation(items)[: rng.integers(1, 2 + len(items) // share)]
 
 
-def asked(update: GraphUpdate, pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+def requested(update: GraphUpdate, pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
     """The observations that an update's removals name, directly or by a variable."""
     landmarks, keyframes = set(update.remove_landmarks.tolist()), set(update.remove_keyframes)
     single = set(map(tuple, update.remove_observations.tolist()))
@@ -74,13 +74,13 @@ def assert_only_this_left(
     assert_isam_matches_tables(smoother)
     assert len(loose_in(smoother._tables, smoother._config)) == 0  # the local test missed none
     dropped = set(after.dropped_landmarks.tolist())
-    wanted = asked(update, pairs)
-    assert pairs_of(smoother) == {(k, j) for k, j in pairs - wanted if j not in dropped}
-    gone = np.union1d(update.remove_landmarks, after.dropped_landmarks)
-    np.testing.assert_array_equal(after.landmark_ids, np.setdiff1d(before.landmark_ids, gone))
+    expected = requested(update, pairs)
+    assert pairs_of(smoother) == {(k, j) for k, j in pairs - expected if j not in dropped}
+    removed = np.union1d(update.remove_landmarks, after.dropped_landmarks)
+    np.testing.assert_array_equal(after.landmark_ids, np.setdiff1d(before.landmark_ids, removed))
     kept = np.setdiff1d(before.keyframe_ids, update.remove_keyframes)
     np.testing.assert_array_equal(after.keyframe_ids, kept)
-    assert dropped.issubset({j for _, j in wanted})
+    assert dropped.issubset({j for _, j in expected})
     return after
 
 
@@ -106,16 +106,19 @@ def test_removing_and_adding_again_gives_the_same_optimum(room: int, kind: str, 
     after = smoother.update(update)
     new_keyframes = np.setdiff1d(before.keyframe_ids, after.keyframe_ids)
     new_landmarks = np.setdiff1d(before.landmark_ids, after.landmark_ids)
-    seen = made.observations
+    observations = made.observations
     lost = pairs - pairs_of(smoother)
-    rows = [(k, j) in lost for k, j in zip(seen.keyframe_ids, seen.landmark_ids, strict=True)]
+    rows = [
+        (k, j) in lost
+        for k, j in zip(observations.keyframe_ids, observations.landmark_ids, strict=True)
+    ]
     again = smoother.update(
         GraphUpdate(
             new_keyframes,
             made.initial_poses[new_keyframes],
             new_landmarks,
             made.initial_points[new_landmarks],
-            seen.select(np.array(rows, bool)),
+            observations.select(np.array(rows, bool)),
         )
     )
     assert not again.rebuilt

@@ -134,8 +134,8 @@ def test_a_segment_connected_by_one_point_is_dropped(smoother: Smoother) -> None
     """Every new keyframe has many landmarks, but the segment can rotate about a single point."""
     before = smoother.estimate()
     far = ROOM.moved(se3_exp(np.array([0.0, 0.0, 0.0, 40.0, 0.0, 0.0])))
-    seen = far.observations
-    few = seen.select(seen.keyframe_ids < 3)
+    observed = far.observations
+    few = observed.select(observed.keyframe_ids < 3)
     known = int(before.landmark_ids[3])
     hinge = observe(50, [known], np.array([[330.0, 240.0, 315.0]]))
     new = np.unique(few.landmark_ids)
@@ -206,10 +206,10 @@ def test_an_update_that_cannot_be_repaired_is_removed_as_a_whole(
 def test_a_batch_optimisation_is_repaired_too(smoother: Smoother) -> None:
     expected = smoother.optimise_batch()
     row = 40
-    seen = smoother._tables.observations.select(np.array([row]))
-    seen.measurements[0, 0] = np.nan
+    observations = smoother._tables.observations.select(np.array([row]))
+    observations.measurements[0, 0] = np.nan
     smoother._tables.observations.remove(np.array([row]))
-    smoother._tables.observations.add(seen)
+    smoother._tables.observations.add(observations)
     found = smoother.optimise_batch()
     assert found.rebuilt
     assert found.factors == expected.factors - 1

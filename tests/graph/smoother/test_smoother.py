@@ -89,17 +89,17 @@ def test_two_runs_are_identical() -> None:
 
 def test_huber_bounds_the_effect_of_outliers() -> None:
     room = make_room(noise_px=0.5)
-    seen = room.observations
-    measurements = seen.measurements.copy()
+    observed = room.observations
+    measurements = observed.measurements.copy()
     measurements[::25, ::2] += 20.0
-    spoiled = dataclasses.replace(
-        room, observations=dataclasses.replace(seen, measurements=measurements)
+    disturbed = dataclasses.replace(
+        room, observations=dataclasses.replace(observed, measurements=measurements)
     )
     smoother, _ = run(room)
     clean = smoother.optimise_batch()
     harm_m = {}
     for robust in (True, False):
-        smoother, _ = run(spoiled, SmootherConfig(robust=robust, gate_sigmas=1e3))
+        smoother, _ = run(disturbed, SmootherConfig(robust=robust, gate_sigmas=1e3))
         moved = smoother.optimise_batch().poses_world_camera - clean.poses_world_camera
         harm_m[robust] = np.linalg.norm(moved[:, :3, 3], axis=1).mean()
     assert harm_m[True] < 0.2 * harm_m[False]
@@ -152,9 +152,9 @@ def test_a_second_segment_has_its_own_prior() -> None:
     room = make_room(keyframes=4)
     smoother, _ = run(room)
     moved = room.moved(T_NEW_OLD)
-    seen = moved.observations
+    observations = moved.observations
     prior = PosePrior(100, moved.poses_world_camera[0], 1e-8 * np.eye(6))
-    new = np.unique(seen.landmark_ids)
+    new = np.unique(observations.landmark_ids)
     estimate = smoother.update(
         GraphUpdate(
             100 + np.arange(4),
@@ -162,7 +162,10 @@ def test_a_second_segment_has_its_own_prior() -> None:
             1000 + new,
             moved.initial_points[new],
             Observations(
-                100 + seen.keyframe_ids, 1000 + seen.landmark_ids, seen.measurements, seen.sigmas_px
+                100 + observations.keyframe_ids,
+                1000 + observations.landmark_ids,
+                observations.measurements,
+                observations.sigmas_px,
             ),
             priors=(prior,),
         )
@@ -174,19 +177,19 @@ def test_a_second_segment_has_its_own_prior() -> None:
 
 def test_observation_errors_find_a_planted_outlier() -> None:
     room = make_room(noise_px=0.5)
-    seen = room.observations
+    observed = room.observations
     wrong = 200
-    measurements = seen.measurements.copy()
+    measurements = observed.measurements.copy()
     measurements[wrong, 1] += 6.0
     room = dataclasses.replace(
-        room, observations=dataclasses.replace(seen, measurements=measurements)
+        room, observations=dataclasses.replace(observed, measurements=measurements)
     )
     smoother, _ = run(room)
     smoother.optimise_batch()
     errors = smoother.observation_errors()
     worst = int(np.argmax(errors.chi2))
-    assert errors.keyframe_ids[worst] == seen.keyframe_ids[wrong]
-    assert errors.landmark_ids[worst] == seen.landmark_ids[wrong]
+    assert errors.keyframe_ids[worst] == observed.keyframe_ids[wrong]
+    assert errors.landmark_ids[worst] == observed.landmark_ids[wrong]
     assert np.mean(errors.chi2 < 7.815) > 0.93
     assert errors.is_stereo.all()
     assert (errors.depth_m > 0.5).all()
@@ -225,14 +228,14 @@ def test_notes_list_refused_factors_with_reasons() -> None:
     room, smoother = make_room(noise_px=0.3), Smoother(CAMERA)
     first, second = room.update_of(0), room.update_of(1)
     assert smoother.update(first).notes() == []
-    seen = second.observations
-    measurements = seen.measurements.copy()
+    observed = second.observations
+    measurements = observed.measurements.copy()
     measurements[:2, 0] = np.inf
     loop = RelativePose(0, 77, np.eye(4), np.eye(6), kind="loop")
     estimate = smoother.update(
         dataclasses.replace(
             second,
-            observations=dataclasses.replace(seen, measurements=measurements),
+            observations=dataclasses.replace(observed, measurements=measurements),
             relative_poses=(loop,),
         )
     )

@@ -74,8 +74,8 @@ def test_a_monocular_view_needs_no_disparity_sigma(smoother: Smoother) -> None:
 
 
 def test_a_repeated_observation_is_added_once(smoother: Smoother) -> None:
-    seen = NEXT.observations
-    doubled = seen.select(np.array([0, 1, 1, *range(2, len(seen))]))
+    observed = NEXT.observations
+    doubled = observed.select(np.array([0, 1, 1, *range(2, len(observed))]))
     estimate = smoother.update(dataclasses.replace(NEXT, observations=doubled))
     assert estimate.refused.reasons.tolist() == [RefusalReason.DUPLICATE]
 
@@ -93,10 +93,12 @@ def test_points_behind_the_camera_are_refused_by_depth(
 ) -> None:
     T_world_camera = smoother.estimate().poses_world_camera[2]
     point = T_world_camera[:3, 3] + z_m * T_world_camera[:3, 2]
-    seen = Observations(
+    observed = Observations(
         np.array([2]), np.array([900]), np.array([[318.5, 241.5, 310.0]]), np.ones((1, 3))
     )
-    update = GraphUpdate(landmark_ids=np.array([900]), points_world=point[None], observations=seen)
+    update = GraphUpdate(
+        landmark_ids=np.array([900]), points_world=point[None], observations=observed
+    )
     estimate = smoother.update(update)
     assert estimate.refused.reasons.tolist() == [reason]
     assert 900 not in estimate.landmark_ids
@@ -106,10 +108,12 @@ def test_a_stereo_view_that_contradicts_a_new_point_is_refused(smoother: Smoothe
     """At twice the disparity a Gauss-Newton step would put the point behind the camera."""
     T_world_camera = smoother.estimate().poses_world_camera[2]
     point = T_world_camera[:3, 3] + 4.0 * T_world_camera[:3, 2]
-    seen = Observations(
+    observed = Observations(
         np.array([2]), np.array([900]), np.array([[318.5, 241.5, 297.5]]), np.ones((1, 3))
     )
-    update = GraphUpdate(landmark_ids=np.array([900]), points_world=point[None], observations=seen)
+    update = GraphUpdate(
+        landmark_ids=np.array([900]), points_world=point[None], observations=observed
+    )
     assert smoother.update(update).refused.reasons.tolist() == [RefusalReason.REPROJECTION]
 
 
@@ -177,7 +181,7 @@ def test_an_underconstrained_keyframe_is_refused(smoother: Smoother) -> None:
             np.concatenate(
                 [
                     NEXT.observations.measurements[first],
-                    CAMERA.project_stereo(seen_from(3, ROOM.points_world[:40])),
+                    CAMERA.project_stereo(observed_from(3, ROOM.points_world[:40])),
                 ]
             ),
             np.ones((45, 3)),
@@ -190,13 +194,13 @@ def test_an_underconstrained_keyframe_is_refused(smoother: Smoother) -> None:
     assert estimate.refused.keyframe_ids[whole].tolist() == [3]
     assert estimate.refused.reasons[whole].tolist() == [RefusalReason.KEYFRAME_UNDERCONSTRAINED]
     T_a_b = np.linalg.inv(ROOM.poses_world_camera[2]) @ ROOM.poses_world_camera[3]
-    held = dataclasses.replace(
+    anchored = dataclasses.replace(
         made_up, relative_poses=(RelativePose(2, 3, T_a_b, 1e-4 * np.eye(6)),)
     )
-    assert 3 in smoother.update(held).keyframe_ids
+    assert 3 in smoother.update(anchored).keyframe_ids
 
 
-def seen_from(keyframe: int, points_world: np.ndarray) -> np.ndarray:
+def observed_from(keyframe: int, points_world: np.ndarray) -> np.ndarray:
     T_world_camera = ROOM.poses_world_camera[keyframe]
     return (points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
 

@@ -72,9 +72,9 @@ def test_the_current_poses_are_used_for_the_fusion() -> None:
         assert mapper.add(moved_by(away, k)) == []
     mapper.update_poses({k.id: k.T_world_camera for k in given} | {99: np.eye(4)})
     found = [r for k in given[4:] for r in mapper.add(k)] + mapper.flush()
-    for mine, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
-        np.testing.assert_array_equal(mine.keyframe.T_world_camera, theirs.keyframe.T_world_camera)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a.map.rho.numpy(), b.map.rho.numpy())
+        np.testing.assert_array_equal(a.keyframe.T_world_camera, b.keyframe.T_world_camera)
 
 
 def test_a_flush_starts_a_new_stream() -> None:
@@ -83,8 +83,8 @@ def test_a_flush_starts_a_new_stream() -> None:
     again = all_of(mapper, given[3:])
     alone = all_of(DenseMapper(CAMERA), given[3:])
     assert [r.keyframe.id for r in first + again] == list(range(6))
-    for mine, theirs in zip(again, alone, strict=True):
-        np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
+    for a, b in zip(again, alone, strict=True):
+        np.testing.assert_array_equal(a.map.rho.numpy(), b.map.rho.numpy())
 
 
 def test_a_late_keyframe_is_used_by_its_neighbours() -> None:
@@ -105,9 +105,9 @@ def test_removed_keyframes_have_no_effect() -> None:
     found = [r for k in given[:6] for r in mapper.add(k)]
     mapper.remove([2, 5])
     found += [r for k in given[6:] for r in mapper.add(k)] + mapper.flush()
-    for mine, theirs in zip(found, expected, strict=True):
-        assert mine.keyframe.id == theirs.keyframe.id
-        np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
+    for a, b in zip(found, expected, strict=True):
+        assert a.keyframe.id == b.keyframe.id
+        np.testing.assert_array_equal(a.map.rho.numpy(), b.map.rho.numpy())
 
 
 def test_late_labels_have_the_effect_of_early_ones() -> None:
@@ -115,13 +115,13 @@ def test_late_labels_have_the_effect_of_early_ones() -> None:
     moves, numbers = np.zeros((30, 40), bool), np.ones((30, 40), np.uint16)
     moves[5:15, 8:20] = True
     hidden = np.where(moves, np.float32(np.nan), given[3].depth_m)
-    told = replace(given[3], depth_m=hidden, instances=numbers, unmatched=moves)
-    expected = all_of(DenseMapper(CAMERA), [told if k.id == 3 else k for k in given])
+    relabelled = replace(given[3], depth_m=hidden, instances=numbers, unmatched=moves)
+    expected = all_of(DenseMapper(CAMERA), [relabelled if k.id == 3 else k for k in given])
     mapper = DenseMapper(CAMERA)
     found = [r for k in given[:6] for r in mapper.add(k)]
     mapper.relabel(3, numbers, moves)
     mapper.relabel(99, numbers, moves)
     found += [r for k in given[6:] for r in mapper.add(k)] + mapper.flush()
-    for mine, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(mine.map.rho.numpy(), theirs.map.rho.numpy())
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a.map.rho.numpy(), b.map.rho.numpy())
     assert found[3].keyframe.instances is numbers

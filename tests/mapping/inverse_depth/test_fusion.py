@@ -87,10 +87,13 @@ def reference(own: InverseDepthMap, views: list[View], seeds):
         seed = rho0[v, u] if known else seeds[v, u]
         if not np.isfinite(seed):
             continue
-        said = [neighbour_estimate(seed, u, v, view, not known) for view in views]
-        r, s = [rho0[v, u], *(m for m, _ in said)], [variance0[v, u], *(x for _, x in said)]
+        estimates = [neighbour_estimate(seed, u, v, view, not known) for view in views]
+        r, s = (
+            [rho0[v, u], *(m for m, _ in estimates)],
+            [variance0[v, u], *(x for _, x in estimates)],
+        )
         chosen = largest_set(r, s)
-        if not chosen and known and not any(m < seed for m, _ in said):
+        if not chosen and known and not any(m < seed for m, _ in estimates):
             chosen = [0]
         if chosen:
             total = sum(1 / s[k] for k in chosen)
@@ -123,10 +126,10 @@ def test_a_neighbour_gives_the_inverse_depth_of_the_same_plane() -> None:
     truth = plane_rho(T_a)
     view = View(as_map(plane_rho(T_b), 0.01), relative(T_a, T_b))
     mean, variance = hypothesis(torch.tensor(truth, dtype=torch.float32), view, CAMERA)
-    seen = np.isfinite(mean.numpy())
-    assert seen.mean() > 0.6
-    np.testing.assert_allclose(mean.numpy()[seen], truth[seen], rtol=2e-5)
-    assert (variance.numpy()[seen] > 0).all()
+    valid = np.isfinite(mean.numpy())
+    assert valid.mean() > 0.6
+    np.testing.assert_allclose(mean.numpy()[valid], truth[valid], rtol=2e-5)
+    assert (variance.numpy()[valid] > 0).all()
 
 
 def test_points_behind_the_other_camera_have_no_projection() -> None:
@@ -206,8 +209,8 @@ def test_the_rim_of_a_seeded_surface_is_not_seeded_from_behind() -> None:
 def test_the_factor_corrects_wrong_variances(scale: float) -> None:
     rng = np.random.default_rng(1)
     maps = [as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004 / scale) for _ in range(4)]
-    said = [(m.rho, m.variance) for m in maps[1:]]
-    assert variance_factor(maps[0], said) == pytest.approx(scale**2, rel=0.1)
+    estimates = [(m.rho, m.variance) for m in maps[1:]]
+    assert variance_factor(maps[0], estimates) == pytest.approx(scale**2, rel=0.1)
 
 
 def test_no_neighbours_give_no_factor() -> None:
@@ -233,10 +236,10 @@ def test_the_calibrated_variance_decreases_with_smoothing() -> None:
     rng = np.random.default_rng(4)
     given = as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004)
     final = regularise(given)
-    said = float(with_calibrated_variance(final, unchanged(given, 1.0)).variance.nanmedian())
+    estimates = float(with_calibrated_variance(final, unchanged(given, 1.0)).variance.nanmedian())
     smoothed = float((final.rho - 0.5).square().nanmedian() / 0.455)
     slope = BLUR_PX**2 * float(squared_gradient(final.rho).nanmedian())
-    assert smoothed < said - slope < 0.8 * 0.004**2
+    assert smoothed < estimates - slope < 0.8 * 0.004**2
 
 
 def test_an_edge_pixel_may_belong_to_either_surface() -> None:

@@ -43,10 +43,10 @@ def submap(anchor: int, count: int = 400, instances: int = 3) -> Submap:
 
 def table(rows: list[int], classes: int) -> LabelTable:
     """A table for submaps with these numbers of rows; the first row is of no instance."""
-    told = [RNG.normal(0, 2, (n, classes)).astype(np.float32) for n in rows]
-    for keyframe in told:
+    log_likelihoods = [RNG.normal(0, 2, (n, classes)).astype(np.float32) for n in rows]
+    for keyframe in log_likelihoods:
         keyframe[0] = 0
-    return LabelTable.of(told, LabelStoreConfig())
+    return LabelTable.of(log_likelihoods, LabelStoreConfig())
 
 
 def test_the_cloud_equals_a_loop_over_voxels(tmp_path: Path) -> None:
@@ -78,22 +78,22 @@ def test_the_cloud_equals_a_loop_over_voxels(tmp_path: Path) -> None:
 
 def test_labels_equal_a_loop_over_voxels_and_submaps() -> None:
     """Each submap counts once; one without a point in the voxel, by its points in the cell."""
-    told, points, voxels = table([3, 2, 4], 5), 300, 60
+    log_likelihoods, points, voxels = table([3, 2, 4], 5), 300, 60
     voxel = np.r_[np.arange(voxels), RNG.integers(0, voxels, points - voxels)]
     cell = np.arange(voxels) // 7
-    instance = RNG.integers(0, len(told.submaps), points)
-    labels, probabilities = _fused_labels(voxel, cell, instance, told)
-    store, rows = LabelStoreConfig(), told.log_likelihoods.astype(float)
+    instance = RNG.integers(0, len(log_likelihoods.submaps), points)
+    labels, probabilities = _fused_labels(voxel, cell, instance, log_likelihoods)
+    store, rows = LabelStoreConfig(), log_likelihoods.log_likelihoods.astype(float)
     for v in range(voxels):
         evidence, misses = np.log(store.prior(5)), 0.0
         for submap in range(3):
-            of_submap = told.submaps[instance] == submap
+            of_submap = log_likelihoods.submaps[instance] == submap
             mine = of_submap & (voxel == v)
             if not mine.any():
                 mine = of_submap & (cell[voxel] == cell[v])
             if mine.any():
                 evidence += rows[instance[mine]].mean(axis=0)
-                misses += np.mean(instance[mine] == told.first[submap])
+                misses += np.mean(instance[mine] == log_likelihoods.first[submap])
         evidence[1:] += store.log_missed(np.array(misses))
         share = np.exp(evidence) / np.exp(evidence).sum()
         assert labels[v] == share.argmax()
@@ -103,20 +103,20 @@ def test_labels_equal_a_loop_over_voxels_and_submaps() -> None:
 def test_objects_in_several_views_are_kept_and_in_one_view_dropped() -> None:
     """As in the label store: misses of an object are not independent."""
     store, classes = LabelStoreConfig(), 40
-    seen = np.zeros(classes, np.float32)
-    seen[2] = 0.6
-    seen[0] = 0.4
-    word = np.log(store.likelihoods(seen[None], np.float32([0.8])))
+    expected = np.zeros(classes, np.float32)
+    expected[2] = 0.6
+    expected[0] = 0.4
+    word = np.log(store.likelihoods(expected[None], np.float32([0.8])))
     for found, missed, label in ((3, 8, 2), (1, 100, 0), (0, 5, 0)):
         keyframes = [np.r_[np.zeros((1, classes), np.float32), word]] * (found + missed)
-        told = LabelTable.of(keyframes, store)
-        instance = told.first + (np.arange(found + missed) < found)
+        log_likelihoods = LabelTable.of(keyframes, store)
+        instance = log_likelihoods.first + (np.arange(found + missed) < found)
         views = np.zeros(len(instance), np.int64)
-        assert _fused_labels(views, np.zeros(1, np.int64), instance, told)[0] == [label]
+        assert _fused_labels(views, np.zeros(1, np.int64), instance, log_likelihoods)[0] == [label]
         labels = LabelStore(classes, store)
         for k in range(found + missed):
             if k < found:
-                labels.update(np.zeros(1, np.int64), seen[None], np.float32([0.8]))
+                labels.update(np.zeros(1, np.int64), expected[None], np.float32([0.8]))
             else:
                 labels.miss(np.zeros(1, np.int64), np.ones(1, np.float32))
         assert labels.estimates(np.zeros(1, np.int64)).labels == [label]
@@ -176,8 +176,14 @@ def test_the_better_of_overlapping_masks_is_used() -> None:
 
 def test_a_better_mask_has_more_weight() -> None:
     found = [instance(slice(0, 3), 1, 0.9, 0.9), instance(slice(3, 5), 1, 0.9, 0.3)]
-    told = keyframe_labels(found, (6, 8), 4, LabelStoreConfig()).log_likelihoods
-    np.testing.assert_allclose(np.exp(told) @ LabelStoreConfig().prior(4), 1, rtol=1e-5)
-    assert told[1, 1] > told[2, 1] > 0 > told[2, 2] > told[1, 2]
-    assert not told[0].any()
-    assert np.isfinite(told).all()
+    log_likelihoods = keyframe_labels(found, (6, 8), 4, LabelStoreConfig()).log_likelihoods
+    np.testing.assert_allclose(np.exp(log_likelihoods) @ LabelStoreConfig().prior(4), 1, rtol=1e-5)
+    assert (
+        log_likelihoods[1, 1]
+        > log_likelihoods[2, 1]
+        > 0
+        > log_likelihoods[2, 2]
+        > log_likelihoods[1, 2]
+    )
+    assert not log_likelihoods[0].any()
+    assert np.isfinite(log_likelihoods).all()

@@ -150,12 +150,12 @@ def test_new_instances_relabel_the_points_of_their_pixels() -> None:
     numbers = np.arange(1200, dtype=np.uint16).reshape(30, 40)
     moves = np.zeros((30, 40), bool)
     moves[:, 25:] = True
-    told = relabel(submap, CAMERA, numbers, moves)
+    relabelled = relabel(submap, CAMERA, numbers, moves)
     expected = make_submap(
         replace(result, keyframe=replace(result.keyframe, instances=numbers)), CAMERA, 0.01
     )
     keep = expected.instances % 40 < 25
     assert 0 < keep.sum() < len(keep)
-    np.testing.assert_array_equal(told.instances, expected.instances[keep])
-    np.testing.assert_array_equal(told.points, expected.points[keep])
-    np.testing.assert_array_equal(told.colours, expected.colours[keep])
+    np.testing.assert_array_equal(relabelled.instances, expected.instances[keep])
+    np.testing.assert_array_equal(relabelled.points, expected.points[keep])
+    np.testing.assert_array_equal(relabelled.colours, expected.colours[keep])

@@ -32,11 +32,11 @@ def posterior(p: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def test_a_batch_update_equals_bayes_rule_one_by_one() -> None:
     rng = np.random.default_rng(1)
     store, ids = LabelStore(C, NO_LIMIT), np.array([3, 0, 1500])
-    seen = [views(3, rng) for _ in range(6)]
-    for p, weights in seen:
+    observed = [views(3, rng) for _ in range(6)]
+    for p, weights in observed:
         store.update(ids, p, weights)
     for row, i in enumerate(ids):
-        expected = posterior(*(np.array([part[row] for part in v]) for v in zip(*seen)))  # noqa: B905
+        expected = posterior(*(np.array([part[row] for part in v]) for v in zip(*observed)))  # noqa: B905
         assert np.allclose(store.probabilities(np.array([i]))[0], expected, atol=1e-5)
     assert store.estimates(ids).views.tolist() == [6, 6, 6]
 

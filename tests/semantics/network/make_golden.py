@@ -64,20 +64,20 @@ def network_results(name: str, model: MaskRCNN) -> Arrays:
     """Intermediate and final results for two images of different shape."""
     images = [torch.from_numpy(picture(96, 128, 0)), torch.from_numpy(picture(120, 90, 1))]
     images = [image.double() for image in images]
-    seen: dict[str, list] = {"levels": [], "rpn": [], "box": [], "masks": []}
+    recorded: dict[str, list] = {"levels": [], "rpn": [], "box": [], "masks": []}
     hooks = (
         (model.backbone, "levels"), (model.rpn.head, "rpn"), (model.roi_heads.box_predictor, "box"),
         (model.roi_heads.mask_predictor, "masks"),
     )  # fmt: skip
     for module, key in hooks:
-        module.register_forward_hook(lambda _m, _i, out, key=key: seen[key].append(out))
+        module.register_forward_hook(lambda _m, _i, out, key=key: recorded[key].append(out))
     proposals: list = []
     model.rpn.register_forward_hook(lambda _m, _i, out: proposals.extend(out[0]))
     results = model(images)
     out: Arrays = {}
-    for i, level in enumerate(seen["levels"][0].values()):
+    for i, level in enumerate(recorded["levels"][0].values()):
         out[f"level{i}"] = level[:, ::128].numpy()
-    out["box_logits"] = seen["box"][0][0][::40].numpy()
+    out["box_logits"] = recorded["box"][0][0][::40].numpy()
     for b, result in enumerate(results):
         out[f"proposals{b}"] = proposals[b][::5].numpy()
         for key in ("boxes", "labels", "scores"):

@@ -18,14 +18,14 @@ CONFIG = NetworkConfig(
 
 def test_the_mask_enters_as_the_last_channel_pooled_two_by_two() -> None:
     head = MaskIoUHead(CONFIG)
-    seen = []
-    head.convs[0].register_forward_hook(lambda _m, inputs, _o: seen.append(inputs[0]))
+    recorded = []
+    head.convs[0].register_forward_hook(lambda _m, inputs, _o: recorded.append(inputs[0]))
     features, masks = torch.rand(2, 6, 14, 14), torch.rand(2, 28, 28)
     assert head(features, masks).shape == (2, 3)
-    assert seen[0].shape == (2, 7, 14, 14)
-    torch.testing.assert_close(seen[0][:, :6], features)
+    assert recorded[0].shape == (2, 7, 14, 14)
+    torch.testing.assert_close(recorded[0][:, :6], features)
     expected = masks.unfold(1, 2, 2).unfold(2, 2, 2).amax(dim=(3, 4))
-    torch.testing.assert_close(seen[0][:, 6], expected)
+    torch.testing.assert_close(recorded[0][:, 6], expected)
 
 
 def test_masks_and_ious_of_the_predicted_label_are_used() -> None:

@@ -200,16 +200,16 @@ def test_the_whole_network(named: tuple[str, MaskRCNN]) -> None:
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster
     images = [torch.from_numpy(picture(96, 128, 0)), torch.from_numpy(picture(120, 90, 1))]
     images = [image.double() for image in images]
-    seen: dict[str, list] = {}
+    recorded: dict[str, list] = {}
     for key, module in (("levels", model.backbone), ("proposals", model.rpn),
                         ("box", model.roi_heads.box_predictor)):  # fmt: skip
-        module.register_forward_hook(lambda _m, _i, out, key=key: seen.update({key: out}))
+        module.register_forward_hook(lambda _m, _i, out, key=key: recorded.update({key: out}))
     with torch.inference_mode():
         results = model(images)
-    for i, level in enumerate(seen["levels"]):
+    for i, level in enumerate(recorded["levels"]):
         assert_golden(f"{name}/level{i}", level[:, ::128])
     for b, (result, image) in enumerate(zip(results, images, strict=True)):
-        assert_golden(f"{name}/proposals{b}", seen["proposals"][b][::5])
+        assert_golden(f"{name}/proposals{b}", recorded["proposals"][b][::5])
         assert len(result.found.labels) == 30
         assert_golden(f"{name}/labels{b}", result.found.labels, 0)
         assert_golden(f"{name}/boxes{b}", result.found.boxes)
@@ -219,7 +219,7 @@ def test_the_whole_network(named: tuple[str, MaskRCNN]) -> None:
         assert_golden(f"{name}/pasted{b}", pasted)
         own = result.found.distributions.gather(1, result.found.labels[:, None])[:, 0]
         torch.testing.assert_close(own, result.found.scores)
-    assert_golden(f"{name}/box_logits", seen["box"][0][::40])
+    assert_golden(f"{name}/box_logits", recorded["box"][0][::40])
 
 
 def test_the_whole_network_at_inference(named: tuple[str, MaskRCNN]) -> None:

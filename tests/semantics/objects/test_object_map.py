@@ -58,7 +58,7 @@ class Scene:
         number = len(self.poses)
         T_scene_camera = se3_exp(np.array([0, 0.05 * x, 0, x, 0, 0]))
         self.poses[number] = self.T_world_scene @ T_scene_camera
-        instances, depth_m = seen(T_scene_camera, cards, score)
+        instances, depth_m = instances_of(T_scene_camera, cards, score)
         assignment = assign_pixels(instances, depth_m, SIZE, VoteConfig())
         own = self.poses[number]
         view = KeyframeView(number, number / 2, own, depth_m, RAYS, assignment, dict(self.poses))
@@ -72,7 +72,7 @@ class Scene:
         return self.map.objects(self.poses, self.T_world_scene[:3, :3] @ UP)
 
 
-def seen(T: Array, cards: list[Card], score: float) -> tuple[list[Instance], np.ndarray]:
+def instances_of(T: Array, cards: list[Card], score: float) -> tuple[list[Instance], np.ndarray]:
     """Instances of the cards that are in the image, and every second pixel of its depth."""
     rays = pixel_rays(CAMERA, 1) @ T[:3, :3].T
     instances, z_m = [], (3.0 - T[2, 3]) / rays[..., 2]

@@ -39,7 +39,7 @@ BOXES = torch.tensor([
 ])  # fmt: skip
 LABELS = torch.tensor([1, 2, 1, 1, 1, 1])
 SCORES = torch.tensor([0.9, 0.9, 0.5, 0.5, 0.01, 0.01])
-TAKEN = [0, 2, 4]
+SELECTED = [0, 2, 4]
 
 
 def scene() -> tuple[MaskRCNN, torch.Tensor, Target]:
@@ -69,11 +69,11 @@ def test_examples_hold_masks_and_scores_of_both_passes() -> None:
     model, image, target = scene()
     found = ClassifiedBoxes(BOXES, LABELS, SCORES, torch.full((6, 3), 1 / 3))
     given = examples(model, image, found, target, DetectedConfig())
-    assert len(given) == len(TAKEN)
+    assert len(given) == len(SELECTED)
     with torch.inference_mode():
         whole = segment_both_ways(model, image, found)
-    torch.testing.assert_close(given.masks.float(), whole.masks[TAKEN], atol=2e-3, rtol=0)
-    pasted = paste(whole.masks, whole.mask_boxes, (96, 128))[TAKEN] > 0.5
+    torch.testing.assert_close(given.masks.float(), whole.masks[SELECTED], atol=2e-3, rtol=0)
+    pasted = paste(whole.masks, whole.mask_boxes, (96, 128))[SELECTED] > 0.5
     best = mask_iou(pasted, target.masks).amax(dim=1)
     torch.testing.assert_close(given.ious, best)
     assert (given.ious > 0).all()

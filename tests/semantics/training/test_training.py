@@ -75,17 +75,17 @@ def test_classes_have_equal_chances_however_many_objects_they_have() -> None:
 
 
 def test_dice_counts_the_share_of_a_mask_that_is_right() -> None:
-    wanted = torch.zeros(2, 28, 28)
-    wanted[0, 4:24, 3] = 1  # thin
-    wanted[1, 4:24, 4:24] = 1
-    assert float(dice_loss(wanted, wanted)) == pytest.approx(0, abs=1e-6)
-    half = wanted.clone()
+    target = torch.zeros(2, 28, 28)
+    target[0, 4:24, 3] = 1  # thin
+    target[1, 4:24, 4:24] = 1
+    assert float(dice_loss(target, target)) == pytest.approx(0, abs=1e-6)
+    half = target.clone()
     half[0, 14:] = 0
-    thin = float(dice_loss(half[:1], wanted[:1]))
+    thin = float(dice_loss(half[:1], target[:1]))
     assert thin == pytest.approx(1 - 21 / 31)
-    wide = wanted[1:].clone()
+    wide = target[1:].clone()
     wide[0, 14:] = 0
-    assert float(dice_loss(wide, wanted[1:])) == pytest.approx(thin, abs=0.02)
+    assert float(dice_loss(wide, target[1:])) == pytest.approx(thin, abs=0.02)
 
 
 def test_mask_targets_are_exact_shares() -> None:
@@ -107,12 +107,12 @@ def test_mask_targets_are_exact_shares() -> None:
 def test_the_iou_target_counts_the_object_outside_the_box_too() -> None:
     predicted = torch.zeros(1, 28, 28)
     predicted[0, :, :14] = 0.9  # the left half
-    wanted = torch.zeros(1, 28, 28)
-    wanted[0, :14] = 1.0  # the upper half
+    target = torch.zeros(1, 28, 28)
+    target[0, :14] = 1.0  # the upper half
     box = torch.tensor([100.0])
-    inside_only = iou_targets(predicted, wanted, torch.tensor([50.0]), box)
+    inside_only = iou_targets(predicted, target, torch.tensor([50.0]), box)
     assert float(inside_only) == pytest.approx(25 / 75)
-    larger = iou_targets(predicted, wanted, torch.tensor([80.0]), box)
+    larger = iou_targets(predicted, target, torch.tensor([80.0]), box)
     assert float(larger) == pytest.approx(25 / (50 + 80 - 25))
 
 

@@ -54,8 +54,10 @@ def make_world(keyframes: int, count: int = COUNT) -> tuple[WorldMap, Array]:
 
 def pairs(update: GraphUpdate) -> set[tuple[int, int]]:
     """(keyframe, landmark) of every observation; none may be sent twice."""
-    seen = update.observations
-    sent = list(zip(seen.keyframe_ids.tolist(), seen.landmark_ids.tolist(), strict=True))
+    observations = update.observations
+    sent = list(
+        zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
+    )
     assert len(sent) == len(set(sent))
     return set(sent)
 
@@ -99,11 +101,11 @@ def test_quantised_sigmas_are_few_and_near() -> None:
 def test_observations_belong_to_their_keypoints() -> None:
     world, points = make_world(2)
     keyframe = world.keyframes[1]
-    seen = observations_of(keyframe, np.array([9, 4]), np.array([9, 4]))
-    assert seen.keyframe_ids.tolist() == [1, 1]
-    assert seen.landmark_ids.tolist() == [9, 4]
+    observations = observations_of(keyframe, np.array([9, 4]), np.array([9, 4]))
+    assert observations.keyframe_ids.tolist() == [1, 1]
+    assert observations.landmark_ids.tolist() == [9, 4]
     expected = CAMERA.project_stereo(transform(inverse(pose_of(1)), points[[9, 4]]))
-    np.testing.assert_allclose(seen.measurements, expected, atol=1e-9)
+    np.testing.assert_allclose(observations.measurements, expected, atol=1e-9)
 
 
 def test_a_landmark_is_added_at_its_second_observation_with_all() -> None:
@@ -177,9 +179,9 @@ def test_the_cap_bounds_landmarks_and_spreads_them() -> None:
     assert len(update.landmark_ids) == 50
     assert np.array_equal(np.flatnonzero(world.landmarks.in_graph), update.landmark_ids)
     buckets = world.keyframes[2].features.image_pixels // 80
-    taken = {tuple(b) for b in buckets[update.landmark_ids].tolist()}
+    covered = {tuple(b) for b in buckets[update.landmark_ids].tolist()}
     occupied = {tuple(b) for b in buckets.tolist()}
-    assert len(taken) == min(len(occupied), 50)
+    assert len(covered) == min(len(occupied), 50)
 
 
 def test_landmarks_in_the_graph_count_towards_the_cap() -> None:
@@ -273,8 +275,8 @@ def test_the_smoother_corrects_disturbed_poses(whole: bool) -> None:
     read_back(world, smoother.update(factor_selection.keyframe_update(world, world.keyframes[0])))
     for k in range(1, 5):
         features = make_features(pose_of(k), points, random_descriptors(COUNT, RNG))
-        spoiled = pose_of(k) @ se3_exp(RNG.normal(0, [0.003] * 3 + [0.01] * 3))
-        keyframe = add_keyframe(world, spoiled, features)
+        disturbed = pose_of(k) @ se3_exp(RNG.normal(0, [0.003] * 3 + [0.01] * 3))
+        keyframe = add_keyframe(world, disturbed, features)
         world.attach(keyframe, np.arange(COUNT), np.arange(COUNT))
         estimate = smoother.update(factor_selection.keyframe_update(world, keyframe))
         assert len(estimate.refused) == 0
@@ -355,8 +357,8 @@ def test_landmarks_outside_the_window_are_marginalised_and_restored() -> None:
 def test_a_marginalised_landmark_with_new_observations_is_restored() -> None:
     """As fusing after a loop does: observations of a newer landmark go to an old one."""
     world, factor_selection, _ = windowed_world(WINDOWED)
-    gone = world.replace_landmarks(np.array([COUNT + 3]), np.array([4]))
-    factor_selection.remove_landmarks(gone)
+    removed = world.replace_landmarks(np.array([COUNT + 3]), np.array([4]))
+    factor_selection.remove_landmarks(removed)
     update = factor_selection.map_update(world)
     assert update.landmark_ids.tolist() == [4]
     assert pairs(update) == {(6, 4), (7, 4), (8, 4)}

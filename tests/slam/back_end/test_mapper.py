@@ -31,8 +31,8 @@ def row_of_keyframes(count: int, mapping: MappingConfig) -> Mapper:
     for k in range(count):
         own = points_before(T, ALONE, rng)
         looks = np.concatenate([descriptors, random_descriptors(ALONE, rng)])
-        seen = np.concatenate([points, own])
-        keyframe = add_keyframe(world, T, make_features(T, seen, looks))
+        observed = np.concatenate([points, own])
+        keyframe = add_keyframe(world, T, make_features(T, observed, looks))
         if shared is None:
             shared = world.make_landmarks(keyframe, np.arange(60), points)
         else:
@@ -61,7 +61,7 @@ def test_no_keyframe_is_culled_with_too_few_other_observations() -> None:
 def test_landmarks_of_only_a_culled_keyframe_are_removed() -> None:
     mapper = row_of_keyframes(10, MappingConfig())
     world = mapper.world
-    held = {i for k in world.keyframes.values() for i in world.observed(k)[1].tolist()}
-    assert set(np.flatnonzero(world.landmarks.in_map).tolist()) == held
+    expected = {i for k in world.keyframes.values() for i in world.observed(k)[1].tolist()}
+    assert set(np.flatnonzero(world.landmarks.in_map).tolist()) == expected
     estimate = mapper.smoother.update(mapper._factor_selector.map_update(world))
     assert set(estimate.keyframe_ids.tolist()) == set(world.keyframes)

@@ -123,8 +123,8 @@ def assert_consistent(world: WorldMap, smoother: Smoother) -> None:
     """Check that map and graph agree, counters are right, and masked keypoints observe nothing."""
     assert in_map(world) == in_graph(smoother)
     landmarks = world.landmarks
-    held = smoother.estimate().landmark_ids
-    np.testing.assert_array_equal(np.flatnonzero(landmarks.in_graph), held)
+    graph_ids = smoother.estimate().landmark_ids
+    np.testing.assert_array_equal(np.flatnonzero(landmarks.in_graph), graph_ids)
     views = np.zeros(len(landmarks), int)
     for keyframe in world.keyframes.values():
         assert (keyframe.landmark_ids[keyframe.masked] == -1).all()
@@ -178,14 +178,14 @@ def test_observations_are_removed_and_landmarks_kept() -> None:
 
 def test_landmarks_are_removed_with_all_their_observations() -> None:
     session = Session(4)
-    asked = np.array([5, 17])
-    gone = session.pruner().prune_landmarks(np.array([17, 5, -1, 10**6])).landmark_ids
-    assert gone.tolist() == asked.tolist()
-    assert not session.world.landmarks.in_map[gone].any()
-    assert all(k.masked[gone].all() for k in session.world.keyframes.values())
-    assert not {i for _, i in in_graph(session.smoother)} & set(gone.tolist())
+    requested = np.array([5, 17])
+    removed = session.pruner().prune_landmarks(np.array([17, 5, -1, 10**6])).landmark_ids
+    assert removed.tolist() == requested.tolist()
+    assert not session.world.landmarks.in_map[removed].any()
+    assert all(k.masked[removed].all() for k in session.world.keyframes.values())
+    assert not {i for _, i in in_graph(session.smoother)} & set(removed.tolist())
     assert_consistent(session.world, session.smoother)
-    again = session.pruner().prune_landmarks(gone)
+    again = session.pruner().prune_landmarks(removed)
     assert len(again.landmark_ids) == 0
     assert str(again) == "nothing removed"
 
@@ -287,9 +287,9 @@ def test_map_and_graph_agree_in_any_order_of_events(
         if event == "fuse":
             session.fuse()
         if event == "cull landmark":
-            victims = rng.permutation(np.flatnonzero(world.landmarks.in_map))[:3]
-            world.landmarks.remove(victims)
-            session.factor_selection.remove_landmarks(victims)
+            removed_ids = rng.permutation(np.flatnonzero(world.landmarks.in_map))[:3]
+            world.landmarks.remove(removed_ids)
+            session.factor_selection.remove_landmarks(removed_ids)
         if event == "cull keyframe" and len(keyframes) > 3:
             session.cull_keyframe(int(rng.choice(keyframes[1:-1])), parent_id=keyframes[-1])
         if event == "mask":

@@ -121,9 +121,9 @@ def test_a_significant_difference_is_reported(comparison, tmp_path):
     assert counts == "0 / 10 of 10"
     assert judgement == "worse"
     assert {entry.text for entry in tables["ablation"].rows[0].entries} == {"+50"}
-    (counted, said) = summary(judged(comparison, 1.5))
+    (counted, verdict) = summary(judged(comparison, 1.5))
     assert "20 cells, all done" in counted
-    assert said == f"ATE: {HOSTILE} is worse than default by 0.72 cm on the mean of 10 pairs."
+    assert verdict == f"ATE: {HOSTILE} is worse than default by 0.72 cm on the mean of 10 pairs."
 
 
 def test_no_significant_difference_is_reported_as_none(comparison, tmp_path):
@@ -144,8 +144,8 @@ def test_the_provenance_is_complete_without_empty_values(comparison, tmp_path):
         "experiment": {"seeds": [0], "note": "", "render": None},
     }
     *_, made = make_sections(replace(comparison, provenance=given), tmp_path)
-    told = {listing.title: listing.text for listing in made.listings}
-    assert told == {"Run": "commit: abc\nworkers: 2", "Experiment": "seeds: [0]"}
+    listings = {listing.title: listing.text for listing in made.listings}
+    assert listings == {"Run": "commit: abc\nworkers: 2", "Experiment": "seeds: [0]"}
 
 
 def test_pending_cells_and_partial_truth_are_reported(comparison):

@@ -134,9 +134,11 @@ def test_seeds_of_a_recording_are_one_pair():
     """Otherwise a deterministic system would gain significance from repeated runs."""
     values = np.repeat(noise(5, 1), 9, axis=2)
     assert verdicts(comparison(values, drawn=()))[0].pairs == 6
-    theirs, own, _ = pairs(comparison(values, ("a",)), ("default", "other"), "ate_rmse")
-    assert len(theirs) == 9 + 5
-    assert (theirs[0], own[0]) == (values[0, 0, 0], values[1, 0, 0])
+    base_values, other_values, _ = pairs(
+        comparison(values, ("a",)), ("default", "other"), "ate_rmse"
+    )
+    assert len(base_values) == 9 + 5
+    assert (base_values[0], other_values[0]) == (values[0, 0, 0], values[1, 0, 0])
 
 
 def test_a_failed_cell_is_an_incomplete_pair():

@@ -102,12 +102,12 @@ def test_a_pool_runs_all_and_passes_on_failures(tmp_path):
 def test_closing_a_pool_kills_running_jobs(tmp_path):
     pids: list[int] = []
 
-    class Watched(LocalPool):
+    class RecordingPool(LocalPool):
         def _started(self, process):
             pids.append(process.pid)
             super()._started(process)
 
-    jobs = Watched(2).run([job(tmp_path), endless(tmp_path)])
+    jobs = RecordingPool(2).run([job(tmp_path), endless(tmp_path)])
     assert next(jobs)[0].name == "one"
     wait_for(lambda: len(pids) == 2)
     jobs.close()

@@ -84,7 +84,7 @@ def test_a_tum_archive_becomes_a_sequence(server, tmp_path):
     assert sequence.camera.fx == pytest.approx(517.306408), "TUM's own, by the folder's name"
     assert sorted(path.name for path in folder.parent.iterdir()) == ["freiburg1_tiny"]
     assert obtain(recording, tmp_path) == folder
-    assert len(server.asked) == 1
+    assert len(server.requests) == 1
 
 
 def test_the_first_hash_is_kept_and_a_later_file_must_agree(server, tmp_path):

@@ -43,12 +43,12 @@ def member(name: str, kind: bytes, target: str = "") -> tarfile.TarInfo:
 @pytest.mark.parametrize("make", [tar_of, zip_of], ids=["tar", "zip"])
 def test_files_are_unpacked_unchanged(make, tmp_path):
     archive = make(tmp_path / "a", files=FILES)
-    told: list[tuple[int, int]] = []
-    unpack(archive, tmp_path / "out", lambda *done: told.append(done))
+    progress: list[tuple[int, int]] = []
+    unpack(archive, tmp_path / "out", lambda *done: progress.append(done))
     for name, content in FILES.items():
         assert (tmp_path / "out" / name).read_bytes() == content
         assert stat.S_IMODE((tmp_path / "out" / name).stat().st_mode) & 0o6111 == 0
-    assert 0 < told[-1][0] <= told[-1][1]
+    assert 0 < progress[-1][0] <= progress[-1][1]
 
 
 @pytest.mark.parametrize(

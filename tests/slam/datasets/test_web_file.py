@@ -36,21 +36,21 @@ def names(folder: Path) -> list[str]:
 
 
 def test_a_file_is_downloaded_completely_with_one_request(server, tmp_path):
-    told: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     file = WebFile(f"{server.url}/file.tgz", SHA256, len(CONTENT))
     path = tmp_path / "new" / "file.tgz"
-    assert download(file, path, lambda *done: told.append(done)) == SHA256
+    assert download(file, path, lambda *done: progress.append(done)) == SHA256
     assert path.read_bytes() == CONTENT
-    assert told[-1] == (len(CONTENT), len(CONTENT))
+    assert progress[-1] == (len(CONTENT), len(CONTENT))
     assert download(file, path) == SHA256
-    assert len(server.asked) == 1
+    assert len(server.requests) == 1
     assert names(path.parent) == ["file.tgz"]
 
 
 def test_a_connection_that_ends_early_is_resumed_where_it_ended(server, tmp_path):
     server.cut_after, server.cuts = 300_000, 2
     assert download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f") == SHA256
-    assert server.asked == ["", "bytes=300000-", "bytes=600000-"]
+    assert server.requests == ["", "bytes=300000-", "bytes=600000-"]
 
 
 def test_an_interrupted_download_is_resumed_by_the_next_call(server, tmp_path, monkeypatch):
@@ -60,7 +60,7 @@ def test_an_interrupted_download_is_resumed_by_the_next_call(server, tmp_path, m
         download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f")
     assert not (tmp_path / "f").exists()
     assert download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f") == SHA256
-    assert server.asked == ["", "bytes=300000-"]
+    assert server.requests == ["", "bytes=300000-"]
     assert names(tmp_path) == ["f"]
 
 
@@ -108,14 +108,14 @@ def test_a_broken_file_on_disk_is_downloaded_again(server, tmp_path):
 def test_a_missing_file_is_requested_once(server, tmp_path):
     with pytest.raises(InputError, match=rf"404 Not Found.*put it to {tmp_path}/f$"):
         download(WebFile(f"{server.url}/none"), tmp_path / "f")
-    assert len(server.asked) == 1
+    assert len(server.requests) == 1
 
 
 def test_server_errors_are_retried_a_few_times(server, tmp_path):
     server.status = 503
     with pytest.raises(InputError, match="503"):
         download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f")
-    assert len(server.asked) == web_file.TRIES
+    assert len(server.requests) == web_file.TRIES
 
 
 def test_an_unreachable_server_is_reported_at_once(tmp_path):
@@ -137,7 +137,7 @@ def test_a_full_disk_is_not_reported_as_a_connection_error(server, tmp_path, mon
     monkeypatch.setattr(web_file, "_copy", full)
     with pytest.raises(OSError, match="No space left"):
         download(WebFile(f"{server.url}/file.tgz"), tmp_path / "f")
-    assert len(server.asked) == 1, "it must not be tried again"
+    assert len(server.requests) == 1, "it must not be tried again"
 
 
 def test_two_processes_download_once(server, tmp_path):
@@ -147,5 +147,5 @@ def test_two_processes_download_once(server, tmp_path):
         thread.start()
     for thread in both:
         thread.join()
-    assert len(server.asked) == 1
+    assert len(server.requests) == 1
     assert (tmp_path / "f").read_bytes() == CONTENT

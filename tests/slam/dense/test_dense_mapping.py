@@ -85,11 +85,11 @@ def test_labels_agree_with_the_truth(mapped: Path, room: Path) -> None:
     cloud = read_ply(mapped / "dense" / "cloud.ply")
     points = np.stack([cloud[c] for c in "xyz"], axis=1).astype(float)
     keyframe = run.keyframes[4]
-    seen = transform(inverse(keyframe.T_world_camera), points)
-    pixels = np.rint(run.camera.project(seen)).astype(int)
+    points_camera = transform(inverse(keyframe.T_world_camera), points)
+    pixels = np.rint(run.camera.project(points_camera)).astype(int)
     true_m = cv2.imread(str(room / "depth_true" / f"{keyframe.timestamp_s:.6f}.png"), -1) / 5000
-    inside = ((pixels >= 0) & (pixels < (160, 120))).all(axis=1) & (seen[:, 2] > 0)
-    pixels, z, label = pixels[inside], seen[inside, 2], cloud["label"][inside]
+    inside = ((pixels >= 0) & (pixels < (160, 120))).all(axis=1) & (points_camera[:, 2] > 0)
+    pixels, z, label = pixels[inside], points_camera[inside, 2], cloud["label"][inside]
     visible = np.abs(true_m[pixels[:, 1], pixels[:, 0]] - z) < 0.05
     content = json.loads((room / "annotations.json").read_text())
     found = CocoSegmenter(room / "annotations.json").segment(
@@ -134,8 +134,8 @@ def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_
     opened, names = open_run(run), CocoSegmenter(truth_file(open_run(run))).labels
     folder = DenseFolder.open(run)
     evidence = [folder.evidence(k.id) for k in opened.keyframes]
-    seen = [e.log_likelihoods[e.landmark_instances].argmax(axis=1) for e in evidence]
-    old = int(np.bincount(np.concatenate(seen)).argmax())
+    points_camera = [e.log_likelihoods[e.landmark_instances].argmax(axis=1) for e in evidence]
+    old = int(np.bincount(np.concatenate(points_camera)).argmax())
     new = names.number("cup")
     assert old not in (0, new)
     store, ids = LabelStore(len(names)), np.flatnonzero(opened.world.landmarks.in_map)

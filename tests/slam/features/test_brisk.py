@@ -283,9 +283,9 @@ def test_the_reserve_equals_the_rest_of_a_larger_search() -> None:
     expected = {tuple(p): k for k, p in enumerate(larger.image_pixels.tolist())}
     rows = np.array([expected.get(tuple(p), -1) for p in both.image_pixels.tolist()])
     for name in ("descriptors", "angles_rad", "depth_m", "sigmas_px", "pixels", "colours"):
-        mine, others = getattr(both, name)[rows >= 0], getattr(larger, name)[rows[rows >= 0]]
+        common, others = getattr(both, name)[rows >= 0], getattr(larger, name)[rows[rows >= 0]]
         # sums over a patch are rounded by how many patches some processors take at once
-        np.testing.assert_allclose(mine, others, rtol=1e-5 * (name == "angles_rad"), err_msg=name)
+        np.testing.assert_allclose(common, others, rtol=1e-5 * (name == "angles_rad"), err_msg=name)
 
 
 def test_octaves_give_no_reserve() -> None:

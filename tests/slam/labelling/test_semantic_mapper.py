@@ -159,13 +159,13 @@ def test_labels_follow_fused_and_culled_landmarks(at_once: SlamSystem) -> None:
     semantics, landmarks = at_once.semantics, at_once.mapper.world.landmarks
     semantics.follow_map()
     assert landmarks.in_map[semantics.labels.known()].all()
-    a, b, gone = semantics.labels.known()[[3, 8, 12]]
+    a, b, removed = semantics.labels.known()[[3, 8, 12]]
     both = semantics.labels.estimates(np.array([a, b])).views.sum()
     world = at_once.mapper.world
     world.replace_landmarks(np.array([a]), np.array([b]))
-    landmarks.remove(np.array([gone]))
+    landmarks.remove(np.array([removed]))
     semantics.follow_map()
-    assert semantics.labels.estimates(np.array([a, b, gone])).views.tolist() == [
+    assert semantics.labels.estimates(np.array([a, b, removed])).views.tolist() == [
         0,
         both,
         0,

@@ -54,9 +54,9 @@ def snapshot(number: int, T: Array | None = None) -> KeyframeSnapshot:
 def make_server(path: Path) -> tuple[DenseServer, list[Any]]:
     path.mkdir()
     (path / "config.yaml").write_text(dump(SystemConfig()))
-    said: list[Any] = []
+    answers: list[Any] = []
     masks = SegmenterOptions("truth")
-    return DenseServer(DenseSetup(path, CAMERA, masks, LABELS, shown=500), said.append), said
+    return DenseServer(DenseSetup(path, CAMERA, masks, LABELS, shown=500), answers.append), answers
 
 
 def to_map(number: int, instances: list[Instance], T: Array | None = None) -> KeyframeToMap:
@@ -64,19 +64,19 @@ def to_map(number: int, instances: list[Instance], T: Array | None = None) -> Ke
     return KeyframeToMap(whole, instances, {number: whole.T_world_camera})
 
 
-def mapped(said: list[Any]) -> list[int]:
-    return [m.keyframe_id for m in said if isinstance(m, Mapped)]
+def mapped(answers: list[Any]) -> list[int]:
+    return [m.keyframe_id for m in answers if isinstance(m, Mapped)]
 
 
 def test_a_submap_is_sent_after_its_neighbours_and_is_accurate(tmp_path) -> None:
-    server, said = make_server(tmp_path / "run")
+    server, answers = make_server(tmp_path / "run")
     for number in POSES:
         server.handle(to_map(number, []))
-    assert mapped(said) == [0, 1]
+    assert mapped(answers) == [0, 1]
     submap = DenseFolder.open(tmp_path / "run").submap(1)
     points_world, _ = submap.placed(POSES[1])
     assert np.abs(points_world[:, 2] - PLANE_Z_M).max() < 0.003
-    preview = next(m.preview for m in said if isinstance(m, Mapped) and m.keyframe_id == 1)
+    preview = next(m.preview for m in answers if isinstance(m, Mapped) and m.keyframe_id == 1)
     assert 300 < len(preview.points) <= 500
     shown = preview.points @ POSES[1][:3, :3].T + POSES[1][:3, 3]
     assert np.abs(shown[:, 2] - PLANE_Z_M).max() < 0.003
@@ -112,12 +112,12 @@ def in_time(tmp_path_factory: pytest.TempPathFactory) -> DenseFolder:
 
 def with_late_masks(path: Path, last: int) -> DenseFolder:
     """The same, but the masks come after keyframe ``last``."""
-    server, said = make_server(path)
+    server, answers = make_server(path)
     for number in range(7):
         server.handle(to_map(number, []))
         if number == last:
             server.handle(LateMasks(0, [CHAIR, PERSON], np.arange(4), PIXELS))
-    assert mapped(said) == [0]
+    assert mapped(answers) == [0]
     return DenseFolder.open(path)
 
 
@@ -129,8 +129,8 @@ def same_evidence(one: DenseFolder, other: DenseFolder) -> bool:
 def test_masks_before_fusion_equal_masks_in_time(tmp_path, in_time) -> None:
     late = with_late_masks(tmp_path / "run", 3)
     for name in ("points", "colours", "variances", "instances"):
-        mine, theirs = getattr(late.submap(0), name), getattr(in_time.submap(0), name)
-        np.testing.assert_array_equal(mine, theirs)
+        a, b = getattr(late.submap(0), name), getattr(in_time.submap(0), name)
+        np.testing.assert_array_equal(a, b)
     assert same_evidence(late, in_time)
     assert in_time.evidence(0).landmark_instances.tolist() == [1, 1, 2]
 
@@ -159,30 +159,30 @@ def test_late_masks_relabel_the_submap(tmp_path, in_time) -> None:
 
 
 def test_a_removed_keyframe_is_removed_before_and_after_saving(tmp_path) -> None:
-    server, said = make_server(tmp_path / "run")
+    server, answers = make_server(tmp_path / "run")
     for number in range(7):
         server.handle(to_map(number, []))
-    assert mapped(said) == [0]
+    assert mapped(answers) == [0]
     server.handle(RemoveKeyframes([0, 3]))
     server._report(server._fusion.finish())
-    assert mapped(said) == [0, 1, 2, 4, 5, 6]
+    assert mapped(answers) == [0, 1, 2, 4, 5, 6]
     folder = DenseFolder.open(tmp_path / "run")
     assert [k for k in POSES if folder.is_done(k)] == [1, 2, 4, 5, 6]
     assert not list(folder.path.glob("*/000000"))
 
 
 def test_a_keyframe_that_cannot_be_mapped_is_reported(tmp_path) -> None:
-    server, said = make_server(tmp_path / "run")
+    server, answers = make_server(tmp_path / "run")
     server.handle(to_map(0, [], np.full((4, 4), np.nan)))
-    assert isinstance(said[0], NotMapped)
-    assert "not finite" in said[0].reason
+    assert isinstance(answers[0], NotMapped)
+    assert "not finite" in answers[0].reason
 
 
 def test_a_finished_keyframe_is_reported_again_on_request(tmp_path) -> None:
     server, _ = make_server(tmp_path / "run")
     for number in range(7):
         server.handle(to_map(number, []))
-    said: list[Any] = []
-    again = DenseServer(server._setup, said.append)
+    answers: list[Any] = []
+    again = DenseServer(server._setup, answers.append)
     again.handle(to_map(0, []))
-    assert mapped(said) == [0]
+    assert mapped(answers) == [0]

@@ -72,8 +72,8 @@ def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
     assert main(["run", *common]) == 0
     assert main(["map", str(offline), "--quiet"]) == 0
     clouds = [read_ply(path / "dense" / "cloud.ply") for path in (out, offline)]
-    mine, theirs = (np.stack([c[axis] for axis in "xyz"], axis=1) for c in clouds)
-    for found, other in ((mine, theirs), (theirs, mine)):
+    live_points, offline_points = (np.stack([c[axis] for axis in "xyz"], axis=1) for c in clouds)
+    for found, other in ((live_points, offline_points), (offline_points, live_points)):
         distances_m = cKDTree(other).query(found[::5])[0]
         assert (distances_m < 0.03).mean() > 0.9
         assert distances_m[distances_m < 0.05].mean() < 0.01

@@ -57,9 +57,9 @@ def keyframes_without(run: Path) -> dict[int, str]:
     done = [k for k in range(100) if folder.is_done(k)]
     assert len(done) > 3
     assert set(done) <= set(ids)
-    told = json.loads((run / "dense" / "dense.json").read_text())["keyframes_left_out"]
-    assert sorted(map(int, told)) == sorted(set(ids) - set(done))
-    return {int(k): str(reason) for k, reason in told.items()}
+    reasons = json.loads((run / "dense" / "dense.json").read_text())["keyframes_left_out"]
+    assert sorted(map(int, reasons)) == sorted(set(ids) - set(done))
+    return {int(k): str(reason) for k, reason in reasons.items()}
 
 
 def off_the_plane_m(run: Path) -> float:

@@ -76,9 +76,9 @@ def test_tracking_continues_while_the_disk_is_full(small_disk, caplog) -> None:
         assert len(rows) == 1 + len(FRAMES)
         fill(small_disk)
         pids = list(slam.processes().values())
-        with pytest.raises(InputError, match="the whole trajectory is in") as told:
+        with pytest.raises(InputError, match="the whole trajectory is in") as caught:
             slam.close()
-    path = Path(str(told.value).rsplit(" ", 1)[1])
+    path = Path(str(caught.value).rsplit(" ", 1)[1])
     assert len(read_tum(path)) == len(FRAMES)
     path.unlink()
     assert not running(pids)

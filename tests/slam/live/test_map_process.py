@@ -56,8 +56,8 @@ def test_a_segment_restarts_after_losing_its_first_keyframe() -> None:
     nothing = np.zeros(0, ENTRY)
     server.handle(1, LostKeyframe(0, NO_KEYFRAME, np.eye(4), nothing, 500))
     server.handle(2, keyframe(system, 1, (0, np.eye(4))))  # made while the first was being lost
-    seen = VisibilityCounts(np.arange(500), np.ones(500, int), np.ones(500, int))
-    server.handle(3, keyframe(system, 2, None, seen))
+    counts = VisibilityCounts(np.arange(500), np.ones(500, int), np.ones(500, int))
+    server.handle(3, keyframe(system, 2, None, counts))
     world = system.mapper.world
     assert list(world.keyframes) == [2]
     assert not world.landmarks.in_map[:500].any()
@@ -92,8 +92,8 @@ def test_observations_removed_under_a_mask_are_restored() -> None:
     assert made.any()
     np.testing.assert_array_equal(landmarks.patches[back[made]], all_patches.images[under[made]])
     assert np.isfinite(landmarks.patch_views[back[made]][:, 0]).all()
-    told = [answer for answer in answers if isinstance(answer, MapChanged)][-1].delta
-    assert np.isin(back[back >= 0], told.ids).all()
+    delta = [answer for answer in answers if isinstance(answer, MapChanged)][-1].delta
+    assert np.isin(back[back >= 0], delta.ids).all()
     server.handle(5, RestoreObservations(7, under, all_patches[under]))  # culled meanwhile
     server.handle(6, keyframe(system, 2, (1, one.T_world_camera)))
     assert list(system.mapper.world.keyframes) == [0, 1, 2]

@@ -26,7 +26,7 @@ POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(10)]
 FRAMES = [render_plane(pose, index) for index, pose in enumerate(POSES)]
 
 
-class Given:
+class FakeSource:
     """A source that gives these frames."""
 
     name, camera, groundtruth = "given", CAMERA, None
@@ -38,7 +38,7 @@ class Given:
         yield from self._frames
 
 
-def taken(newest: Newest[int]) -> list[int]:
+def consume_all(newest: Newest[int]) -> list[int]:
     found = []
     while not newest.ended:
         item = newest.get(0.05)
@@ -67,19 +67,19 @@ def test_items_consumed_in_time_are_all_delivered_in_order() -> None:
             yield k
 
     newest = Newest(slowly(), keep=1)
-    assert taken(newest) == [0, 1, 2, 3, 4]
+    assert consume_all(newest) == [0, 1, 2, 3, 4]
     assert newest.dropped == 0
 
 
 def test_a_slow_consumer_gets_the_newest_and_drops_are_counted() -> None:
     newest = filled(10, keep=2)
-    assert taken(newest) == [8, 9]
+    assert consume_all(newest) == [8, 9]
     assert newest.dropped == 8
 
 
 def test_an_overflow_keeps_only_the_newest() -> None:
     newest = filled(6, keep=3)
-    assert taken(newest) == [3, 4, 5]  # 3 drove out the others
+    assert consume_all(newest) == [3, 4, 5]  # 3 drove out the others
     assert newest.dropped == 3
 
 
@@ -91,7 +91,7 @@ def test_an_error_of_the_source_is_raised_after_its_frames() -> None:
     newest = Newest(broken(), keep=1)
     assert newest.get(5) == 1
     with pytest.raises(InputError, match="unplugged"):
-        taken(newest)
+        consume_all(newest)
 
 
 def test_an_endless_source_stops_on_request() -> None:
@@ -113,7 +113,7 @@ def slam() -> Iterator[LiveSlam]:
 def test_a_waiting_source_is_tracked_completely_without_refused_frames(slam) -> None:
     small = Frame(3, FRAMES[3].timestamp_s, FRAMES[3].rgb[::2], FRAMES[3].depth_m)
     frames = [*FRAMES[:3], small, FRAMES[2], *FRAMES[4:6]]
-    assert play(slam, Given(frames), PlayOptions(realtime=False, quiet=True)) is None
+    assert play(slam, FakeSource(frames), PlayOptions(realtime=False, quiet=True)) is None
     health = slam.health()
     assert (health.frames, health.frames_refused, health.frames_dropped) == (5, 2, 0)
 
@@ -132,14 +132,14 @@ def test_a_waiting_source_does_not_outrun_the_map(monkeypatch) -> None:
             return result
 
         monkeypatch.setattr(slam, "track", watched)
-        play(slam, Given(frames), PlayOptions(realtime=False, quiet=True))
+        play(slam, FakeSource(frames), PlayOptions(realtime=False, quiet=True))
     assert sum(made) > 3  # the map itself may have culled some by now
     assert len(waiting) == len(frames)
     assert max(waiting) <= WAITING
 
 
 def test_silence_is_reported_once_and_frames_after_it_are_tracked(slam, caplog) -> None:
-    class Silent(Given):
+    class Silent(FakeSource):
         def frames(self) -> Iterator[Frame]:
             yield FRAMES[6]
             time.sleep(0.6)
@@ -153,7 +153,7 @@ def test_silence_is_reported_once_and_frames_after_it_are_tracked(slam, caplog) 
 
 def test_a_recording_is_delivered_at_its_stamps() -> None:
     frames = [replace(FRAMES[k], timestamp_s=5.0 + 0.1 * k) for k in range(5)]
-    read_s, given_s = [], []
+    read_s, delivered_s = [], []
 
     def reading() -> Iterator[Frame]:
         for frame in frames:
@@ -161,8 +161,8 @@ def test_a_recording_is_delivered_at_its_stamps() -> None:
             yield frame
 
     for _ in paced(reading()):
-        given_s.append(time.monotonic())
-    due_s = given_s[0] + 0.1 * np.arange(5)
+        delivered_s.append(time.monotonic())
+    due_s = delivered_s[0] + 0.1 * np.arange(5)
     late_s = 0.03  # the first may have been noted so much after it was given
-    assert (np.array(given_s) > due_s - late_s).all()
+    assert (np.array(delivered_s) > due_s - late_s).all()
     assert (np.array(read_s)[2:] > due_s[2:] - 0.05 - late_s).all()  # then it knows the interval

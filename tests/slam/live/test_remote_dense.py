@@ -33,7 +33,7 @@ from bmask_slam.world.world_map import WorldMap
 SETUP = DenseSetup(Path("run"), CAMERA, SegmenterOptions(), ("background",))
 
 
-class StandIn:
+class FakeWorker:
     """A fake process that does nothing and crashes on request."""
 
     def __init__(self, *arguments: Any) -> None:
@@ -59,13 +59,13 @@ class StandIn:
 
 @pytest.fixture
 def dense(monkeypatch: pytest.MonkeyPatch) -> RemoteDenseMapper:
-    monkeypatch.setattr(remote_dense, "SupervisedWorker", StandIn)
+    monkeypatch.setattr(remote_dense, "SupervisedWorker", FakeWorker)
     return RemoteDenseMapper(SETUP)
 
 
-def process(dense: RemoteDenseMapper) -> StandIn:
+def process(dense: RemoteDenseMapper) -> FakeWorker:
     worker = dense._worker
-    assert isinstance(worker, StandIn)
+    assert isinstance(worker, FakeWorker)
     return worker
 
 
@@ -80,7 +80,7 @@ def a_map(count: int) -> WorldMap:
     return world
 
 
-def ask(dense: RemoteDenseMapper, *ids: int) -> Frame:
+def add_keyframes(dense: RemoteDenseMapper, *ids: int) -> Frame:
     frame = Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), np.ones((480, 640), np.float32))
     for number in ids:
         dense.add_keyframe(number, frame)
@@ -93,13 +93,13 @@ def no(number: int) -> bool:
 
 def test_the_newest_keyframe_is_sent_first_and_one_at_a_time(dense) -> None:
     world, worker = a_map(4), process(dense)
-    frame = ask(dense, 0, 1, 2)
+    frame = add_keyframes(dense, 0, 1, 2)
     frame.rgb[:] = 7  # the caller's buffer: it may be used again
     dense.update(world, no, no)
     dense.update(world, no, no)
     assert worker.keyframes() == [2]
     assert (worker.sent[0].snapshot.frame.rgb == 0).all()
-    ask(dense, 3)
+    add_keyframes(dense, 3)
     for number in (2, 3, 1, 0):
         worker.answers = [Accepted(number)]
         dense.update(world, no, no)
@@ -110,12 +110,12 @@ def test_the_newest_keyframe_is_sent_first_and_one_at_a_time(dense) -> None:
 
 def test_too_many_keyframes_drop_the_oldest_that_was_not_sent(dense) -> None:
     world, worker = a_map(MAX_WAITING + 3), process(dense)
-    ask(dense, 0)
+    add_keyframes(dense, 0)
     dense.update(world, no, no)
-    ask(dense, *range(1, MAX_WAITING + 1))
+    add_keyframes(dense, *range(1, MAX_WAITING + 1))
     assert dense.full
     assert dense.dropped == 0
-    ask(dense, MAX_WAITING + 1, MAX_WAITING + 2)
+    add_keyframes(dense, MAX_WAITING + 1, MAX_WAITING + 2)
     assert list(dense.skipped) == [1, 2]
     assert (dense.dropped, dense.waiting) == (2, MAX_WAITING + 1)
     worker.answers = [Accepted(0), Mapped(0, None)]
@@ -125,7 +125,7 @@ def test_too_many_keyframes_drop_the_oldest_that_was_not_sent(dense) -> None:
 
 def test_keyframes_wait_for_the_map_and_some_time_for_masks(dense, monkeypatch) -> None:
     world, worker = a_map(3), process(dense)
-    ask(dense, 0, 1, 2)
+    add_keyframes(dense, 0, 1, 2)
     dense.update(world, lambda k: k > 0, lambda k: k < 1)
     assert worker.keyframes() == []
     dense.add_masks(Masks(0, ["an instance"]), world)
@@ -144,10 +144,10 @@ def test_keyframes_wait_for_the_map_and_some_time_for_masks(dense, monkeypatch) 
 
 def test_crowded_keyframes_do_not_wait_for_masks(dense) -> None:
     world, worker = a_map(CROWDED + 1), process(dense)
-    ask(dense, *range(CROWDED - 1))
+    add_keyframes(dense, *range(CROWDED - 1))
     dense.update(world, no, lambda k: True)
     assert worker.keyframes() == []
-    ask(dense, CROWDED - 1, CROWDED)
+    add_keyframes(dense, CROWDED - 1, CROWDED)
     dense.update(world, no, lambda k: k != 1)
     worker.answers = [Accepted(1)]
     dense.update(world, lambda k: k == CROWDED, lambda k: True)
@@ -156,11 +156,11 @@ def test_crowded_keyframes_do_not_wait_for_masks(dense) -> None:
 
 def test_culled_keyframes_are_removed_and_unfinished_ones_kept(dense) -> None:
     world, worker = a_map(4), process(dense)
-    ask(dense, 0, 1)
+    add_keyframes(dense, 0, 1)
     dense.update(world, no, no)
     worker.answers = [Accepted(1), Mapped(1, None)]
     dense.update(world, no, no)
-    ask(dense, 2, 3)
+    add_keyframes(dense, 2, 3)
     for number in (1, 2, 3):
         del world.keyframes[number]
     dense.remove_culled(world, lambda k: k == 3)
@@ -171,10 +171,10 @@ def test_culled_keyframes_are_removed_and_unfinished_ones_kept(dense) -> None:
 
 def test_sent_keyframes_are_resent_and_skipped_after_two_crashes(dense) -> None:
     world, worker = a_map(3), process(dense)
-    ask(dense, 0)
+    add_keyframes(dense, 0)
     dense.update(world, no, no)
     worker.answers = [Accepted(0)]
-    ask(dense, 1)
+    add_keyframes(dense, 1)
     dense.update(world, no, no)
     worker.crashes_next = True
     dense.update(world, no, no)
@@ -192,7 +192,7 @@ def test_sent_keyframes_are_resent_and_skipped_after_two_crashes(dense) -> None:
 
 def test_finish_sends_all_waiting_keyframes_despite_a_crash(dense, monkeypatch) -> None:
     world, worker = a_map(3), process(dense)
-    ask(dense, 0, 1)
+    add_keyframes(dense, 0, 1)
     preview = Preview(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8))
 
     def send(message: Any, begins: bool = False) -> None:
@@ -216,11 +216,11 @@ def test_finish_sends_all_waiting_keyframes_despite_a_crash(dense, monkeypatch) 
 
 def test_after_giving_up_all_keyframes_are_reported_as_skipped(dense) -> None:
     world, worker = a_map(3), process(dense)
-    ask(dense, 0, 1)
+    add_keyframes(dense, 0, 1)
     dense.update(world, no, no)
     worker.given_up = True
     dense.update(world, no, no)
-    ask(dense, 2)
+    add_keyframes(dense, 2)
     assert sorted(dense.skipped) == [0, 1, 2]
     assert not dense.full
     assert dense.finish(world, 5.0) == replace(MapWritten(), failure=dense.finish(world, 0).failure)

@@ -47,8 +47,10 @@ def followed() -> tuple[SlamSystem, WorldMap, FrameHistory, list[int]]:
     for index, shift in enumerate(x):
         system.process(render_plane(se3_exp(np.array([0, 0, 0, shift, 0, 0])), index))
         if index == 8:
-            seen = system.mapper.world.observed(list(system.mapper.world.keyframes.values())[-1])
-            system.mapper.pruner().prune_landmarks(seen[1][:20])
+            observed = system.mapper.world.observed(
+                list(system.mapper.world.keyframes.values())[-1]
+            )
+            system.mapper.pruner().prune_landmarks(observed[1][:20])
         sent = pickle.dumps(maker.delta(system.mapper.world, system.mapper.history))
         sizes.append(len(sent))
         apply_delta(pickle.loads(sent), copy, history)

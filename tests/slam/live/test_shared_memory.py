@@ -24,7 +24,7 @@ def data(rng: np.random.Generator, size: int) -> bytes:
 def test_data_is_preserved_when_the_ring_wraps_around() -> None:
     rng, (writer, reader) = np.random.default_rng(0), ends(10_000)
     waiting: list[tuple[int, bytes]] = []
-    refused = taken = 0
+    refused = received = 0
     for _ in range(3000):
         if rng.random() < 0.55:
             sent = data(rng, int(rng.integers(1, 4000)))
@@ -36,9 +36,9 @@ def test_data_is_preserved_when_the_ring_wraps_around() -> None:
         elif waiting:
             begin, sent = waiting.pop(0)
             assert reader.read(begin, len(sent)) == sent
-            taken += 1
+            received += 1
     assert refused > 100
-    assert taken > 500
+    assert received > 500
 
 
 def test_data_larger_than_the_ring_is_rejected() -> None:
@@ -55,10 +55,10 @@ def test_received_bytes_are_a_writable_copy() -> None:
     writer, reader = ends(1024)
     first = writer.write(memoryview(b"first"))
     assert first is not None
-    taken = reader.read(first, 5)
+    received = reader.read(first, 5)
     for _ in range(40):
         begin = writer.write(memoryview(b"other" * 10))
         assert begin is not None
         reader.read(begin, 50)
-    assert taken == b"first"
-    np.frombuffer(taken, np.uint8)[0] = 0
+    assert received == b"first"
+    np.frombuffer(received, np.uint8)[0] = 0

@@ -35,7 +35,7 @@ def sleep(channel: Channel) -> None:
     time.sleep(600)
 
 
-def gone(pid: int, timeout_s: float = 5.0) -> bool:
+def has_ended(pid: int, timeout_s: float = 5.0) -> bool:
     deadline_s = time.monotonic() + timeout_s
     while time.monotonic() < deadline_s:
         try:
@@ -120,7 +120,7 @@ def test_a_worker_that_does_not_end_is_killed(caplog) -> None:
     worker = Worker("sleeper", f"{HERE}:sleep")
     pid = worker.pid
     worker.stop(timeout_s=0.5)
-    assert gone(pid)
+    assert has_ended(pid)
     assert "sleeper does not end; killed" in caplog.text
 
 
@@ -167,4 +167,4 @@ def test_a_worker_ends_with_its_owner() -> None:
     pid = int(owner.stdout.readline())
     owner.kill()
     owner.wait()
-    assert gone(pid)
+    assert has_ended(pid)

@@ -58,37 +58,39 @@ class Ring:
         world, k = self.mapper.world, self.mapper.world.next_keyframe_id
         camera_points = transform(inverse(pose_of(k)), self.points)
         pixels = CAMERA.project(np.where(camera_points[:, 2:] > 0.1, camera_points, [9e9, 0, 1]))
-        seen = np.flatnonzero(
+        observed = np.flatnonzero(
             (camera_points[:, 2] > 0.1) & (np.abs(pixels - [320, 240]) < [310, 230]).all(axis=1)
         )
-        noise = self.noise[k, seen]
-        features = make_features(pose_of(k), self.points[seen], self.descriptors[seen], noise)
+        noise = self.noise[k, observed]
+        features = make_features(
+            pose_of(k), self.points[observed], self.descriptors[observed], noise
+        )
         features = replace(features, depth_m=CAMERA.stereo_bf_px_m / features.disparity_px)
         T = pose_of(0)
         if k:
             T = world.keyframes[k - 1].T_world_camera @ inverse(pose_of(k - 1)) @ pose_of(k)
         keyframe = add_keyframe(world, T, features)
-        self.points_of[k] = seen
-        self._observe(keyframe, seen)
+        self.points_of[k] = observed
+        self._observe(keyframe, observed)
         self.mapper.loops.add(keyframe)
         self.mapper.optimise(keyframe)
         return keyframe, self.mapper.close_loops(keyframe)
 
-    def _observe(self, keyframe: Keyframe, seen: Array) -> None:
+    def _observe(self, keyframe: Keyframe, observed: Array) -> None:
         world, k = self.mapper.world, keyframe.id
-        known = {p: self.landmark_of[p] for p in seen.tolist() if p in self.landmark_of}
+        known = {p: self.landmark_of[p] for p in observed.tolist() if p in self.landmark_of}
         now = world.landmarks.current(np.arange(len(world.landmarks)))
         in_map = world.landmarks.in_map[now]
         tracked = {p: now[i] for p, (i, at) in known.items() if k - at <= self.memory and in_map[i]}
-        rows = np.array([row for row, p in enumerate(seen.tolist()) if p in tracked], np.int64)
-        ids = np.array([tracked[p] for p in seen[rows].tolist()], np.int64)
+        rows = np.array([row for row, p in enumerate(observed.tolist()) if p in tracked], np.int64)
+        ids = np.array([tracked[p] for p in observed[rows].tolist()], np.int64)
         world.attach(keyframe, rows, ids)
-        free = np.setdiff1d(np.arange(len(seen)), rows)
+        free = np.setdiff1d(np.arange(len(observed)), rows)
         points = STRETCHED.backproject(
             keyframe.features.pixels[free], keyframe.features.depth_m[free]
         )
         new_ids = world.make_landmarks(keyframe, free, transform(keyframe.T_world_camera, points))
-        for p, i in zip(np.r_[seen[rows], seen[free]], np.r_[ids, new_ids], strict=True):
+        for p, i in zip(np.r_[observed[rows], observed[free]], np.r_[ids, new_ids], strict=True):
             self.landmark_of[int(p)] = (int(i), k)
 
     def run(self, count: int) -> list[LoopConstraint]:
@@ -245,10 +247,10 @@ def test_an_inconsistent_old_loop_is_removed_with_its_fusions(
     closer.closed = dict.fromkeys(closer.closed, False)
     extra = constraint(20, 36, inverse(pose_of(20)) @ pose_of(36))
     monkeypatch.setattr(closer, "loops_of", lambda *_: [extra])
-    asked = smoother.relative_pose_errors
+    relative_pose_errors = smoother.relative_pose_errors
 
     def old_ones_bad(kind: str) -> RelativePoseErrors:
-        errors = asked(kind)
+        errors = relative_pose_errors(kind)
         return replace(errors, chi2=np.where(errors.keyframe_a < 20, 1e3, 0.0))
 
     monkeypatch.setattr(smoother, "relative_pose_errors", old_ones_bad)
@@ -262,13 +264,13 @@ def test_a_loop_removed_with_its_keyframe_is_not_rejected() -> None:
     loops = ring.run(ONCE_ROUND)
     mapper = ring.mapper
     assert refuted(mapper) == set()
-    gone = loops[-1].keyframe_a
-    mapper.world.remove_keyframe(mapper.world.keyframes[gone], mapper.world.keyframes[gone + 1])
-    mapper._factor_selector.remove_keyframe(gone)
-    mapper.loops.remove(gone)
+    culled = loops[-1].keyframe_a
+    mapper.world.remove_keyframe(mapper.world.keyframes[culled], mapper.world.keyframes[culled + 1])
+    mapper._factor_selector.remove_keyframe(culled)
+    mapper.loops.remove(culled)
     ring.step()
     in_graph = mapper.smoother.relative_pose_errors("loop")
-    assert gone not in in_graph.keyframe_a
+    assert culled not in in_graph.keyframe_a
     assert refuted(mapper) == set()
 
 
@@ -281,10 +283,10 @@ def test_keyframes_at_the_ends_of_loops_are_never_culled(monkeypatch: pytest.Mon
     loops = ring.run(ONCE_ROUND)
     offered: list[int] = []
 
-    def remember(_: WorldMap, candidates: list[Keyframe], __: MappingConfig) -> None:
+    def record(_: WorldMap, candidates: list[Keyframe], __: MappingConfig) -> None:
         offered.extend(k.id for k in candidates)
 
-    monkeypatch.setattr(bmask_slam.back_end.mapper, "redundant_keyframe", remember)
+    monkeypatch.setattr(bmask_slam.back_end.mapper, "redundant_keyframe", record)
     newest, _ = ring.step()
     world = ring.mapper.world
     ends = {end for loop in loops for end in loop.ends}
@@ -301,14 +303,14 @@ def test_joining_a_segment_keeps_the_closed_loops_in_the_graph() -> None:
     mapper = ring.mapper
     before = mapper.smoother.relative_pose_errors("loop")
     newest = max(mapper.world.keyframes.values(), key=lambda k: k.id)
-    elsewhere = se3_exp(np.array([0.2, -0.1, 0.3, 1.0, 2.0, 3.0])) @ newest.T_world_camera
-    other = add_keyframe(mapper.world, elsewhere, newest.features, segment=1)
+    wrong_pose = se3_exp(np.array([0.2, -0.1, 0.3, 1.0, 2.0, 3.0])) @ newest.T_world_camera
+    other = add_keyframe(mapper.world, wrong_pose, newest.features, segment=1)
     keypoints, ids = mapper.world.observed(newest)
     features = newest.features
-    seen = replace(
+    observed = replace(
         untracked(newest.T_world_camera, features), keypoints=keypoints, landmark_ids=ids
     )
-    mapper.join(1, untracked(elsewhere, features), seen)
+    mapper.join(1, untracked(wrong_pose, features), observed)
     assert other.segment == 0
     after = mapper.smoother.relative_pose_errors("loop")
     assert len(before.chi2) >= 3

@@ -139,10 +139,10 @@ def walk(
     places = {p: random_descriptors(80, np.random.default_rng(p)) for p in set(route)}
     found = []
     for k, place in enumerate(route):
-        seen = changed(places[place], 25, rng)
-        candidates = recogniser.query(k, seen, lambda i: [i - 1, i + 1])
+        descriptors = changed(places[place], 25, rng)
+        candidates = recogniser.query(k, descriptors, lambda i: [i - 1, i + 1])
         found.append([c.keyframe_id for c in candidates])
-        recogniser.index.add(k, seen)
+        recogniser.index.add(k, descriptors)
     return found
 
 

@@ -51,12 +51,12 @@ def views(
     T_new_old = np.eye(4) if T_new_old is None else T_new_old
     points = points_before(T_WORLD_B, count, rng)
     descriptors = random_descriptors(count, rng)
-    elsewhere = points_before(T_WORLD_B, count, rng)
-    points_b = np.where((np.arange(count) < outliers * count)[:, None], elsewhere, points)
+    other_points = points_before(T_WORLD_B, count, rng)
+    points_b = np.where((np.arange(count) < outliers * count)[:, None], other_points, points)
     made = []
-    for k, (T, seen) in enumerate(((T_WORLD_A, points), (T_WORLD_B, points_b))):
+    for k, (T, observed) in enumerate(((T_WORLD_A, points), (T_WORLD_B, points_b))):
         error = noise * SIGMAS * rng.normal(size=(count, 3))
-        T_moved, moved = T_new_old @ T, transform(T_new_old, seen)
+        T_moved, moved = T_new_old @ T, transform(T_new_old, observed)
         features = make_features(T_moved, moved, descriptors, error)
         features = replace(features, angles_rad=np.full(count, 0.25 * k))
         ids = np.arange(count) + 1000 * k

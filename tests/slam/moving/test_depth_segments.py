@@ -78,10 +78,10 @@ def loaded(box_m: float = 1.9) -> np.ndarray:
     return depth_m
 
 
-def held(depth_m: np.ndarray, seen: np.ndarray, **config: float) -> np.ndarray:
+def carried_by(depth_m: np.ndarray, observed: np.ndarray, **config: float) -> np.ndarray:
     """Samples that the card carries if views observed the samples ``seen`` (30, 40) only."""
     regions = depth_segments(depth_m, DepthSegmentConfig(step_px=8, **config))  # type: ignore[arg-type]
-    return regions.held(CARD, seen.astype(np.int8))
+    return regions.carried_by(CARD, observed.astype(np.int8))
 
 
 BOX, CARD = np.zeros((2, 240, 320), bool)
@@ -92,18 +92,18 @@ ROOM = ~BOX & ~CARD
 
 
 def test_unobserved_segments_touching_a_moving_one_are_carried() -> None:
-    np.testing.assert_array_equal(held(loaded(), ROOM), BOX)
+    np.testing.assert_array_equal(carried_by(loaded(), ROOM), BOX)
 
 
 def test_static_segments_are_not_carried() -> None:
-    assert not held(loaded(), ROOM | BOX).any()
+    assert not carried_by(loaded(), ROOM | BOX).any()
     lower = BOX.copy()
     lower[:15] = False
-    np.testing.assert_array_equal(held(loaded(), ROOM | lower), BOX & ~lower)
+    np.testing.assert_array_equal(carried_by(loaded(), ROOM | lower), BOX & ~lower)
 
 
 def test_a_large_unobserved_segment_is_not_carried() -> None:
-    assert not held(loaded(), np.zeros((30, 40))).any()
+    assert not carried_by(loaded(), np.zeros((30, 40))).any()
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_large_unobserved_segment_is_not_carried() -> None:
     ],
 )
 def test_not_all_segments_are_carried(box_m: float, config: dict[str, float]) -> None:
-    assert held(loaded(box_m), ROOM, **config).sum() < 0.15 * BOX.sum()
+    assert carried_by(loaded(box_m), ROOM, **config).sum() < 0.15 * BOX.sum()
 
 
 def test_regions_equal_a_flood_fill() -> None:
@@ -136,17 +136,17 @@ def test_regions_equal_a_flood_fill() -> None:
 
 def reached(region: np.ndarray, depth_m: np.ndarray) -> int:
     """The number of pixels connected with a region's first one by steps below the jump."""
-    todo, seen = [tuple(np.argwhere(region)[0])], set()
+    todo, visited = [tuple(np.argwhere(region)[0])], set()
     while todo:
         i, j = todo.pop()
-        if (i, j) in seen:
+        if (i, j) in visited:
             continue
-        seen.add((i, j))
+        visited.add((i, j))
         for k, m in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
             inside = 0 <= k < region.shape[0] and 0 <= m < region.shape[1]
             if inside and region[k, m] and abs(depth_m[i, j] - depth_m[k, m]) < 0.03 * 1.5:
                 todo.append((k, m))
-    return len(seen)
+    return len(visited)
 
 
 @pytest.mark.parametrize(

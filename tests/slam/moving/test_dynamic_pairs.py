@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.moving.composited import composed
-from benchmarks.moving.dynamic_pairs import DATA, man_in, moving_points, read_pair
+from benchmarks.moving.dynamic_pairs import DATA, moving_points, person_mask, read_pair
 from benchmarks.moving.moving_points import Count, count
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
@@ -19,7 +19,7 @@ def test_a_person_is_found_moving_by_geometry_alone() -> None:
     total = {"man": Count(), "rest": Count()}
     for folder in (DATA / "test1", DATA / "test2"):
         for pair in permutations(read_pair(folder)):
-            counts = count(*moving_points(pair, SystemConfig()), {"man": man_in(pair[1])})
+            counts = count(*moving_points(pair, SystemConfig()), {"man": person_mask(pair[1])})
             total = {kind: total[kind] + counts[kind] for kind in total}
     assert total["man"].on > 400
     assert total["man"].share > 0.9

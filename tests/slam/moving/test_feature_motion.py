@@ -44,9 +44,9 @@ def inside_one(pixel: Array, depth_m: float, box: tuple[Array, Array], T: Array)
     if centre[2] < 0.2:
         return False
     u, v = CAMERA.project(centre[None])[0]
-    beside = abs(pixel[0] - u) < CAMERA.fx * half_m[0] / centre[2]
-    above = abs(pixel[1] - v) < CAMERA.fy * half_m[1] / centre[2]
-    return bool(beside and above and not abs(depth_m - centre[2]) > half_m[2])
+    in_columns = abs(pixel[0] - u) < CAMERA.fx * half_m[0] / centre[2]
+    in_rows = abs(pixel[1] - v) < CAMERA.fy * half_m[1] / centre[2]
+    return bool(in_columns and in_rows and not abs(depth_m - centre[2]) > half_m[2])
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])

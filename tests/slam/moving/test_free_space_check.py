@@ -95,8 +95,8 @@ def reference(p: Array, depth_m: Array) -> int:
 
 
 def test_views_decide_by_majority_without_unknown_ones() -> None:
-    told = np.array([[-1, -1, 0, 1], [-1, 1, 0, 0], [1, 0, 0, 0]], np.int8)
-    assert CHECK.agree(told).tolist() == [-1, 0, 0, 1]
+    motions = np.array([[-1, -1, 0, 1], [-1, 1, 0, 0], [1, 0, 0, 0]], np.int8)
+    assert CHECK.agree(motions).tolist() == [-1, 0, 0, 1]
 
 
 def test_unknown_points_follow_neighbours_of_the_same_depth() -> None:
@@ -144,7 +144,7 @@ def test_the_buffer_keeps_views_spaced_in_time_and_is_restored() -> None:
             b.view.step,
         )
         np.testing.assert_array_equal(a.T_keyframe_camera, b.T_keyframe_camera)
-        for one, two in ((a.view, b.view), (a.seen, b.seen)):
+        for one, two in ((a.view, b.view), (a.full, b.full)):
             np.testing.assert_array_equal(one.nearest_m, two.nearest_m)
             np.testing.assert_array_equal(one.farthest_m, two.farthest_m)
     assert [bool(v.view.nearest_m.any()) for v in memory.views] == [True, False, True]
@@ -157,17 +157,17 @@ def test_moving_pixels_are_removed_from_stored_views() -> None:
     memory = DepthViewBuffer(6, 0.25)
     memory.add(0, 0.0, depth_view(depth_m, 5), regions.space(nearer))
     kept = memory.views[0]
-    there = (kept.seen.nearest_m < 2.5) & (kept.seen.nearest_m > 0)
+    there = (kept.full.nearest_m < 2.5) & (kept.full.nearest_m > 0)
     assert there.any()
     assert not kept.view.nearest_m[there].any()
     assert not kept.view.farthest_m[there].any()
-    np.testing.assert_array_equal(kept.view.nearest_m[~there], kept.seen.nearest_m[~there])
+    np.testing.assert_array_equal(kept.view.nearest_m[~there], kept.full.nearest_m[~there])
     memory.restore_depth(1, np.ones(depth_m.shape, bool))
     assert not kept.view.nearest_m[there].any()
     memory.restore_depth(0, np.ones(depth_m.shape, bool))
-    np.testing.assert_array_equal(kept.view.nearest_m, kept.seen.nearest_m)
-    np.testing.assert_array_equal(kept.view.farthest_m, kept.seen.farthest_m)
-    assert all(v.seen.nearest_m.any() for v in memory.views)
+    np.testing.assert_array_equal(kept.view.nearest_m, kept.full.nearest_m)
+    np.testing.assert_array_equal(kept.view.farthest_m, kept.full.farthest_m)
+    assert all(v.full.nearest_m.any() for v in memory.views)
 
 
 @pytest.mark.parametrize("bad", [{"margin_m": 0.0}, {"views": 0}, {"window_px": -1}])

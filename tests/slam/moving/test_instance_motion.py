@@ -63,5 +63,5 @@ def test_a_keyframe_observes_an_unoccluded_position(
 
 
 def test_a_view_without_depth_observes_nothing() -> None:
-    seen = masks(np.full((120, 160), np.nan, np.float32))
-    assert not instance_motion().shows(seen, track(np.array([0.0, 0.0, 2.0])))
+    without_depth = masks(np.full((120, 160), np.nan, np.float32))
+    assert not instance_motion().shows(without_depth, track(np.array([0.0, 0.0, 2.0])))

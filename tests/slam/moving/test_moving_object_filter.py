@@ -68,7 +68,7 @@ class CardSegmenter:
         return [Instance(mask, mask_box(mask), self._label, found, 0.95, 0.95)]
 
 
-class WatchedSystem(SlamSystem):
+class CountingSystem(SlamSystem):
     """Counts keypoints on and off the card, and the excluded ones of both, for every frame."""
 
     counts: list[tuple[int, int, int, int]]
@@ -82,15 +82,15 @@ class WatchedSystem(SlamSystem):
             abs(v - 240) < 112
         )
         outside = (u < columns.start - 12) | (u > right + 12) | (abs(v - 240) > 132)
-        left_out = static.moving
-        both = (inside, inside & left_out, outside, outside & left_out)
+        excluded = static.moving
+        both = (inside, inside & excluded, outside, outside & excluded)
         self.counts.append(tuple(int(n.sum()) for n in both))  # type: ignore[arg-type]
         return static
 
 
-def run(frames: Sequence[Frame], label: int = 0, settings: Sequence[str] = ()) -> WatchedSystem:
+def run(frames: Sequence[Frame], label: int = 0, settings: Sequence[str] = ()) -> CountingSystem:
     config = resolve(SystemConfig, None, [*SETTINGS, *settings])
-    system = WatchedSystem(CAMERA, config, CardSegmenter(label) if label else None)
+    system = CountingSystem(CAMERA, config, CardSegmenter(label) if label else None)
     system.counts = []
     for frame in frames:
         system.process(frame)
@@ -177,7 +177,7 @@ def test_a_label_on_verified_static_points_is_not_excluded() -> None:
     late = CardSegmenter(1)
     segment = late.segment
     late.segment = lambda image, name: segment(image, "0") if int(name) > 20 else []  # type: ignore
-    system = WatchedSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), late)
+    system = CountingSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), late)
     system.counts = []
     for frame in standing(30):
         system.process(replace(frame, name=str(frame.index)))
@@ -204,15 +204,15 @@ def test_a_person_in_one_keyframe_only_is_dropped() -> None:
     calls: list[str] = []
     config = resolve(SystemConfig, None, [*SETTINGS, "moving_objects.geometry=false"])
     system = SlamSystem(CAMERA, config, once)
-    left_out = []
+    excluded = []
     for frame in standing(30):
         static = system.moving_objects.filter(frame, system.prepare(frame))
-        left_out.append(static.ignored)
+        excluded.append(static.ignored)
         if system.process(frame).keyframe_id is not None:
             calls.append(frame.name)
     assert len(calls) > 3
-    assert min(left_out[1:6]) > 50
-    assert max(left_out[-6:]) == 0
+    assert min(excluded[1:6]) > 50
+    assert max(excluded[-6:]) == 0
 
 
 def test_landmarks_are_kept_until_their_object_moves(
@@ -239,12 +239,12 @@ def test_static_points_in_a_moving_box_are_used(frames: list[Frame]) -> None:
     someone = Sighting(wall, np.full(3, 0.5), certain(1, len(NAMES), 0.95), 3.0)
     system.moving_objects.tracks.update(frames[7].timestamp_s, [someone])
     features = system.prepare(frames[8])
-    left_out = {
+    excluded = {
         geometry: replaced(system, geometry).moving_objects.filter(frames[8], features).moving.sum()
         for geometry in (True, False)
     }
-    assert left_out[False] > 50
-    assert left_out[True] < 0.1 * left_out[False]
+    assert excluded[False] > 50
+    assert excluded[True] < 0.1 * excluded[False]
 
 
 def replaced(system: SlamSystem, geometry: bool) -> SlamSystem:
@@ -301,12 +301,12 @@ def test_many_static_points_override_the_mostly_moving_case(
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, [*SETTINGS, *settings]))
     for frame in frames[:22]:
         system.process(frame)
-    asked = []
-    system.camera_tracker.preview = lambda *a: asked.append(1)  # type: ignore
+    calls = []
+    system.camera_tracker.preview = lambda *a: calls.append(1)  # type: ignore
     features = system.prepare(frames[22])
     static = system.moving_objects.filter(frames[22], features)
     assert static.moving.sum() > 20
-    assert bool(asked) is (settled_share == 1.0)
+    assert bool(calls) is (settled_share == 1.0)
 
 
 def test_a_bad_prediction_does_not_make_the_room_move() -> None:

@@ -141,14 +141,14 @@ def test_removed_observations_are_listed_without_those_under_another_mask() -> N
 
 
 def test_verification_counts_from_the_first_observation_unless_it_moved() -> None:
-    for moved, since_s, taken in ((False, 0.0, 2), (True, 0.1, 1)):
+    for moved, since_s, expected in ((False, 0.0, 2), (True, 0.1, 1)):
         static_verification, world = watching()
         world.add_keyframe(keyframe(1))
         if moved:
             verified(static_verification, world, [depth(400)] * 15)
         add(static_verification, world, masks_of(keyframe_id=1), track())
         (one,) = static_verification.pending
-        assert (one.time_s, len(one.removed)) == (since_s, taken)
+        assert (one.time_s, len(one.removed)) == (since_s, expected)
 
 
 def test_pending_instances_out_of_view_or_culled_are_dropped() -> None:
@@ -201,12 +201,12 @@ def test_earlier_or_later_frames_verify_an_instance(
     left: int, body_m: float, from_s: float, stood: bool
 ) -> None:
     static_verification, now_s, masks = StaticVerification(CHECK, CONFIG, 20, 5), 5.0, masks_of()
-    seen = [*surfaces(CAMERA, masks, CHECK.config.window_px, 20), None]
+    visible = [*surfaces(CAMERA, masks, CHECK.config.window_px, 20), None]
     view = depth_view(depth(left, body_m), CHECK.config.window_px)
     views = [PosedView(0, now_s + from_s + 0.1 * k, view, view, np.eye(4)) for k in range(5)]
-    assert static_verification.stood(masks, seen, views, now_s) == [stood, False]
+    assert static_verification.stood(masks, visible, views, now_s) == [stood, False]
     switched_off = StaticVerification(CHECK, StaticVerificationConfig(stands_s=0), 20, 5)
-    assert switched_off.stood(masks, seen, views, now_s) == [False, False]
+    assert switched_off.stood(masks, visible, views, now_s) == [False, False]
 
 
 def same(a: Arrays, b: Arrays) -> None:

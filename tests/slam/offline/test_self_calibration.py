@@ -60,21 +60,21 @@ def test_a_delay_is_found_adopted_and_kept_by_resume(late_depth: Path, tmp_path:
     assert resumed is not None and resumed.calibration == whole.calibration
     for name in ("trajectory.txt", "camera.yaml"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    gone_on = dataclasses.replace(options, out=tmp_path / "on", map=tmp_path / "whole")
+    continued = dataclasses.replace(options, out=tmp_path / "on", map=tmp_path / "whole")
     with pytest.raises(InputError) as caught:  # the same stamps again
-        run(dataclasses.replace(gone_on, calibrate="off"))
+        run(dataclasses.replace(continued, calibrate="off"))
     assert "can only be continued with its own camera" in str(caught.value)
     later = runner.find_calibration(
-        gone_on, runner.open_sequence(late_depth), runner.SlamSystem, runner.StopRequest()
+        continued, runner.open_sequence(late_depth), runner.SlamSystem, runner.StopRequest()
     )
     assert later.camera == found
 
 
 def test_report_and_off_change_nothing(late_depth: Path, tmp_path: Path) -> None:
     options = RunOptions(late_depth, CONFIG, quiet=True, max_frames=100)
-    told = run(dataclasses.replace(options, out=tmp_path / "r", calibrate="report"))
+    reported = run(dataclasses.replace(options, out=tmp_path / "r", calibrate="report"))
     off = run(dataclasses.replace(options, out=tmp_path / "o", calibrate="off"))
-    assert told.calibration.endswith("found, not applied") and off.calibration == ""
+    assert reported.calibration.endswith("found, not applied") and off.calibration == ""
     assert not (tmp_path / "r" / "camera.yaml").exists()
     trajectories = [(tmp_path / name / "trajectory.txt").read_bytes() for name in "ro"]
     assert trajectories[0] == trajectories[1]

@@ -19,9 +19,9 @@ def test_escorts_keep_their_position_before_the_camera_and_face_forward() -> Non
         camera = steady_poses(crowded_office.PATH, times_s)
         person = np.array([escort.at(t)[0] for t in times_s])
         middle = np.c_[person[:, :2, 3], camera[:, 2, 3], np.ones(len(person))]
-        seen = (inverse(camera) @ middle[..., None])[:, :3, 0]
-        assert np.ptp(seen[:, 0]) < 0.12 and np.ptp(seen[:, 2]) < 0.12
-        assert 0.8 < seen[:, 2].min() < 1.6
+        points_camera = (inverse(camera) @ middle[..., None])[:, :3, 0]
+        assert np.ptp(points_camera[:, 0]) < 0.12 and np.ptp(points_camera[:, 2]) < 0.12
+        assert 0.8 < points_camera[:, 2].min() < 1.6
         step = np.diff(person[:, :2, 3], axis=0)
         length_m = np.linalg.norm(step, axis=1)
         forward = -(person[1:, :2, 1] + person[:-1, :2, 1]) / 2

@@ -35,9 +35,9 @@ def run(tmp_path: Path) -> Path:
     tables = FactorTables()
     tables.keyframes.insert(np.array([0, 4]), poses[[0, 4]])
     tables.landmarks.insert(np.array([0, 1, 2]), POINTS)
-    seen = CAMERA.project_stereo(transform(inverse(poses[[0, 4]]), POINTS)).reshape(6, 3)
+    measurements = CAMERA.project_stereo(transform(inverse(poses[[0, 4]]), POINTS)).reshape(6, 3)
     keyframes, landmarks = np.repeat([0, 4], 3), np.tile([0, 1, 2], 2)
-    tables.observations.add(Observations(keyframes, landmarks, seen, np.ones((6, 3))))
+    tables.observations.add(Observations(keyframes, landmarks, measurements, np.ones((6, 3))))
     write_graph(folder / "graph", tables, CAMERA)
     return folder
 

@@ -28,19 +28,23 @@ from bmask_slam.semantics.objects.object_map import MapObject
 NAMES = label_set(("chair", "desk", "cup"))
 
 
-def thing(number: int, label: int, probability: float, keyframes: list[int]) -> MapObject:
+def make_object(number: int, label: int, probability: float, keyframes: list[int]) -> MapObject:
     p: Array = np.full(4, (1 - probability) / 3)
     p[label] = probability
     T = se3_exp(np.array([0.1, 0.2, 0.3 * number, 1.0, 2.0, 3.0 + number]))
     box = OrientedBox(T, np.array([0.4, 1.25, 0.9]))
-    seen = np.array(keyframes), np.array([7, 9])
-    return MapObject(number, label, p, np.array([1.0, -2.0, 3.5]), box, *seen, 0.5, 2.25)
+    ids = np.array(keyframes), np.array([7, 9])
+    return MapObject(number, label, p, np.array([1.0, -2.0, 3.5]), box, *ids, 0.5, 2.25)
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    things = [thing(0, 1, 0.6, [0, 1, 2, 5]), thing(1, 2, 0.9, [4]), thing(4, 1, 0.8, [3, 4, 6])]
-    found = MapObjects(NAMES, things, np.array([0.0, -1.0, 0.0]))
+    made = [
+        make_object(0, 1, 0.6, [0, 1, 2, 5]),
+        make_object(1, 2, 0.9, [4]),
+        make_object(4, 1, 0.8, [3, 4, 6]),
+    ]
+    found = MapObjects(NAMES, made, np.array([0.0, -1.0, 0.0]))
     write_objects(tmp_path / OBJECTS, found)
     write_boxes(tmp_path / BOXES, found)
     return tmp_path
@@ -50,7 +54,7 @@ def test_objects_are_read_back(run: Path) -> None:
     names, objects = read_objects(run)
     assert names == ("unknown", "chair", "desk", "cup")
     assert [o.id for o in objects] == [0, 1, 4]
-    original, o = thing(4, 1, 0.8, [3, 4, 6]), objects[2]
+    original, o = make_object(4, 1, 0.8, [3, 4, 6]), objects[2]
     assert np.allclose(o.box.T_world_box, original.box.T_world_box, atol=1e-6)
     assert np.allclose(o.box.size_m, original.box.size_m)
     assert np.allclose(o.centroid_world, original.centroid_world)
@@ -75,8 +79,8 @@ def test_the_most_certain_object_is_first(run: Path, capsys: pytest.CaptureFixtu
 def test_only_the_most_certain_objects_are_listed_without_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    things = [thing(k, 1 + k % 3, 0.5 + k / 100, [k]) for k in range(12)]
-    write_objects(tmp_path / OBJECTS, MapObjects(NAMES, things, np.array([0.0, -1.0, 0.0])))
+    made = [make_object(k, 1 + k % 3, 0.5 + k / 100, [k]) for k in range(12)]
+    write_objects(tmp_path / OBJECTS, MapObjects(NAMES, made, np.array([0.0, -1.0, 0.0])))
     assert [o.id for o in query(tmp_path, None, 10).objects] == list(range(11, 1, -1))
     assert main(["query", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -113,7 +117,7 @@ def test_boxes_are_written_as_lines(run: Path) -> None:
     assert "element edge 36" in head
     rows = [line.split() for line in body.splitlines()]
     corners = np.array([[float(v) for v in row[:3]] for row in rows[:24]])
-    assert np.allclose(corners[:8], thing(0, 1, 0.6, [0]).box.corners_world, atol=1e-5)
+    assert np.allclose(corners[:8], make_object(0, 1, 0.6, [0]).box.corners_world, atol=1e-5)
     edges = np.array(rows[24:], int)
     lengths = np.linalg.norm(corners[edges[:, 0]] - corners[edges[:, 1]], axis=1)
     assert set(np.round(lengths, 3)) == {0.4, 1.25, 0.9}

@@ -113,9 +113,9 @@ def test_label_distributions_belong_to_the_landmarks(labelled: Run) -> None:
 def test_objects_are_near_their_landmarks(labelled: Run) -> None:
     landmarks = labelled.landmarks
     assert {"desk", "screen"} <= {o.label for o in labelled.objects}
-    for thing in labelled.objects:
-        points = landmarks.points_world[np.isin(landmarks.ids, thing.landmarks)]
-        distances_m = np.linalg.norm(points - thing.centroid_world, axis=1)
+    for map_object in labelled.objects:
+        points = landmarks.points_world[np.isin(landmarks.ids, map_object.landmarks)]
+        distances_m = np.linalg.norm(points - map_object.centroid_world, axis=1)
         assert distances_m.min(initial=0) < 0.5
 
 

@@ -105,11 +105,11 @@ def test_many_missing_files_are_an_error_at_opening(folder):
 def test_many_broken_files_are_an_error_on_the_way(folder):
     for k in (3, 5, 7):
         break_text(folder, k)
-    seen = []
+    indices = []
     with pytest.raises(InputError, match="3 of 12 frames are broken"):
         for frame in open_sequence(folder).frames():
-            seen.append(frame.index)
-    assert seen == [0, 1, 2, 4, 6]
+            indices.append(frame.index)
+    assert indices == [0, 1, 2, 4, 6]
     relaxed = open_sequence(folder, SequenceConfig(max_broken_share=0.5))
     assert len(list(relaxed.frames())) == 9
 

@@ -37,8 +37,8 @@ def test_frames(folder):
 @pytest.mark.parametrize("prefetch", [0, 1, 4, 100])
 def test_slices_and_prepare(folder, prefetch):
     sequence = open_sequence(folder)
-    taken = [f.index for f in sequence.frames(2, 11, 4, prefetch=prefetch)]
-    assert taken == [2, 6, 10]
+    indices = [f.index for f in sequence.frames(2, 11, 4, prefetch=prefetch)]
+    assert indices == [2, 6, 10]
     pairs = list(sequence.frames(stride=5, prefetch=prefetch, prepare=lambda f: f.index**2))
     assert [(f.index, x) for f, x in pairs] == [(0, 0), (5, 25), (10, 100)]
 
@@ -89,11 +89,11 @@ def test_exceptions_are_passed_to_the_consumer(folder):
             raise ZeroDivisionError("from prepare")
         return frame.index
 
-    seen = []
+    prepared = []
     with pytest.raises(ZeroDivisionError, match="from prepare"):
         for _, x in open_sequence(folder).frames(prepare=prepare):
-            seen.append(x)
-    assert seen == [0, 1, 2]
+            prepared.append(x)
+    assert prepared == [0, 1, 2]
     assert prefetch_threads() == 0
 
 
@@ -187,10 +187,10 @@ def test_red_kitchen():
     a, b = (frame for frame in sequence.frames(stop=11, stride=10))
     T_world_a, T_world_b = sequence.groundtruth.poses_world_camera[[0, 10]]
     v, u = np.mgrid[20:460:5, 20:620:5].reshape(2, -1)
-    seen = np.isfinite(a.depth_m[v, u])
-    pixels = np.column_stack([u, v])[seen]
+    prepared = np.isfinite(a.depth_m[v, u])
+    pixels = np.column_stack([u, v])[prepared]
     points_a = sequence.camera.backproject(
-        pixels.astype(float), a.depth_m[v, u][seen].astype(float)
+        pixels.astype(float), a.depth_m[v, u][prepared].astype(float)
     )
     T_b_a = np.linalg.inv(T_world_b) @ T_world_a
     points_b = points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]

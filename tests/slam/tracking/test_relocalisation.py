@@ -66,8 +66,8 @@ def test_a_known_place_is_found(world: WorldMap, x_m: float, turn_rad: float) ->
 
 
 def test_an_unknown_place_is_not_found(world: WorldMap) -> None:
-    elsewhere = se3_exp(np.array([0, 0, 0, 0.0, 2.2, 0.5]))
-    assert find(world, elsewhere) is None
+    other_pose = se3_exp(np.array([0, 0, 0, 0.0, 2.2, 0.5]))
+    assert find(world, other_pose) is None
 
 
 def test_the_most_similar_keyframe_comes_first(world: WorldMap) -> None:

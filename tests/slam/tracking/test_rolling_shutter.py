@@ -75,13 +75,16 @@ def test_a_keypoint_without_depth_moves_as_at_the_median_depth() -> None:
     points = scene()
     features, _ = exposed(points, 0.025)
     whole = at_one_moment(features, ROLLING, Motion(TWIST, 0.1))
-    blind = np.arange(len(points)) % 4 == 0
-    depth_m = np.where(blind, np.nan, features.depth_m)
+    without_depth = np.arange(len(points)) % 4 == 0
+    depth_m = np.where(without_depth, np.nan, features.depth_m)
     still = at_one_moment(replace(features, depth_m=depth_m), ROLLING, Motion(TWIST, 0.1))
-    assert np.isnan(still.depth_m[blind]).all() and np.isnan(still.disparity_px[blind]).all()
-    np.testing.assert_array_equal(still.pixels[~blind], whole.pixels[~blind])
-    shift_px = np.linalg.norm(whole.pixels - features.pixels, axis=1)[blind]
-    left_px = np.linalg.norm(whole.pixels - still.pixels, axis=1)[blind]
+    assert (
+        np.isnan(still.depth_m[without_depth]).all()
+        and np.isnan(still.disparity_px[without_depth]).all()
+    )
+    np.testing.assert_array_equal(still.pixels[~without_depth], whole.pixels[~without_depth])
+    shift_px = np.linalg.norm(whole.pixels - features.pixels, axis=1)[without_depth]
+    left_px = np.linalg.norm(whole.pixels - still.pixels, axis=1)[without_depth]
     assert left_px.mean() < 0.3 * shift_px.mean()
 
 
@@ -112,8 +115,8 @@ def test_the_velocity_is_found_from_matches() -> None:
         motion = corrected(motion, estimate, points, still, ROLLING)
     before, after = np.abs(wrong.twist - TWIST), np.abs(motion.twist - TWIST)
     assert (after[:3] < 0.02).all() and (after[3:] < 0.04).all(), (before, after)
-    held = corrected(Motion(wrong.twist, 1e-6), estimate, points, still, ROLLING)
-    np.testing.assert_allclose(held.twist, wrong.twist, atol=1e-6)
+    with_prior = corrected(Motion(wrong.twist, 1e-6), estimate, points, still, ROLLING)
+    np.testing.assert_allclose(with_prior.twist, wrong.twist, atol=1e-6)
 
 
 def test_the_path_of_a_shaken_camera_is_better() -> None:

@@ -38,7 +38,7 @@ def make_map(count: int, rng: np.random.Generator) -> tuple[WorldMap, Array]:
     return world, points
 
 
-def see(
+def observe(
     world: WorldMap, rng: np.random.Generator, clutter: int = 200, noise: float = 1.0
 ) -> Features:
     """Noisy keypoints of all landmarks with 40 changed bits, and this many other keypoints."""
@@ -47,8 +47,8 @@ def see(
     for row in flips:
         row[rng.permutation(512)[:40]] = 1
     descriptors = world.landmarks.descriptors ^ np.packbits(flips, axis=1).view(np.uint64)
-    strangers = points_before(T_WORLD_CAMERA, clutter, rng)
-    points = np.concatenate([world.landmarks.points_world, strangers])
+    others = points_before(T_WORLD_CAMERA, clutter, rng)
+    points = np.concatenate([world.landmarks.points_world, others])
     descriptors = np.concatenate([descriptors, random_descriptors(clutter, rng)])
     noise_px = noise * rng.normal(size=(count + clutter, 3)) * [0.7, 0.7, 0.12]
     return make_features(T_WORLD_CAMERA, points, descriptors, noise_px)
@@ -69,7 +69,7 @@ def off(angle_deg: float, shift_m: float, rng: np.random.Generator) -> Array:
 def test_the_pose_is_recovered_among_other_landmarks(angle_deg: float, shift_m: float) -> None:
     rng = np.random.default_rng(1)
     world, _ = make_map(200, rng)
-    features = see(world, rng)
+    features = observe(world, rng)
     tracked = track(world, features, off(angle_deg, shift_m, rng))
     assert tracked.status is TrackingStatus.OK
     xi = se3_log(inverse(T_WORLD_CAMERA) @ tracked.T_world_camera)
@@ -85,7 +85,7 @@ def test_tracking_moves_with_the_world() -> None:
     for T in (np.eye(4), T_NEW_OLD):
         rng = np.random.default_rng(2)
         world, _ = make_map(120, rng)
-        features = see(world, rng)
+        features = observe(world, rng)
         T_predicted = off(1.0, 0.02, rng)
         world.landmarks.points_world[:] = transform(T, world.landmarks.points_world)
         world.landmarks.directions[:] = world.landmarks.directions @ T[:3, :3].T
@@ -103,7 +103,7 @@ def test_the_status_depends_on_the_inliers(seen: int, status: TrackingStatus) ->
     rng = np.random.default_rng(3)
     config = replace(PLAIN, min_inliers=30, weak_inliers=15)
     world, _ = make_map(200, rng)
-    features = see(world, rng, clutter=0, noise=0.1)
+    features = observe(world, rng, clutter=0, noise=0.1)
     hidden = features.descriptors.copy()
     hidden[seen:] = random_descriptors(200 - seen, rng)
     tracked = track(world, replace(features, descriptors=hidden), T_WORLD_CAMERA, config)
@@ -116,7 +116,7 @@ def test_the_status_depends_on_the_inliers(seen: int, status: TrackingStatus) ->
 def test_a_wrong_map_gives_lost(what: str) -> None:
     rng = np.random.default_rng(4)
     world, _ = make_map(150, rng)
-    features = see(world, rng)
+    features = observe(world, rng)
     ids = np.arange(150)
     if what == "no keypoints":
         features = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
@@ -136,7 +136,7 @@ def test_with_a_recent_landmark_but_no_local_ones_it_is_lost() -> None:
     rng = np.random.default_rng(5)
     world, _ = make_map(100, rng)
     none = np.zeros(0, np.int64)
-    features = see(world, rng)
+    features = observe(world, rng)
     for config in (PLAIN, TrackingConfig()):
         tracker = Tracker(CAMERA, config)
         tracked = tracker.track(features, T_WORLD_CAMERA, np.arange(100), none, world)
@@ -169,7 +169,7 @@ def test_the_search_equals_a_loop() -> None:
     world.landmarks.points_world[:40, 2] *= -1.0  # behind, and seen from there before
     towards = T[:3, 3] - world.landmarks.points_world[:40]
     world.landmarks.directions[:40] = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-    features = see(world, rng)
+    features = observe(world, rng)
     ids = rng.permutation(300)[:250]
     tracker = Tracker(CAMERA, PLAIN)
     visible, matches = tracker.search(
@@ -189,7 +189,7 @@ def test_the_search_equals_a_loop() -> None:
 def test_a_keypoint_of_another_scale_is_not_matched() -> None:
     rng = np.random.default_rng(7)
     world, _ = make_map(100, rng)
-    features = see(world, rng, clutter=0)
+    features = observe(world, rng, clutter=0)
     scales = np.where(np.arange(100) < 50, 1.0, 3.0)
     index, ids = WindowIndex(features.pixels), np.arange(100)
     _, matches = Tracker(CAMERA, PLAIN).search(
@@ -222,11 +222,11 @@ def test_rendered_images_are_tracked_with_subpixel_registration() -> None:
         tracked = Tracker(CAMERA, config).track(second, np.eye(4), ids, ids, world)
         assert tracked.status is TrackingStatus.OK
         assert len(tracked.landmark_ids) > 100
-        seen = tracked.features.pixels[tracked.keypoints]
+        pixels = tracked.features.pixels[tracked.keypoints]
         true = CAMERA.project(
             transform(inverse(T_WORLD_CAMERA), world.landmarks.points_world[tracked.landmark_ids])
         )
-        errors_px[enabled] = np.sqrt(np.mean((seen - true) ** 2))
+        errors_px[enabled] = np.sqrt(np.mean((pixels - true) ** 2))
         xi = se3_log(inverse(T_WORLD_CAMERA) @ tracked.T_world_camera)
         assert np.linalg.norm(xi[:3]) < np.deg2rad(0.1)
         assert np.linalg.norm(xi[3:]) < 0.004
@@ -240,13 +240,13 @@ def test_images_at_another_distance_are_registered() -> None:
     world, _ = map_of_plane(extractor)
     T_nearer = se3_exp(np.array([0.0, 0.0, 0.0, 0.02, -0.01, 0.4]))
     tracked = track(world, extractor.extract(render_plane(T_nearer, 1)), T_nearer, TrackingConfig())
-    seen = tracked.features.pixels[tracked.keypoints]
+    pixels = tracked.features.pixels[tracked.keypoints]
     true = CAMERA.project(
         transform(inverse(T_nearer), world.landmarks.points_world[tracked.landmark_ids])
     )
     registered = tracked.features.sigmas_px[tracked.keypoints, 0] < 0.5
     assert registered.mean() > 0.7
-    assert np.sqrt(np.mean((seen - true)[registered] ** 2)) < 0.12
+    assert np.sqrt(np.mean((pixels - true)[registered] ** 2)) < 0.12
 
 
 def test_registration_does_not_change_the_frames_features() -> None:

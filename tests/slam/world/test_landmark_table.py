@@ -58,8 +58,8 @@ def test_ids_of_removed_landmarks_are_not_reused() -> None:
     ids = table.add(columns(6))
     table.in_graph[ids] = True
     table.remove(np.array([1, 4]))
-    asked = np.array([-1, 4, 0, 1, 5, -1, 0])
-    assert table.remaining(asked).tolist() == [0, 5, 0]
+    requested = np.array([-1, 4, 0, 1, 5, -1, 0])
+    assert table.remaining(requested).tolist() == [0, 5, 0]
     assert np.flatnonzero(table.in_graph).tolist() == [0, 2, 3, 5]
     assert table.add(columns(2)).tolist() == [6, 7]
     assert len(table.remaining(np.zeros(0, np.int64))) == 0

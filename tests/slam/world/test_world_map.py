@@ -85,9 +85,9 @@ def test_observed_excludes_removed_landmarks() -> None:
     world = make_world()
     ids = make(world, 0, [5, 7, 9])
     world.landmarks.remove(ids[[1]])
-    keypoints, seen = world.observed(world.keyframes[0])
+    keypoints, landmark_ids = world.observed(world.keyframes[0])
     assert keypoints.tolist() == [5, 9]
-    assert seen.tolist() == [0, 2]
+    assert landmark_ids.tolist() == [0, 2]
 
 
 def test_covisibility_counts_shared_landmarks() -> None:
@@ -183,23 +183,23 @@ def test_patches_are_replaced_only_at_other_views() -> None:
     np.testing.assert_allclose(views[:, 0], -table.points_world[ids], atol=1e-12)
     assert np.isnan(views[:, 1:]).all()
 
-    def see_from(landmark: int, view: Array) -> None:
+    def observe_from(landmark: int, view: Array) -> None:
         table.patch_views[landmark] = [view, *[np.full(3, np.nan)] * (PATCHES - 1)]
 
-    see_from(0, -table.points_world[0] * 1.25)  # farther by less than 1.3
-    see_from(1, -table.points_world[1] * 1.35)  # by more
-    see_from(2, -table.points_world[2] / 1.35)
+    observe_from(0, -table.points_world[0] * 1.25)  # farther by less than 1.3
+    observe_from(1, -table.points_world[1] * 1.35)  # by more
+    observe_from(2, -table.points_world[2] / 1.35)
     for landmark, angle_deg in ((3, 18.0), (4, 22.0)):
         axis = np.cross(table.points_world[landmark], [1.0, 0.0, 0.0])
         axis *= np.deg2rad(angle_deg) / np.linalg.norm(axis)
         turn = se3_exp(np.r_[axis, 0, 0, 0])[:3, :3]
-        see_from(landmark, -turn @ table.points_world[landmark])
+        observe_from(landmark, -turn @ table.points_world[landmark])
     before = table.patches[:5].copy()
     world.renew_patches(keyframe, config)
     patches = table.patches[:5]
     np.testing.assert_array_equal(patches[:, 0], before[:, 0])  # what there was stays
-    taken = np.isfinite(table.patch_views[:5]).all(axis=2).sum(axis=1) - 1
-    assert taken.tolist() == [0, 1, 1, 0, 1]
+    patch_counts = np.isfinite(table.patch_views[:5]).all(axis=2).sum(axis=1) - 1
+    assert patch_counts.tolist() == [0, 1, 1, 0, 1]
     np.testing.assert_array_equal(patches[[1, 2, 4], 1], first[[1, 2, 4]])
 
 

@@ -40,7 +40,7 @@ class Device:
     def __init__(self, framesets: list, coeffs: tuple = (0, 0, 0, 0, 0), scale: float = 0.001):
         self.framesets, self.coeffs, self.scale = framesets, coeffs, scale
         self.started = self.stopped = 0
-        self.asked: dict[str, tuple] = {}
+        self.requests: dict[str, tuple] = {}
         self.aligned_to: list[str] = []
 
 
@@ -72,7 +72,7 @@ def plug_in(monkeypatch: pytest.MonkeyPatch, device: Device | None) -> None:
             if device is None:
                 raise RuntimeError("No device connected")
             device.started += 1
-            device.asked = config.streams
+            device.requests = config.streams
             sensor = SimpleNamespace(get_depth_scale=lambda: device.scale)
             video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
             stream = SimpleNamespace(as_video_stream_profile=lambda: video)
@@ -124,7 +124,7 @@ def test_realsense_frames_and_camera(monkeypatch) -> None:
     device = Device([frameset(k, 1000 + 33 * k) for k in range(3)], scale=0.00025)
     plug_in(monkeypatch, device)
     source = RealSenseSource(silence_s=SILENCE_S)
-    assert device.asked == {"color": (640, 480, "rgb8", 30), "depth": (640, 480, "z16", 30)}
+    assert device.requests == {"color": (640, 480, "rgb8", 30), "depth": (640, 480, "z16", 30)}
     assert device.aligned_to == ["color"]
     assert source.camera == Camera(640, 480, 610.0, 611.0, 321.5, 238.25, depth_scale=4000.0)
     with pytest.raises(InputError, match=r"no frame for 0\.3 s; is the camera still plugged in"):
