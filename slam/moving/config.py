@@ -18,8 +18,8 @@ class MovingObjectConfig:
     ``priors`` is a YAML file of P(moving) by class, or the name of one in ``data/labels``. If fewer
     than ``min_static`` static keypoints are left, all are used, and the frame result says so. If
     more than ``doubt_share`` of the keypoints seem to move, and fewer than ``settled_share`` lie
-    where a surface was observed, the predicted pose is checked by tracking with all of them. Masks of
-    moving things are widened by ``mask_border_px``. An instance is judged only with at least
+    where a surface was observed, the predicted pose is checked by tracking with all of them. Masks
+    of moving objects are widened by ``mask_border_px``. An instance is judged only with at least
     ``min_judged`` pixels.
     """
 
