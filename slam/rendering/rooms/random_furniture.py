@@ -28,7 +28,7 @@ DEVICES: dict[str, Callable[[SceneBuilder], None]] = {
 """Devices on walls, by the name of their class."""
 
 _WOODS: tuple[Colour, ...] = (f.OAK, f.WALNUT, (206, 196, 180), (142, 104, 70), (88, 66, 52))
-_SMALL_OBJECTS = (
+_ITEMS = (
     "cup",
     "bottle",
     "cell phone",
@@ -82,7 +82,7 @@ def add_hanging(b: SceneBuilder, hanging: Hanging) -> None:
 def scatter(b: SceneBuilder, width: float, depth: float, count: int, occupied: list[_Disc]) -> None:
     """Lay up to ``count`` things on a table top of the given size, outside the ``taken`` discs."""
     discs = list(occupied)
-    for name in b.rng.choice(_SMALL_OBJECTS, count, p=_ODDS):
+    for name in b.rng.choice(_ITEMS, count, p=_ODDS):
         radius = _RADIUS_M[name]
         half = np.array([width, depth]) / 2 - radius
         if half.min() <= 0:
@@ -92,11 +92,11 @@ def scatter(b: SceneBuilder, width: float, depth: float, count: int, occupied: l
             if all(np.hypot(x - u, y - v) > radius + r for u, v, r in discs):
                 discs.append((x, y, radius))
                 with b.at(pose(x, y, 0, b.rng.uniform(0, 360))):
-                    _small_object(b, str(name))
+                    _item(b, str(name))
                 break
 
 
-def _small_object(b: SceneBuilder, name: str) -> None:
+def _item(b: SceneBuilder, name: str) -> None:
     """One small thing on z = 0; its front looks along -y."""
     if name == "books":
         for k in range(int(b.rng.integers(2, 4))):
