@@ -28,17 +28,7 @@ DEVICES: dict[str, Callable[[SceneBuilder], None]] = {
 """Devices on walls, by the name of their class."""
 
 _WOODS: tuple[Colour, ...] = (f.OAK, f.WALNUT, (206, 196, 180), (142, 104, 70), (88, 66, 52))
-_ITEMS = (
-    "cup",
-    "bottle",
-    "cell phone",
-    "book",
-    "books",
-    "trophy",
-    "plant",
-    "drone",
-    "sheet",
-)
+_ITEMS = ("cup", "bottle", "cell phone", "book", "books", "trophy", "plant", "drone", "sheet")
 _ODDS = np.array([0.18, 0.15, 0.14, 0.15, 0.09, 0.08, 0.06, 0.06, 0.09])
 _RADIUS_M = {
     "cup": 0.075, "bottle": 0.05, "cell phone": 0.09, "book": 0.15, "books": 0.17, "trophy": 0.13,
@@ -80,7 +70,7 @@ def add_hanging(b: SceneBuilder, hanging: Hanging) -> None:
 
 
 def scatter(b: SceneBuilder, width: float, depth: float, count: int, occupied: list[_Disc]) -> None:
-    """Lay up to ``count`` things on a table top of the given size, outside the ``taken`` discs."""
+    """Lay up to ``count`` things on a table top of the given size, outside the ``occupied`` discs."""
     discs = list(occupied)
     for name in b.rng.choice(_ITEMS, count, p=_ODDS):
         radius = _RADIUS_M[name]
