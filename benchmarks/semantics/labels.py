@@ -1,15 +1,13 @@
-"""How right and how sure the labels of landmarks and objects are, on rendered sequences.
+"""Accuracy and calibration of the labels of landmarks and objects, on rendered sequences.
 
     python -m benchmarks.semantics.labels SEQUENCE... [--segmenter truth] [--imperfect] [--out DIR]
 
 Sequences are rendered with `--true-depth`, those of docs/semantics.md by `bmask-slam render office
 --frames 300 --true-depth` and, for 930 and 931, `bmask-slam render room --seed 930 --frames 300
---true-depth`. A landmark is what the truth shows at its place in most keyframes that see it.
-Objects that at least two keyframes show with enough pixels are to be found at a 3-D IoU of 0.25,
-with their label: against the box of the surface that the keyframes measure, by true depth where the
-sensor gave one that is right within four sigmas (what a camera can know; of a side seen at a
-glancing angle it gives none); against that of the surface that they show to a perfect sensor; and
-against the whole object's.
+--true-depth`. A landmark's true class is that at its position in most keyframes in which it is
+visible. Objects visible in at least two keyframes with enough pixels must be found at a 3-D IoU of
+0.25 with their label: against the box of the measured surface (true depth where the sensor's depth
+is within four sigmas), against that of the visible surface, and against the whole object's box.
 """
 
 from __future__ import annotations
@@ -25,9 +23,16 @@ from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.semantics.imperfect_masks import Errors, ImperfectSegmenter
+from bmask_slam.comparison.jobs.truth_figures import (
+    true_classes,
+    true_depth,
+    truth_from_world,
+    truth_image,
+    visible,
+)
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.rendering.annotations import OBJECTS_TRUTH
 from bmask_slam.rendering.engine.sensor import depth_sigma_m
 from bmask_slam.semantics.beliefs.label_store import LabelStore
@@ -47,7 +52,7 @@ KINDS = ("measured", "visible", "whole")
 
 
 class RecordingStore(LabelStore):
-    """Also remembers the single view of each id whose mask was best."""
+    """Also stores the single view of each id with the best mask."""
 
     def update(self, ids, distributions, weights):  # type: ignore[no-untyped-def]
         super().update(ids, distributions, weights)
@@ -67,7 +72,7 @@ class RecordingStore(LabelStore):
 
 @dataclass
 class RunCounters:
-    """What was counted over all sequences; probabilities with whether they were right."""
+    """Counts over all sequences; probabilities with whether they were right."""
 
     on_objects: int = 0
     right: int = 0
@@ -102,11 +107,11 @@ def main() -> None:
     parser.add_argument("sequences", type=Path, nargs="+")
     parser.add_argument("--segmenter", default="truth")
     parser.add_argument("--weights")
-    parser.add_argument("--imperfect", action="store_true", help="spoil the masks on purpose")
+    parser.add_argument("--imperfect", action="store_true", help="add errors to the masks")
     parser.add_argument("--set", action="append", default=[], metavar="A.B=C")
     parser.add_argument("--seed", type=int, default=0, help="of the imperfect masks")
     parser.add_argument("--out", type=Path, default=Path("runs/labels"))
-    parser.add_argument("--verbose", action="store_true", help="name what was missed")
+    parser.add_argument("--verbose", action="store_true", help="list missed objects")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     counters = RunCounters()
@@ -138,8 +143,11 @@ def measure(system: SlamSystem, sequence: Sequence, counters: RunCounters, verbo
     """Compare a finished system with the truth of its sequence."""
     keyframes = list(system.mapper.world.keyframes.values())
     truths = {k.id: read_truth(sequence, k) for k in keyframes}
-    T_truth_world = alignment(keyframes, truths)
-    categories = true_categories(sequence.folder, system)
+    T_truth_world = truth_from_world(
+        np.array([k.T_world_camera for k in keyframes]),
+        np.array([truths[k.id].T_truth_camera for k in keyframes]),
+    )
+    categories = true_classes(sequence.folder, system.semantics.names)
     before = replace(counters)
     measure_landmarks(system, truths, T_truth_world, categories, counters)
     lines = measure_objects(system, sequence, (truths, T_truth_world, categories), counters)
@@ -147,18 +155,16 @@ def measure(system: SlamSystem, sequence: Sequence, counters: RunCounters, verbo
     share = (counters.right - before.right) / max(counters.on_objects - before.on_objects, 1)
     counters.per_sequence.append(
         f"{sequence.name}: {len(keyframes)} keyframes, landmarks on objects right {share:.3f}, "
-        f"{objects} objects, {reported} told\n" + ("\n".join(lines) if verbose else "")
+        f"{objects} objects, {reported} reported\n" + ("\n".join(lines) if verbose else "")
     )
 
 
 def read_truth(sequence: Sequence, keyframe: Keyframe) -> Truth:
-    name = sequence.pairs.rgb_files[keyframe.frame_index].name
-    instances = cv2.imread(str(sequence.folder / "instances" / name), cv2.IMREAD_UNCHANGED)
-    depth = cv2.imread(str(sequence.folder / "depth_true" / name), cv2.IMREAD_UNCHANGED)
+    instances = truth_image(sequence, "instances", keyframe.frame_index)
+    depth_m = true_depth(sequence, keyframe.frame_index)
     assert sequence.groundtruth is not None
     row = np.abs(sequence.groundtruth.timestamps_s - keyframe.timestamp_s).argmin()
     pose = sequence.groundtruth.poses_world_camera[row]
-    depth_m = np.where(depth > 0, depth / sequence.camera.depth_scale, np.nan)
     return Truth(instances.astype(np.int64), depth_m, measured(sequence, keyframe, depth_m), pose)
 
 
@@ -169,23 +175,6 @@ def measured(sequence: Sequence, keyframe: Keyframe, depth_m: np.ndarray) -> np.
     return (given > 0) & (np.abs(given - depth_m) < 4 * depth_sigma_m(depth_m))
 
 
-def alignment(keyframes: list[Keyframe], truths: dict[int, Truth]) -> Array:
-    """T_truth_world that fits best to all keyframes' poses."""
-    T = np.array([truths[k.id].T_truth_camera @ inverse(k.T_world_camera) for k in keyframes])
-    return T[0] @ se3_exp(se3_log(inverse(T[0]) @ T).mean(axis=0))
-
-
-def true_categories(folder: Path, system: SlamSystem) -> Ints:
-    """(I + 1,) the system's label of each instance number; 0 for the background."""
-    content = json.loads((folder / "annotations.json").read_text())
-    names = {c["id"]: c["name"] for c in content["categories"]}
-    found = {a["instance_id"]: names[a["category_id"]] for a in content["annotations"]}
-    categories = np.zeros(10_000, np.int64)
-    for instance, name in found.items():
-        categories[instance] = system.semantics.names.number(name)
-    return categories
-
-
 def measure_landmarks(
     system: SlamSystem,
     truths: dict[int, Truth],
@@ -193,33 +182,29 @@ def measure_landmarks(
     categories: Ints,
     counters: RunCounters,
 ) -> None:
-    """What landmarks are, by the majority of the keyframes in which they are not hidden."""
+    """Compare labels with the true class in most keyframes in which a landmark is visible."""
     cloud, camera = system.landmarks(), system.camera
     assert cloud.labels is not None
     points = transform(T_truth_world, cloud.points_world)
     counts = np.zeros((len(points), len(system.semantics.names)), int)
     for truth in truths.values():
-        local = transform(inverse(truth.T_truth_camera), points)
-        ahead = np.flatnonzero(local[:, 2] > 0.1)
-        pixels = np.rint(camera.project(local[ahead])).astype(int)
-        inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-        rows, (u, v) = ahead[inside], pixels[inside].T
-        near = np.abs(truth.depth_m[v, u] - local[rows, 2]) < 0.02 + 0.01 * local[rows, 2] ** 2
-        counts[rows[near], categories[truth.instances[v, u]][near]] += 1
-    visible = counts.sum(axis=1) > 0
-    label = counts.argmax(axis=1)[visible]
+        points_camera = transform(inverse(truth.T_truth_camera), points)
+        rows, pixels = visible(points_camera, truth.depth_m, camera)
+        counts[rows, categories[truth.instances[pixels[:, 1], pixels[:, 0]]]] += 1
+    in_view = counts.sum(axis=1) > 0
+    label = counts.argmax(axis=1)[in_view]
     found = cloud.labels.estimates
-    best = [view_label(system, i) for i in cloud.ids[visible].tolist()]
+    best = [view_label(system, i) for i in cloud.ids[in_view].tolist()]
     best_label, best_p = (np.array(column) for column in zip(*best, strict=True))
-    right, best_right = found.labels[visible] == label, best_label == label
+    right, best_right = found.labels[in_view] == label, best_label == label
     on = label > 0
     counters.on_objects += int(on.sum())
     counters.right += int(right[on].sum())
     counters.right_best_view += int(best_right[on].sum())
     counters.background += int((~on).sum())
     counters.background_right += int(right[~on].sum())
-    spoken = found.views[visible] > 0
-    counters.sure.append(found.probability[visible][spoken])
+    spoken = found.views[in_view] > 0
+    counters.sure.append(found.probability[in_view][spoken])
     counters.correct.append(right[spoken])
     counters.sure_best_view.append(best_p[spoken])
     counters.correct_best_view.append(best_right[spoken])
@@ -258,7 +243,7 @@ def measure_objects(
         if k in hit:
             continue
         if extra.size and extra[k].max() >= 0.1:
-            ignored.add(k)  # something real, too small or too rarely seen to be asked for
+            ignored.add(k)  # a true object that is too small or too rarely visible
             continue
         name = system.semantics.names.names[o.label]
         lines.append(f"  wrong  {name} {o.id} size {box.size_m.round(2)} iou {ious[k].max():.2f}")

@@ -17,7 +17,7 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
-from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices, read_tum
+from bmask_slam.graph.trajectory import associate, nearest_indices, read_tum
 from bmask_slam.run_folder.semantic_files import LABELS, read_labels
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
@@ -53,12 +53,14 @@ def label_accuracy(run: Path, sequence: Sequence) -> float | None:
         return None
     cloud, labels = read_ply(run / "landmarks.ply"), read_labels(run)
     points_world = np.column_stack([cloud[axis] for axis in "xyz"]).astype(float)
-    points_truth = transform(truth_from_world(keyframes, truth), points_world)
+    points_truth = transform(
+        truth_from_world(keyframes.poses_world_camera, truth.poses_world_camera), points_world
+    )
     classes = true_classes(folder, names)
     counts = np.zeros((len(points_truth), len(names)), int)
     indices = nearest_indices(sequence.timestamps_s, truth.timestamps_s)
     for index, T_truth_camera in zip(indices.tolist(), truth.poses_world_camera, strict=True):
-        instances = _image(sequence, "instances", index).astype(np.int64)
+        instances = truth_image(sequence, "instances", index).astype(np.int64)
         points_camera = transform(inverse(T_truth_camera), points_truth)
         rows, pixels = visible(points_camera, true_depth(sequence, index), sequence.camera)
         counts[rows, classes[instances[pixels[:, 1], pixels[:, 0]]]] += 1
@@ -96,9 +98,9 @@ def keyframe_frames(run: Path) -> list[tuple[int, int]]:
     return [(int(row["index"]), int(row["keyframe"])) for row in made]
 
 
-def truth_from_world(keyframes: Trajectory, truth: Trajectory) -> Array:
-    """T_truth_world (4, 4), the mean over associated poses."""
-    T = truth.poses_world_camera @ inverse(keyframes.poses_world_camera)
+def truth_from_world(poses_world_camera: Array, poses_truth_camera: Array) -> Array:
+    """T_truth_world (4, 4), the mean over poses (K, 4, 4) of the same images."""
+    T = poses_truth_camera @ inverse(poses_world_camera)
     return np.asarray(T[0] @ se3_exp(se3_log(inverse(T[0]) @ T).mean(axis=0)))
 
 
@@ -126,10 +128,11 @@ def visible(points_camera: Array, depth_m: Array, camera: Camera) -> tuple[Ints,
 def true_depth(sequence: Sequence, index: int) -> Array:
     """Depth (H, W) in metres, NaN where missing; the sensor's if there is no exact one."""
     kept = (sequence.folder / "depth_true").is_dir()
-    depth = _image(sequence, "depth_true" if kept else "depth", index)
+    depth = truth_image(sequence, "depth_true" if kept else "depth", index)
     return np.where(depth > 0, depth / sequence.camera.depth_scale, np.nan)
 
 
-def _image(sequence: Sequence, kind: str, index: int) -> NDArray[np.uint16]:
+def truth_image(sequence: Sequence, kind: str, index: int) -> NDArray[np.uint16]:
+    """The image of a frame in the folder ``kind`` of a rendered sequence."""
     name = sequence.pairs.rgb_files[index].name
     return np.asarray(cv2.imread(str(sequence.folder / kind / name), cv2.IMREAD_UNCHANGED))

@@ -70,7 +70,7 @@ def add_hanging(b: SceneBuilder, hanging: Hanging) -> None:
 
 
 def scatter(b: SceneBuilder, width: float, depth: float, count: int, occupied: list[_Disc]) -> None:
-    """Lay up to ``count`` things on a table top of the given size, outside the ``occupied`` discs."""
+    """Place up to ``count`` items on a table top of this size, outside the ``occupied`` discs."""
     discs = list(occupied)
     for name in b.rng.choice(_ITEMS, count, p=_ODDS):
         radius = _RADIUS_M[name]

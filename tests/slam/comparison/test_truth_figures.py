@@ -83,7 +83,9 @@ def test_a_run_without_labels_has_no_figure(run, office):
 
 def test_the_mean_transform(office):
     truth = open_sequence(office).groundtruth
-    found = truth_from_world(truth.moved(T_WORLD_TRUTH), truth)
+    found = truth_from_world(
+        truth.moved(T_WORLD_TRUTH).poses_world_camera, truth.poses_world_camera
+    )
     np.testing.assert_allclose(found, inverse(T_WORLD_TRUTH), atol=1e-9)
 
 
