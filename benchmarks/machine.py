@@ -1,4 +1,4 @@
-"""What a measurement was made on and with: machine, versions, commit, and a yardstick of speed."""
+"""The circumstances of a measurement: machine, versions, commit, and a speed reference."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def describe_machine() -> dict[str, str]:
 
 
 def load_average() -> float:
-    """Processes that wanted to run during the last minute, this one's included."""
+    """Mean number of runnable processes during the last minute, with this one."""
     return os.getloadavg()[0]
 
 
 def describe_commit(written: tuple[str, ...]) -> str:
-    """The commit's short hash; says so when tracked files differ from it.
+    """The commit's short hash, with the tracked files that differ from it.
 
     ``written`` are paths that the benchmark writes itself; they do not count.
     """
@@ -50,8 +50,7 @@ def now() -> str:
 def brisk_ms(folder: Path) -> float:
     """Median time of OpenCV's BRISK, detection and description, on a sequence's first frames.
 
-    What the library alone takes at its own defaults, whatever ours are, so that times on different
-    machines, or on one that is busy, can be set in relation.
+    With the library's defaults, so that times on different or busy machines can be compared.
     """
     brisk = cv2.BRISK_create(*YARDSTICK)
     times_ms = []

@@ -1,4 +1,4 @@
-"""Pages under docs/results/: tables in Markdown, and the line that says how a section was measured.
+"""Pages under docs/results/: tables in Markdown, and the line on how a section was measured.
 
 Every section ends with one line: machine, commit, date in UTC, how long it took. The command stands
 above it. `written_sections` reads them back.
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 WRITTEN = ("docs/results", "docs/images", "README.md")
-"""What benchmarks write; changes of these do not count as changes of the code."""
+"""Files that benchmarks write; changes of these do not count as changes of the code."""
 STAMP = re.compile(
     r"^(?P<machine>[^;\n|]+); commit (?P<commit>[0-9a-f]{7,40})[^;\n]*; "
     r"(?P<date>\d{4}-\d\d-\d\d \d\d:\d\d) UTC",
@@ -51,7 +51,7 @@ def _section(text: str) -> WrittenSection:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; ValueError when a row is not as wide as the header."""
+    """A Markdown table; ValueError if a row has another length than the header."""
     lines = [header, ["---"] * len(header), *rows]
     for line in lines:
         if len(line) != len(header):

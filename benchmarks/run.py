@@ -49,7 +49,7 @@ OVERVIEW_FRAME = 40
 
 
 def plan(folders: dict[str, Path], quick: bool) -> list[Job]:
-    """What is run: all as it comes, again, at 10 Hz, without parts, and with the network."""
+    """The runs: default, repeated, at 10 Hz, without parts, and with the network."""
     if quick:
         options = ("--max-frames", str(QUICK_FRAMES))
         return [Job(name, folder, "default", options) for name, folder in folders.items()]
@@ -81,7 +81,7 @@ def find_sequences(arguments: argparse.Namespace) -> tuple[dict[str, Path], list
 
 
 def recorded(name: str, folder: Path, work: Path, frames: int) -> Any:
-    """A run that writes down how the graph grows."""
+    """A run that records how the graph grows."""
     out = work / "results" / f"{name}-recorded"
     logger.info("running %s, recorded", name)
     call(["-m", "benchmarks.suite.recorded_run", str(folder), "--out", str(out)])
@@ -89,7 +89,7 @@ def recorded(name: str, folder: Path, work: Path, frames: int) -> Any:
 
 
 def measure_all(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Everything that the report needs, as plain data."""
+    """All measurements of the report, as plain data."""
     load = [load_average()]
     folders, commands = find_sequences(arguments)
     yardstick = next(iter(folders.values()))
@@ -146,7 +146,7 @@ def draw_overview(folder: Path, arguments: argparse.Namespace) -> None:
 
 
 def image_path(arguments: argparse.Namespace) -> Path:
-    """The growth figure lies beside the report's folder, as docs/images beside docs/results."""
+    """Path of the growth figure: ``images`` beside the report's folder."""
     path: Path = arguments.report.parent.parent / "images" / "graph_growth.png"
     return path
 
@@ -160,7 +160,7 @@ def command_line(arguments: argparse.Namespace) -> str:
 
 
 def parse() -> argparse.Namespace:
-    """The command line, with the report's place filled in."""
+    """The command line, with the report's path filled in."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a few frames of two sequences")
     parser.add_argument(

@@ -1,9 +1,9 @@
-"""Run benchmarks one after the other and keep what they print in a page under docs/results/.
+"""Run benchmarks and write their output to a page under docs/results/.
 
     python -m benchmarks.section_report graph [--only loops,session] [--sequences runs/bench]
 
 Each section of a page holds the command, what it printed, and a line with machine, commit and date.
-With ``--only`` the other sections stay as they were. README.md and docs/results/benchmarks.md are
+With ``--only`` the other sections are kept. README.md and docs/results/benchmarks.md are
 written by ``make bench``.
 """
 
@@ -41,7 +41,7 @@ class Report:
 
     @property
     def head(self) -> str:
-        """How the page begins."""
+        """The begin of the page."""
         return (
             f"# {self.title}\n\nWritten by `python -m benchmarks.section_report {self.path.stem}`; "
             "a section with a command is what that printed.\n"
@@ -168,7 +168,7 @@ REPORTS = {
 
 
 def make_section(report: Report, name: str, sequences: Path) -> str:
-    """Run a benchmark; its section."""
+    """Run a benchmark; returns its section."""
     title, given = report.sections[name]
     module, *arguments = given.format(sequences=sequences).split()
     command = ["-m", f"benchmarks.{module}", *arguments]
@@ -193,7 +193,7 @@ def make_section(report: Report, name: str, sequences: Path) -> str:
 
 
 def replace_section(report: Report, new: str) -> None:
-    """Put a section into its page, in the place of the old one."""
+    """Write a section into its page, in place of the old one."""
     old = report.path.read_text() if report.path.exists() else report.head
     parts = {
         part.split("\n", 1)[0]: part.rstrip() + "\n\n"
@@ -206,7 +206,7 @@ def replace_section(report: Report, new: str) -> None:
 
 
 def main() -> None:
-    """Write a page, or renew some of its sections."""
+    """Write a page, or some of its sections."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("report", choices=REPORTS)
     parser.add_argument("--only", help="some of its sections, such as loops,session")

@@ -1,14 +1,14 @@
-"""Self-calibration where the truth is known: started wrong, what is found, and what it brings.
+"""Self-calibration from a wrong camera with known truth: parameters found, and errors of runs.
 
     python -m benchmarks.calibration.self_calibration --out DIR [--kitchen FOLDER]
 
 Renders an office with a sweeping camera and late depth, runs on it with focal lengths and depth
 scale 3 % off, the principal point 6 px off and the delay unknown, calibrates (reference: the exact
 trajectory), runs again with the camera that was found, calibrates and runs once more. Then the red
-kitchen, whose camera is an estimate. Its reference is of another program that tracked depth images
-alone, and follows a point beside the camera (see kitchen_reference.py): calibrated twice in turn
-and compared with the place of that point found too (``--hand-eye``), over some runs that differ by
-their number of keypoints. Tables in Markdown.
+kitchen, whose camera is an estimate. Its reference is of a program that tracked depth images only,
+and is the path of a point beside the camera (see kitchen_reference.py): it is calibrated twice in
+turn and evaluated with that lever arm estimated too (``--hand-eye``), in runs with different
+numbers of keypoints. Tables in Markdown.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def main() -> None:
 
 
 def kitchen(sequence: Path, out: Path) -> None:
-    """Print what is found of a real camera, and the errors before and after."""
+    """Print the calibration of a real camera, and the errors before and after."""
     write_camera(out / "given.yaml", read_camera(sequence / "camera.yaml"))
     cameras = ("given", "calibrated", "calibrated again")
     for before, after in itertools.pairwise(cameras):
@@ -109,7 +109,7 @@ def kitchen(sequence: Path, out: Path) -> None:
 
 
 def repeated(sequence: Path, out: Path, camera: str, keypoints: int) -> Path:
-    """A run with that camera and at most so many keypoints a frame."""
+    """A run with that camera and at most ``keypoints`` keypoints a frame."""
     config = resolve(SystemConfig, None, (f"features.max_keypoints={keypoints}",))
     path = out / f"{camera}-{keypoints}"
     run(
@@ -172,7 +172,7 @@ def table_of_parameters(done: Calibrated, truth: Camera) -> str:
 
 
 def table_of_errors(errors: dict[str, dict[str, float]]) -> str:
-    """ATE and RPE of the runs with each camera; none a metre where it moves less than that."""
+    """ATE and RPE of the runs with each camera; none per metre for shorter paths."""
     lines = ["| camera | " + " | ".join(ERRORS.values()) + " |", "|" + " --- |" * (1 + len(ERRORS))]
     for name, values in errors.items():
         cells = (f"{values[e]:.4f}" if e in values else "" for e in ERRORS)

@@ -1,7 +1,7 @@
-"""A building to walk through: corridors round a block of rooms, landmarks on its walls.
+"""A simulated building: corridors round a block of rooms, with landmarks on its walls.
 
-The plan is drawn in metres on (x, z); y points down, as in the camera. A landmark is seen when
-it is in the image, in range, and no wall stands between.
+The plan is drawn in metres on (x, z); y points down, as in the camera. A landmark is visible if
+it is in the image, in range, and not behind a wall.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def walk(rounds: int, per_round: int, rng: np.random.Generator) -> Array:
 
 
 def visible(T_world_camera: Array, points: Array, on_wall: Ints) -> tuple[Ints, Array]:
-    """Rows (M,) of the points that a camera sees, and their exact measurements (M, 3)."""
+    """Rows (M,) of visible points, and their exact measurements (M, 3)."""
     p = transform(inverse(T_world_camera), points)
     near = np.flatnonzero((p[:, 2] > RANGE_M[0]) & (p[:, 2] < RANGE_M[1]))
     z = CAMERA.project_stereo(p[near])

@@ -1,12 +1,12 @@
-"""Are the covariances right? NEES over many synthetic rooms, and on a rendered sequence; times.
+"""Consistency of covariances: NEES over many synthetic rooms and on a rendered sequence; times.
 
     python -m benchmarks.graph.covariances [--runs 200] [--sequence runs/bench/living_room]
 
 NEES is the squared error in units of the stated covariance, divided by its degrees of freedom
-here: 1 on average if the covariance is right, and its square root is the factor by which the
-stated sigmas are too small. The first pose of a room is exact, though its prior allows 0.1 mm: a
-NEES of absolute poses a little below 1 is right there. On rendered images it also holds what no
-factor states: errors of registration, of wrong matches, of noise that is not Gaussian.
+here: 1 on average if the covariance is right; its square root is the factor by which the sigmas
+are too small. The first pose of a room is exact although its prior allows 0.1 mm, so that a NEES of
+absolute poses a little below 1 is right. On rendered images it also includes errors without a
+factor: of registration, of wrong matches, of noise that is not Gaussian.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def nees(errors: Array, covariances: Array) -> Array:
 def session(
     keyframes: int, seed: int, config: SmootherConfig, cull: int = 0
 ) -> tuple[Feeder, Smoother]:
-    """A room, walked as far as so many of 150 keyframes: its feeder and smoother then."""
+    """The feeder and smoother of a room after the first of 150 keyframes."""
     arguments = argparse.Namespace(
         keyframes=150, observations=150, landmarks=3000, cull=cull, seed=seed
     )

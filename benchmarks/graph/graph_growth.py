@@ -41,7 +41,7 @@ def walls(count: int, rng: np.random.Generator) -> Array:
 
 
 class Feeder:
-    """Makes one update a keyframe as a front end would: old landmarks first, then new ones."""
+    """Makes one update per keyframe like a front end: old landmarks first, then new ones."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.rng = np.random.default_rng(args.seed)

@@ -1,10 +1,10 @@
-"""Kills a run with checkpoints at random moments, resumes it, and compares every byte it leaves.
+"""Kills a run with checkpoints at random moments, resumes it, and compares all its files.
 
     python -m benchmarks.graph.kill_and_resume SEQUENCE --every 60 --kills 10
 
 Each row is a run of its own: the program is started as a user would, killed (SIGKILL) at a moment
 drawn from the time between its first checkpoint (before the first frame) and the end of the
-undisturbed run, and resumed. Of the undisturbed run the cost of the checkpoints is told too.
+undisturbed run, and resumed. The cost of the checkpoints in the undisturbed run is printed too.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Kill:
         frames: lines of frames.csv at the kill.
         checkpoint: frames of the last checkpoint.
         was: the last line of the log at the kill.
-        same: whether all that is left is that of the undisturbed run.
+        same: whether all files equal those of the undisturbed run.
     """
 
     after_s: float

@@ -1,12 +1,12 @@
-"""A long session, simulated: a building walked five times, its old landmarks retired.
+"""A long session, simulated: a path of five rounds in a building, with marginalised landmarks.
 
     python -m benchmarks.graph.long_session [--keyframes 2000] [--measurements 100] [--out DIR]
 
-Each keyframe measures 100 landmarks with the noise that the red kitchen asks for. A place that
-was seen before is recognised: a loop first, then its landmarks are found again. Everything goes
-through ``Smoother.update`` as from the feed of a run. Afterwards all retired landmarks are put
-back, and the session is compared with the optimum of that full graph. ``--full N`` also takes
-the time of the first N keyframes without retirement.
+Each keyframe measures 100 landmarks with noise as in the red kitchen. At a known place a loop is
+added first, then its landmarks are matched again. All updates go through ``Smoother.update`` as in
+a run. Afterwards all marginalised landmarks are restored, and the session is compared with the
+optimum of that full graph. ``--full N`` also measures the first N keyframes without
+marginalisation.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.graph.building import CAMERA, landmarks, visible, walk
+from benchmarks.graph.pose_graphs import position_rmse_m
 from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
-from bmask_slam.graph.metrics import align
 from bmask_slam.graph.smoother.smoother import Smoother
 
 SIGMAS_PX = np.array([1.0, 1.0, 0.2])
-"""Of u, v and disparity: about what the red kitchen's frames ask for (docs/architecture.md)."""
+"""Of u, v and disparity, as in the red kitchen (docs/architecture.md)."""
 STEP_SIGMAS = np.array([0.001] * 3 + [0.003] * 3)
 LOOP_SIGMAS = np.array([0.002] * 3 + [0.01] * 3)
 FEED = FactorSelectionConfig()
 GAP = 40
-"""Keyframes after which a landmark counts as seen before rather than tracked."""
+"""Number of keyframes after which a landmark counts as matched again rather than tracked."""
 FOUND = 0.8
 """Share of the visible landmarks that a keyframe detects."""
 ROUNDS, PER_M2 = 5, 14.0
@@ -46,11 +46,11 @@ COLUMNS = ("update_ms", "solver_ms", "landmarks", "factors", "ate_m", "rss_mb")
 class FrontEnd:
     """Makes one update a keyframe as the real front end would."""
 
-    def __init__(self, args: argparse.Namespace, retires: bool) -> None:
+    def __init__(self, args: argparse.Namespace, marginalise: bool) -> None:
         self.rng = np.random.default_rng(args.seed)
         self.poses = walk(ROUNDS, args.keyframes // ROUNDS, self.rng)
         self.points, self.on_wall = landmarks(PER_M2, self.rng)
-        self.measurements, self.retires = args.measurements, retires
+        self.measurements, self.marginalise = args.measurements, marginalise
         self.observed_ids: list[Ints] = []
         self.last_observed = np.full(len(self.points), -1)
         self.loops: list[tuple[int, int]] = []
@@ -75,11 +75,11 @@ class FrontEnd:
             points,
             Observations(np.full(len(ids), k), ids, z, sigmas),
             relative_poses=loops,
-            marginalise_landmarks=self._outside_window(known) if self.retires else known[:0],
+            marginalise_landmarks=self._outside_window(known) if self.marginalise else known[:0],
         )
 
     def _measure(self, k: int) -> tuple[Ints, Array]:
-        """Some of the visible landmarks, those seen last first, and their noisy measurements."""
+        """Some visible landmarks, the last observed first, and their noisy measurements."""
         ids, z = visible(self.poses[k], self.points, self.on_wall)
         detected = self.rng.random(len(ids)) < FOUND
         ids, z = ids[detected], z[detected]
@@ -92,7 +92,7 @@ class FrontEnd:
     def _recognise(
         self, k: int, ids: Ints, z: Array
     ) -> tuple[tuple[RelativePose, ...], Ints, Array]:
-        """Where a known place begins, a loop to it; its landmarks are found from then on."""
+        """A loop at the begin of a known place, whose landmarks are matched from then on."""
         again = (self.last_observed[ids] >= 0) & (self.last_observed[ids] < k - GAP)
         if self._in_known_place or again.mean() < 0.5:
             self._in_known_place &= bool(again.any())
@@ -110,7 +110,7 @@ class FrontEnd:
         return (loop,), ids[~again], z[~again]
 
     def _outside_window(self, in_graph: Ints) -> Ints:
-        """As ``back_end.factor_selection.FactorSelector`` chooses what retires."""
+        """As ``back_end.factor_selection.FactorSelector`` chooses what marginalise."""
         estimated = np.zeros(len(self.points), bool)
         estimated[self.observed_ids[-1]] = True
         shared = np.array([np.count_nonzero(estimated[ids]) for ids in self.observed_ids])
@@ -130,19 +130,14 @@ class FrontEnd:
 
 def ate_m(estimate: GraphEstimate, poses: Array) -> float:
     """RMSE (m) of the keyframes' positions after alignment by a rigid transform."""
-    truth = poses[estimate.keyframe_ids, :3, 3]
-    estimated = estimate.poses_world_camera[:, :3, 3]
-    T = align(estimated, truth).T_reference_estimate
-    return float(
-        np.sqrt(np.mean(np.sum((estimated @ T[:3, :3].T + T[:3, 3] - truth) ** 2, axis=1)))
-    )
+    return position_rmse_m(estimate.poses_world_camera, poses[estimate.keyframe_ids])
 
 
 def session(
-    args: argparse.Namespace, retires: bool, count: int
+    args: argparse.Namespace, marginalise: bool, count: int
 ) -> tuple[Smoother, FrontEnd, GraphEstimate, Array]:
-    """Walk so many keyframes; the rows (K, 6) of COLUMNS."""
-    front, smoother = FrontEnd(args, retires), Smoother(CAMERA)
+    """Run a session of ``count`` keyframes; returns also the rows (K, 6) of COLUMNS."""
+    front, smoother = FrontEnd(args, marginalise), Smoother(CAMERA)
     estimate, rows = None, []
     for k in range(count):
         estimate = smoother.update(front.update(k, estimate))
@@ -189,10 +184,13 @@ def table(lines: list[dict[str, float]]) -> str:
 
 
 def plot(rows: Array, full: Array, path: Path) -> None:
-    """Update times over the session, with those without retirement as far as they were taken."""
+    """Plot update times over the session, and those without marginalisation if measured."""
     figure = Figure(figsize=(9, 3.6), dpi=120, layout="constrained")
     axis = figure.subplots()
-    for data, colour, text in ((full, "#d6302a", "full graph"), (rows, "#1f5fa8", "retirement")):
+    for data, colour, text in (
+        (full, "#d6302a", "full graph"),
+        (rows, "#1f5fa8", "marginalisation"),
+    ):
         if len(data):
             axis.plot(data[:, 0], ".", color=colour, ms=2, alpha=0.5, label=text)
     axis.set(xlabel="keyframe", ylabel="graph update (ms)", ylim=(0, None))
@@ -206,7 +204,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--keyframes", type=int, default=2000, help="in all five rounds")
     parser.add_argument("--measurements", type=int, default=100, help="new ones a keyframe")
-    parser.add_argument("--full", type=int, default=0, help="keyframes without retirement")
+    parser.add_argument("--full", type=int, default=0, help="keyframes without marginalisation")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     args = parser.parse_args()
@@ -227,7 +225,10 @@ def main() -> None:
     full = session(args, False, args.full)[3] if args.full else np.zeros((0, len(COLUMNS)))
     if len(full):
         same = rows[: len(full)]
-        for text, data in (("without retirement", full), ("with it, the same keyframes", same)):
+        for text, data in (
+            ("without marginalisation", full),
+            ("with it, the same keyframes", same),
+        ):
             last = data[-len(data) // 4 :, 0]
             print(f"{text}: last quarter p95 {np.percentile(last, 95):.1f} ms")
     result = {

@@ -5,11 +5,10 @@
 First table: final cost and time of each graph with each method, against GTSAM's own
 Levenberg-Marquardt run from the file's poses (or the odometry) and from the chordal solution, the
 better of the two. Second: a share of the loop edges is replaced by random ones. GNC's poses are
-compared with the optimum of the right edges alone, which knows which were replaced (RMSE of
-positions after alignment), and both with the optimum of the undisturbed graph. What the replaced
-edges knew is lost: by how much this raises the expected ATE is told by the covariances of the two
-optima, and for sphere2500 by GTSAM's ground truth. In the last column the random edges are added
-and none is replaced.
+compared with the optimum of the right edges alone (RMSE of positions after alignment), and both
+with the optimum of the undisturbed graph. The information of the replaced edges is lost: the
+increase of the expected ATE follows from the covariances of the two optima, and for sphere2500
+from GTSAM's ground truth. In the last column the random edges are added and none is replaced.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ import numpy as np
 from benchmarks.paths import SHARED
 from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.g2o.pose_graphs import read_g2o
-from bmask_slam.graph.geometry import make_pose, so3_exp
+from bmask_slam.graph.geometry import make_pose, so3_exp, transform
 from bmask_slam.graph.metrics import align
 from bmask_slam.graph.pose_graph.factors import chordal_poses
 from bmask_slam.graph.pose_graph.loop_prediction import pose_draws
@@ -74,7 +73,7 @@ def with_wrong_loops(
     """The graph with this share of its loop edges replaced by random ones, and their mask (M,).
 
     A wrong edge joins two random vertices by a random rotation, and a translation as long as the
-    graph is wide: nothing in it gives it away.
+    graph is wide, so that it cannot be recognised by itself.
     """
     loops = np.flatnonzero(~graph.is_odometry)
     wrong = rng.choice(loops, round(share * len(loops)), replace=False)
@@ -107,12 +106,15 @@ def with_added(graph: PoseGraph, other: PoseGraph, mask: Mask) -> PoseGraph:
     )
 
 
-def position_rmse_m(poses: Array, reference: Array) -> float:
-    """Positions against positions, after alignment by a rigid transform."""
+def aligned_errors_m(poses: Array, reference: Array) -> Array:
+    """Errors (K, 3) of positions after alignment by a rigid transform."""
     points, target = poses[:, :3, 3], reference[:, :3, 3]
-    T = align(points, target).T_reference_estimate
-    moved = points @ T[:3, :3].T + T[:3, 3]
-    return float(np.sqrt(np.mean(np.sum((moved - target) ** 2, axis=1))))
+    return transform(align(points, target).T_reference_estimate, points) - target
+
+
+def position_rmse_m(poses: Array, reference: Array) -> float:
+    """RMSE of positions after alignment by a rigid transform."""
+    return float(np.sqrt(np.mean(np.sum(aligned_errors_m(poses, reference) ** 2, axis=1))))
 
 
 def sphere_truth(file: Path) -> Array:
@@ -130,7 +132,7 @@ def sphere_truth(file: Path) -> Array:
 
 
 def expected_ate_m(graph: PoseGraph, used: Mask) -> float:
-    """ATE that the covariance of an optimum of the ``used`` edges promises, from draws."""
+    """ATE by the covariance of an optimum of the ``used`` edges, from draws."""
     columns = slice(0, 2) if graph.is_planar else slice(3, 6)
     squares = []
     for tangents in pose_draws(graph, used)[:, :, columns]:
@@ -179,7 +181,7 @@ def compare_methods(graphs: dict[str, PoseGraph]) -> None:
 
 
 def wrong_loops(name: str, graph: PoseGraph, arguments: argparse.Namespace, seed: int) -> None:
-    """Print how near GNC comes to the optimum of the right edges, and that to the clean one."""
+    """Print distances between the optima of GNC, the right edges and the clean graph."""
     clean = optimise_pose_graph(graph).graph
     disturbed, wrong = with_wrong_loops(clean, arguments.wrong, np.random.default_rng(seed))
     disturbed = replace(disturbed, poses=graph.poses, has_poses=graph.has_poses)

@@ -1,9 +1,9 @@
-"""A long session of the live loop: are latency and memory flat?
+"""A long session of the live loop: latency and memory over time.
 
     python -m benchmarks.live.session SEQUENCE [--minutes 30] [--hz 30]
 
-A rendered tour is walked to and fro for so long, as a camera of that rate would see it, frame after
-frame without pauses. Memory is that of each process's own (anonymous) pages, at the end of each
+A rendered sequence is played forward and backward with the stamps of a camera of that rate, without
+pauses. Memory is that of each process's own (anonymous) pages, at the end of each
 sixth of the session.
 """
 
@@ -38,7 +38,7 @@ def own_mb(pid: int | str) -> float:
 
 
 class Tour:
-    """A sequence walked to and fro, as a source that waits for the loop."""
+    """A sequence played forward and backward, as a source that waits for the loop."""
 
     name = "tour"
     waits = True

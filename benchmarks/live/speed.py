@@ -1,10 +1,10 @@
-"""The live loop beside the offline run, on the same frames, one after the other.
+"""The live loop compared with the offline run on the same frames.
 
     python -m benchmarks.live.speed [SEQUENCE] [--segmenter light] [--repeats 3] [--max-frames N]
 
-Realtime: frames come at the speed of their stamps, and one that there is no time for is dropped.
+Realtime: frames come at the rate of their stamps, and are dropped if tracking is busy.
 Flat out: the next frame comes when the one before is tracked, its features computed ahead. Latency
-counts from the moment a frame is there until its pose is known. Medians over the repeats.
+is the time from the arrival of a frame to its pose. Medians over the repeats.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def main() -> None:
     print(f"{'':{NAME}}" + "".join(f"{title:>12}" for _, title, _ in COLUMNS))
     with tempfile.TemporaryDirectory() as scratch:
         runs: dict[str, list[dict[str, float]]] = {name: [] for name in variants}
-        for _ in range(arguments.repeats):  # interleaved, since the machine's mood changes
+        for _ in range(arguments.repeats):  # interleaved, since the speed of the machine varies
             for name, command in variants.items():
                 runs[name].append(measured(command, Path(scratch) / "run"))
     for name, found in runs.items():

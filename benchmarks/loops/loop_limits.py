@@ -21,13 +21,13 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
+from benchmarks.graph.pose_graphs import aligned_errors_m
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.batch.bundle_adjustment import AdjustmentConfig, adjust, loop_numbers
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
 from bmask_slam.graph.geometry import inverse, se3_log
-from bmask_slam.graph.metrics import align
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
 from bmask_slam.run_folder.map_file import SavedRun, read_run
 
@@ -56,13 +56,6 @@ def make_loops_exact(run: SavedRun, truth: Array) -> None:
             robust=None,
         )
         run.tables.pose_factors[number] = replace(entry, factor=exact)
-
-
-def aligned_errors_m(poses: Array, truth: Array) -> Array:
-    """Errors (K, 3) of positions after alignment by a rigid transform."""
-    points, target = poses[:, :3, 3], truth[:, :3, 3]
-    T = align(points, target).T_reference_estimate
-    return points @ T[:3, :3].T + T[:3, 3] - target
 
 
 def rmse_mm(errors_m: Array) -> float:

@@ -1,12 +1,12 @@
-"""How well votes for places agree with the true poses of a sequence, and what a query costs.
+"""Accuracy of place recognition against the true poses of a sequence, and time of a query.
 
     bmask-slam render corridor --out corridor
     python -m benchmarks.loops.place_recognition corridor [--every 10] [--json]
 
 Every tenth frame is a keyframe. Two keyframes show the same place if enough of the keypoints of
-one are seen by the other, by true poses and depth, from within 60 degrees of turn. The map size is
-raised by copies of the sequence whose descriptors have 120 bits changed at random: farther than any
-gate, but spread alike. Nothing of the sequence is tracked, and no loop is closed.
+one are visible in the other, by true poses and depth, within 60 degrees of rotation. The map is
+enlarged by copies of the sequence with 120 bits of each descriptor changed at random, which exceeds
+every threshold. Nothing of the sequence is tracked, and no loop is closed.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class View:
 
 @dataclass(frozen=True)
 class PlaceScore:
-    """Of the queries at a known place, how many got a candidate; of these, how many a right one.
+    """Numbers of queries at a known place, with a candidate, and with a right one.
 
     ``wrong``: queries whose first candidate shows (nearly) nothing of the same place.
     """

@@ -3,8 +3,8 @@
     python -m benchmarks.mapping.dense DIR [--rooms office] [--out dense.json]
 
 Rooms of 150 frames with a Kinect's noise, poses by the system. Depth of the keyframes before and
-after fusion, what each Step brings, and the normalised squared error (nees) of the variance that
-is stated, which should be 1; then the cloud and Open3D's TSDF of the same keyframes and poses
+after fusion, the effect of each Step, and the normalised squared error (nees) of the stated
+variance, which should be 1; then the cloud and Open3D's TSDF of the same keyframes and poses
 against the true surface. Coverage and outliers (beyond 5 cm) are shares of the pixels that have a
 truth; "<5cm" means without outliers. A Kinect's noise leaves few holes, so that coverage can grow
 little there: what fusion fills shows where a fifth of every image is lost.
@@ -45,7 +45,7 @@ ROOMS, FRAMES = "office,living_room", 150
 
 
 def measure(run: MappedRun, options: MapOptions) -> dict[str, Any]:
-    """Everything, as plain data."""
+    """All measurements, as plain data."""
     truths, config = read_truth(run), fusion_config(options)
     steps = Steps(run, config)
     maps = ablation(steps)
@@ -142,7 +142,7 @@ DEPTHS = {
 
 
 def prepared(root: Path, room: str) -> tuple[Path, Path]:
-    """The sequence of a room and its run under a folder, made if they are not there."""
+    """The sequence of a room and its run under a folder, made if they do not exist."""
     sequence, run_folder = root / room, root / f"{room}-run"
     if not sequence.is_dir():
         render_sequence(RenderConfig(room, frames=FRAMES, true_depth=True), sequence)

@@ -1,4 +1,4 @@
-"""Depth of keyframes before and after fusion against the truth, and what each Step brings."""
+"""Depth of keyframes before and after fusion against the truth, and the effect of each Step."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def depth_errors(maps: list[Map], truths: list[Truth], where: list[NDArray]) -> 
 
 
 class Steps:
-    """The Steps on all keyframes of a run, one by one or left out."""
+    """The Steps on all keyframes of a run, each alone or skipped."""
 
     def __init__(self, run: MappedRun, config: DenseConfig, lost: float = 0.0) -> None:
         """``lost`` is a share of each keyframe's depth that the sensor does not give."""
@@ -114,7 +114,7 @@ def patchy(run: MappedRun, truths: list[Truth], config: DenseConfig) -> dict[str
 
 
 def ablation(steps: Steps) -> dict[str, list[Map]]:
-    """Maps of every keyframe after each Step, and with Steps left out."""
+    """Maps of every keyframe after each Step, and with Steps skipped."""
     step3 = [regularise(m) for m in steps.raw]
     step4 = steps.fused(step3)
     step5 = [regularise(f.map) for f in step4]

@@ -1,4 +1,4 @@
-"""How long the Steps take on one keyframe, beside Open3D's TSDF."""
+"""Time of the Steps on one keyframe, and of Open3D's TSDF."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from bmask_slam.mapping.products.submaps import make_submap
 
 ROUNDS = 6
 MAX_LOAD = 1.7
-"""Of the machine, this process included: above it the clock says nothing."""
+"""Of the machine with this process; above it wall times are not measured."""
 
 
 def step_times_ms(steps: Steps, run: MappedRun, config: DenseConfig) -> dict[str, Any]:
     """Least times of a keyframe in the middle: Steps one by one and together, and Open3D's TSDF.
 
-    "processor" is processor time on one thread, "wall" what the clock says on two, empty if others
-    load the machine. They take turns, ROUNDS times, since a machine is now slower, now faster.
+    "processor" is processor time on one thread, "wall" wall time on two, empty on a busy
+    machine. They alternate ROUNDS times, since the speed of a machine varies.
     """
     load = os.getloadavg()[0]
     single = _Single(steps, run, config)

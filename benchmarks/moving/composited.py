@@ -1,11 +1,11 @@
-"""A real man walks through a real recording: he is cut out of one and put into the other.
+"""A real person composited into another real recording.
 
     python -m benchmarks.moving.composited [--frames 150] [--out runs/composited]
 
-The man of the shared data's dynamic_pairs, with his colour and depth, walks to and fro before the
-camera of the red kitchen along a path in the kitchen's world. He hides what is behind him and is
-hidden by what is before him; his lower edge stays at the picture's. The recording as it is, and
-with him, are run with nothing and with geometry; with him also with masks, by ``--segmenter``.
+The person of the shared data's dynamic_pairs, with colour and depth, moves to and fro before the
+camera of the red kitchen along a path in the kitchen's world, with mutual occlusion; the lower edge
+stays at that of the image. The original and the composited recording are run without filter and
+with geometry; the composited one also with masks, by ``--segmenter``.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SIDE_M, AHEAD_M = 0.55, 1.15
 
 
 def walk(poses: Array, stamps_s: Array) -> Array:
-    """(F, 3) where the man is in the world: now left, now right, before the camera of that time."""
+    """Positions (F, 3) of the person in the world, left and right of the axis in turn."""
     knots_s = np.arange(stamps_s[0], stamps_s[-1] + LEG_S, LEG_S)
     at = np.searchsorted(stamps_s, knots_s).clip(max=len(stamps_s) - 1)
     side_m = SIDE_M * np.where(np.arange(len(at)) % 2, 1.0, -1.0)
@@ -54,12 +54,12 @@ def walk(poses: Array, stamps_s: Array) -> Array:
 def composed(
     frame: Frame, person: Frame, place_camera: Array, focal_px: tuple[float, float]
 ) -> Frame:
-    """A frame with the man standing at a place (3,) in its camera's frame.
+    """A frame with the person at a place (3,) in its camera's frame.
 
     Args:
         frame: of the recording.
-        man: a frame of the pairs; what its mask covers is taken.
-        place_camera: his middle.
+        man: a frame of the pairs; the pixels of its mask are used.
+        place_camera: the person's centre.
         focal_px: focal length and centre column of the recording's camera.
     """
     mask = cv2.erode(person_mask(person).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
@@ -86,7 +86,7 @@ def composed(
 
 
 def make(folder: Path, frames: int) -> None:
-    """Write the recording with the man, in TUM layout, with the truth of where he is."""
+    """Write the recording with the person in TUM layout, with true masks."""
     kitchen = open_sequence(KITCHEN)
     truth = read_tum(KITCHEN / "groundtruth.txt")
     poses = truth.poses_world_camera[:frames]
@@ -135,11 +135,11 @@ def main() -> None:
             make(temporary, arguments.frames)
     nothing, geometry = "moving_objects.geometry=false", "moving_objects.geometry=true"
     variants = {
-        "without him, nothing": (KITCHEN, nothing, "none"),
-        "without him, geometry": (KITCHEN, geometry, "none"),
-        "with him, nothing": (folder, nothing, "none"),
-        "with him, geometry": (folder, geometry, "none"),
-        f"with him, geometry and masks ({arguments.segmenter})":
+        "without person, nothing": (KITCHEN, nothing, "none"),
+        "without person, geometry": (KITCHEN, geometry, "none"),
+        "with person, nothing": (folder, nothing, "none"),
+        "with person, geometry": (folder, geometry, "none"),
+        f"with person, geometry and masks ({arguments.segmenter})":
             (folder, geometry, arguments.segmenter),
     }  # fmt: skip
     rows = []

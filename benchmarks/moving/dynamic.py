@@ -1,4 +1,4 @@
-"""What people who walk before the camera do to the trajectory, with and without the cure.
+"""The effect of walking people on the trajectory, with and without the moving-object filter.
 
     python -m benchmarks.moving.dynamic [--sequences runs/bench] [--segmenter truth] [--seed 6]
 
@@ -6,12 +6,11 @@ The same camera path through the same room is rendered without people, with one,
 walk, and with one who carries a box of no class and pulls a chair along; the first two keep step
 with the camera. Sequences that are there already are used as they are. Each is run with nothing,
 with the labels of masks alone, with geometry alone, with both, and with the truth of every frame
-("ideal"), which shows what the people cost by what they hide. "x clean" compares with the same
-camera path without people, run with nothing; "left out" is the share of the keypoints on people,
-the box, the chair while it is pulled, and on all the rest, that were not used. The times of the
-check, and of finding other keypoints in place of those left out ("refill"), are the processor's, of
-all frames. The second table is how much of the pictures they cover, box and pulled chair among
-them.
+("ideal"), which shows the effect of occlusion alone. "x clean" compares with the same camera path
+without people, run with nothing; "excluded" is the share of the keypoints on people, the box, the
+chair while it is pulled, and elsewhere, that were not used. Times of the check, and of keypoint
+replenishment, are processor times over all frames. The second table is the coverage of the images
+by moving objects.
 """
 
 from __future__ import annotations
@@ -58,11 +57,11 @@ VARIANTS = {
     "both": (True, True),
     IDEAL: (False, False),
 }
-"""Name to whether labels and geometry count."""
+"""By name, whether labels and geometry are used."""
 FPS_HZ = 15.0
 PICTURES = 8
 WANTED_COVERAGE = (0.15, 0.5)
-"""How much of a picture people are to cover."""
+"""Range of the share of an image that people should cover."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class Outcome:
         tracked_share: of the frames.
         left_out: share of keypoints left out, by what they are on; None where it is not there.
         check_ms: median time of the moving-object filter in a frame, and its 95 % quantile.
-        mostly_moving: frames in which nearly everything seemed to move.
+        mostly_moving: frames in which nearly all keypoints seemed to move.
         covered: share of each picture that moves.
     """
 
@@ -89,7 +88,7 @@ class Outcome:
 
 
 class IdealSystem(CountingSystem):
-    """Leaves out what the truth says, in every frame."""
+    """Excludes the truly moving keypoints in every frame."""
 
     def _without_moving(self, frame: Frame, features: Features) -> StaticFeatures:
         static, moving = super()._without_moving(frame, features), self._on_moving(frame, features)

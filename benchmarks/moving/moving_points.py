@@ -62,7 +62,7 @@ class MovingTruth:
 
 @dataclass(frozen=True)
 class Count:
-    """Keypoints on something, and how many of them were left out."""
+    """Numbers of keypoints on an object, and of excluded ones."""
 
     on: int = 0
     excluded: int = 0
@@ -72,7 +72,7 @@ class Count:
 
     @property
     def share(self) -> float:
-        """Of the keypoints on it, those that were left out; NaN without any."""
+        """The share of excluded keypoints; NaN without keypoints."""
         return self.excluded / self.on if self.on else float("nan")
 
 
@@ -91,7 +91,7 @@ def count(pixels: Array, moving: Mask, masks: Mapping[str, Mask]) -> dict[str, C
 
 
 def picture(frame: Frame, static: tuple[Array, Mask], masks: Mapping[str, Mask]) -> Image:
-    """A frame with its keypoints and the outline of what moves, half size, BGR."""
+    """A frame with its keypoints and outlines of moving objects, half size, BGR."""
     drawn = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
     moves = np.any(list(masks.values()), axis=0).astype(np.uint8)
     outlines, _ = cv2.findContours(moves, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
@@ -103,18 +103,17 @@ def picture(frame: Frame, static: tuple[Array, Mask], masks: Mapping[str, Mask])
 
 
 class CountingSystem(SlamSystem):
-    """The system; keeps the counts of every frame, and pictures of every ``every``-th.
+    """The system; counts keypoints in every frame, and draws every ``every``-th.
 
-    ``check_ms`` is the processor's time that a frame's dynamic check took, which other programs
-    do not change, with finding keypoints in place of those left out. ``covered`` is
-    the share of each frame that what moves covers.
+    ``check_ms`` is the processor's time of a frame's dynamic check and
+    of keypoint replenishment. ``covered`` is the share of each frame that moving objects cover.
     """
 
     truth: MovingTruth
     every: int
 
     def watch(self, truth: MovingTruth, every: int) -> CountingSystem:
-        """Begin to count."""
+        """Start counting."""
         self.truth, self.every = truth, every
         self.counts: list[dict[str, Count]] = []
         self.pictures: list[Image] = []
@@ -123,7 +122,7 @@ class CountingSystem(SlamSystem):
         return self
 
     def total(self, kind: str) -> Count:
-        """Of all frames but the first, which has nothing to be compared with."""
+        """The sum over all frames except the first, which has no earlier view."""
         return sum((c[kind] for c in self.counts[1:]), Count())
 
     def _without_moving(self, frame: Frame, features: Features) -> StaticFeatures:
@@ -146,7 +145,7 @@ class CountingSystem(SlamSystem):
 
 
 def strip(pictures: list[Image], columns: int = 4) -> Image:
-    """Pictures, one or more, in rows; an incomplete last row is left away."""
+    """Pictures, one or more, in rows; an incomplete last row is dropped."""
     columns = min(columns, len(pictures))
     rows = range(0, len(pictures) - columns + 1, columns)
     return np.vstack([np.hstack(pictures[k : k + columns]) for k in rows])
@@ -176,7 +175,7 @@ def main() -> None:
     print("check ms: median {:.2f}, 95 % {:.2f}".format(*np.percentile(system.check_ms, [50, 95])))
     for kind in (*KINDS, "rest"):
         total = system.total(kind)
-        print(f"{kind}: left out {total.share:.3f} of {total.on}")
+        print(f"{kind}: excluded {total.share:.3f} of {total.on}")
     if options.strip:
         cv2.imwrite(str(options.strip), strip(system.pictures))
 

@@ -1,12 +1,12 @@
-"""What the semantics cost where nothing moves, also when the masks are wrong.
+"""The effect of the semantics on accuracy in static scenes, also with wrong masks.
 
     python -m benchmarks.moving.no_harm [SEQUENCE ...] [--rooms 20-31] [--repeats 8] [--hand-eye]
 
 Each sequence is static; ``--rooms`` are those of dynamic.py without people, of these seeds. Each is
 run without semantics and without the check of what moves ("nothing"), as usual with the network's
 masks ("network"), with masks that are drawn at random ("random": up to eight ellipses a keyframe,
-half of them people), and with the network's masks under each other's names ("shuffled": what was a
-chair is a person to the system). Any change of the keypoints moves an ATE by a tenth or more, so
+half of them people), and with the network's masks with permuted classes ("shuffled": a chair may
+be labelled as a person). Any change of the keypoints moves an ATE by a tenth or more, so
 each is run several times, with keypoints spread over a grid whose cells are a few pixels wider or
 narrower, and every run has random masks and names of its own: the mean ATE, its range, and the mean
 of the logarithms of the runs' ratios to that with nothing on the same grid, as a change, with its
@@ -47,7 +47,7 @@ from bmask_slam.system_config import SystemConfig
 
 VARIANTS = ("nothing", "network", "random", "shuffled")
 SEED = 1000
-"""The first of random masks and names; it and those after it were never looked at before."""
+"""The first seed of random masks and names; not used in development."""
 SCORES = (0.5, 0.95)
 MOST, RADII_PX = 8, (20, 120)
 
@@ -80,7 +80,7 @@ class RandomMasks:
 
 
 class ShuffledLabels:
-    """The masks of another segmenter under each other's names."""
+    """The masks of another segmenter with permuted classes."""
 
     def __init__(self, inner: Segmenter, seed: int) -> None:
         self.inner, self.labels = inner, inner.labels
@@ -100,7 +100,7 @@ class ShuffledLabels:
 
 
 def other_keypoints(repeat: int) -> str:
-    """The setting of a grid that is a little finer or coarser than usual; 0: the usual one."""
+    """The setting of a slightly finer or coarser keypoint grid; 0: the default."""
     return f"features.bucket_px={FeatureConfig().bucket_px + (repeat + 1) // 2 * (-1) ** repeat}"
 
 

@@ -1,4 +1,4 @@
-"""Our Mask R-CNN beside torchvision's: the same weights, image and torch, one after the other.
+"""Our Mask R-CNN compared with torchvision's: the same weights, image and torch, alternately.
 
     python -m benchmarks.semantics.beside_torchvision [--environment runs/bench/torchvision]
 

@@ -1,4 +1,4 @@
-"""A segmenter that errs as networks do, on purpose and by seed, around one that does not."""
+"""A segmenter that adds random errors, like those of networks, to the masks of another."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from bmask_slam.semantics.segmenters.segmenter import Segmenter
 
 @dataclass(frozen=True)
 class Errors:
-    """How often and how far a segmenter is wrong.
+    """Rates and sizes of a segmenter's errors.
 
     Attributes:
         missed: share of the instances that it does not find.
-        confused: share of the classes that it takes for one certain other in 3 of 10 views.
+        confused: share of the classes that it confuses with a fixed other one in 3 of 10 views.
         invented: masks on nothing, an image.
         joined: share of the instances whose mask also covers a neighbour's.
         border_px: standard deviation by which masks grow or shrink.

@@ -1,4 +1,4 @@
-"""What an update of the label store takes: a keyframe's votes about so many landmarks at once.
+"""Time of an update of the label store with a keyframe's votes on many landmarks.
 
     python -m benchmarks.semantics.label_store [--landmarks 1000] [--repeats 300]
 

@@ -1,6 +1,6 @@
-"""Hard inputs made of recorded and rendered sequences: faster, blurred, rows exposed in turn.
+"""Hard inputs from recorded and rendered sequences: faster, blurred, with rolling shutter.
 
-A folder in TUM layout is written where the caller says. Nothing of it belongs into the repository.
+They are written as folders in TUM layout.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 BURST, PAUSE = 12, 18
-"""Frames blurred in one go by a box, and frames between that are not."""
+"""Numbers of consecutive frames that are blurred by a box, and that are not."""
 
 
 @dataclass(frozen=True)
 class Hardship:
-    """What is done to a sequence.
+    """Changes of a sequence.
 
     Attributes:
         stride: every n-th frame is kept.
         max_frames: of those that are kept.
         shutter: blur along the image motion, as a share of the motion to the next kept frame.
         box_px: side of a box that blurs BURST frames in every BURST + PAUSE.
-        readout_s: rolling shutter, of a rendered sequence only; the new camera.yaml says so.
-        restamp: the kept frames follow each other as fast as all did: the camera moves faster.
+        readout_s: rolling shutter, of a rendered sequence only; written to the new camera.yaml.
+        restamp: give the kept frames the original frame rate, so that the camera moves faster.
     """
 
     stride: int = 1
@@ -48,7 +48,7 @@ class Hardship:
 
 
 def make_hard(source: Path, hardship: Hardship, out: Path) -> Path:
-    """Write a hard version of a sequence to a folder, unless it is there; returns it."""
+    """Write a hard version of a sequence to a folder, unless it exists; returns the folder."""
     if out.is_dir():
         return out
     sequence = open_sequence(source)
@@ -78,7 +78,7 @@ def make_hard(source: Path, hardship: Hardship, out: Path) -> Path:
 
 
 def _disturbed(sequence: Sequence, kept: list[int], hardship: Hardship) -> Iterator[Frame]:
-    """The kept frames with blur, and with rows exposed one after the other."""
+    """The kept frames with blur and rolling shutter."""
     for k, index in enumerate(kept):
         frame = sequence.load(index)
         if hardship.box_px and k % (BURST + PAUSE) >= PAUSE:
@@ -92,7 +92,7 @@ def _disturbed(sequence: Sequence, kept: list[int], hardship: Hardship) -> Itera
 
 
 def _moved(frame: Frame, flow: Floats, hardship: Hardship, camera: Camera) -> Frame:
-    """A frame blurred along a flow (H, W, 2) px an interval, each row seen at its own time."""
+    """A frame blurred along a flow (H, W, 2) px an interval, each row at its own time."""
     rgb, depth_m = frame.rgb, frame.depth_m
     if hardship.readout_s:
         height, width = depth_m.shape
@@ -108,7 +108,7 @@ def _moved(frame: Frame, flow: Floats, hardship: Hardship, camera: Camera) -> Fr
 
 
 def _flow(sequence: Sequence, frame: Frame, other: int) -> Floats:
-    """The motion (H, W, 2) in px of what a frame shows to another frame.
+    """The image motion (H, W, 2) in px from a frame to another one.
 
     By depth and true poses of a rendered sequence, else by dense optical flow (DIS, OpenCV).
     """

@@ -1,4 +1,4 @@
-"""How well keypoints and depth are placed, against the exact truth of a rendered sequence.
+"""Accuracy of keypoints and depth against the exact truth of a rendered sequence.
 
     bmask-slam render office --frames 300 --true-depth --out office
     python -m benchmarks.suite.keypoint_noise office [--json]
@@ -93,11 +93,9 @@ def true_depth_at(depth_m: Array, pixels: Array) -> Array:
 
 
 def true_pixels(first: _View, second: _View, camera: Camera) -> tuple[Ints, Array, Array]:
-    """Indices of the first view's keypoints that the second one sees, and where (N, 2).
+    """The first view's keypoints visible in the second: rows, pixels (N, 2), zooms (N,).
 
-    Also how many times larger (N,) things look there.
-
-    A point counts as seen if the second view's noise-free depth there agrees with it.
+    A point counts as visible if the second view's noise-free depth there agrees with it.
     """
     pixels = first.features.image_pixels
     depth_m = true_depth_at(first.true_depth_m, pixels)

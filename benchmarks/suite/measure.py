@@ -1,4 +1,4 @@
-"""One measurement: a run in a process of its own, and what its run folder says afterwards."""
+"""One measurement: a run in a process of its own, and the figures of its run folder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TRAJECTORIES = (
 
 @dataclass(frozen=True)
 class Job:
-    """A sequence to run on, under a name, and what differs from the defaults."""
+    """A sequence with its name, and options that differ from the defaults."""
 
     sequence: str
     folder: Path
@@ -41,17 +41,17 @@ class Job:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a run reached.
+    """The figures of a run.
 
     Attributes:
         sequence, variant: of the job.
-        command: as one would type it.
+        command: as typed.
         metrics: of metrics.json, by name.
-        printed: the rows of metrics.json as they are, for what the command line prints of them.
+        printed: the rows of metrics.json, as the command line prints them.
         stages: (median ms, 95 % ms, number of frames that took this stage) by name.
         frames, weak, lost: of frames.csv.
         path_m: length of the reference's path during the run, 0 without a reference.
-        drift_m: error of the last pose after the first one is put upon the reference's.
+        drift_m: error of the last pose if the first one is that of the reference.
     """
 
     sequence: str
@@ -69,7 +69,7 @@ class Measurement:
 
 
 def shown(path: Path) -> str:
-    """The path from the repository's root, with ../ for what lies beside it."""
+    """The path relative to the repository's root."""
     path = path.resolve()
     for base, prefix in ((ROOT, ""), (ROOT.parent, "../")):
         if path.is_relative_to(base):
@@ -92,7 +92,7 @@ def call(arguments: list[str]) -> str:
 
 
 def render(folder: Path, name: str, options: tuple[str, ...] = ()) -> str:
-    """Render a sequence unless it is there already; returns the command."""
+    """Render a sequence unless it exists; returns the command."""
     command = ["render", name, *options, "--out"]
     if not (folder / "groundtruth.txt").is_file():
         logger.info("rendering %s", folder)
@@ -107,14 +107,14 @@ def measure(job: Job, work: Path) -> Measurement:
     where = [str(job.folder), "--out", str(out), "--overwrite", "--quiet"]
     options = job.options
     if "--segmenter" not in options:
-        options = (*options, "--segmenter", "none")  # as the systems beside it
+        options = (*options, "--segmenter", "none")  # as the other systems
     call(["-m", "bmask_slam", "run", *where, *options])
     command = " ".join(["bmask-slam run", shown(job.folder), *options])
     return read_run(out, job, command)
 
 
 def read_run(out: Path, job: Job, command: str) -> Measurement:
-    """What the files of a run folder say."""
+    """The measurement of a run folder."""
     rows = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     with (out / "frames.csv").open(encoding="utf-8", newline="") as file:
         frames = list(csv.DictReader(file))
@@ -139,7 +139,7 @@ def read_run(out: Path, job: Job, command: str) -> Measurement:
 def stage_times(frames: list[dict[str, str]], stage: str) -> tuple[float, float, int]:
     """Median and 95th percentile in milliseconds, and how many frames took part.
 
-    What only keyframes do is counted over keyframes.
+    Stages of keyframes are counted over keyframes.
     """
     taking = [row for row in frames if row["keyframe"] or stage not in KEYFRAME_STAGES]
     times_ms = [float(row[f"{stage}_ms"]) for row in taking if row[f"{stage}_ms"]]

@@ -1,9 +1,9 @@
-"""How much of a hard recording is tracked, and how well: fast, blurred, in a crowd.
+"""Tracking of hard recordings (fast, blurred, in a crowd): shares of frames and errors.
 
     python -m benchmarks.suite.never_lost [NAME ...] [--repeats N] [--set A.B=C]
 
-Inputs are made of those under ../shared/data, and of a rendered office, in a folder for such
-things (``--into``). Cameras are the published ones and the readout time of their sensor. A row is
+Inputs are made from those under ../shared/data and from a rendered office, in the folder
+``--into``. Cameras are the published ones and the readout time of their sensor. A row is
 the median of runs that differ by the grid on which keypoints are spread (see
 benchmarks/moving/no_harm.py): frames with a pose, frames of which the pose is WEAK, the longest
 loss in frames, errors against the truth (the red kitchen's is of the depth camera: by hand-eye),
@@ -40,7 +40,7 @@ XTION = {"rolling_shutter_s": 0.0248}
 
 @dataclass(frozen=True)
 class Input:
-    """A recording of ``SHARED`` or a rendered scene, what is done to it, and its camera's timing.
+    """A recording of ``SHARED`` or a rendered scene, its changes, and its camera's timing.
 
     ``stride`` is that of the run; ``hand_eye``: the truth is of another body.
     """
@@ -80,7 +80,7 @@ class Outcome:
 
 
 def sequence_of(entry: Input, into: Path) -> Path:
-    """The folder of an input, made if it is not there."""
+    """The folder of an input, made if it does not exist."""
     source = SHARED / entry.source
     if not source.is_dir():
         source = into / entry.source
@@ -137,7 +137,7 @@ def _posed(out: Path) -> int:
 
 
 def row(name: str, outcomes: list[Outcome]) -> tuple[str, ...]:
-    """The medians of some runs as cells, of the ATE also the range."""
+    """The medians of runs as cells, with the range of the ATE."""
     columns = np.array([[getattr(o, f) for f in Outcome.__dataclass_fields__] for o in outcomes])
     tracked, weak, loss, ate, rpe, ms = np.median(columns, axis=0)
     span = f" ({columns[:, 3].min():.1f}-{columns[:, 3].max():.1f})" if len(outcomes) > 1 else ""
@@ -154,7 +154,7 @@ def main() -> None:
     """Print the table, a row as soon as it is measured."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", choices=[*INPUTS, []], metavar="NAME")
-    parser.add_argument("--into", type=Path, default=Path("runs/hard"), help="where inputs lie")
+    parser.add_argument("--into", type=Path, default=Path("runs/hard"), help="folder of the inputs")
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--masks", type=Path, help="cached masks of the sequences, by their name")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="A.B=C")
