@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import argparse
 import re
-import subprocess
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.machine import describe_commit, now
 from benchmarks.pages import WRITTEN
-from benchmarks.paths import RESULTS, ROOT
+from benchmarks.paths import RESULTS
+from benchmarks.suite.measure import call
 from bmask_slam.runtime.machine import processor
 
 
@@ -175,14 +174,10 @@ def make_section(report: Report, name: str, sequences: Path) -> str:
     typed = f"python {' '.join(command)}"
     print(f"{title}: {typed}", flush=True)
     commit, begin_s = describe_commit(WRITTEN), time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise SystemExit(f"{typed} failed:\n{done.stderr[-2000:]}")
+    output = call(command)
     wall_s = time.perf_counter() - begin_s
     stamp = f"{processor()}; commit {commit}; {now()}; {wall_s:.0f} s."
-    printed = done.stdout.rstrip()
+    printed = output.rstrip()
     if name not in report.markdown:
         printed = f"```\n{printed}\n```"
     captions = report.pictures.get(name, {})

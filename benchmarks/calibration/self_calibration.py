@@ -14,12 +14,13 @@ numbers of keypoints. Tables in Markdown.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.pages import table
 from benchmarks.paths import KITCHEN
 from bmask_slam.calibration.calibrate import CalibrateOptions, calibrate_run
 from bmask_slam.calibration.report import NORMAL_95, Calibrated, format_calibration
@@ -66,7 +67,7 @@ def main() -> None:
             sweeping=not arguments.steady,
         )
         render_sequence(config, sequence)
-    truth = dataclasses.replace(read_camera(sequence / "camera.yaml"), depth_time_offset_s=DELAY_S)
+    truth = replace(read_camera(sequence / "camera.yaml"), depth_time_offset_s=DELAY_S)
     write_camera(out / "true.yaml", truth)
     write_camera(out / "wrong.yaml", wrong_camera(truth))
     cameras = ("true", "wrong", "found", "found again")
@@ -95,8 +96,7 @@ def kitchen(sequence: Path, out: Path) -> None:
         )
         print(f"\nRed kitchen, run with the {before} camera:\n\n{format_calibration(done)}\n")
     print("Mean of the runs and its standard error:\n")
-    print("| camera, reference of | " + " | ".join(ERRORS.values()) + " |")
-    print("|" + " --- |" * (1 + len(ERRORS)))
+    lines = []
     for camera in cameras:
         runs = [repeated(sequence, out, camera, keypoints) for keypoints in KEYPOINTS]
         for title, with_body in (("the camera", False), ("a point beside it", True)):
@@ -104,31 +104,27 @@ def kitchen(sequence: Path, out: Path) -> None:
             values = np.array([[row.value(name) for name in ERRORS] for row in rows])
             spread = values.std(axis=0, ddof=1) / np.sqrt(len(runs))
             pairs = zip(values.mean(axis=0), spread, strict=True)
-            cells = " | ".join(f"{mean:.4f} ± {sigma:.4f}" for mean, sigma in pairs)
-            print(f"| {camera}, {title} | {cells} |", flush=True)
+            lines.append((f"{camera}, {title}", *(f"{m:.4f} ± {sigma:.4f}" for m, sigma in pairs)))
+    print(table(("camera, reference of", *ERRORS.values()), lines))
 
 
 def repeated(sequence: Path, out: Path, camera: str, keypoints: int) -> Path:
     """A run with that camera and at most ``keypoints`` keypoints a frame."""
     config = resolve(SystemConfig, None, (f"features.max_keypoints={keypoints}",))
     path = out / f"{camera}-{keypoints}"
-    run(
-        RunOptions(
-            sequence,
-            config,
-            camera=out / f"{camera}.yaml",
-            out=path,
-            calibrate="off",
-            overwrite=True,
-            quiet=True,
-        )
-    )
+    run_with(sequence, config, out / f"{camera}.yaml", path)
     return path
+
+
+def run_with(sequence: Path, config: SystemConfig, camera: Path, out: Path) -> None:
+    """A run with a camera file and without self-calibration."""
+    options = RunOptions(sequence, config, camera=camera, out=out)
+    run(replace(options, calibrate="off", overwrite=True, quiet=True))
 
 
 def wrong_camera(truth: Camera) -> Camera:
     """The camera from which the calibration starts."""
-    return dataclasses.replace(
+    return replace(
         truth,
         fx=truth.fx * (1 + FOCAL_SHARE),
         fy=truth.fy * (1 + FOCAL_SHARE),
@@ -141,15 +137,7 @@ def wrong_camera(truth: Camera) -> Camera:
 
 def errors_of(sequence: Path, out: Path, name: str) -> dict[str, float]:
     """ERRORS of a run with the camera ``name``.yaml."""
-    options = RunOptions(
-        sequence,
-        camera=out / f"{name}.yaml",
-        out=out / name,
-        calibrate="off",
-        overwrite=True,
-        quiet=True,
-    )
-    run(options)
+    run_with(sequence, SystemConfig(), out / f"{name}.yaml", out / name)
     rows = evaluate(out / name, sequence).rows
     return {row["name"]: float(row["value"]) for row in rows if row["name"] in ERRORS}
 
@@ -159,25 +147,22 @@ def table_of_parameters(done: Calibrated, truth: Camera) -> str:
     true = parameters_of(truth, done.before.depth_scale)
     start = parameters_of(done.before, done.before.depth_scale)
     found = done.result.calibration
-    lines = [
-        "| parameter | truth | start | found | error | 95 % bound | inside |",
-        "|" + " --- |" * 7,
-    ]
+    rows = []
     for i in np.flatnonzero(done.prior_sigmas > 0):
         error, bound = found[i] - true[i], NORMAL_95 * done.sigmas[i]
-        numbers = " | ".join(f"{x:.5g}" for x in (true[i], start[i], found[i], error, bound))
-        inside = "yes" if abs(error) <= bound else "no"
-        lines.append(f"| {PARAMETERS[i]} | {numbers} | {inside} |")
-    return "\n".join(lines)
+        numbers = (f"{x:.5g}" for x in (true[i], start[i], found[i], error, bound))
+        rows.append((PARAMETERS[i], *numbers, "yes" if abs(error) <= bound else "no"))
+    header = ("parameter", "truth", "start", "found", "error", "95 % bound", "inside")
+    return table(header, rows)
 
 
 def table_of_errors(errors: dict[str, dict[str, float]]) -> str:
     """ATE and RPE of the runs with each camera; none per metre for shorter paths."""
-    lines = ["| camera | " + " | ".join(ERRORS.values()) + " |", "|" + " --- |" * (1 + len(ERRORS))]
-    for name, values in errors.items():
-        cells = (f"{values[e]:.4f}" if e in values else "" for e in ERRORS)
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    rows = (
+        (name, *(f"{values[e]:.4f}" if e in values else "" for e in ERRORS))
+        for name, values in errors.items()
+    )
+    return table(("camera", *ERRORS.values()), rows)
 
 
 if __name__ == "__main__":

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.paths import KITCHEN, ROOT
+from benchmarks.paths import KITCHEN
+from benchmarks.suite.measure import call
 
 NAME = 24
 COLUMNS = (
@@ -35,19 +34,7 @@ COLUMNS = (
 
 def measured(command: list[str], out: Path) -> dict[str, float]:
     """The metrics of one command, run in a process of its own."""
-    line = [
-        sys.executable,
-        "-m",
-        "bmask_slam",
-        *command,
-        "--quiet",
-        "--overwrite",
-        "--out",
-        str(out),
-    ]
-    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{' '.join(line)}\n{done.stderr[-2000:]}")
+    call(["-m", "bmask_slam", *command, "--quiet", "--overwrite", "--out", str(out)])
     return {row["name"]: row["value"] for row in json.loads((out / "metrics.json").read_text())}
 
 

@@ -76,7 +76,7 @@ class DepthSegments:
         moves[0] = False
         return np.asarray(moves[self.labels])
 
-    def held(self, moving: Mask, point_motions: PointMotions) -> Mask:
+    def carried(self, moving: Mask, point_motions: PointMotions) -> Mask:
         """Mask (h, w) of samples that moving ones (h, w) carry, such as a box held by a person.
 
         Only samples that no view observed: a table that the person touches was observed as static.

@@ -88,7 +88,7 @@ class FeatureMotion:
         carried = self.in_boxes(self._samples, depth_m, boxes_world, T_world_camera)
         carried = carried.reshape(by_sample.shape)
         carried &= (by_sample != PointMotion.STATIC) & (segments.labels > 0)
-        carried |= segments.held(moving | carried, by_sample)
+        carried |= segments.carried(moving | carried, by_sample)
         observed, space = segments.space(moving), segments.space(moving | carried)
         point_motions = self._check.spread(
             features.pixels, features.depth_m, point_motions[: len(features)]

@@ -39,7 +39,7 @@ def test_a_keyframe_is_fused_after_six_more() -> None:
     mapper, given = DenseMapper(CAMERA), keyframes(16)
     ids = [[r.keyframe.id for r in mapper.add(k)] for k in given]
     assert ids == [[]] * WINDOW + [[k] for k in range(16 - WINDOW)]
-    assert len(mapper._held) <= 2 * WINDOW + 1
+    assert len(mapper._prepared) <= 2 * WINDOW + 1
     assert [r.keyframe.id for r in mapper.flush()] == list(range(10, 16))
 
 

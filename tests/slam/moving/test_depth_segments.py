@@ -81,7 +81,7 @@ def loaded(box_m: float = 1.9) -> np.ndarray:
 def carried_by(depth_m: np.ndarray, observed: np.ndarray, **config: float) -> np.ndarray:
     """Samples that the card carries if views observed the samples ``seen`` (30, 40) only."""
     regions = depth_segments(depth_m, DepthSegmentConfig(step_px=8, **config))  # type: ignore[arg-type]
-    return regions.carried_by(CARD, observed.astype(np.int8))
+    return regions.carried(CARD, observed.astype(np.int8))
 
 
 BOX, CARD = np.zeros((2, 240, 320), bool)
