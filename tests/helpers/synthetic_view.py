@@ -49,6 +49,19 @@ def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
     return Frame(index, index / 30.0, np.repeat(gray[..., None], 3, axis=2), z_m.astype(np.float32))
 
 
+def render_or_black(T_world_camera: Array | None, index: int) -> Frame:
+    """`render_plane`, or a black frame without depth for None."""
+    if T_world_camera is not None:
+        return render_plane(T_world_camera, index)
+    black = np.zeros((480, 640, 3), np.uint8)
+    return Frame(index, index / 30.0, black, np.full((480, 640), np.nan, np.float32))
+
+
+def sideways_path(x_m: Array) -> list[Array]:
+    """Poses along x that turn a little about y and back."""
+    return [se3_exp(np.array([0, 0.05 * np.sin(40 * x), 0, x, 0, 0])) for x in x_m]
+
+
 def make_features(
     T_world_camera: Array, points_world: Array, descriptors: Array, noise_px: Array | None = None
 ) -> Features:

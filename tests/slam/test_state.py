@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_view import CAMERA, render_plane
+from synthetic_view import CAMERA, render_or_black
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.patch_alignment import PATCH_PX
@@ -26,7 +26,6 @@ from bmask_slam.moving.static_verification import PendingMovable, Removed
 from bmask_slam.semantics.instances.instances import Instance, PackedMask, certain, mask_box
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.tracks.instance_track import Sighting
-from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.landmark_table import PATCHES, LandmarkTable, Patches
@@ -47,13 +46,6 @@ def poses(count: int) -> list[Array | None]:
     return [None if i in (9, 10) else T for i, T in enumerate(turn)]
 
 
-def view(pose: Array | None, index: int) -> Frame:
-    if pose is not None:
-        return render_plane(pose, index)
-    black = np.zeros((480, 640, 3), np.uint8)
-    return Frame(index, index / 30.0, black, np.full((480, 640), np.nan, np.float32))
-
-
 class Halves:
     """A segmenter: the left half of every image is one instance, the right half another."""
 
@@ -68,7 +60,7 @@ class Halves:
         ]
 
 
-FRAMES = [view(pose, index) for index, pose in enumerate(poses(14))]
+FRAMES = [render_or_black(pose, index) for index, pose in enumerate(poses(14))]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
 
 

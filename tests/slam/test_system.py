@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from repository import KITCHEN
-from synthetic_view import CAMERA, render_plane
+from synthetic_view import CAMERA, render_or_black, render_plane
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array, Image
@@ -38,14 +38,7 @@ def process_views(
     system: SlamSystem, poses: list[Array | None], first: int = 0
 ) -> list[FrameResult]:
     """Run the system along poses; None is a black frame without depth."""
-    return [system.process(view(pose, first + i)) for i, pose in enumerate(poses)]
-
-
-def view(pose: Array | None, index: int) -> Frame:
-    if pose is not None:
-        return render_plane(pose, index)
-    black = np.zeros((480, 640, 3), np.uint8)
-    return Frame(index, index / 30.0, black, np.full((480, 640), np.nan, np.float32))
+    return [system.process(render_or_black(pose, first + i)) for i, pose in enumerate(poses)]
 
 
 def largest_error_m(system: SlamSystem, poses: list[Array | None]) -> float:
@@ -211,7 +204,7 @@ def test_depth_of_zero_is_missing_depth_and_a_stamp_must_go_forward() -> None:
     np.testing.assert_array_equal(*results)
     with pytest.raises(InputError, match="not later than the frame before"):
         system.process(frames[1])
-    assert system.process(view(path(4)[3], 3)).status is TrackingStatus.OK
+    assert system.process(render_or_black(path(4)[3], 3)).status is TrackingStatus.OK
 
 
 class WholeImage(NoSegmenter):

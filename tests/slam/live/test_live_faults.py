@@ -14,11 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from feeding import track_frames
-from synthetic_view import CAMERA, render_plane
+from synthetic_view import CAMERA, render_plane, sideways_path
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import ImageToSegment
@@ -34,10 +33,7 @@ from bmask_slam.tracking.results import TrackingStatus
 
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
-FRAMES = [
-    render_plane(se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a, 0, 0])), index)
-    for index, a in enumerate(np.arange(20) * 0.02)
-]
+FRAMES = [render_plane(T, k) for k, T in enumerate(sideways_path(0.02 * np.arange(20)))]
 
 
 def running(pids: list[int]) -> list[int]:

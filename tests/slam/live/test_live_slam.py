@@ -15,12 +15,12 @@ import faiss
 import numpy as np
 import pytest
 from feeding import track_frames
-from synthetic_view import CAMERA, render_plane
+from synthetic_view import CAMERA, render_plane, sideways_path
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import inverse, se3_exp
+from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
@@ -36,7 +36,7 @@ from bmask_slam.tracking.results import TrackingStatus
 
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
-TRUTH = [se3_exp(np.array([0, 0.05 * np.sin(40 * a), 0, a, 0, 0])) for a in np.arange(30) * 0.02]
+TRUTH = sideways_path(0.02 * np.arange(30))
 FRAMES = [render_plane(pose, index) for index, pose in enumerate(TRUTH)]
 
 
