@@ -1,4 +1,4 @@
-"""``python -m slam``: the command line."""
+"""``python -m bmask_slam``: the command line."""
 
 import sys
 

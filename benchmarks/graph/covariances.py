@@ -49,8 +49,9 @@ def session(
     return feeder, smoother
 
 
-def one_room(seed: int, keyframes: int = 10) -> dict[str, float]:
+def one_room(seed: int) -> dict[str, float]:
     """NEES of a pose, a landmark, two poses together and the step between them."""
+    keyframes = 10
     config = SmootherConfig(robust=False, gate_sigmas=1e3)
     feeder, smoother = session(keyframes, seed, config)
     estimate = smoother.optimise_batch()

@@ -68,7 +68,7 @@ class Steps:
             for k in self.keyframes
         ]
 
-    def fused(self, maps: list[Map], count: int = 6, colours: bool = True) -> list[Fused]:
+    def fused(self, maps: list[Map], count: int = 6) -> list[Fused]:
         """Step 4 with so many neighbours."""
         index = {k.id: i for i, k in enumerate(self.keyframes)}
         results = []
@@ -79,7 +79,7 @@ class Steps:
                 View(
                     maps[index[k.id]],
                     T_own_world @ k.T_world_camera,
-                    self.images[index[k.id]].float() if colours else None,
+                    self.images[index[k.id]].float(),
                 )
                 for k in choose_neighbours(own, window, count)
             ]

@@ -202,7 +202,7 @@ class DenseMapper:
         chosen = choose_neighbours(
             own.keyframe, [p.keyframe for p in others.values()], self.config.neighbours
         )
-        return fuse_keyframe(own, [others[n.id] for n in chosen], self.camera, self.config)
+        return fuse_keyframe(own, [others[n.id] for n in chosen], self.camera)
 
 
 def as_image(rgb: Image, device: str = "cpu") -> Tensor:
@@ -211,9 +211,7 @@ def as_image(rgb: Image, device: str = "cpu") -> Tensor:
     return torch.from_numpy(blurred).to(device, torch.float32)
 
 
-def fuse_keyframe(
-    own: _Prepared, others: list[_Prepared], camera: Camera, config: DenseConfig
-) -> FusedKeyframe:
+def fuse_keyframe(own: _Prepared, others: list[_Prepared], camera: Camera) -> FusedKeyframe:
     """Steps 4 and 5 of a keyframe with its neighbours."""
     T_own_world = inverse(own.keyframe.T_world_camera)
     views = [

@@ -1,4 +1,4 @@
-"""Step 2: matching costs of two images under a hypothesis, summed over support windows.
+"""Step 2: matching costs of two images under a hypothesis, summed by a guided filter.
 
 Images are (3, H, W) float32, 0 to 255. A hypothesis is the other image warped to this one's
 pixels, NaN where it has none.
@@ -15,21 +15,17 @@ from torch.nn.functional import avg_pool2d, pad
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    """Constants of the costs (Yoon and Kweon 2006; Hosni et al. 2013).
+    """Constants of the costs (Hosni et al. 2013).
 
     Attributes:
         alpha: weight of the gradient's cost.
         max_colour, max_gradient: at which the two costs are truncated.
-        gamma_colour, gamma_distance: of the support weights; radius: of their window in pixels.
         guided_radius, guided_epsilon: of the guided filter, the latter for colours 0 to 1.
     """
 
     alpha: float = 0.9
     max_colour: float = 30.0
     max_gradient: float = 2.0
-    gamma_colour: float = 12.0
-    gamma_distance: float = 17.5
-    radius: int = 17
     guided_radius: int = 9
     guided_epsilon: float = 1e-3
 
@@ -53,30 +49,8 @@ def _slope(image: Tensor) -> Tensor:
     return pad((grey[:, 2:] - grey[:, :-2]) / 2, (1, 1))
 
 
-def support_weighted(cost: Tensor, image: Tensor, other: Tensor, config: MatchingConfig) -> Tensor:
-    """Mean cost (H, W) over a window, weighted by both images' adaptive support weights.
-
-    w = exp(-(dC / gamma_c + dG / gamma_g)) with Euclidean distances in colour and in the image.
-    """
-    r, (height, width) = config.radius, cost.shape
-    other = torch.nan_to_num(other)
-    costs, images, others = (pad(x, (r, r, r, r)) for x in (cost, image, other))
-    inside = pad(torch.ones_like(cost), (r, r, r, r))
-    total, norm = torch.zeros_like(cost), torch.zeros_like(cost)
-    for dy in range(-r, r + 1):
-        for dx in range(-r, r + 1):
-            window = (..., slice(r + dy, r + dy + height), slice(r + dx, r + dx + width))
-            colour = torch.linalg.norm(images[window] - image, dim=0)
-            colour += torch.linalg.norm(others[window] - other, dim=0)
-            apart = 2 * (dx * dx + dy * dy) ** 0.5 / config.gamma_distance
-            weight = torch.exp(-(colour / config.gamma_colour + apart)) * inside[window]
-            norm += weight
-            total += weight * costs[window]
-    return total / norm
-
-
 class GuidedFilter:
-    """A fast substitute for adaptive support weights: He et al. 2010, with a grey guide."""
+    """Edge-preserving means of costs: He et al. 2010, with a grey guide."""
 
     def __init__(self, image: Tensor, config: MatchingConfig) -> None:
         self._radius = config.guided_radius

@@ -14,7 +14,6 @@ from bmask_slam.mapping.inverse_depth.matching_cost import (
     GuidedFilter,
     MatchingConfig,
     matching_cost,
-    support_weighted,
     winner,
 )
 
@@ -26,22 +25,21 @@ def match_stereo(
     right: Tensor,
     camera: Camera,
     search_range: tuple[float, float],
-    exact: bool = False,
     config: MatchingConfig | None = None,
 ) -> InverseDepthMap:
     """Inverse depth of the left image of a rectified pair (3, H, W), u_right = u_left - d.
 
-    Costs are summed by a guided filter, or with ``exact`` by adaptive support weights. The least
-    cost within ``search_range`` (1/m), extended by one pixel of disparity at both ends, wins. A
-    winner at an end of the range is no minimum and is dropped, and so is one that the match of the
-    right image does not confirm within a pixel. sigma_rho = sigma_d / (f b) with sigma_d = 1 px.
+    Costs are summed by a guided filter. The least cost within ``search_range`` (1/m), extended by
+    one pixel of disparity at both ends, is chosen. It is dropped at an end of the range, where it
+    is no minimum, and if the match of the right image differs by more than a pixel.
+    sigma_rho = sigma_d / (f b) with sigma_d = 1 px.
     """
     bf, config = camera.stereo_bf_px_m, config or MatchingConfig()
     first = max(math.floor(search_range[0] * bf) - 1, 0)
     last = math.ceil(search_range[1] * bf) + 1
     disparities = range(first, last + 1)
-    costs = _summed(left, right, disparities, config, exact)
-    mirrored = _summed(right.flip(-1), left.flip(-1), disparities, config, exact)
+    costs = _summed(left, right, disparities, config)
+    mirrored = _summed(right.flip(-1), left.flip(-1), disparities, config)
     disparity = winner(costs)[0] + first
     other = (winner(mirrored)[0] + first).flip(-1)
     inner = (disparity > max(first, 0.5)) & (disparity < last)
@@ -50,15 +48,10 @@ def match_stereo(
     return InverseDepthMap(rho, torch.where(known, bf**-2, torch.nan))
 
 
-def _summed(
-    image: Tensor, other: Tensor, disparities: range, config: MatchingConfig, exact: bool
-) -> Tensor:
+def _summed(image: Tensor, other: Tensor, disparities: range, config: MatchingConfig) -> Tensor:
     """Costs (D, H, W) of the other image shifted right by each disparity."""
     moved = [pad(other, (d, 0), value=torch.nan)[..., : other.shape[-1]] for d in disparities]
     costs = [matching_cost(image, m, config) for m in moved]
-    if exact:
-        pairs = zip(costs, moved, strict=True)
-        return torch.stack([support_weighted(c, image, m, config) for c, m in pairs])
     return GuidedFilter(image, config)(torch.stack(costs))
 
 

@@ -1,4 +1,4 @@
-"""Which observations of the map enter the factor graph, and how its estimate is read back."""
+"""Selects the observations that enter the factor graph, and reads its estimate back."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class FactorSelector:
         self._removed_keyframes: list[int] = []
 
     def remove_landmarks(self, ids: Ints) -> None:
-        """These landmarks were culled or fused: their factors go with the next update."""
+        """Remove the factors of culled or fused landmarks with the next update."""
         self._removed.append(ids)
 
     def remove_keyframe(self, keyframe_id: int) -> None:
-        """This keyframe was culled: its factors go with the next update."""
+        """Remove the factors of a culled keyframe with the next update."""
         self._removed_keyframes.append(keyframe_id)
 
     def state(self) -> Arrays:
@@ -82,7 +82,7 @@ class FactorSelector:
         )
 
     def map_update(self, world: WorldMap) -> GraphUpdate:
-        """The update of what changed in the map without a new keyframe: fusions, removals.
+        """The update with changes of the map without a new keyframe: fusions, removals.
 
         Marginalised landmarks that were given observations enter the graph again.
         """
@@ -134,9 +134,9 @@ class FactorSelector:
         return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
 
     def _outside_window(self, world: WorldMap, observed_ids: Ints) -> Ints:
-        """Landmarks in the graph that no keyframe of the active window sees, if they are enough.
+        """Landmarks in the graph that no keyframe of the active window observes, if they are enough.
 
-        Those that were not seen for longest come first.
+        Those not observed for longest come first.
         """
         count, landmarks = self.config.window_keyframes, world.landmarks
         if not count or len(world.keyframes) <= self.config.full_keyframes:

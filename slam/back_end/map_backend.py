@@ -1,4 +1,4 @@
-"""What the front end asks of the owner of the map, and what its implementations share.
+"""The protocol of the owner of the map, and what its implementations share.
 
 There are two: `back_end.mapper.Mapper` in the same process, and `RemoteMapper` of `live.processes`,
 whose map and graph are in a process of their own.

@@ -46,7 +46,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BackEndConfig:
-    """Settings of the map, of what enters the graph, of the graph, and of its loops."""
+    """Settings of the map, of factor selection, of the graph, and of its loops."""
 
     mapping: MappingConfig = field(default_factory=MappingConfig)
     factor_selection: FactorSelectionConfig = field(default_factory=FactorSelectionConfig)
@@ -59,7 +59,7 @@ class Mapper:
 
     Attributes:
         world: keyframes and landmarks. history: of all tracked frames. smoother: the graph.
-        loops: finds loops, and knows those that were closed.
+        loops: finds loops, and holds closed ones.
         update_ms: wall time of every graph update.
     """
 
@@ -81,7 +81,7 @@ class Mapper:
 
     @property
     def places(self) -> DescriptorIndex:
-        """Finds the keyframes that look like a frame."""
+        """The index that finds keyframes similar to a frame."""
         return self.loops.index
 
     @property
@@ -108,7 +108,7 @@ class Mapper:
         }
 
     def restore(self, state: Arrays, path: Path) -> None:
-        """Become the mapper of a state that was read from a file. Raises InputError."""
+        """Restore a state that was read from a file. Raises InputError."""
         self.update_ms = state["update_ms"].tolist()
         self.world = world_of(part(state, "world"))
         self.history.restore(part(state, "history"))
@@ -182,17 +182,17 @@ class Mapper:
         return joined
 
     def pruner(self) -> MapPruner:
-        """Takes observations out of map and graph together, at any time."""
+        """The pruner of this map and graph."""
         return MapPruner(self.world, self.smoother, self.camera)
 
     def prune_mask(self, keyframe_id: int, mask: Mask, widen_px: int) -> None:
-        """Take out what a keyframe observes under a mask (H, W), widened by ``widen_px``."""
+        """Remove what a keyframe observes under a mask (H, W), widened by ``widen_px``."""
         pruner = replace(self.pruner(), border_px=-widen_px)
         report = pruner.prune_mask(keyframe_id, mask)
         logger.info("mask of keyframe %d: %s", keyframe_id, report)
 
     def prune_landmarks(self, landmark_ids: Ints) -> None:
-        """Take landmarks (N,) out of map and graph, with all their observations."""
+        """Remove landmarks (N,) from map and graph, with all their observations."""
         logger.info("landmarks that move: %s", self.pruner().prune_landmarks(landmark_ids))
 
     def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:

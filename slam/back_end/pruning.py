@@ -28,13 +28,13 @@ def _no_ids() -> Ints:
 
 @dataclass(frozen=True)
 class PruneReport:
-    """What left the map and the graph, and what the graph did about the rest.
+    """The result of pruning in map and graph.
 
     Attributes:
         landmark_ids: (N,) sorted, removed from map and graph with all their observations.
-        observations: (N, 2) keyframe id, landmark id of those that left alone.
-        loops: names of the relative poses that left.
-        refused: why nothing was done; "" if it was.
+        observations: (N, 2) keyframe id, landmark id of observations removed without their landmark.
+        loops: names of removed relative poses.
+        refused: why nothing was done; "" if done.
         dropped_landmarks: (N,) out of the graph as well, left underconstrained there; they are
             still in the map and may enter again.
         anchored_keyframes: (N,) left underconstrained, and anchored loosely where they are.
@@ -79,10 +79,10 @@ class MapPruner:
     border_px: int = 2
 
     def prune_mask(self, keyframe_id: int, mask: Mask) -> PruneReport:
-        """Take out what a keyframe observes under a mask (H, W) of its image, as recorded.
+        """Remove what a keyframe observes under a mask (H, W) of its image, as recorded.
 
-        The keypoints observe nothing from now on and make no landmark. Of a culled keyframe no
-        observation is left that could be taken out.
+        The keypoints observe nothing from now on and make no landmark. A culled keyframe has no
+        observations to remove.
         """
         expected = (self.camera.height, self.camera.width)
         if mask.shape != expected or mask.dtype != bool:
@@ -97,7 +97,7 @@ class MapPruner:
         return self._prune_observations(keyframe, keypoints)
 
     def prune_landmarks(self, ids: Ints) -> PruneReport:
-        """Take landmarks (N,) out entirely; of fused ones, what they were fused into.
+        """Remove landmarks (N,), or those into which they were fused.
 
         Ids that are not in the map are skipped.
         """
@@ -168,7 +168,7 @@ class MapPruner:
         return np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))
 
     def _prune_observations(self, keyframe: Keyframe, keypoints: Ints) -> PruneReport:
-        """Take out what keypoints (N,) observe; landmarks that nothing else observes go too."""
+        """Remove the observations of keypoints (N,), and landmarks without other observations."""
         ids = keyframe.landmark_ids[keypoints]
         existing = (ids >= 0) & self.world.landmarks.in_map[ids]
         alone = existing & (self.world.landmarks.observations[ids] <= 1)
@@ -179,7 +179,7 @@ class MapPruner:
         return report
 
     def _remove(self, ids: Ints, pairs: Ints) -> PruneReport:
-        """Take landmarks out of graph and map, single observations (N, 2) out of the graph."""
+        """Remove landmarks from graph and map, and single observations (N, 2) from the graph."""
         if not len(ids) and not len(pairs):
             return PruneReport()
         update = GraphUpdate(remove_landmarks=ids, remove_observations=pairs)

@@ -1,4 +1,4 @@
-"""``bmask-slam calibrate``: the camera of a run from what the run has seen."""
+"""``bmask-slam calibrate``: the camera of a run from its observations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``bmask-slam query`` and ``export``: what a finished run holds."""
+"""``bmask-slam query`` and ``export``: contents of a finished run."""
 
 from __future__ import annotations
 

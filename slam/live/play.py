@@ -38,7 +38,7 @@ class PlayOptions:
 
     Attributes:
         realtime: drop frames that tracking has no time for; else the source waits.
-        silence_s: warn when no frame comes for so long.
+        silence_s: warn when no frame comes for this time.
         quiet: show no progress bar.
     """
 

@@ -1,4 +1,4 @@
-"""From a keyframe to loops that may enter the graph: recognise, verify, wait for confirmation.
+"""Finds loops of a keyframe: recognition, verification, confirmation.
 
 A verified loop can still be wrong, since rooms repeat. It waits until others, found from other
 keyframes, agree with it (pairwise consistency, Mangelson et al., ICRA 2018). What it does to the
@@ -37,7 +37,7 @@ class LoopClosingConfig:
     A candidate's ``neighbours`` most covisible keyframes are verified with it. ``min_support``
     loops from two keyframes must agree with each other at ``probability``; the last ``waiting``
     ones are kept. The map is trusted within ``drift_rad_per_m`` and ``drift_m_per_m`` of a
-    path: a loop must not ask for more drift, and only loops whose ends are within ``comparable_m``
+    path: a loop must not imply more drift, and only loops whose ends are within ``comparable_m``
     of path are compared.
 
     A loop's covariance is raised by ``model_sigma_rad``, ``model_sigma_m`` and ``model_share`` of
@@ -86,7 +86,7 @@ class LoopCloser:
         self._camera = camera
 
     def state(self) -> Arrays:
-        """What was closed, what waits, and what the last query found."""
+        """Closed loops, waiting loops, and the results of the last query."""
         waiting = self.waiting
         return {
             "closed": np.array(list(self.closed), np.int64).reshape(-1, 2),
@@ -104,7 +104,7 @@ class LoopCloser:
         }
 
     def restore(self, state: Arrays, world: WorldMap) -> None:
-        """Become the closer of a state, with the keyframes of a map."""
+        """Restore a state, with the keyframes of a map."""
         self.index.restore({k.id: k.features.descriptors for k in world.keyframes.values()})
         self.recogniser.restore(part(state, "recogniser"))
         ends_closed = map(tuple, state["closed"].tolist())

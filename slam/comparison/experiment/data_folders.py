@@ -50,8 +50,8 @@ def locate_sequence(
     """
     roots = [experiment.file.parent, *folders]
     found = [p for root in roots for p in _candidate_folders(root, source.folder) if p.is_dir()]
-    with_images = (p for p in found if (p / "rgb.txt").is_file() or _associated(p))
-    folder = next(with_images, None)
+    lists = ("rgb.txt", "associations.txt")
+    folder = next((p for p in found if any((p / name).is_file() for name in lists)), None)
     near = [path.parent for path in trajectories]
     truths = [source.reference] if source.reference else list(_truths(source, found, roots, near))
     reference = next((p for p in truths if p.is_file()), None)
@@ -72,10 +72,6 @@ def _candidate_folders(root: Path, name: str) -> Iterator[Path]:
     for prefix in PREFIXES:
         yield root / path.with_name(prefix + path.name)
         yield root / (prefix + path.name)
-
-
-def _associated(folder: Path) -> bool:
-    return (folder / "associations.txt").is_file()
 
 
 def _truths(

@@ -93,7 +93,7 @@ class RayPool:
 
     def __init__(self, address: str) -> None:
         self._ray: Any = connect(address, local_cpus=1)
-        self._remote = self._ray.remote(num_cpus=1, max_retries=0)(_run_on_ray)
+        self._remote = self._ray.remote(num_cpus=1, max_retries=0)(run_job)
 
     def __enter__(self) -> RayPool:
         return self
@@ -117,8 +117,3 @@ class RayPool:
         finally:
             for reference in waiting:
                 self._ray.cancel(reference, force=True)
-
-
-def _run_on_ray(job: Job) -> Outcome:
-    """In a worker of the cluster; the job's own process ends with the worker."""
-    return run_job(job)

@@ -5,7 +5,7 @@ MASKS_S, and not at all if CROWDED keyframes wait and none is ready: masks may f
 ready keyframes the newest is sent first, one at a time. At most MAX_WAITING wait; one more drops
 the oldest, which is counted and listed in dense.json, and which ``bmask-slam map RUN`` adds. A
 keyframe that was sent is sent again to a new process if the process dies, and is skipped only if
-two processes die of it. The submap of a culled keyframe is removed.
+two processes die while handling it. The submap of a culled keyframe is removed.
 """
 
 from __future__ import annotations
@@ -171,17 +171,13 @@ class RemoteDenseMapper:
 
     def finish(self, world: WorldMap, timeout_s: float) -> MapWritten:
         """Map what waits and write the clouds; the run folder must hold the map by now."""
-
-        def never(number: int) -> bool:
-            return False
-
-        self.remove_culled(world, never)
+        self.remove_culled(world, lambda _: False)
         poses = {k.id: k.T_world_camera for k in world.keyframes.values()}
         deadline_s, crashes_at_request = time.monotonic() + timeout_s, -1
         while self._written is None:
             if self._worker.given_up or time.monotonic() > deadline_s:
                 return MapWritten(failure="the dense map's process did not finish")
-            self.update(world, never, never)
+            self.update(world, lambda _: False, lambda _: False)
             if not self.waiting and crashes_at_request != self.crashes:
                 crashes_at_request = self.crashes
                 self._worker.send(FinishMap(poses, self.skipped), begins=True)
@@ -236,7 +232,7 @@ class RemoteDenseMapper:
             self._crashes_with[self._working] += 1
             if self._crashes_with[self._working] >= MAX_KEYFRAME_CRASHES:
                 self._sent.pop(self._working, None)
-                self._skip(self._working, "the process died of it twice")
+                self._skip(self._working, "the process crashed on it twice")
         self._working = None
         self._to_resend = sorted(self._sent)
 

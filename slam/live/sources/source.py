@@ -78,18 +78,18 @@ class Source(Protocol):
 class RecordedSource:
     """A recorded sequence, at the rate of its stamps if ``realtime``."""
 
-    def __init__(self, sequence: Sequence, realtime: bool, max_frames: int | None = None) -> None:
+    def __init__(self, sequence: Sequence, realtime: bool) -> None:
         self.name, self.camera = sequence.name, sequence.camera
         self.groundtruth = sequence.groundtruth
         self.counts = SourceCounts(
             unpaired_rgb=sequence.pairs.unpaired_rgb, unpaired_depth=sequence.pairs.unpaired_depth
         )
         self.waits = not realtime
-        self._sequence, self._max_frames = sequence, max_frames
+        self._sequence = sequence
 
     def frames(self) -> Iterator[Frame]:
         """Each frame, not before its time if ``realtime``."""
-        frames = self._sequence.frames(0, self._max_frames)
+        frames = self._sequence.frames()
         for frame in frames if self.waits else paced(frames):
             self.counts.broken = len(self._sequence.skipped)
             yield frame
