@@ -134,7 +134,7 @@ class FactorSelector:
         return np.sort(ids[spread_order(bucket, views.astype(float))[:room]])
 
     def _outside_window(self, world: WorldMap, observed_ids: Ints) -> Ints:
-        """Landmarks in the graph that no keyframe of the active window observes, if they are enough.
+        """Landmarks in the graph that no keyframe of the active window observes, if enough.
 
         Those not observed for longest come first.
         """

@@ -32,7 +32,7 @@ class PruneReport:
 
     Attributes:
         landmark_ids: (N,) sorted, removed from map and graph with all their observations.
-        observations: (N, 2) keyframe id, landmark id of observations removed without their landmark.
+        observations: (N, 2) keyframe and landmark id, removed without their landmark.
         loops: names of removed relative poses.
         refused: why nothing was done; "" if done.
         dropped_landmarks: (N,) out of the graph as well, left underconstrained there; they are
