@@ -76,7 +76,7 @@ def without_deformation(errors_m: Array, truth: Array) -> Array:
 def expected_ate_mm(run: SavedRun) -> float:
     """ATE that the posterior of the run's graph promises, RMS of draws from it."""
     tables, maker = run.tables, FactorMaker(run.camera, run.config)
-    observations = tables.observations.select(tables.observations.all_rows())
+    observations = tables.observations.all()
     factors: list[Any] = maker.observations(observations)
     factors += [maker.pose_factor(entry.factor) for entry in tables.pose_factors.values()]
     keyframes, landmarks = tables.keyframes, tables.landmarks

@@ -234,7 +234,7 @@ class _Adjuster:
     def _graph(self, numbers: list[int]) -> gtsam.NonlinearFactorGraph:
         """All observations, and the pose factors of these numbers."""
         table = self._tables.observations
-        factors = self._maker.observations(table.select(table.all_rows()))
+        factors = self._maker.observations(table.all())
         chosen = [self._tables.pose_factors[number].factor for number in numbers]
         return make_graph(factors + [self._maker.pose_factor(factor) for factor in chosen])
 

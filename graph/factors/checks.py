@@ -179,9 +179,8 @@ def reprojection(
 
 def observation_errors(tables: FactorTables, camera: Camera) -> ObservationErrors:
     """Chi-square of every observation at the current values."""
-    observations = tables.observations.select(tables.observations.all_rows())
-    poses = tables.keyframes.get(observations.keyframe_ids)
-    points = tables.landmarks.get(observations.landmark_ids)
+    observations = tables.observations.all()
+    poses, points = tables.values_of(observations)
     depth_m, chi_squares = reprojection(observations, poses, points, camera)
     is_stereo = np.isfinite(observations.measurements[:, 2])
     return ObservationErrors(

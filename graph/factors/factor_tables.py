@@ -123,6 +123,10 @@ class ObservationTable:
         """All rows of these landmarks."""
         return _rows_of(self.of_landmark, ids)
 
+    def all(self) -> Observations:
+        """All observations, ordered by keyframe, then landmark."""
+        return self.select(self.all_rows())
+
     def select(self, rows: Ints) -> Observations:
         """The observations in these rows."""
         return self._columns.select(rows)
@@ -228,6 +232,11 @@ class FactorTables:
     def numbers_of_keyframes(self, ids: Iterable[int]) -> list[int]:
         """Numbers of the pose factors that involve these keyframes, ascending."""
         return sorted(set().union(*(self.pose_factors_of.get(k, set()) for k in ids)))
+
+    def values_of(self, observations: Observations) -> tuple[Array, Array]:
+        """The poses (N, 4, 4) and points (N, 3) of observations (N)."""
+        poses = self.keyframes.get(observations.keyframe_ids)
+        return poses, self.landmarks.get(observations.landmark_ids)
 
     def relative_poses(self, kind: str) -> tuple[RelativePose, ...]:
         """The relative poses of a kind, in the order in which they were added."""

@@ -95,7 +95,7 @@ def write_landmark_graph(path: Path, tables: FactorTables, camera: Camera) -> No
     lines += _lines(POINT, offset + landmarks.ids, landmarks.values)
     for number in sorted(tables.pose_factors):
         lines += _pose_factor_lines(tables.pose_factors[number].factor)
-    observations = tables.observations.select(tables.observations.all_rows())
+    observations = tables.observations.all()
     names = np.stack(
         [
             observations.keyframe_ids,

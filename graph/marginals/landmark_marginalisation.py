@@ -126,13 +126,9 @@ def reinsert(tables: FactorTables, camera: Camera, config: SmootherConfig) -> No
     )
     table.add(old)
     tables.marginalised = MarginalisedLandmarks()
-    observations = table.select(table.all_rows())
-    constrained = constrained_landmarks(
-        observations,
-        tables.keyframes.get(observations.keyframe_ids),
-        tables.landmarks.get(observations.landmark_ids),
-        config.min_parallax_deg,
-    )
+    observations = table.all()
+    values = tables.values_of(observations)
+    constrained = constrained_landmarks(observations, *values, config.min_parallax_deg)
     loose = np.setdiff1d(tables.landmarks.ids, constrained)
     table.remove(table.rows_of_landmarks(loose.tolist()))
     tables.landmarks.remove(loose)

@@ -154,8 +154,7 @@ def rows_in_front(
     A factor with its landmark behind the camera has a zero Jacobian.
     """
     observations = tables.observations.select(rows)
-    poses = tables.keyframes.get(observations.keyframe_ids)
-    points = tables.landmarks.get(observations.landmark_ids)
+    poses, points = tables.values_of(observations)
     depth_m = np.einsum("ij,ij->i", points - poses[:, :3, 3], poses[:, :3, 2])
     front = depth_m >= config.min_depth_m
     return observations.select(front), poses[front], points[front]

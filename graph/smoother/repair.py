@@ -13,7 +13,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.checks import reprojection
+from bmask_slam.graph.factors.checks import observation_errors, reprojection
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.graph_update import ANCHOR, GraphUpdate
 from bmask_slam.graph.factors.observability import constrained_landmarks
@@ -83,20 +83,16 @@ def _is_anchored(keyframe: int, tables: FactorTables) -> bool:
 
 
 def _broken_observations(tables: FactorTables, camera: Camera) -> Ints:
-    """Pairs (N, 2) of observations without a finite error; a NaN spoils every value."""
-    observations = tables.observations.select(tables.observations.all_rows())
-    poses = tables.keyframes.get(observations.keyframe_ids)
-    points = tables.landmarks.get(observations.landmark_ids)
-    _, chi2 = reprojection(observations, poses, points, camera)
-    bad = ~np.isfinite(chi2)
-    return np.stack([observations.keyframe_ids[bad], observations.landmark_ids[bad]], axis=1)
+    """Pairs (N, 2) of observations without a finite error; a NaN makes every value NaN."""
+    errors = observation_errors(tables, camera)
+    bad = ~np.isfinite(errors.chi2)
+    return np.stack([errors.keyframe_ids[bad], errors.landmark_ids[bad]], axis=1)
 
 
 def _loose_landmarks(tables: FactorTables, camera: Camera, config: SmootherConfig) -> Ints:
     """Landmarks that observations from in front of the camera do not constrain."""
-    observations = tables.observations.select(tables.observations.all_rows())
-    poses = tables.keyframes.get(observations.keyframe_ids)
-    points = tables.landmarks.get(observations.landmark_ids)
+    observations = tables.observations.all()
+    poses, points = tables.values_of(observations)
     depth_m, _ = reprojection(observations, poses, points, camera)
     useful = depth_m >= config.min_depth_m
     constrained = constrained_landmarks(

@@ -55,7 +55,7 @@ def read_graph(path: Path) -> tuple[FactorTables, Camera]:
 
 def graph_arrays(tables: FactorTables) -> Arrays:
     """All of the factor tables but for the slots of the factors in ISAM2."""
-    observations = tables.observations.select(tables.observations.all_rows())
+    observations = tables.observations.all()
     factors = [tables.pose_factors[number].factor for number in sorted(tables.pose_factors)]
     return {
         "keyframe_ids": tables.keyframes.ids,

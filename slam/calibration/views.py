@@ -35,7 +35,7 @@ def connected_views(tables: FactorTables, keyframe_ids: Ints, most: int) -> Obse
     loops, are not used: they were measured with the calibration in question.
     """
     table = tables.observations
-    found = table.select(table.all_rows())
+    found = table.all()
     found = found.select(np.isin(found.keyframe_ids, keyframe_ids))
     ids, count = np.unique(found.keyframe_ids, return_counts=True)
     if len(ids) > most:

@@ -80,7 +80,7 @@ def move_landmarks(
 
 def _move_with_neighbours(points: Array, before: GraphSnapshot, tables: FactorTables) -> Array:
     """Points (N, 3) moved with the first observer of the nearest landmark of the graph."""
-    observations = tables.observations.select(tables.observations.all_rows())  # by keyframe
+    observations = tables.observations.all()  # by keyframe
     landmark_ids, first = np.unique(observations.landmark_ids, return_index=True)
     observer = observations.keyframe_ids[first]
     where = before.points_world[np.searchsorted(before.landmark_ids, landmark_ids)]

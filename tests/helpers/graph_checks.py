@@ -22,7 +22,7 @@ def filled(room: Room) -> Smoother:
 def from_scratch(smoother: Smoother, room: Room) -> GraphEstimate:
     """The optimum of a new graph with the same factors, initialised at the room's truth."""
     tables = smoother._tables
-    observations = tables.observations.select(tables.observations.all_rows())
+    observations = tables.observations.all()
     factors = [f.factor for f in tables.pose_factors.values()]
     fresh = Smoother(CAMERA)
     fresh.update(
@@ -73,7 +73,7 @@ def assert_same_optimum(smoother: Smoother, room: Room) -> None:
 def pairs_of(smoother: Smoother) -> set[tuple[int, int]]:
     """(keyframe, landmark) of every observation in the graph."""
     table = smoother._tables.observations
-    observations = table.select(table.all_rows())
+    observations = table.all()
     return set(
         zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
     )

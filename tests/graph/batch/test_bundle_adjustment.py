@@ -35,12 +35,8 @@ def errors(tables: FactorTables, room: Room) -> Array:
 
 
 def chi_squares(tables: FactorTables) -> Array:
-    observations = tables.observations.select(tables.observations.all_rows())
-    poses, points = (
-        tables.keyframes.get(observations.keyframe_ids),
-        tables.landmarks.get(observations.landmark_ids),
-    )
-    return reprojection(observations, poses, points, CAMERA)[1]
+    observations = tables.observations.all()
+    return reprojection(observations, *tables.values_of(observations), CAMERA)[1]
 
 
 def loop(room: Room, a: int, b: int, error: Array | None = None) -> RelativePose:

@@ -63,9 +63,7 @@ def test_everything_is_read_back(file: Path) -> None:
         np.testing.assert_allclose(
             getattr(after, name).values, getattr(before, name).values, atol=1e-12
         )
-    observations, expected = (
-        g.observations.select(g.observations.all_rows()) for g in (after, before)
-    )
+    observations, expected = (g.observations.all() for g in (after, before))
     np.testing.assert_array_equal(observations.keyframe_ids, expected.keyframe_ids)
     np.testing.assert_array_equal(observations.landmark_ids, expected.landmark_ids)
     np.testing.assert_allclose(observations.measurements, expected.measurements, atol=1e-11)
@@ -106,12 +104,9 @@ def test_the_cost_equals_g2os(file: Path) -> None:
         omega[np.triu_indices(3)] = values[3:]
         total += float(e @ (omega + np.triu(omega, 1).T) @ e)
     tables = room_graph()
-    observations = tables.observations.select(tables.observations.all_rows())
-    rows = (
-        tables.keyframes.get(observations.keyframe_ids),
-        tables.landmarks.get(observations.landmark_ids),
-    )
-    assert total == pytest.approx(reprojection(observations, *rows, CAMERA)[1].sum(), rel=1e-9)
+    observations = tables.observations.all()
+    chi2 = reprojection(observations, *tables.values_of(observations), CAMERA)[1]
+    assert total == pytest.approx(chi2.sum(), rel=1e-9)
 
 
 def test_adjusting_the_file_equals_adjusting_the_graph(file: Path) -> None:
@@ -152,7 +147,7 @@ def test_a_file_of_another_program(tmp_path: Path, caplog: pytest.LogCaptureFixt
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500, 510, 320, 240)
     assert (camera.width, camera.height) == (641, 481)
     assert tables.landmarks.ids.tolist() == [2, 3]
-    observations = tables.observations.select(tables.observations.all_rows())
+    observations = tables.observations.all()
     disparity_px = observations.measurements[:, 0] - observations.measurements[:, 2]
     np.testing.assert_allclose(disparity_px[:3], camera.stereo_bf_px_m * np.array([0.5, 0.4, 0.5]))
     assert np.isnan(disparity_px[3])
