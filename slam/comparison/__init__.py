@@ -4,7 +4,7 @@
     comparison = compare("rendered", "runs/rendered")
     comparison.to_pandas()
 
-The names are loaded when they are asked for, so that the process of a job starts at once.
+The names are imported when they are first used, so that the process of a job starts fast.
 """
 
 from __future__ import annotations
@@ -13,40 +13,27 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bmask_slam.comparison.comparing import compare
-    from bmask_slam.comparison.experiment.options import CompareOptions
-    from bmask_slam.comparison.experiment.result import (
-        Cell,
-        CellStatus,
-        Comparison,
-        Kind,
-        Method,
-        read_results,
-    )
-    from bmask_slam.comparison.statistics import Summary, Verdict, summarise, verdicts
+    from bmask_slam.comparison.comparing import compare as compare
+    from bmask_slam.comparison.experiment.options import CompareOptions as CompareOptions
+    from bmask_slam.comparison.experiment.result import Cell as Cell
+    from bmask_slam.comparison.experiment.result import CellStatus as CellStatus
+    from bmask_slam.comparison.experiment.result import Comparison as Comparison
+    from bmask_slam.comparison.experiment.result import Kind as Kind
+    from bmask_slam.comparison.experiment.result import Method as Method
+    from bmask_slam.comparison.experiment.result import read_results as read_results
+    from bmask_slam.comparison.statistics import Summary as Summary
+    from bmask_slam.comparison.statistics import Verdict as Verdict
+    from bmask_slam.comparison.statistics import summarise as summarise
+    from bmask_slam.comparison.statistics import verdicts as verdicts
 
-_MODULES = {
-    "comparing": ("compare",),
-    "experiment.options": ("CompareOptions",),
-    "experiment.result": ("Cell", "CellStatus", "Comparison", "Kind", "Method", "read_results"),
-    "statistics": ("Summary", "Verdict", "summarise", "verdicts"),
+_RESULT = ("Cell", "CellStatus", "Comparison", "Kind", "Method", "read_results")
+_HOME = {
+    "compare": "comparing",
+    "CompareOptions": "experiment.options",
+    **dict.fromkeys(_RESULT, "experiment.result"),
+    **dict.fromkeys(("Summary", "Verdict", "summarise", "verdicts"), "statistics"),
 }
-_HOME = {name: module for module, names in _MODULES.items() for name in names}
-
-__all__ = [
-    "Cell",
-    "CellStatus",
-    "CompareOptions",
-    "Comparison",
-    "Kind",
-    "Method",
-    "Summary",
-    "Verdict",
-    "compare",
-    "read_results",
-    "summarise",
-    "verdicts",
-]
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> Any:
