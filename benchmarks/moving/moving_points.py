@@ -1,13 +1,10 @@
-"""Which keypoints were taken for moving, against what moves in a rendered sequence.
+"""Counts of excluded keypoints against the moving objects of a rendered sequence, and pictures.
 
-    python -m benchmarks.moving.moving_points SEQUENCE --segmenter none --strip moving.png
-
-Red in the picture: left out as moving; green: used. What moves is outlined in yellow.
+Red keypoints are excluded as moving, green ones used. Moving objects are outlined in yellow.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Mapping
@@ -17,26 +14,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Image, Mask
 from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.rendering.annotations import CATEGORY_IDS
 from bmask_slam.rendering.things.people import PULLED_S
-from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
-from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
-from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import Tracked
 
 NEAR_PX = 6
-"""Keypoints so near to a border count for neither side."""
+"""Keypoints nearer to a border are not counted."""
 KINDS = ("person", "box", "chair")
 
 
 class MovingTruth:
-    """What moves in each frame of a rendered sequence: people, a carried box, a pulled chair."""
+    """Moving objects in each frame of a rendered sequence: people, a carried box, a pulled chair."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -46,7 +39,7 @@ class MovingTruth:
         self._people = [i for i, label in labels.items() if label == CATEGORY_IDS["person"]]
 
     def masks(self, frame: Frame) -> dict[str, Mask]:
-        """(H, W) by kind; the chair only while it is pulled.
+        """Masks (H, W) by kind; the chair only while it is pulled.
 
         A box is in no annotation, and the instance after it is the chair that is pulled.
         """
@@ -149,36 +142,3 @@ def strip(pictures: list[Image], columns: int = 4) -> Image:
     columns = min(columns, len(pictures))
     rows = range(0, len(pictures) - columns + 1, columns)
     return np.vstack([np.hstack(pictures[k : k + columns]) for k in rows])
-
-
-def main() -> None:
-    """Parse, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sequence", type=Path)
-    parser.add_argument("--segmenter", default="none")
-    parser.add_argument("--frames", type=int)
-    parser.add_argument("--set", action="append", default=[])
-    parser.add_argument("--strip", type=Path, help="PNG with a few of the frames")
-    options = parser.parse_args()
-    sequence = open_sequence(options.sequence)
-    segmenter = make_segmenter(SegmenterOptions(options.segmenter), options.sequence)
-    config = resolve(SystemConfig, None, options.set)
-    frames = min(options.frames or len(sequence), len(sequence))
-    system = CountingSystem(sequence.camera, config, segmenter)
-    system.watch(MovingTruth(options.sequence), max(frames // 12, 1))
-    for frame in sequence.frames():
-        if frame.index >= frames:
-            break
-        system.process(frame)
-        if frame.index % 10 == 0:
-            print(frame.index, {k: (c.on, c.excluded) for k, c in system.counts[-1].items()})
-    print("check ms: median {:.2f}, 95 % {:.2f}".format(*np.percentile(system.check_ms, [50, 95])))
-    for kind in (*KINDS, "rest"):
-        total = system.total(kind)
-        print(f"{kind}: excluded {total.share:.3f} of {total.on}")
-    if options.strip:
-        cv2.imwrite(str(options.strip), strip(system.pictures))
-
-
-if __name__ == "__main__":
-    main()
