@@ -29,7 +29,7 @@ KINDS = ("person", "box", "chair")
 
 
 class MovingTruth:
-    """Moving objects in each frame of a rendered sequence: people, a carried box, a pulled chair."""
+    """Moving objects in the frames of a rendered sequence: people, a carried box, a chair."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
