@@ -63,11 +63,7 @@ class _Search:
     """Solutions of one graph with different sets of loops."""
 
     def __init__(
-        self,
-        graph: PoseGraph,
-        solver: PoseGraphSolver,
-        config: PoseGraphConfig,
-        noise_scale: float,
+        self, graph: PoseGraph, solver: PoseGraphSolver, config: PoseGraphConfig, noise_scale: float
     ) -> None:
         self._graph, self._solver, self._config = graph, solver, config
         degrees = graph.information.shape[-1]

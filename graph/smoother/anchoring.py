@@ -134,11 +134,7 @@ def keyframes_anchored_by(numbers: list[int], tables: FactorTables) -> Ints:
 
 
 def loose_among(
-    ids: Ints,
-    rows: Ints,
-    numbers: Iterable[int],
-    tables: FactorTables,
-    config: SmootherConfig,
+    ids: Ints, rows: Ints, numbers: Iterable[int], tables: FactorTables, config: SmootherConfig
 ) -> Ints:
     """The keyframes that would be loose with these rows and pose factors alone."""
     observations, poses, points = rows_in_front(rows, tables, config)

@@ -117,11 +117,7 @@ def _left_underconstrained(
 
 
 def _left_loose(
-    rows: Ints,
-    keyframes: Ints,
-    numbers: list[int],
-    tables: FactorTables,
-    config: SmootherConfig,
+    rows: Ints, keyframes: Ints, numbers: list[int], tables: FactorTables, config: SmootherConfig
 ) -> Ints:
     """Keyframes that are underconstrained once rows, keyframes and pose factors are removed."""
     if _still_linked(rows, keyframes, numbers, tables, config):
@@ -133,11 +129,7 @@ def _left_loose(
 
 
 def _still_linked(
-    rows: Ints,
-    keyframes: Ints,
-    numbers: list[int],
-    tables: FactorTables,
-    config: SmootherConfig,
+    rows: Ints, keyframes: Ints, numbers: list[int], tables: FactorTables, config: SmootherConfig
 ) -> bool:
     """Whether the keyframes that share what is removed stay firmly linked: a fast local test.
 

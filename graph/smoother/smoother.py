@@ -33,11 +33,7 @@ from bmask_slam.graph.marginals.landmark_marginalisation import (
     remove_marginalised,
 )
 from bmask_slam.graph.marginals.summaries import mark_retracted, mark_returned, with_returning
-from bmask_slam.graph.smoother.anchoring import (
-    anchor_components,
-    release_anchors,
-    with_first_prior,
-)
+from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors, with_first_prior
 from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError
 from bmask_slam.graph.smoother.removal import Removal, remove
 from bmask_slam.graph.smoother.repair import repair

@@ -154,9 +154,7 @@ def _joins(
 
 
 def _split_by_keyframes(
-    pose_factors: tuple[RelativePose | PosePrior, ...],
-    keyframes: Ints,
-    candidates: Candidates,
+    pose_factors: tuple[RelativePose | PosePrior, ...], keyframes: Ints, candidates: Candidates
 ) -> tuple[tuple[RelativePose | PosePrior, ...], list[RefusedFactor]]:
     inside = {*keyframes.tolist(), *candidates.tables.keyframes.ids.tolist()}
     kept = tuple(f for f in pose_factors if inside.issuperset(f.keyframe_ids))

@@ -55,10 +55,7 @@ class Fused:
 
 
 def fuse(
-    own: InverseDepthMap,
-    neighbours: Sequence[View],
-    camera: Camera,
-    image: Tensor | None = None,
+    own: InverseDepthMap, neighbours: Sequence[View], camera: Camera, image: Tensor | None = None
 ) -> Fused:
     """Fuse a map with those of up to six neighbours by paper eq. (8) over compatible hypotheses.
 
@@ -166,11 +163,7 @@ def rim_steps(given: InverseDepthMap) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def reject_other_colours(
-    seeds: Tensor,
-    variances: Sequence[Tensor],
-    image: Tensor,
-    views: Sequence[View],
-    camera: Camera,
+    seeds: Tensor, variances: Sequence[Tensor], image: Tensor, views: Sequence[View], camera: Camera
 ) -> None:
     """Make the views' variances (H, W) NaN in place where a seed has another colour in the view."""
     height, width = seeds.shape

@@ -249,11 +249,7 @@ def _disc(radius_px: int) -> Bytes:
 
 
 def _surfaces(
-    owner: NDArray[np.int16],
-    inner: Mask,
-    depth_m: Floats,
-    count: int,
-    config: VoteConfig,
+    owner: NDArray[np.int16], inner: Mask, depth_m: Floats, count: int, config: VoteConfig
 ) -> Array:
     """Depth range (K, 2) of each instance's surface: median and MAD of its inner pixels."""
     step = owner.shape[0] // max(depth_m.shape[0], 1)

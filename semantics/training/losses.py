@@ -174,11 +174,7 @@ def around_objects(
 
 
 def mask_losses(
-    model: MaskRCNN,
-    table: FeatureTable,
-    found: Rois,
-    targets: Sequence[Target],
-    batch: ImageBatch,
+    model: MaskRCNN, table: FeatureTable, found: Rois, targets: Sequence[Target], batch: ImageBatch
 ) -> Losses:
     """Losses of the masks and of the predicted IoUs, of each object's class (eq. 11)."""
     heads = model.roi_heads

@@ -63,12 +63,7 @@ class Mapper:
         update_ms: wall time of every graph update.
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        tracker: Tracker,
-        config: BackEndConfig,
-    ):
+    def __init__(self, camera: Camera, tracker: Tracker, config: BackEndConfig):
         self.camera = camera
         self.world = WorldMap()
         self.history = FrameHistory()

@@ -97,10 +97,7 @@ def _live(arguments: argparse.Namespace) -> int:
     from bmask_slam.runtime.progress import console_log
 
     config = chosen_config(arguments).config
-    with (
-        console_log(),
-        closing(open_source(arguments.source, source_options(arguments))) as source,
-    ):
+    with console_log(), closing(open_source(arguments.source, source_options(arguments))) as source:
         options = _live_options(arguments, source)
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts

@@ -14,11 +14,7 @@ from bmask_slam.dense.keyframe_input import undistort_labels
 from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.mapping.inverse_depth.dense_mapper import (
-    DenseKeyframe,
-    DenseMapper,
-    FusedKeyframe,
-)
+from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, DenseMapper, FusedKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
 from bmask_slam.mapping.products.submaps import Submap, make_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence, dilate, keyframe_labels

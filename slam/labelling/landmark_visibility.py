@@ -63,11 +63,7 @@ class VisibleLandmarks:
         return VisibleLandmarks(*kept, self.T_world_camera, self.segment)
 
     def with_visible(
-        self,
-        depth_m: Floats,
-        camera: Camera,
-        world: WorldMap,
-        selected: Mask | None = None,
+        self, depth_m: Floats, camera: Camera, world: WorldMap, selected: Mask | None = None
     ) -> VisibleLandmarks:
         """These and others of the segment on the surface that the keyframe's depth image shows.
 

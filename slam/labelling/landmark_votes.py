@@ -34,11 +34,7 @@ class LabelVotes:
         self._recent = {}
 
     def vote(
-        self,
-        keyframe_id: int,
-        assignment: PixelAssignment,
-        observed: Observed,
-        store: LabelStore,
+        self, keyframe_id: int, assignment: PixelAssignment, observed: Observed, store: LabelStore
     ) -> Ints:
         """Let a keyframe's instances vote on all visible landmarks; returns their ids (N,)."""
         world = self._map.world

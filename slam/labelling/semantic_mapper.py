@@ -19,20 +19,11 @@ from bmask_slam.labelling.landmark_votes import LabelVotes
 from bmask_slam.labelling.results import LandmarkLabels, MapObjects
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.label_store import LabelStore
-from bmask_slam.semantics.beliefs.votes import (
-    PixelAssignment,
-    assign_pixels,
-    check_instances,
-    vote,
-)
+from bmask_slam.semantics.beliefs.votes import PixelAssignment, assign_pixels, check_instances, vote
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.gravity import GravityEstimator
-from bmask_slam.semantics.objects.object_map import (
-    KeyframeView,
-    ObjectMap,
-    pixel_rays,
-)
+from bmask_slam.semantics.objects.object_map import KeyframeView, ObjectMap, pixel_rays
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter, Segmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.world.map_editor import MapReader
@@ -254,10 +245,7 @@ class SemanticMapper:
         self._waiting = {}
 
     def _add_objects(
-        self,
-        waited: tuple[int, _Waiting],
-        assignment: PixelAssignment,
-        observed: Observed,
+        self, waited: tuple[int, _Waiting], assignment: PixelAssignment, observed: Observed
     ) -> Ints:
         """The object of each of the assignment's instances (K,), and -1 for "none" as the last."""
         keyframe_id, waiting = waited

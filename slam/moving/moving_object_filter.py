@@ -16,12 +16,7 @@ from bmask_slam.graph.geometry import inverse
 from bmask_slam.moving.config import MovingObjectConfig
 from bmask_slam.moving.depth_view_buffer import DepthViewBuffer, PosedView
 from bmask_slam.moving.feature_motion import FeatureMotion, FeatureMotions
-from bmask_slam.moving.free_space_check import (
-    DepthView,
-    FreeSpaceCheck,
-    PointMotion,
-    depth_view,
-)
+from bmask_slam.moving.free_space_check import DepthView, FreeSpaceCheck, PointMotion, depth_view
 from bmask_slam.moving.instance_motion import InstanceMotion
 from bmask_slam.moving.keyframe_masks import KeyframeMasks, surfaces
 from bmask_slam.moving.landmark_motion import LandmarkMotion
@@ -97,11 +92,7 @@ class MovingObjectFilter:
         return self._replenished(frame, features, static, views)
 
     def static_features_at(
-        self,
-        frame: Frame,
-        features: Features,
-        T_world_camera: Array | None,
-        views: list[PosedView],
+        self, frame: Frame, features: Features, T_world_camera: Array | None, views: list[PosedView]
     ) -> StaticFeatures:
         """A frame's static features at a pose (4, 4); all features without a pose."""
         geometry = self.config.geometry

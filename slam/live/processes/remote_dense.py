@@ -129,10 +129,7 @@ class RemoteDenseMapper:
             self._worker.send(LateMasks(number, masks.instances, ids, pixels))
 
     def update(
-        self,
-        world: WorldMap,
-        is_new: Callable[[int], bool],
-        lacks_masks: Callable[[int], bool],
+        self, world: WorldMap, is_new: Callable[[int], bool], lacks_masks: Callable[[int], bool]
     ) -> None:
         """Apply the process's answers, and send the next keyframe; to be called often.
 

@@ -13,10 +13,7 @@ from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
 from bmask_slam.graph.pose_graph.factors import chordal_poses, pose_graph_cost
 from bmask_slam.graph.pose_graph.loop_consistency import loop_consistency
 from bmask_slam.graph.pose_graph.loop_prediction import predicted_chi2
-from bmask_slam.graph.pose_graph.optimisation import (
-    PoseGraphConfig,
-    optimise_pose_graph,
-)
+from bmask_slam.graph.pose_graph.optimisation import PoseGraphConfig, optimise_pose_graph
 from bmask_slam.graph.pose_graph.pose_graph import PoseGraph, planar_poses, spanning_tree_poses
 
 FOLDER = SHARED / "posegraphs"

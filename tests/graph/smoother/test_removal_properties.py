@@ -10,9 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_room import Room, make_room
 
-from bmask_slam.graph.factors.graph_estimate import (
-    GraphEstimate,
-)
+from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.smoother.anchoring import loose_in

@@ -163,9 +163,7 @@ def test_a_segment_connected_by_one_point_is_dropped(smoother: Smoother) -> None
     assert_continues(smoother, estimate)
 
 
-def test_a_nan_measurement_is_found_although_gtsam_names_another(
-    smoother: Smoother,
-) -> None:
+def test_a_nan_measurement_is_found_although_gtsam_names_another(smoother: Smoother) -> None:
     before = smoother.estimate()
     point = transform(before.poses_world_camera[4], np.array([[0.1, 0.1, 2.0]]))
     estimate = smoother.update(

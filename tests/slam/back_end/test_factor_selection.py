@@ -4,13 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_view import (
-    CAMERA,
-    add_keyframe,
-    make_features,
-    points_before,
-    random_descriptors,
-)
+from synthetic_view import CAMERA, add_keyframe, make_features, points_before, random_descriptors
 
 from bmask_slam.back_end.factor_selection import (
     FactorSelectionConfig,

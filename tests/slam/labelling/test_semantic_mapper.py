@@ -165,11 +165,7 @@ def test_labels_follow_fused_and_culled_landmarks(at_once: SlamSystem) -> None:
     world.replace_landmarks(np.array([a]), np.array([b]))
     landmarks.remove(np.array([removed]))
     semantics.follow_map()
-    assert semantics.labels.estimates(np.array([a, b, removed])).views.tolist() == [
-        0,
-        both,
-        0,
-    ]
+    assert semantics.labels.estimates(np.array([a, b, removed])).views.tolist() == [0, both, 0]
 
 
 def test_the_estimate_is_the_same_with_and_without_masks(at_once: SlamSystem) -> None:

@@ -188,9 +188,7 @@ def test_a_label_on_verified_static_points_is_not_excluded() -> None:
     assert not any(k.masked.any() for k in system.mapper.world.keyframes.values())
 
 
-def test_a_walking_person_is_excluded_all_the_time(
-    frames: list[Frame],
-) -> None:
+def test_a_walking_person_is_excluded_all_the_time(frames: list[Frame]) -> None:
     system = run(frames[8:], label=1, settings=["moving_objects.static_verification.stands_s=0.3"])
     inside, found, _, _ = np.array(system.counts[1:]).sum(axis=0)
     assert found > 0.95 * inside > 0
@@ -215,9 +213,7 @@ def test_a_person_in_one_keyframe_only_is_dropped() -> None:
     assert max(excluded[-6:]) == 0
 
 
-def test_landmarks_are_kept_until_their_object_moves(
-    frames: list[Frame],
-) -> None:
+def test_landmarks_are_kept_until_their_object_moves(frames: list[Frame]) -> None:
     late = CardSegmenter(1)
     segment, late.segment = late.segment, lambda image, name: []  # type: ignore[method-assign]
     system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS), late)

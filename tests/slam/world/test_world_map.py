@@ -120,11 +120,7 @@ def test_fused_landmarks_leave_one_observation_a_keyframe() -> None:
     assert not world.landmarks.in_map[old].any()
     assert [
         np.flatnonzero(k.landmark_ids == new[0]).tolist() for k in world.keyframes.values()
-    ] == [
-        [0],
-        [4],
-        [6],
-    ]
+    ] == [[0], [4], [6]]
     assert not any((k.landmark_ids == old[0]).any() for k in world.keyframes.values())
     assert world.landmarks.found[new].tolist() == [6]
     assert world.landmarks.visible[new].tolist() == [9]
