@@ -10,25 +10,25 @@ from bmask_slam.graph.whole_file import whole_file, whole_folder
 
 
 def test_a_link_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
-    other_file, path = tmp_path / "victim", tmp_path / "trajectory.txt"
-    other_file.write_text("precious")
+    outside, path = tmp_path / "outside", tmp_path / "trajectory.txt"
+    outside.write_text("precious")
     for name in (path.name, f"{path.name}.tmp", f".part-{path.name}"):
-        (tmp_path / name).symlink_to(other_file)
+        (tmp_path / name).symlink_to(outside)
     with whole_file(path) as temporary:
         temporary.write_text("poses")
-    assert other_file.read_text() == "precious"
+    assert outside.read_text() == "precious"
     assert not path.is_symlink()
     assert path.read_text() == "poses"
 
 
 def test_a_linked_folder_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
-    other_file, path = tmp_path / "victim", tmp_path / "dense"
-    other_file.mkdir()
-    (other_file / "a").write_text("precious")
-    path.symlink_to(other_file)
+    outside, path = tmp_path / "outside", tmp_path / "dense"
+    outside.mkdir()
+    (outside / "a").write_text("precious")
+    path.symlink_to(outside)
     with whole_folder(path) as temporary:
         (temporary / "b").write_text("")
-    assert (other_file / "a").read_text() == "precious"
+    assert (outside / "a").read_text() == "precious"
     assert [p.name for p in path.iterdir()] == ["b"]
 
 

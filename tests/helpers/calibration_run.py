@@ -109,9 +109,8 @@ def _rolled(pixels: Array, points_world: Array, times_s: Array, truth: Camera) -
     for _ in range(4 if truth.rolling_shutter_s else 0):
         later_s = truth.rolling_shutter_s * share_of_rows(pixels[..., 1], truth)
         T = camera_path((times_s[:, None] + later_s.clip(-0.1, 0.1)).ravel())
-        points_camera = transform(inverse(T), np.tile(points_world, (len(times_s), 1))[:, None])[
-            :, 0
-        ]
+        points_camera = transform(inverse(T), np.tile(points_world, (len(times_s), 1))[:, None])
+        points_camera = points_camera[:, 0]
         in_front = points_camera[:, 2:] > 0.1
         pixels = truth.project(np.where(in_front, points_camera, [0.0, 0.0, 1.0])).reshape(
             pixels.shape

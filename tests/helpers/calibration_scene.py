@@ -78,9 +78,8 @@ def make_problem(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     n = np.einsum("mji,mj->mi", poses[k, :3, :3], normals[point_ids])
     facing = np.abs((n * points_camera).sum(axis=1)) > 0.5 * np.linalg.norm(points_camera, axis=1)
-    facing &= (
-        np.abs(points_camera[:, :2]).max(axis=1) < 0.7 * points_camera[:, 2]
-    )  # beyond, distortion folds back
+    # farther out the distortion folds back
+    facing &= np.abs(points_camera[:, :2]).max(axis=1) < 0.7 * points_camera[:, 2]
     inside = (
         (pixels > 0).all(axis=1)
         & (pixels < SIZE).all(axis=1)

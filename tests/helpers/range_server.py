@@ -38,16 +38,16 @@ def serve(served: Served) -> Iterator[Served]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            requests = self.headers.get("Range", "")
-            served.requests.append(requests)
+            wanted = self.headers.get("Range", "")
+            served.requests.append(wanted)
             content = served.files.get(self.path[1:])
             if served.status or content is None:
                 self.send_error(served.status or 404)
                 return
             tag = f'"{hash(content)}"'
             begin = 0
-            if served.ranges and requests and self.headers.get("If-Range", tag) == tag:
-                begin = int(re.findall(r"\d+", requests)[0])
+            if served.ranges and wanted and self.headers.get("If-Range", tag) == tag:
+                begin = int(re.findall(r"\d+", wanted)[0])
             if begin > len(content):
                 self.send_error(416)
                 return

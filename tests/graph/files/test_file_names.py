@@ -37,11 +37,11 @@ def test_names_that_lead_elsewhere_are_refused(name: str, fault: str) -> None:
 
 
 def test_no_folder_on_the_way_to_a_target_is_a_link(tmp_path: Path) -> None:
-    out, other_file = tmp_path / "out", tmp_path / "victim"
-    other_file.mkdir()
+    out, outside = tmp_path / "out", tmp_path / "outside"
+    outside.mkdir()
     assert target_below(out, "a/b/c.png") == out / "a/b/c.png"
     assert (out / "a/b").is_dir()
-    (out / "d").symlink_to(other_file)
+    (out / "d").symlink_to(outside)
     with pytest.raises(InputError, match="is a link"):
         target_below(out, "d/e/c.png")
-    assert not list(other_file.iterdir())
+    assert not list(outside.iterdir())

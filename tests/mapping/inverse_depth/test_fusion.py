@@ -236,10 +236,10 @@ def test_the_calibrated_variance_decreases_with_smoothing() -> None:
     rng = np.random.default_rng(4)
     given = as_map(0.5 + rng.normal(0, 0.004, (200, 200)), 0.004)
     final = regularise(given)
-    estimates = float(with_calibrated_variance(final, unchanged(given, 1.0)).variance.nanmedian())
+    stated = float(with_calibrated_variance(final, unchanged(given, 1.0)).variance.nanmedian())
     smoothed = float((final.rho - 0.5).square().nanmedian() / 0.455)
     slope = BLUR_PX**2 * float(squared_gradient(final.rho).nanmedian())
-    assert smoothed < estimates - slope < 0.8 * 0.004**2
+    assert smoothed < stated - slope < 0.8 * 0.004**2
 
 
 def test_an_edge_pixel_may_belong_to_either_surface() -> None:

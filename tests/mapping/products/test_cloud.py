@@ -43,10 +43,10 @@ def submap(anchor: int, count: int = 400, instances: int = 3) -> Submap:
 
 def table(rows: list[int], classes: int) -> LabelTable:
     """A table for submaps with these numbers of rows; the first row is of no instance."""
-    log_likelihoods = [RNG.normal(0, 2, (n, classes)).astype(np.float32) for n in rows]
-    for keyframe in log_likelihoods:
+    evidence = [RNG.normal(0, 2, (n, classes)).astype(np.float32) for n in rows]
+    for keyframe in evidence:
         keyframe[0] = 0
-    return LabelTable.of(log_likelihoods, LabelStoreConfig())
+    return LabelTable.of(evidence, LabelStoreConfig())
 
 
 def test_the_cloud_equals_a_loop_over_voxels(tmp_path: Path) -> None:
@@ -103,20 +103,20 @@ def test_labels_equal_a_loop_over_voxels_and_submaps() -> None:
 def test_objects_in_several_views_are_kept_and_in_one_view_dropped() -> None:
     """As in the label store: misses of an object are not independent."""
     store, classes = LabelStoreConfig(), 40
-    expected = np.zeros(classes, np.float32)
-    expected[2] = 0.6
-    expected[0] = 0.4
-    word = np.log(store.likelihoods(expected[None], np.float32([0.8])))
+    distribution = np.zeros(classes, np.float32)
+    distribution[2] = 0.6
+    distribution[0] = 0.4
+    word = np.log(store.likelihoods(distribution[None], np.float32([0.8])))
     for found, missed, label in ((3, 8, 2), (1, 100, 0), (0, 5, 0)):
         keyframes = [np.r_[np.zeros((1, classes), np.float32), word]] * (found + missed)
-        log_likelihoods = LabelTable.of(keyframes, store)
-        instance = log_likelihoods.first + (np.arange(found + missed) < found)
+        evidence = LabelTable.of(keyframes, store)
+        instance = evidence.first + (np.arange(found + missed) < found)
         views = np.zeros(len(instance), np.int64)
-        assert _fused_labels(views, np.zeros(1, np.int64), instance, log_likelihoods)[0] == [label]
+        assert _fused_labels(views, np.zeros(1, np.int64), instance, evidence)[0] == [label]
         labels = LabelStore(classes, store)
         for k in range(found + missed):
             if k < found:
-                labels.update(np.zeros(1, np.int64), expected[None], np.float32([0.8]))
+                labels.update(np.zeros(1, np.int64), distribution[None], np.float32([0.8]))
             else:
                 labels.miss(np.zeros(1, np.int64), np.ones(1, np.float32))
         assert labels.estimates(np.zeros(1, np.int64)).labels == [label]
@@ -176,14 +176,8 @@ def test_the_better_of_overlapping_masks_is_used() -> None:
 
 def test_a_better_mask_has_more_weight() -> None:
     found = [instance(slice(0, 3), 1, 0.9, 0.9), instance(slice(3, 5), 1, 0.9, 0.3)]
-    log_likelihoods = keyframe_labels(found, (6, 8), 4, LabelStoreConfig()).log_likelihoods
-    np.testing.assert_allclose(np.exp(log_likelihoods) @ LabelStoreConfig().prior(4), 1, rtol=1e-5)
-    assert (
-        log_likelihoods[1, 1]
-        > log_likelihoods[2, 1]
-        > 0
-        > log_likelihoods[2, 2]
-        > log_likelihoods[1, 2]
-    )
-    assert not log_likelihoods[0].any()
-    assert np.isfinite(log_likelihoods).all()
+    evidence = keyframe_labels(found, (6, 8), 4, LabelStoreConfig()).log_likelihoods
+    np.testing.assert_allclose(np.exp(evidence) @ LabelStoreConfig().prior(4), 1, rtol=1e-5)
+    assert evidence[1, 1] > evidence[2, 1] > 0 > evidence[2, 2] > evidence[1, 2]
+    assert not evidence[0].any()
+    assert np.isfinite(evidence).all()

@@ -82,8 +82,8 @@ def test_masks_out_of_order_are_ignored() -> None:
 
 def moving_after(evidence: list[float], prior: float) -> bool:
     tracks = InstanceTracks()
-    for k, evidence_k in enumerate(evidence):
-        tracks.update(0.3 * k, [replace(sighting(0.0), prior=prior, evidence=evidence_k)])
+    for k, step in enumerate(evidence):
+        tracks.update(0.3 * k, [replace(sighting(0.0), prior=prior, evidence=step)])
     return tracks.tracks[0].moving
 
 

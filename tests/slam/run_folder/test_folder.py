@@ -83,15 +83,15 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["frames.csv", "log.txt"])
 def test_a_resumed_run_writes_through_no_link(tmp_path: Path, name: str) -> None:
-    run, other_file = tmp_path / "run", tmp_path / "victim"
+    run, outside = tmp_path / "run", tmp_path / "outside"
     with RunFolder(run) as folder:
         size = folder.synced_bytes()
-    (run / name).rename(other_file)
-    before = other_file.read_bytes()
-    (run / name).symlink_to(other_file)
+    (run / name).rename(outside)
+    before = outside.read_bytes()
+    (run / name).symlink_to(outside)
     with pytest.raises(InputError, match=rf"{name}: is a link"):
         RunFolder(run, resume_bytes=size)
-    assert other_file.read_bytes() == before
+    assert outside.read_bytes() == before
 
 
 def test_an_input_error_after_frames_keeps_them(tmp_path: Path) -> None:
