@@ -39,35 +39,35 @@ _OF_ALL: _Columns = {
     "in_graph": ((), np.bool_, False),
 }
 _COLUMNS = _OF_ALL | _APPEARANCE
-_PLACE: _Columns = {"place": ((), np.int64, 0)}
+_ROW: _Columns = {"row": ((), np.int64, 0)}
 
 
 class Appearance:
     """A column over landmark ids that has rows only for landmarks in the map.
 
-    Row 0 is a placeholder for all removed landmarks: it is zero, and what is written to it is lost.
+    Row 0 is a placeholder for all removed landmarks: it stays zero when it is written.
     """
 
-    def __init__(self, rows: NDArray, place: Ints) -> None:
-        self._rows, self._place = rows, place
+    def __init__(self, rows: NDArray, row: Ints) -> None:
+        self._rows, self._row_of = rows, row
 
     def __len__(self) -> int:
-        return len(self._place)
+        return len(self._row_of)
 
     def __getitem__(self, ids: Any) -> NDArray:
-        return self._rows[self._place[ids]]
+        return self._rows[self._row_of[ids]]
 
     def __setitem__(self, ids: Any, values: Any) -> None:
-        nothing = self._rows[0].copy()
-        self._rows[self._place[ids]] = values
-        self._rows[0] = nothing
+        placeholder = self._rows[0].copy()
+        self._rows[self._row_of[ids]] = values
+        self._rows[0] = placeholder
 
     def pick(self, ids: Ints, which: Ints) -> NDArray:
         """Entry which[k] of the row of ids[k]."""
-        return self._rows[self._place[ids], which]
+        return self._rows[self._row_of[ids], which]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
-        return np.array(self._rows[self._place], dtype)
+        return np.array(self._rows[self._row_of], dtype)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class LandmarkTable:
         visible, found: (N,) frames in which it should have been, and was, matched.
         replaced_by: (N,) the landmark that this one was fused into, -1 for none.
         in_map, in_graph: (N,) bool.
-        place: (N,) row of its appearance, 0 for removed landmarks.
+        row: (N,) row of its appearance, 0 for removed landmarks.
 
     Descriptors, directions, extent, angles, colours and patches are kept for landmarks in the map
     only; those of removed landmarks are zero, and their rows are used again.
@@ -126,11 +126,11 @@ class LandmarkTable:
     replaced_by: Ints
     in_map: Mask
     in_graph: Mask
-    place: Ints
+    row: Ints
 
     def __init__(self) -> None:
         self._size = 0
-        self._store = {name: _filled(1024, column) for name, column in (_OF_ALL | _PLACE).items()}
+        self._store = {name: _filled(1024, column) for name, column in (_OF_ALL | _ROW).items()}
         self._appearance = {name: _filled(1, column) for name, column in _APPEARANCE.items()}
         self._free: list[int] = []
         self._make_views()
@@ -143,7 +143,7 @@ class LandmarkTable:
         first = self._size
         self.extend_to(first + len(columns["points_world"]))
         ids = np.arange(first, self._size)
-        self._settle(ids)
+        self._assign_rows(ids)
         for name, values in columns.items():
             getattr(self, name)[ids] = values
         self.in_map[ids] = True
@@ -152,9 +152,9 @@ class LandmarkTable:
 
     def extend_to(self, size: int) -> None:
         """Add rows up to a size, not in the map, to be filled from another table."""
-        self._vacate(np.arange(size, self._size))
+        self._release_rows(np.arange(size, self._size))
         capacity, old = len(self._store["in_map"]), self._size
-        for name, (shape, dtype, fill) in (_OF_ALL | _PLACE).items():
+        for name, (shape, dtype, fill) in (_OF_ALL | _ROW).items():
             if size > capacity:
                 bigger: NDArray = np.empty((max(2 * capacity, size), *shape), dtype)
                 bigger[:old] = self._store[name][:old]
@@ -165,8 +165,8 @@ class LandmarkTable:
 
     def set_in_map(self, in_map: Mask) -> None:
         """Set which of all landmarks (N,) are in the map; the appearance of new ones is zero."""
-        self._vacate(np.flatnonzero((self.place > 0) & ~in_map))
-        self._settle(np.flatnonzero((self.place == 0) & in_map))
+        self._release_rows(np.flatnonzero((self.row > 0) & ~in_map))
+        self._assign_rows(np.flatnonzero((self.row == 0) & in_map))
         self.in_map[:] = in_map
 
     def remaining(self, ids: Ints) -> Ints:
@@ -188,7 +188,7 @@ class LandmarkTable:
         """Remove landmarks from the map; keyframes drop them when they are next read."""
         self.in_map[ids] = False
         self.in_graph[ids] = False
-        self._vacate(np.unique(ids))
+        self._release_rows(np.unique(ids))
 
     def patch_distances(self, ids: Ints, views: Array, limits: tuple[float, float]) -> Array:
         """Distances (N, PATCHES) of patches from views (N, 3), as shares of the limits.
@@ -256,11 +256,11 @@ class LandmarkTable:
     def restore(self, state: Arrays) -> None:
         """Become the table of a state; this table must be new."""
         self.extend_to(int(state["size"]))
-        self._settle(state["ids"])
+        self._assign_rows(state["ids"])
         for name in _COLUMNS:
             getattr(self, name)[state["ids"]] = True if name == "in_map" else state[name]
 
-    def _settle(self, ids: Ints) -> None:
+    def _assign_rows(self, ids: Ints) -> None:
         """Assign rows of the appearance to landmarks (N,) that have none."""
         missing = len(ids) - len(self._free)
         if missing > 0:
@@ -273,23 +273,23 @@ class LandmarkTable:
             self._free += range(capacity + more - 1, capacity - 1, -1)
             self._make_views()
         if len(ids):
-            self.place[ids] = self._free[-len(ids) :][::-1]
+            self.row[ids] = self._free[-len(ids) :][::-1]
             del self._free[-len(ids) :]
 
-    def _vacate(self, ids: Ints) -> None:
+    def _release_rows(self, ids: Ints) -> None:
         """Release the rows of landmarks (N,), each given once, and set them to zero."""
-        places = self.place[ids]
-        places = places[places > 0]
+        used = self.row[ids]
+        used = used[used > 0]
         for name, (_, _, fill) in _APPEARANCE.items():
-            self._appearance[name][places] = fill
-        self.place[ids] = 0
-        self._free += places[::-1].tolist()
+            self._appearance[name][used] = fill
+        self.row[ids] = 0
+        self._free += used[::-1].tolist()
 
     def _make_views(self) -> None:
         for name, array in self._store.items():
             setattr(self, name, array[: self._size])
         for name, rows in self._appearance.items():
-            setattr(self, name, Appearance(rows, self.place))
+            setattr(self, name, Appearance(rows, self.row))
 
 
 def _filled(count: int, column: tuple[tuple[int, ...], type, float]) -> NDArray:

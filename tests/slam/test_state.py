@@ -217,4 +217,4 @@ def test_compared_classes_have_only_compared_attributes(system: SlamSystem) -> N
     assert vars(tables.observations).keys() == rows
     columns = table._store.keys() | table._appearance.keys()
     assert vars(table).keys() == {"_size", "_store", "_appearance", "_free", *columns}
-    assert columns - {"in_map", "place"} == table.state().keys() - {"size", "ids"}
+    assert columns - {"in_map", "row"} == table.state().keys() - {"size", "ids"}

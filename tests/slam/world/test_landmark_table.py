@@ -124,4 +124,4 @@ def test_a_copy_gets_the_current_landmarks() -> None:
     table.extend_to(8)
     table.set_in_map(np.ones(8, bool))
     assert table.extent[np.arange(8)].tolist() == [0, 1, 0, 3, 0, 0, 0, 0]
-    assert len(np.unique(table.place)) == 8
+    assert len(np.unique(table.row)) == 8
