@@ -160,8 +160,8 @@ def measure_health(
         unwritten=unwritten + (dense.unwritten if dense else 0),
         lost_frames=meter.lost_frames,
         lost_episodes=meter.lost_episodes,
-        map_deaths=remote.crashes,
-        segmenter_deaths=segmenter.crashes if segmenter else 0,
-        dense_deaths=dense.crashes if dense else 0,
+        map_deaths=remote.worker.crashes,
+        segmenter_deaths=segmenter.worker.crashes if segmenter else 0,
+        dense_deaths=dense.worker.crashes if dense else 0,
         source=asdict(source),
     )

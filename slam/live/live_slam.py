@@ -183,8 +183,8 @@ class LiveSlam:
     def processes(self) -> dict[str, int]:
         """Process ids by name."""
         system = self._system
-        workers = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
-        return {name: worker.pid for name, worker in workers.items() if worker is not None}
+        owners = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
+        return {name: owner.worker.pid for name, owner in owners.items() if owner is not None}
 
     def health(self) -> Health:
         """The state of the live loop."""

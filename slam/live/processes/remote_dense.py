@@ -63,6 +63,7 @@ class RemoteDenseMapper:
         skipped: keyframes of the map that will get no submap, and why.
         dropped: how many of those were dropped because newer ones came.
         unwritten: how many could not be written because the disk was full.
+        worker: the supervised process.
     """
 
     def __init__(self, setup: DenseSetup, policy: RestartPolicy | None = None) -> None:
@@ -78,17 +79,7 @@ class RemoteDenseMapper:
         self._crashes_with: Counter[int] = Counter()
         self._written: MapWritten | None = None
         target = "bmask_slam.live.processes.dense_process:serve_dense"
-        self._worker = SupervisedWorker("dense mapper", target, (setup,), policy or RestartPolicy())
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._worker.pid
-
-    @property
-    def crashes(self) -> int:
-        """How often a process died or hung."""
-        return self._worker.crashes
+        self.worker = SupervisedWorker("dense mapper", target, (setup,), policy or RestartPolicy())
 
     @property
     def waiting(self) -> int:
@@ -98,15 +89,15 @@ class RemoteDenseMapper:
     @property
     def full(self) -> bool:
         """Whether one more keyframe would drop another."""
-        return len(self._waiting) >= MAX_WAITING and not self._worker.given_up
+        return len(self._waiting) >= MAX_WAITING and not self.worker.given_up
 
     def wait_until_ready(self) -> None:
         """Wait until the process is ready. Raises InputError if it cannot start."""
-        self._worker.wait_until_ready()
+        self.worker.wait_until_ready()
 
     def add_keyframe(self, keyframe_id: int, frame: Frame) -> None:
         """Queue a keyframe; its images are copied."""
-        if self._worker.given_up:
+        if self.worker.given_up:
             self.skipped[keyframe_id] = "dense mapping was given up"
             return
         own = replace(frame, rgb=frame.rgb.copy(), depth_m=frame.depth_m.copy())
@@ -126,7 +117,7 @@ class RemoteDenseMapper:
                 self._sent[number] = with_masks
             rows, ids = world.observed(keyframe)
             pixels = keyframe.features.image_pixels[rows]
-            self._worker.send(LateMasks(number, masks.instances, ids, pixels))
+            self.worker.send(LateMasks(number, masks.instances, ids, pixels))
 
     def update(
         self, world: WorldMap, is_new: Callable[[int], bool], lacks_masks: Callable[[int], bool]
@@ -138,7 +129,7 @@ class RemoteDenseMapper:
             lacks_masks: whether masks of a keyframe may still come.
         """
         self._apply_answers()
-        if self._worker.given_up or self._working is not None:
+        if self.worker.given_up or self._working is not None:
             return
         if self._to_resend:
             self._send(self._sent[self._to_resend.pop(0)])
@@ -164,7 +155,7 @@ class RemoteDenseMapper:
             self.previews.pop(number, None)
             self.submaps.discard(number)
         self._to_resend = [number for number in self._to_resend if number in self._sent]
-        self._worker.send(RemoveKeyframes(sorted(removed)))
+        self.worker.send(RemoveKeyframes(sorted(removed)))
 
     def finish(self, world: WorldMap, timeout_s: float) -> MapWritten:
         """Map what waits and write the clouds; the run folder must hold the map by now."""
@@ -172,21 +163,21 @@ class RemoteDenseMapper:
         poses = {k.id: k.T_world_camera for k in world.keyframes.values()}
         deadline_s, crashes_at_request = time.monotonic() + timeout_s, -1
         while self._written is None:
-            if self._worker.given_up or time.monotonic() > deadline_s:
+            if self.worker.given_up or time.monotonic() > deadline_s:
                 return MapWritten(failure="the dense map's process did not finish")
             self.update(world, lambda _: False, lambda _: False)
             if not self.waiting and crashes_at_request != self.crashes:
                 crashes_at_request = self.crashes
-                self._worker.send(FinishMap(poses, self.skipped), begins=True)
+                self.worker.send(FinishMap(poses, self.skipped), begins=True)
             time.sleep(0.005)
         return self._written
 
     def close(self) -> None:
         """Kill the process."""
-        self._worker.close()
+        self.worker.close()
 
     def _apply_answers(self) -> None:
-        for message in self._worker.receive():
+        for message in self.worker.receive():
             match message:
                 case Accepted():
                     self._working = None
@@ -201,9 +192,9 @@ class RemoteDenseMapper:
                     self._skip(message.keyframe_id, message.reason)
                 case MapWritten():
                     self._written = message
-        if self._worker.restart_if_needed(busy=self._working is not None):
+        if self.worker.restart_if_needed(busy=self._working is not None):
             self._resend_all()
-        if self._worker.given_up and (self._waiting or self._sent):
+        if self.worker.given_up and (self._waiting or self._sent):
             for number in [*self._waiting, *self._sent]:
                 self._skip(number, "dense mapping was given up")
             self._sent, self._to_resend, self._working = {}, [], None
@@ -221,7 +212,7 @@ class RemoteDenseMapper:
 
     def _send(self, message: KeyframeToMap) -> None:
         self._working = message.id
-        self._worker.send(message, begins=True)
+        self.worker.send(message, begins=True)
 
     def _resend_all(self) -> None:
         """Queue what was sent for the new process, but for a keyframe that killed two."""

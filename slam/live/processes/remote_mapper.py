@@ -53,6 +53,7 @@ class RemoteMapper:
         update_ms: time that the process took for each keyframe.
         changes: how often the copy was updated.
         reference: the keyframe that tracking refers to; set before ``insert``.
+        worker: the process that owns the map.
     """
 
     def __init__(
@@ -68,12 +69,7 @@ class RemoteMapper:
         self._sent_frames = 0
         self._saved_keyframes = 0
         self._pending: set[int] = set()
-        self._process = MapWorker((camera, config, names), self._replacement)
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
+        self.worker = MapWorker((camera, config, names), self._replacement)
 
     @property
     def pending(self) -> int:
@@ -97,12 +93,7 @@ class RemoteMapper:
     @property
     def given_up(self) -> bool:
         """Whether the process died too often to be restarted."""
-        return self._process.given_up
-
-    @property
-    def crashes(self) -> int:
-        """How often the process has died."""
-        return self._process.crashes
+        return self.worker.given_up
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Add a tracked frame to the copy as a keyframe, and send it to the process.
@@ -154,17 +145,17 @@ class RemoteMapper:
 
     def send(self, message: Any) -> None:
         """Send a message, which is sent again to a new process if this one dies."""
-        self._process.send(message)
+        self.worker.send(message)
 
     def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
         """Apply the process's answers to the copy; waits at most so long for the first.
 
         Returns the messages that are not about the map: masks, for the moving-object filter.
         """
-        others = self._apply_answers(self._process.receive(timeout_s))
-        if self._process.has_crashed:
-            others += self._apply_answers(self._process.receive_last())
-            self._process.restart()
+        others = self._apply_answers(self.worker.receive(timeout_s))
+        if self.worker.has_crashed:
+            others += self._apply_answers(self.worker.receive_last())
+            self.worker.restart()
         return others
 
     def _apply_answers(self, messages: list[Any]) -> list[Any]:
@@ -176,7 +167,7 @@ class RemoteMapper:
 
     def wait_until_ready(self, timeout_s: float) -> None:
         """Wait until the process is ready. Raises InputError if it cannot start."""
-        self._process.wait_until_ready(timeout_s)
+        self.worker.wait_until_ready(timeout_s)
 
     def wait_for(self, keyframe: Keyframe, timeout_s: float) -> bool:
         """Wait until a keyframe has its landmarks; False after the timeout, or if it was lost."""
@@ -197,16 +188,16 @@ class RemoteMapper:
         path = self._folder / ".live-final"
         self.send(Finish(path, self._unsent_history()))
         deadline_s = time.monotonic() + timeout_s
-        while self._process.busy and not self.given_up and time.monotonic() < deadline_s:
+        while self.worker.busy and not self.given_up and time.monotonic() < deadline_s:
             self.catch_up(0.1)
-        self._process.stop()
-        if self._process.busy:
+        self.worker.stop()
+        if self.worker.busy:
             raise InputError(f"{self._folder}: the map's process did not finish")
         return path
 
     def close(self) -> None:
         """Kill the process and remove its files."""
-        self._process.kill()
+        self.worker.kill()
         for path in self._folder.glob(".live-*"):
             path.unlink(missing_ok=True)
 

@@ -53,6 +53,7 @@ class RemoteSegmenter:
         labels: classes of the segmenter.
         dropped: number of keyframes that were skipped.
         segmentation_ms: time of each keyframe that was segmented.
+        worker: the supervised process.
     """
 
     def __init__(
@@ -63,18 +64,8 @@ class RemoteSegmenter:
         self.segmentation_ms: list[float] = []
         self._requested: dict[int, ImageToSegment] = {}
         target, arguments = f"{__name__}:serve_segmenter", (options, sequence, MAX_WAITING)
-        self._worker = SupervisedWorker("segmenter", target, arguments, policy or RestartPolicy())
-        self.labels = LabelSet(self._worker.wait_until_ready().labels)
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._worker.pid
-
-    @property
-    def crashes(self) -> int:
-        """How often a process died or hung."""
-        return self._worker.crashes
+        self.worker = SupervisedWorker("segmenter", target, arguments, policy or RestartPolicy())
+        self.labels = LabelSet(self.worker.wait_until_ready().labels)
 
     @property
     def waiting(self) -> int:
@@ -89,12 +80,12 @@ class RemoteSegmenter:
         """Request the masks of a keyframe; returns at once."""
         begins = not self._requested
         self._requested[image.keyframe_id] = image
-        self._worker.send(image, begins)
+        self.worker.send(image, begins)
 
     def receive_masks(self) -> list[Masks]:
         """The masks that have come. A process that died or hangs is restarted."""
         found = []
-        for message in self._worker.receive():
+        for message in self.worker.receive():
             self._requested.pop(message.keyframe_id, None)
             match message:
                 case Masks():
@@ -103,13 +94,13 @@ class RemoteSegmenter:
                 case NotSegmented():
                     self.dropped += 1
                     logger.info("keyframe %d has no masks: %s", message.keyframe_id, message.reason)
-        if self._worker.restart_if_needed(busy=bool(self._requested)):
+        if self.worker.restart_if_needed(busy=bool(self._requested)):
             for image in self._requested.values():
-                self._worker.send(image)
-        if self._worker.given_up:
+                self.worker.send(image)
+        if self.worker.given_up:
             self._requested.clear()
         return found
 
     def close(self) -> None:
         """Kill the process."""
-        self._worker.close()
+        self.worker.close()

@@ -153,7 +153,7 @@ def test_a_killed_segmenter_loses_only_masks(tmp_path) -> None:
 def test_a_hanging_segmenter_is_restarted(tmp_path) -> None:
     policy = RestartPolicy(answer_s=2.0)
     segmenter = RemoteSegmenter(label_image(tmp_path), tmp_path, policy)
-    first = segmenter.pid
+    first = segmenter.worker.pid
     try:
         os.kill(first, signal.SIGSTOP)
         segmenter.request(ImageToSegment(7, FRAMES[0].rgb, "a.png"))
@@ -162,11 +162,11 @@ def test_a_hanging_segmenter_is_restarted(tmp_path) -> None:
             time.sleep(0.05)
             found = segmenter.receive_masks()
         assert [masks.keyframe_id for masks in found] == [7]
-        assert (segmenter.crashes, segmenter.waiting) == (1, 0)
-        assert segmenter.pid != first
+        assert (segmenter.worker.crashes, segmenter.waiting) == (1, 0)
+        assert segmenter.worker.pid != first
     finally:
         segmenter.close()
-    assert not running([first, segmenter.pid])
+    assert not running([first, segmenter.worker.pid])
 
 
 def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:

@@ -64,7 +64,7 @@ def dense(monkeypatch: pytest.MonkeyPatch) -> RemoteDenseMapper:
 
 
 def process(dense: RemoteDenseMapper) -> FakeWorker:
-    worker = dense._worker
+    worker = dense.worker
     assert isinstance(worker, FakeWorker)
     return worker
 
