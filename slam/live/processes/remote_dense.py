@@ -166,8 +166,8 @@ class RemoteDenseMapper:
             if self.worker.given_up or time.monotonic() > deadline_s:
                 return MapWritten(failure="the dense map's process did not finish")
             self.update(world, lambda _: False, lambda _: False)
-            if not self.waiting and crashes_at_request != self.crashes:
-                crashes_at_request = self.crashes
+            if not self.waiting and crashes_at_request != self.worker.crashes:
+                crashes_at_request = self.worker.crashes
                 self.worker.send(FinishMap(poses, self.skipped), begins=True)
             time.sleep(0.005)
         return self._written
