@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import ConfigDict, StringConstraints, TypeAdapter, ValidationError
 
@@ -33,7 +33,7 @@ def read_json(path: Path, schema: type[Content], cure: str) -> Content:
     if size > MAX_BYTES:
         raise InputError(f"{path}: {size / 1e9:.1f} GB, more than {MAX_BYTES >> 30} GiB; {cure}")
     try:
-        return _adapter(schema).validate_json(data, strict=True)
+        return _adapter(cast("Any", schema)).validate_json(data, strict=True)
     except ValidationError as error:
         raise InputError(f"{path}: {first_problem(error)}; {cure}") from error
 
