@@ -222,8 +222,7 @@ def _repeated(observations: Observations, tables: FactorTables) -> Mask:
     """Observations of a (keyframe, landmark) pair that the graph or an earlier row has."""
     observed: set[tuple[int, int]] = set()
     repeated = np.zeros(len(observations), bool)
-    pairs = zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
-    for i, pair in enumerate(pairs):
+    for i, pair in enumerate(map(tuple, observations.pairs.tolist())):
         repeated[i] = (
             pair in observed
             or tables.observations.row(*pair) is not None

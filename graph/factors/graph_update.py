@@ -49,6 +49,11 @@ class Observations:
     def __len__(self) -> int:
         return len(self.keyframe_ids)
 
+    @property
+    def pairs(self) -> Ints:
+        """Keyframe and landmark id (M, 2)."""
+        return np.stack([self.keyframe_ids, self.landmark_ids], axis=1)
+
     def select(self, rows: NDArray[np.generic]) -> Observations:
         """The observations at these rows (indices or a mask)."""
         return Observations(

@@ -76,7 +76,7 @@ class MarginalisedLandmarks:
             self._of_landmark[landmark].add(number)
         for keyframe in np.unique(observations.keyframe_ids).tolist():
             self._of_keyframe[keyframe].add(number)
-        for keyframe, landmark in _pairs(chunk):
+        for keyframe, landmark in chunk.observations.select(~chunk.is_summary).pairs.tolist():
             self.observers[landmark].add(keyframe)
 
     def remove(self, number: int) -> Chunk:
@@ -86,7 +86,7 @@ class MarginalisedLandmarks:
             self._of_landmark[landmark].discard(number)
         for keyframe in np.unique(chunk.observations.keyframe_ids).tolist():
             self._of_keyframe[keyframe].discard(number)
-        for keyframe, landmark in _pairs(chunk):
+        for keyframe, landmark in chunk.observations.select(~chunk.is_summary).pairs.tolist():
             self.observers[landmark].discard(keyframe)
         return chunk
 
@@ -117,10 +117,3 @@ class MarginalisedLandmarks:
             -1 if (s := self.returned.get(j)) is None else s.keyframe_id for j in landmarks.tolist()
         ]
         return np.array(hosts, np.int64) == keyframes
-
-
-def _pairs(chunk: Chunk) -> list[tuple[int, int]]:
-    observations = chunk.observations.select(~chunk.is_summary)
-    return list(
-        zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
-    )

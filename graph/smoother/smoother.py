@@ -246,12 +246,10 @@ class Smoother:
 
     def _retract(self, validated: Validated, change: Change, report: UpdateReport) -> None:
         """Remove the whole update again, refused as SOLVER_FAILED."""
-        observations = validated.observations
-        pairs = np.stack([observations.keyframe_ids, observations.landmark_ids], axis=1)
         undo = GraphUpdate(
             remove_keyframes=validated.keyframe_ids,
             remove_landmarks=validated.landmark_ids,
-            remove_observations=pairs,
+            remove_observations=validated.observations.pairs,
         )
         report.add_removal(remove(undo, self._tables, self._config))
         mark_retracted(validated.landmark_ids, self._tables.marginalised)

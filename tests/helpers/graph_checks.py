@@ -72,8 +72,4 @@ def assert_same_optimum(smoother: Smoother, room: Room) -> None:
 
 def pairs_of(smoother: Smoother) -> set[tuple[int, int]]:
     """(keyframe, landmark) of every observation in the graph."""
-    table = smoother._tables.observations
-    observations = table.all()
-    return set(
-        zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
-    )
+    return set(map(tuple, smoother._tables.observations.all().pairs.tolist()))

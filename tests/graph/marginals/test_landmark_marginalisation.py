@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from graph_checks import assert_isam_matches_tables
+from graph_checks import assert_isam_matches_tables, pairs_of
 from synthetic_room import CAMERA, Room, make_room
 
 from bmask_slam.graph.arrays import Array
@@ -189,11 +189,11 @@ def test_a_batch_optimisation_is_that_of_the_full_graph() -> None:
         assert_isam_matches_tables(smoother)
     assert len(estimate.landmark_ids) < 150
     assert set(smoother._tables.marginalised.returned) & set(estimate.landmark_ids.tolist())
-    kept = _pairs(full) - _pairs(smoother) - _marginalised(smoother)
+    kept = pairs_of(full) - pairs_of(smoother) - _marginalised(smoother)
     assert all(j % 5 == k % 5 for k, j in kept)
     sparse, expected = smoother.optimise_batch(), full.optimise_batch()
     assert smoother._tables.marginalised.chunks == {}
-    assert _pairs(smoother) == _pairs(full) - kept
+    assert pairs_of(smoother) == pairs_of(full) - kept
     assert sparse.landmark_ids.tolist() == expected.landmark_ids.tolist()
 
 
@@ -265,14 +265,6 @@ def test_a_saved_graph_keeps_its_marginalised_landmarks(tmp_path: Path) -> None:
 
 def _without(observations: Observations, landmarks: Array) -> Observations:
     return observations.select(np.flatnonzero(~np.isin(observations.landmark_ids, landmarks)))
-
-
-def _pairs(smoother: Smoother) -> set[tuple[int, int]]:
-    table = smoother._tables.observations
-    observations = table.select(table.used_rows())
-    return set(
-        zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
-    )
 
 
 def _marginalised(smoother: Smoother) -> set[tuple[int, int]]:

@@ -44,7 +44,7 @@ def test_an_observation_is_removed_and_added_again() -> None:
     before = smoother.estimate()
     row = int(np.flatnonzero(observed_often(ROOM))[40])
     observed = ROOM.observations.select(np.array([row]))
-    pair = np.stack([observed.keyframe_ids, observed.landmark_ids], axis=1)
+    pair = observed.pairs
     after = smoother.update(GraphUpdate(remove_observations=pair))
     assert after.factors == before.factors - 1
     assert_isam_matches_tables(smoother)
@@ -90,7 +90,7 @@ def test_many_random_removals_and_additions() -> None:
     rng = np.random.default_rng(5)
     smoother = filled(ROOM)
     observations = ROOM.observations
-    pairs = np.stack([observations.keyframe_ids, observations.landmark_ids], axis=1)
+    pairs = observations.pairs
     for _ in range(15):
         estimate = smoother.update(
             GraphUpdate(
@@ -196,7 +196,7 @@ def test_a_disconnected_pair_of_keyframes_is_anchored() -> None:
     rest = ~last_two & np.isin(observed.landmark_ids, shared[2:])
     others = last_two & inside & ~np.isin(observed.landmark_ids, shared)
     leaving = observed.select(rest | others)
-    pairs = np.stack([leaving.keyframe_ids, leaving.landmark_ids], axis=1)
+    pairs = leaving.pairs
     after = smoother.update(GraphUpdate(remove_observations=pairs))
     assert not after.rebuilt
     assert len(after.anchored_keyframes) == 1  # it carries the other

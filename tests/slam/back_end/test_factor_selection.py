@@ -48,10 +48,7 @@ def make_world(keyframes: int, count: int = COUNT) -> tuple[WorldMap, Array]:
 
 def pairs(update: GraphUpdate) -> set[tuple[int, int]]:
     """(keyframe, landmark) of every observation; none may be sent twice."""
-    observations = update.observations
-    sent = list(
-        zip(observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True)
-    )
+    sent = list(map(tuple, update.observations.pairs.tolist()))
     assert len(sent) == len(set(sent))
     return set(sent)
 
