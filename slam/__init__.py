@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from bmask_slam.api import make_segmenter, map_run, run
     from bmask_slam.evaluation import evaluate
+    from bmask_slam.events import Event, EventKind
     from bmask_slam.graph.camera import Camera
     from bmask_slam.graph.errors import InputError
     from bmask_slam.live.live_slam import LiveSlam
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "Camera",
+    "Event",
+    "EventKind",
     "Frame",
     "FrameResult",
     "InputError",
@@ -47,6 +50,8 @@ __all__ = [
 
 _MODULES = {
     "Camera": "graph.camera",
+    "Event": "events",
+    "EventKind": "events",
     "Frame": "sequences.frame",
     "FrameResult": "tracking.results",
     "InputError": "graph.errors",

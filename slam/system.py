@@ -30,6 +30,8 @@ from bmask_slam.world.world_map import Keyframe
 logger = logging.getLogger(__name__)
 OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
 """Arrays in older files that are read by nothing today."""
+NEWER_ARRAYS = ("mapper.events.now", "mapper.events.counted", "mapper.events.counts")
+"""Arrays that older files lack; an empty system's are used then."""
 
 
 class SlamSystem(SystemResults):
@@ -38,6 +40,7 @@ class SlamSystem(SystemResults):
     Attributes:
         camera, config: as given.
         map: the owner of map and graph.
+        events: what happened; all parts report to it.
         camera_tracker: tracks frames against the map.
         moving_objects: keeps what moves out of tracking and out of the map.
         keyframes: decides which frames stay in the map.
@@ -61,6 +64,7 @@ class SlamSystem(SystemResults):
         self.extractor = BriskExtractor(camera, config.features)
         tracker = Tracker(camera, config.tracking)
         self.map = back_end or Mapper(camera, tracker, back_end_config(config))
+        self.events = self.map.events
         self.camera_tracker = CameraTracker(
             tracker, self.map, config.relocalisation, config.mapping.local_map
         )
@@ -106,6 +110,7 @@ class SlamSystem(SystemResults):
             keyframe_id=keyframe.id if keyframe else None,
             keyframe_reason=reason,
             stage_ms=self.stage_ms,
+            events=self.events.take(),
         )
 
     def prepare(self, frame: Frame) -> Features:
@@ -150,8 +155,10 @@ class SlamSystem(SystemResults):
 
     def restore(self, state: Arrays, path: Path) -> None:
         """Become the system of a state that was read from a file. Raises InputError."""
+        own = self.state()
         state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
-        check_like(state, self.state(), path)
+        state = {name: own[name] for name in NEWER_ARRAYS} | state
+        check_like(state, own, path)
         self.mapper.restore(part(state, "mapper"), path)
         self.camera_tracker.restore(part(state, "localiser"))
         self.semantics.restore(part(state, "semantics"), path)
@@ -178,6 +185,7 @@ class SlamSystem(SystemResults):
         frame = check_frame(frame, self.camera, self.camera_tracker.timestamp_s)
         self.stage_ms = {}
         self.camera_tracker.begin_frame(frame.timestamp_s)
+        self.events.begin_frame(frame.index, frame.timestamp_s)
         return frame
 
     @stage("features")
@@ -190,7 +198,17 @@ class SlamSystem(SystemResults):
 
     @stage("tracking")
     def _track(self, static: StaticFeatures) -> Tracked:
-        return self.camera_tracker.track(static.features)
+        return self._reported(self.camera_tracker.track(static.features))
+
+    def _reported(self, tracked: Tracked) -> Tracked:
+        """A tracked frame, once it is reported that it is lost, found again or begins a segment."""
+        if tracked.status is TrackingStatus.LOST:
+            self.events.lost(tracked.matches)
+        elif self.camera_tracker.reference is None:
+            self.events.new_segment(self.camera_tracker.segment)
+        else:
+            self.events.tracked(len(tracked.landmark_ids))
+        return tracked
 
     @stage("moving")
     def _learn_motion(self, frame: Frame, tracked: Tracked, static: StaticFeatures) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
+from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud
@@ -15,6 +16,8 @@ from bmask_slam.tracking.results import FrameResult
 
 class System(Protocol):
     """A SLAM system as runs use it; ``system.SlamSystem`` implements it."""
+
+    events: EventLog
 
     def prepare(self, frame: Frame) -> Any: ...
     def process(self, frame: Frame, features: Any = None) -> FrameResult: ...

@@ -5,11 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.events import totals
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
@@ -117,13 +119,14 @@ class SystemResults(ABC):
         """Write the state without times, so that the same run gives the same bytes."""
         write_map(path, self.state() | {"mapper.update_ms": np.zeros(0)}, self.camera)
 
-    def statistics(self) -> dict[str, float | list[float]]:
-        """Sizes of the map and the time of every graph update in milliseconds."""
+    def statistics(self) -> dict[str, Any]:
+        """Sizes of the map, times of graph updates in milliseconds, what the graph refused."""
         return {
             "keyframes": len(self.map.world.keyframes),
             "landmarks": int(self.map.world.landmarks.in_map.sum()),
             "loops_closed": len(self.mapper.loops.closed),
             "isam2_update_ms": list(self.mapper.update_ms),
+            "graph": totals(self.mapper.events.counts),
         }
 
 

@@ -32,10 +32,11 @@ ROOMS = {
                     training""",
     "semantics/network": "config  backbone  [...]",
     "mapping": "[...]  inverse_depth  products",
-    "slam": """evaluation  config  sequences  features  world  rendering  datasets  tracking
-               loops  moving  runtime  back_end  labelling  system_config  system_interface
-               run_folder  system_results  system  dense  calibration  refinement  viewer
-               offline  live  comparison  api  commands  cli  job_process  __init__  __main__""",
+    "slam": """events  evaluation  config  sequences  features  world  rendering  datasets
+               tracking  loops  moving  runtime  back_end  labelling  system_config
+               system_interface  run_folder  system_results  system  dense  calibration
+               refinement  viewer  offline  live  comparison  api  commands  cli  job_process
+               __init__  __main__""",
     "slam/rendering": "engine  things  rooms  [...]",
     "slam/live": """[...]  sources  processes  system  start  health  display  recorder  live_slam
                     play""",

@@ -113,25 +113,30 @@ class GraphEstimate:
     solver_ms: float = 0.0
     factors: int = 0
 
+    def counts(self) -> dict[str, int]:
+        """How much was refused, dropped, anchored or repaired, by words and reason."""
+        whole = self.refused.landmark_ids == NO_LANDMARK
+        reasons: Counter[tuple[str, int]] = Counter()
+        for what, rows in (("observations refused: ", ~whole), ("keyframes refused: ", whole)):
+            reasons.update((what, reason) for reason in self.refused.reasons[rows].tolist())
+        for factor in self.refused_factors:
+            reasons[f"factors refused: {factor.kind}, ", int(factor.reason)] += 1
+        counts = {
+            f"{what}{RefusalReason(reason).text}": count
+            for (what, reason), count in sorted(reasons.items())
+        }
+        counts["landmarks dropped"] = len(self.dropped_landmarks)
+        counts["keyframes dropped"] = len(self.dropped_keyframes)
+        counts["keyframes anchored"] = len(self.anchored_keyframes)
+        counts["rebuilds"] = int(self.rebuilt)
+        return {what: count for what, count in counts.items() if count}
+
     def notes(self) -> list[str]:
         """One line for each kind of thing that was refused, dropped, anchored or repaired."""
-        whole = self.refused.landmark_ids == NO_LANDMARK
-        counts: Counter[tuple[str, int]] = Counter()
-        for what, rows in (("observations", ~whole), ("keyframes", whole)):
-            counts.update((what, reason) for reason in self.refused.reasons[rows].tolist())
-        counts.update((f"{f.kind} factors", int(f.reason)) for f in self.refused_factors)
-        lines = [
-            f"{count} {what} refused: {RefusalReason(reason).text}"
-            for (what, reason), count in sorted(counts.items())
-        ]
-        for ids, what in (
-            (self.dropped_landmarks, "landmarks dropped"),
-            (self.dropped_keyframes, "keyframes dropped"),
-            (self.anchored_keyframes, "keyframes anchored: too few factors constrain them"),
-        ):
-            if len(ids):
-                lines.append(f"{len(ids)} {what}")
-        if self.rebuilt:
+        counts = self.counts()
+        rebuilt = counts.pop("rebuilds", 0)
+        lines = [f"{count} {what}" for what, count in counts.items()]
+        if rebuilt:
             lines.append(f"rebuilt after a failure near {self.failed_variable or 'no variable'}")
         return lines
 

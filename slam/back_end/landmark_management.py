@@ -13,7 +13,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import transform
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
-from bmask_slam.world.local_map import LocalMapConfig
+from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
@@ -108,6 +108,23 @@ def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> 
     culled = ids[rarely | few | (views == 0)]
     landmarks.remove(culled)
     return culled
+
+
+def loop_sides(
+    world: WorldMap, loops: list[tuple[int, int]], keyframes: int, config: LocalMapConfig
+) -> tuple[Ints, list[Keyframe]]:
+    """Landmarks (N,) around the older ends of loops, and keyframes around their newer ends.
+
+    Of each newer end the ``keyframes`` that share most with it.
+    """
+    old_ids, new_side = [], {}
+    for older, newer in loops:
+        _, seen = world.observed(world.keyframes[older])
+        old_ids.append(local_landmarks(world, seen, config))
+        _, seen = world.observed(world.keyframes[newer])
+        near = world.covisible(seen, config.min_shared)[:keyframes]
+        new_side.update({k.id: k for _, k in near})
+    return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
 
 
 def redundant_keyframe(

@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from bmask_slam.events import EventLog
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.loops.verification import LoopConstraint
@@ -21,7 +22,13 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 
 
 class MapBackend(MapEditor, Protocol):
-    """Takes keyframes in, and keeps map, graph and frame history consistent."""
+    """Takes keyframes in, and keeps map, graph and frame history consistent.
+
+    Attributes:
+        events: what happened in map and graph; the front end reports to it too.
+    """
+
+    events: EventLog
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
         """Make a tracked frame a keyframe of a map segment: landmarks are made, fused and culled.

@@ -16,12 +16,14 @@ from bmask_slam.back_end.landmark_management import (
     cull_landmarks,
     fuse_into,
     fuse_into_neighbours,
+    loop_sides,
     redundant_keyframe,
 )
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.back_end.pruning import MapPruner
 from bmask_slam.back_end.segment_joining import join_segment
 from bmask_slam.back_end.triangulation import triangulate_landmarks
+from bmask_slam.events import EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
@@ -60,6 +62,7 @@ class Mapper:
     Attributes:
         world: keyframes and landmarks. history: of all tracked frames. smoother: the graph.
         loops: finds loops, and holds closed ones.
+        events: of this system.
         update_ms: wall time of every graph update.
     """
 
@@ -68,7 +71,8 @@ class Mapper:
         self.world = WorldMap()
         self.history = FrameHistory()
         self.smoother = Smoother(camera, config.graph)
-        self.loops = LoopCloser(camera, config.loops)
+        self.events = EventLog()
+        self.loops = LoopCloser(camera, config.loops, self.events)
         self.update_ms: list[float] = []
         self._tracker = tracker
         self._mapping, self._graph_config = config.mapping, config.graph
@@ -99,6 +103,7 @@ class Mapper:
                 graph=self.smoother.state(),
                 feed=self._factor_selector.state(),
                 loops=self.loops.state(),
+                events=self.events.state(),
             ),
         }
 
@@ -110,6 +115,7 @@ class Mapper:
         self.smoother.restore(part(state, "graph"), path)
         self._factor_selector.restore(part(state, "feed"))
         self.loops.restore(part(state, "loops"), self.world)
+        self.events.restore(part(state, "events"))
 
     def restart(self) -> None:
         """Rebuild what a state cannot hold (ISAM2, index), as a restored mapper does."""
@@ -117,8 +123,9 @@ class Mapper:
         self.loops.index.rebuild()
 
     def begin_session(self) -> None:
-        """Clear the frame history and the times; map and graph stay."""
+        """Clear the frame history, the events and the times; map and graph stay."""
         self.history = FrameHistory()
+        self.events.begin_session()
         self.update_ms = []
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
@@ -160,6 +167,8 @@ class Mapper:
         kept = [loop for loop in confirmed if loop.ends not in refuted]
         self.loops.waiting += [loop for loop in confirmed if loop.ends in refuted]
         self._remove_loops(refuted, {loop.ends for loop in confirmed})
+        for loop in kept:
+            self.events.loop_closed(loop.ends, loop.inliers)
         if kept:
             self._fuse(kept)
         return kept
@@ -169,6 +178,8 @@ class Mapper:
 
         Returns the frame as tracked in the joined map.
         """
+        inliers = len(recognised.landmark_ids)
+        self.events.joined(segment, self.world.segment_of(recognised.landmark_ids), inliers)
         joined = join_segment(self.world, segment, tracked, recognised)
         loops = self.smoother.relative_poses("loop")
         self.smoother = Smoother(self.camera, self._graph_config)
@@ -184,11 +195,14 @@ class Mapper:
         """Remove what a keyframe observes under a mask (H, W), widened by ``widen_px``."""
         pruner = replace(self.pruner(), border_px=-widen_px)
         report = pruner.prune_mask(keyframe_id, mask)
+        self.events.count(report.counts("mask"))
         logger.info("mask of keyframe %d: %s", keyframe_id, report)
 
     def prune_landmarks(self, landmark_ids: Ints) -> None:
         """Remove landmarks (N,) from map and graph, with all their observations."""
-        logger.info("landmarks that move: %s", self.pruner().prune_landmarks(landmark_ids))
+        report = self.pruner().prune_landmarks(landmark_ids)
+        self.events.count(report.counts("moving"))
+        logger.info("landmarks that move: %s", report)
 
     def restore_observations(self, keyframe_id: int, keypoints: Ints, patches: Patches) -> None:
         """Keypoints (N,) of a keyframe that were masked observe landmarks again.
@@ -220,8 +234,7 @@ class Mapper:
     def _apply(self, estimate: GraphEstimate, timed: bool = True) -> None:
         if timed:
             self.update_ms.append(estimate.update_ms)
-        for note in estimate.notes():
-            logger.log(logging.WARNING if estimate.rebuilt else logging.INFO, "graph: %s", note)
+        self.events.graph(estimate)
         read_back(self.world, estimate)
 
     def _change_graph(self, **changes: Any) -> None:
@@ -236,18 +249,22 @@ class Mapper:
         """Remove loops from the graph; those that are not fresh with what they fused."""
         if not refuted:
             return
-        logger.info("loops refuted by the graph: %s", sorted(refuted))
         removed_loops = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
+        for a, b, _ in removed_loops:
+            self.events.loop_refused((a, b), "it does not fit the graph; waits until more agree")
+        self.events.count({"loops pruned: refuted": len(removed_loops)})
         self._change_graph(remove_relative_poses=removed_loops)
-        for a, b in sorted(refuted - fresh):
-            self.pruner().prune_loop(a, b)
+        for ends in sorted(refuted - fresh):
+            self.events.loop_removed(ends)
+            self.events.count(self.pruner().prune_loop(*ends).counts("refuted"))
         for ends in refuted:
             self.loops.closed.pop(ends, None)
 
     def _fuse(self, loops: list[LoopConstraint]) -> None:
         """Fuse the landmarks of both sides: first the loops' own pairs, then by projection."""
-        world = self.world
-        old_ids, new_side = self._sides(loops)
+        world, count = self.world, self.loops.config.fuse_keyframes
+        ends = [loop.ends for loop in loops]
+        old_ids, new_side = loop_sides(world, ends, count, self._mapping.local_map)
         for loop in loops:
             pairs = np.sort(loop.landmark_pairs, axis=1)
             pairs = pairs[world.landmarks.in_map[pairs].all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
@@ -258,18 +275,6 @@ class Mapper:
             fuse_into(world, new_side, old_ids, self._tracker, self._mapping.fuse_radius_px)
         )
         self._change_graph()
-
-    def _sides(self, loops: list[LoopConstraint]) -> tuple[Ints, list[Keyframe]]:
-        """Landmarks around the loops' older ends, and the keyframes around their newer ends."""
-        world, count = self.world, self.loops.config.fuse_keyframes
-        old_ids, new_side = [], {}
-        for loop in loops:
-            _, landmark_ids = world.observed(world.keyframes[loop.keyframe_a])
-            old_ids.append(local_landmarks(world, landmark_ids, self._mapping.local_map))
-            _, landmark_ids = world.observed(world.keyframes[loop.keyframe_b])
-            near = world.covisible(landmark_ids, self._mapping.local_map.min_shared)[:count]
-            new_side.update({k.id: k for _, k in near})
-        return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
 
     def _cull_keyframe(self, newest: Keyframe) -> None:
         """Remove the youngest redundant keyframe around the newest one.

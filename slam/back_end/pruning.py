@@ -47,6 +47,16 @@ class PruneReport:
     dropped_landmarks: Ints = field(default_factory=_no_ids)
     anchored_keyframes: Ints = field(default_factory=_no_ids)
 
+    def counts(self, reason: str) -> dict[str, int]:
+        """How much left the graph for a reason, and in its wake, as `EventLog.count` takes it."""
+        return {
+            f"landmarks pruned: {reason}": len(self.landmark_ids),
+            f"observations pruned: {reason}": len(self.observations),
+            f"loops pruned: {reason}": len(self.loops),
+            "landmarks dropped": len(self.dropped_landmarks),
+            "keyframes anchored": len(self.anchored_keyframes),
+        }
+
     def __str__(self) -> str:
         """One line for the log."""
         if self.refused:

@@ -20,7 +20,7 @@ DETAILS = (
     *("rpe_trans_rmse_frame", "rpe_rot_rmse_frame", "ate_rot_rmse", "tracking_ms_p95"),
     *("isam2_update_ms_median", "isam2_update_ms_p95", "latency_ms_p95"),
 )
-"""Figures of metrics.json that are not printed."""
+"""Figures of metrics.json that are not printed; nor are those of the graph."""
 SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth or none"
 
 
@@ -130,4 +130,5 @@ def format_summary(rows: list[Row]) -> str:
     """The main figures of a run as a table; metrics.json holds all of them."""
     from bmask_slam.evaluation import format_table
 
-    return format_table([row for row in rows if row["name"] not in DETAILS])
+    told = [row for row in rows if row["name"] not in DETAILS]
+    return format_table([row for row in told if not row["name"].startswith("graph_")])

@@ -142,7 +142,7 @@ def evaluate(
     if plot is not None:
         from bmask_slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib loads slowly
 
-        plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, with_scale)
+        plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, (), with_scale)
     return result
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,27 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.metrics import AbsoluteError, absolute_error
-from bmask_slam.graph.trajectory import Trajectory, associate
+from bmask_slam.graph.trajectory import Trajectory, associate, nearest_indices
 from bmask_slam.graph.whole_file import whole_file
 
 ESTIMATE, REFERENCE, DIFFERENCE = "#1f5fa8", "#9a9a96", "#d6302a"
 GAP_STEPS = 5
 FORMATS = ("png", "pdf", "svg")
+MARKS = {
+    EventKind.LOOP_REFUSED: ("x", "#8a8a86", 3.0),
+    EventKind.LOOP_CLOSED: ("o", "#7b3fa0", 5.0),
+    EventKind.LOOP_REMOVED: ("X", "#7b3fa0", 5.0),
+    EventKind.JOINED: ("D", "#1b8a5a", 6.0),
+    EventKind.SEGMENT: ("s", "#e08a00", 6.0),
+    EventKind.FOUND: ("^", "#1b8a5a", 6.5),
+    EventKind.LOST: ("v", "#b0151b", 6.5),
+    EventKind.CALIBRATION: ("*", "#e08a00", 9.0),
+}
+"""Symbol, colour and size in points of the events that the top view shows, the lowest first."""
 
 
 def plot_trajectory(
@@ -25,12 +38,13 @@ def plot_trajectory(
     estimate: Trajectory,
     reference: Trajectory | None,
     title: str,
+    events: Sequence[Event] = (),
     with_scale: bool = False,
 ) -> None:
     """Write the plot in the format of its suffix; the file appears whole or not at all.
 
     Without a reference, or with fewer than three associated poses, only the top view is drawn, in
-    the estimate's own world frame.
+    the estimate's own world frame. Events are marked in it.
 
     Raises:
         InputError: the folder does not exist, or the suffix is not in FORMATS.
@@ -43,16 +57,18 @@ def plot_trajectory(
     matched, truth = associate(estimate, reference) if reference is not None else (estimate, None)
     if truth is None or len(truth) < 3:
         figure = Figure(figsize=(6.4, 5.6), dpi=150, layout="constrained")
-        draw_top_view(figure.add_subplot(), estimate)
+        top_view, aligned = figure.add_subplot(), estimate
+        draw_top_view(top_view, estimate)
     else:
         error = absolute_error(matched, truth, with_scale)
         figure = Figure(figsize=(11, 5.2), dpi=150, layout="constrained")
         grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1))
-        aligned = error.alignment.apply(estimate)
-        draw_top_view(figure.add_subplot(grid[:, 0]), aligned, reference, (error.aligned, truth))
+        top_view, aligned = figure.add_subplot(grid[:, 0]), error.alignment.apply(estimate)
+        draw_top_view(top_view, aligned, reference, (error.aligned, truth))
         draw_errors([figure.add_subplot(grid[k, 1]) for k in range(2)], error)
         rmse_cm = 100 * error.translation_m.rmse
         title = f"{title}: ATE RMSE {rmse_cm:.2f} cm over {len(matched)} poses"
+    draw_events(top_view, events, aligned, reference)
     figure.suptitle(title, fontsize=11)
     with whole_file(path) as temporary:
         figure.savefig(temporary, format=form)
@@ -70,7 +86,7 @@ def draw_top_view(
     ``matched`` are associated poses of estimate and reference; red lines join them, with
     ``joined_by`` as their entry in the legend.
     """
-    plane = view_plane((estimate if reference is None else reference).positions_world)
+    plane = _view_plane_of(estimate, reference)
     if reference is not None:
         within = _same_time(reference, estimate)
         axes.plot(*_path(within)[:, plane].T, color=REFERENCE, lw=2.2, label="reference", zorder=2)
@@ -85,6 +101,39 @@ def draw_top_view(
     axes.set_xlabel(f"{'xyz'[plane[0]]} (m)")
     axes.set_ylabel(f"{'xyz'[plane[1]]} (m)")
     axes.grid(alpha=0.25, lw=0.5)
+    axes.legend(frameon=False, fontsize=8, loc="best")
+
+
+def draw_events(
+    axes: Axes, events: Sequence[Event], estimate: Trajectory, reference: Trajectory | None = None
+) -> None:
+    """Mark events in a top view of the same trajectories, and count each kind in its legend.
+
+    An event is where the pose next to it in time is; it is only counted if there is none near.
+    """
+    plane = _view_plane_of(estimate, reference)
+    near_s = (
+        GAP_STEPS * float(np.median(np.diff(estimate.timestamps_s))) if len(estimate) > 1 else 0.0
+    )
+    for height, (kind, (symbol, colour, size)) in enumerate(MARKS.items()):
+        stamps_s = np.array([event.timestamp_s for event in events if event.kind is kind])
+        if not len(stamps_s):
+            continue
+        points = np.zeros((0, 2))
+        if len(estimate):
+            rows = nearest_indices(estimate.timestamps_s, stamps_s)
+            rows = rows[np.abs(estimate.timestamps_s[rows] - stamps_s) <= near_s]
+            points = estimate.positions_world[rows][:, plane]
+        axes.plot(
+            *points.T,
+            symbol,
+            color=colour,
+            ms=size,
+            mew=0.8,
+            mfc="none" if kind is EventKind.LOOP_CLOSED else colour,
+            zorder=5 + height,
+            label=f"{kind.value} ({len(stamps_s)})",
+        )
     axes.legend(frameon=False, fontsize=8, loc="best")
 
 
@@ -108,6 +157,10 @@ def draw_errors(axes: list[Axes], error: AbsoluteError) -> None:
         axis.legend(frameon=False, fontsize=8, loc="upper right")
     axes[0].tick_params(labelbottom=False)
     axes[1].set_xlabel("time (s)")
+
+
+def _view_plane_of(estimate: Trajectory, reference: Trajectory | None) -> list[int]:
+    return view_plane((estimate if reference is None else reference).positions_world)
 
 
 def view_plane(positions_world: Array) -> list[int]:

@@ -226,6 +226,8 @@ class LiveSlam:
         except InputError as error:
             logger.error("the map is lost, the trajectory is saved: %s", error)
             return
+        finally:
+            folder.write_events(self._system.events.take())
         rows = measure(self._system, self.options.reference, self._counters, 1)
         median_ms, p95_ms = self._meter.percentiles_ms()
         rows += [row("latency_ms_median", median_ms, "ms"), row("latency_ms_p95", p95_ms, "ms")]

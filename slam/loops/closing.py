@@ -7,11 +7,11 @@ graph is tested once more afterwards, see ``Mapper.close_loops``.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from bmask_slam.events import EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
 from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
@@ -24,8 +24,6 @@ from bmask_slam.graph.pose_graph.loop_consistency import cycle_chi2
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
 from bmask_slam.world.world_map import Keyframe, WorldMap
-
-logger = logging.getLogger(__name__)
 
 MEDIAN_CHI2_6DOF = 5.348
 
@@ -76,14 +74,14 @@ class LoopClosingConfig:
 class LoopCloser:
     """Finds loops by the descriptors of all keyframes; keeps those that wait or were closed."""
 
-    def __init__(self, camera: Camera, config: LoopClosingConfig):
+    def __init__(self, camera: Camera, config: LoopClosingConfig, events: EventLog):
         self.config = config
         self.index = DescriptorIndex(config.index)
         self.recogniser = PlaceRecogniser(self.index, config.places)
         self.waiting: list[LoopConstraint] = []
         self.closed: dict[tuple[int, int], bool] = {}
         """Ends of the closed loops, and whether each is trusted more than the graph."""
-        self._camera = camera
+        self._camera, self._events = camera, events
 
     def state(self) -> Arrays:
         """Closed loops, waiting loops, and the results of the last query."""
@@ -163,9 +161,8 @@ class LoopCloser:
                 old = loop_view(world.keyframes[other], world)
                 result = verify_loop(old, view, self._camera, self.config.verification)
                 if isinstance(result, NoLoop):
-                    logger.info("no loop %d-%d: %s", other, keyframe.id, result)
+                    self._events.loop_refused((other, keyframe.id), result)
                     break
-                logger.info("loop %d-%d, %d inliers", other, keyframe.id, result.inliers)
                 found.append(result)
         return found
 
@@ -177,7 +174,7 @@ class LoopCloser:
         loops = [loop for loop in proposed if self._within_drift(loop, world)]
         if not loops:
             return []
-        loops = [*self.waiting, *loops][-self.config.waiting :]
+        found, loops = loops, [*self.waiting, *loops][-self.config.waiting :]
         chosen = _largest_clique(self._agreement(loops, world))
         supported = len(chosen) >= self.config.min_support
         confirmed = [loops[k] for k in chosen] if supported else []
@@ -185,6 +182,9 @@ class LoopCloser:
             confirmed = []
         entering = {loop.ends for loop in confirmed}
         self.waiting = [loop for loop in loops if loop.ends not in entering]
+        for loop in found:
+            if loop.ends not in entering:
+                self._events.loop_found(loop.ends, loop.inliers)
         return confirmed
 
     def is_strong(self, loops: list[LoopConstraint]) -> bool:
@@ -236,7 +236,8 @@ class LoopCloser:
         r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
         fits = bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
         if not fits:
-            logger.info("loop %d-%d implies too much drift", *loop.ends)
+            reason = f"{loop.inliers} inliers, but it implies more drift than is possible"
+            self._events.loop_refused(loop.ends, reason)
         return fits
 
     def _agreement(self, loops: list[LoopConstraint], world: WorldMap) -> Mask:

@@ -74,6 +74,10 @@ class NoLoop:
     value: float
     limit: float
 
+    def __str__(self) -> str:
+        """The reason with its figures."""
+        return f"{self.reason.value} ({self.value:.3g}, limit {self.limit:.3g})"
+
 
 @dataclass(frozen=True)
 class LoopConstraint:

@@ -26,6 +26,7 @@ from bmask_slam.graph.files.array_file import FileKind, nested, part, read_array
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
+from bmask_slam.run_folder.frame_file import EVENTS, FRAMES
 from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.sequences import Sequence
 from bmask_slam.system_config import SystemConfig
@@ -46,7 +47,7 @@ class Checkpoint:
         calibration: what was found of the camera, whose ``given`` was the sequence's.
         stamps: digest of all timestamps of the sequence.
         skipped: index and reason of the broken frames so far.
-        frames_bytes: size of frames.csv.
+        sizes: of the files that grow, in bytes by name; 0 for one that older versions lack.
         counters: of the frames so far.
         state: of the system.
     """
@@ -56,7 +57,7 @@ class Checkpoint:
     calibration: SelfCalibration
     stamps: str
     skipped: list[tuple[int, str]]
-    frames_bytes: int
+    sizes: dict[str, int]
     counters: RunCounters
     state: Arrays
 
@@ -138,7 +139,8 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         "calibration": dataclasses.asdict(checkpoint.calibration),
         "stamps": checkpoint.stamps,
         "skipped": checkpoint.skipped,
-        "frames_bytes": checkpoint.frames_bytes,
+        "frames_bytes": checkpoint.sizes[FRAMES],
+        "events_bytes": checkpoint.sizes[EVENTS],
         "tally": {name: value for name, value in counters.items() if name != "tracking_ms"},
     }
     tracking_ms = np.array(checkpoint.counters.tracking_ms, float)
@@ -176,7 +178,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             _calibration(header["calibration"], path),
             header["stamps"],
             [(int(i), str(reason)) for i, reason in header["skipped"]],
-            int(header["frames_bytes"]),
+            {FRAMES: int(header["frames_bytes"]), EVENTS: int(header.get("events_bytes", 0))},
             RunCounters(tracking_ms=tracking_ms, **header["tally"]),
             part(arrays, "system"),
         )

@@ -99,6 +99,15 @@ class RunSummary:
     calibration: str = ""
 
 
+def report_calibration(run: ActiveRun) -> None:
+    """The first event: what was found of the camera before the run, if anything was tried."""
+    events, first = run.system.events, run.indices[:1]
+    if run.calibration.text and first:
+        events.begin_frame(first[0], float(run.sequence.timestamps_s[first[0]]))
+        events.calibration(run.calibration.text)
+        run.folder.write_events(events.take())
+
+
 def process_frames(run: ActiveRun) -> None:
     """Process the remaining frames until the last or a stop request, and record each."""
     system, counters, remaining = run.system, run.counters, run.remaining
@@ -139,6 +148,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
     """Finish the system, measure and save; a run that was not stopped is complete then."""
     counters, options, stopped_by = run.counters, run.options, run.stop.signal
     run.system.finish()
+    run.folder.write_events(run.system.events.take())
     rows = measure(run.system, run.reference, counters, options.stride)
     title = "-".join(filter(None, (run.sequence.name, options.config_name)))
     save(run.system, run.folder, rows, run.reference, title)

@@ -46,6 +46,7 @@ class MapLocalisation(SlamSystem):
             matches=tracked.matches,
             inliers=len(tracked.landmark_ids),
             stage_ms=self.stage_ms,
+            events=self.events.take(),
         )
 
     def finish(self) -> None:
@@ -63,7 +64,7 @@ class MapLocalisation(SlamSystem):
 
     @stage("tracking")
     def _find(self, features: Features) -> Tracked:
-        return self.camera_tracker.track_in_map(features)
+        return self._reported(self.camera_tracker.track_in_map(features))
 
     @stage("tracking")
     def _follow(self, frame: Frame, tracked: Tracked) -> Array | None:

@@ -26,6 +26,7 @@ from bmask_slam.offline.frame_loop import (
     RunSummary,
     finish_run,
     process_frames,
+    report_calibration,
     run_indices,
 )
 from bmask_slam.offline.map_localisation import MapLocalisation
@@ -76,6 +77,7 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
             write_camera(folder.path / CAMERA, calibration.camera, calibration.text)
         system = start_system(options, sequence, make)
         active = ActiveRun(options, sequence, reference, system, folder, stop, calibration)
+        report_calibration(active)
         process_frames(active)
         return finish_run(active)
 
@@ -102,7 +104,7 @@ def resume(
     make = make_system or _with_segmenter(options, sequence)
     system, counters = make(sequence.camera, options.config), checkpoint.counters
     system.restore(checkpoint.state, path / CHECKPOINT)
-    with RunFolder(path, resume_bytes=checkpoint.frames_bytes) as folder, StopRequest() as stop:
+    with RunFolder(path, resume_bytes=checkpoint.sizes) as folder, StopRequest() as stop:
         logger.info("resumed after %d frames: %s", counters.frames, shlex.join(sys.argv))
         if not counters.frames:
             logger.warning("%s: no checkpoint was reached; starting from the beginning", path)
@@ -140,8 +142,6 @@ def find_calibration(
         lambda camera: make_system(camera, options.config),
     )
     found = calibrator.calibrate(stop, options.quiet)
-    if found.text:
-        logger.info("calibration: %s", found.text)
     if options.calibrate == "report":
         text = found.text.replace("found and applied", "found, not applied")
         return SelfCalibration(given, given, text)

@@ -26,6 +26,7 @@ from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.refinement.adjustment_plot import GraphSnapshot, check_picture, draw_adjustment
 from bmask_slam.refinement.carried_along import adjusted_map, move_frames, move_landmarks
 from bmask_slam.run_folder.folder import RunFolder
+from bmask_slam.run_folder.frame_file import EVENTS, FRAMES, read_events
 from bmask_slam.run_folder.landmark_file import LANDMARKS_COMMENT
 from bmask_slam.run_folder.map_file import MAP, SavedRun, read_map, read_run, write_map
 from bmask_slam.run_folder.metrics import EVALUATION_ROWS
@@ -107,7 +108,8 @@ def adjust_run(
         after = GraphSnapshot.of(run.tables)
         result = RunAdjustment(folder.path, adjustment, after, errors, plot or out / PICTURE)
         folder.write_text("metrics.json", format_json(result_rows(result)))
-        plot_trajectory(folder.path / "trajectory.png", trajectory, truth, folder.path.name)
+        picture, events = folder.path / "trajectory.png", read_events(path)
+        plot_trajectory(picture, trajectory, truth, folder.path.name, events)
         draw_adjustment(result.picture, before, after, adjustment)
         return result
 
@@ -124,7 +126,7 @@ def _write_run(
     }
     for name, trajectory in moved.items():
         folder.write_trajectory(trajectory, name)
-    for name in ("frames.csv", "config.yaml"):
+    for name in (FRAMES, EVENTS, "config.yaml"):
         if (run.path / name).is_file():
             with whole_file(folder.path / name) as temporary:
                 shutil.copyfile(run.path / name, temporary)

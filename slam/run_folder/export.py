@@ -23,6 +23,7 @@ from bmask_slam.graph.trajectory_formats import (
     write_kitti,
     write_times,
 )
+from bmask_slam.run_folder.folder import trajectory_files
 from bmask_slam.run_folder.landmark_file import LANDMARKS_COMMENT
 
 ExportFormat = Literal["tum", "kitti", "euroc", "g2o", "ply"]
@@ -107,9 +108,9 @@ def _landmarks(source: Path, out: Path) -> Exported:
 def _trajectory(source: Path, form: ExportFormat, out: Path, times: Path | None) -> Exported:
     file, note = source, ""
     if source.is_dir():
-        file = source / "trajectory.txt"
-        others = len(list(source.glob("trajectory_segment_*.txt")))
-        note = f"\n{others} more map segments have files of their own in {source}" if others else ""
+        file, *others = trajectory_files(source)
+        count = len(others)
+        note = f"\n{count} more map segments have files of their own in {source}" if count else ""
     trajectory = read_trajectory(file, None if times is None else read_times(times))
     files, what = _write(trajectory, form, out)
     return Exported(files, f"{len(trajectory)} poses T_world_camera: {what}{note}")

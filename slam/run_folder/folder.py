@@ -6,6 +6,7 @@ trajectory.txt        TUM format, T_world_camera, every frame with a pose
 trajectory_segment_N  .txt: the same of map segment N, if it was never joined to the largest
 keyframes.txt         the keyframes, as trajectory.txt
 frames.csv            one line a frame: status, matches, inliers, milliseconds a stage, keyframe
+events.csv            one line for what happened: lost, found again, segments, loops, the graph
 landmarks.ply         x y z (world, metres), red green blue, observations, id
 graph                 the saved factor graph and values, one file that loads again
 map                   keyframes, landmarks and graph, for ``run --continue`` and ``run --localise``
@@ -16,7 +17,7 @@ dense/                with ``--map``, run or live, or by ``bmask-slam map``: `de
 covariances.txt       with ``--covariances``: of every keyframe's pose, see
                       `run_folder.covariance_file`
 metrics.json          a list of {"name", "value", "unit"}
-trajectory.png        top view, and errors against the reference
+trajectory.png        top view with marks of events, and errors against the reference
 log.txt               the log
 camera.yaml           the camera of the run, where readout time or delay were found and adopted;
                       or what ``bmask-slam calibrate`` found
@@ -25,29 +26,37 @@ checkpoint            while a run with ``--checkpoint-every`` is not finished: t
                       which ``run --resume`` goes on; removed when the run is complete
 ====================  ============================================================================
 
-``frames.csv`` and ``log.txt`` grow line by line; everything else is written under a temporary name
-and renamed, so that a killed run leaves complete files.
+``frames.csv``, ``events.csv`` and ``log.txt`` grow line by line; everything else is written under a
+temporary name and renamed, so that a killed run leaves complete files.
 """
 
 from __future__ import annotations
 
-import csv
 import errno
 import itertools
 import logging
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+from bmask_slam.events import Event
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.graph.whole_file import remove, remove_partial, whole_file
 from bmask_slam.run_folder.covariance_file import COVARIANCES
-from bmask_slam.run_folder.frame_file import COLUMNS, frame_row
+from bmask_slam.run_folder.frame_file import (
+    COLUMNS,
+    EVENT_COLUMNS,
+    EVENTS,
+    FRAMES,
+    event_row,
+    frame_row,
+)
+from bmask_slam.run_folder.growing_table import GrowingTable, check_grown
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
 from bmask_slam.tracking.results import FrameResult
 
@@ -55,7 +64,8 @@ FILES = (
     "config.yaml",
     "trajectory.txt",
     "keyframes.txt",
-    "frames.csv",
+    FRAMES,
+    EVENTS,
     "landmarks.ply",
     "graph",
     "map",
@@ -69,12 +79,19 @@ HEALTH = "health.json"
 SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, *SEMANTIC_FILES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 LOGGERS = ("bmask_slam",)
+GROWING = {FRAMES: COLUMNS, EVENTS: EVENT_COLUMNS}
+"""The files that grow by lines with these columns."""
 
 
 def free_run_path(stem: str, root: Path = Path("runs")) -> Path:
     """``root/stem``, or with -2, -3, ... the first that does not exist yet."""
     names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
     return next(root / name for name in names if not os.path.lexists(root / name))
+
+
+def trajectory_files(run: Path) -> list[Path]:
+    """trajectory.txt of a run folder, then the file of each other map segment."""
+    return [run / "trajectory.txt", *sorted(run.glob("trajectory_segment_*.txt"))]
 
 
 class _LogFile(logging.FileHandler):
@@ -93,38 +110,37 @@ class RunFolder:
     """
 
     def __init__(
-        self, path: Path, overwrite: bool = False, resume_bytes: int | None = None
+        self, path: Path, overwrite: bool = False, resume_bytes: Mapping[str, int] | None = None
     ) -> None:
-        """Make the folder with an empty frames.csv and log.txt, or reopen it to resume its run.
+        """Make the folder with files that grow, still empty, or reopen it to resume its run.
 
-        To resume, frames.csv is cut to ``resume_bytes``.
+        To resume, frames.csv and events.csv are cut to ``resume_bytes``, by name.
 
         Raises:
             InputError: it cannot be written, another process writes there, it holds a run and
-                ``overwrite`` is not set, or frames.csv does not belong to the run to resume.
+                ``overwrite`` is not set, or a file does not belong to the run to resume.
         """
         self.path = path
         self._keep = resume_bytes is not None
         self._made = [] if self._keep else _make_folder(path)
+        kept = resume_bytes or {}
         if resume_bytes is None:
             _clear(path, overwrite)
         else:
-            _check_frames(path / "frames.csv", resume_bytes)
             _check_no_links(path)
+        for name, size in kept.items():
+            check_grown(path / name, GROWING[name], size)
         try:
             mode = "a" if self._keep else "x"
-            self._frames = (path / "frames.csv").open(mode, encoding="utf-8", newline="")
-            _lock(self._frames, path)
+            self._tables = {n: GrowingTable(path / n, c, mode) for n, c in GROWING.items()}
+            _lock(self._tables[FRAMES].file, path)
             self._log = _LogFile(path / "log.txt", mode=mode, encoding="utf-8")
-            self._frames.truncate(resume_bytes or 0)
+            for name, table in self._tables.items():
+                table.begin(kept.get(name, 0))
             remove_partial(path)
         except OSError as error:
             _remove_empty(self._made)
             raise _unwritable(path, error) from error
-        self._rows = csv.DictWriter(self._frames, COLUMNS, lineterminator="\n")
-        if not self._keep:
-            self._rows.writeheader()
-            self._frames.flush()
         self._levels: dict[str, int] = {}
 
     def __enter__(self) -> RunFolder:
@@ -152,9 +168,9 @@ class RunFolder:
         for name, level in self._levels.items():
             logging.getLogger(name).removeHandler(self._log)
             logging.getLogger(name).setLevel(level)
-        for file in (self._log, self._frames):
+        for close in (self._log.close, *(table.close for table in self._tables.values())):
             try:
-                file.close()
+                close()
             except OSError as unwritten:
                 error = error or unwritten
         if isinstance(error, InputError) and not self._keep:
@@ -166,19 +182,22 @@ class RunFolder:
             ) from error
 
     def write_frame(self, result: FrameResult) -> None:
-        """Append a frame to frames.csv and flush it.
+        """Append a frame to frames.csv, and its events to events.csv; both are flushed.
 
         Raises:
             ValueError: ``stage_ms`` has an unknown stage.
         """
-        self._rows.writerow(frame_row(result))
-        self._frames.flush()
+        self._tables[FRAMES].append([frame_row(result)])
+        self.write_events(result.events)
         self._keep = True
 
-    def synced_bytes(self) -> int:
-        """Write frames.csv to disk; its size in bytes."""
-        os.fsync(self._frames.fileno())
-        return os.fstat(self._frames.fileno()).st_size
+    def write_events(self, events: Iterable[Event]) -> None:
+        """Append to events.csv what happened before the first frame or after the last one."""
+        self._tables[EVENTS].append(map(event_row, events))
+
+    def synced_bytes(self) -> dict[str, int]:
+        """Write the files that grow to disk; their sizes in bytes by name."""
+        return {name: table.synced_bytes() for name, table in self._tables.items()}
 
     def complete(self) -> None:
         """Mark the run as finished by removing its checkpoint."""
@@ -204,8 +223,8 @@ def _clear(path: Path, overwrite: bool) -> None:
             "--overwrite"
         )
     try:
-        if "frames.csv" in held:
-            with (path / "frames.csv").open("rb") as file:
+        if FRAMES in held:
+            with (path / FRAMES).open("rb") as file:
                 _lock(file, path)
         _remove(path, held)
     except OSError as error:
@@ -226,21 +245,9 @@ def _lock(file: IO[Any], path: Path) -> None:
         ) from error
 
 
-def _check_frames(frames: Path, size: int) -> None:
-    """Raise InputError if frames.csv is shorter than at the checkpoint or has other columns."""
-    header, found = ",".join(COLUMNS), b""
-    if frames.is_file():
-        found = frames.read_bytes()[: max(size, 0)]
-    if len(found) < size or found.partition(b"\n")[0] != header.encode():
-        raise InputError(
-            f"{frames}: not the file of the checkpoint, which has at least {size} bytes and the "
-            f"columns {header}; start the run again with --overwrite"
-        )
-
-
 def _check_no_links(folder: Path) -> None:
     """Raise InputError if a file that a resumed run goes on with is a link."""
-    for name in ("frames.csv", "log.txt"):
+    for name in (*GROWING, "log.txt"):
         if (folder / name).is_symlink():
             raise InputError(
                 f"{folder / name}: is a link; nothing is written through it, start the run again "

@@ -1,8 +1,7 @@
-"""frames.csv: one line a frame, written while a run goes on, and read back as arrays."""
+"""frames.csv and events.csv: lines that are written while a run goes on, and read back."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.errors import InputError
+from bmask_slam.run_folder.growing_table import read_table
 from bmask_slam.tracking.results import FrameResult
 
-FRAMES = "frames.csv"
+FRAMES, EVENTS = "frames.csv", "events.csv"
 STAGES = ("features", "moving", "tracking", "keyframe", "graph", "loops", "semantics")
 COLUMNS = (
     *("index", "timestamp", "status", "segment", "matches", "inliers"),
@@ -22,6 +23,8 @@ COLUMNS = (
     *(f"{stage}_ms" for stage in STAGES),
     *("keyframe", "keyframe_reason"),
 )
+MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals
+EVENT_COLUMNS = ("index", "timestamp", "kind", "text")
 _NEEDED = ("index", "timestamp", "status", "keyframe")
 
 
@@ -80,18 +83,9 @@ def read_frames(path: Path) -> FrameTable:
     Raises:
         InputError: no such file, a column that is missing, or a value that is no number.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the folder as the run left it")
-    text = path.read_text(encoding="utf-8", errors="replace")
-    whole = text[: text.rfind("\n") + 1]
-    header, *rows = list(csv.reader(whole.splitlines())) or [[]]
-    missing = [name for name in _NEEDED if name not in header]
-    if missing or any(len(row) != len(header) for row in rows):
-        what = f"no column {missing[0]}" if missing else "a line with too few or too many values"
-        raise InputError(f"{path}: {what}; run again")
-    columns = dict(zip(header, zip(*rows, strict=True), strict=True)) if rows else {}
+    columns = read_table(path, _NEEDED)
+    absent = ("",) * len(columns["index"])  # a column that older versions did not write
     try:
-        absent = ("",) * len(rows)  # a column that older versions did not write
         return _table({name: columns.get(name, absent) for name in COLUMNS})
     except ValueError as error:
         raise InputError(f"{path}: {error}; run again") from error
@@ -115,3 +109,30 @@ def _table(columns: dict[str, tuple[str, ...]]) -> FrameTable:
         keyframe_reasons=columns["keyframe_reason"],
         stage_ms={stage: numbers(f"{stage}_ms", np.nan, float) for stage in STAGES},
     )
+
+
+def event_row(event: Event) -> dict[str, object]:
+    """The values of an event's line by column."""
+    stamp, kind = f"{event.timestamp_s:.6f}", event.kind.value
+    return {"index": event.frame, "timestamp": stamp, "kind": kind, "text": event.text}
+
+
+def read_events(run: Path) -> tuple[Event, ...]:
+    """The events of a run folder so far; none if an older version wrote it, without events.csv.
+
+    Raises:
+        InputError: a column that is missing, a value that is no number, or an unknown kind.
+    """
+    path = run / EVENTS
+    if not path.is_file():
+        return ()
+    columns = read_table(path, EVENT_COLUMNS)
+    try:
+        return tuple(
+            Event(int(index), float(stamp), EventKind(kind), text)
+            for index, stamp, kind, text in zip(
+                *(columns[name] for name in EVENT_COLUMNS), strict=True
+            )
+        )
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; run again") from error

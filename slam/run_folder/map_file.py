@@ -24,7 +24,8 @@ from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.marginals.landmark_marginalisation import reinsert
 from bmask_slam.graph.smoother.storage import read_camera, read_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum
-from bmask_slam.run_folder.frame_file import FRAMES, read_frames
+from bmask_slam.run_folder.folder import trajectory_files
+from bmask_slam.run_folder.frame_file import FRAMES, MAX_STAMP_ERROR_S, read_frames
 from bmask_slam.run_folder.origin import CONFIG
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.labels import LabelSet, label_set
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 
 MAP_FILE = FileKind("map", 4, compressed=True)
 MAP = "map"
-MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals
 MAX_POSE_ERROR = 1e-5  # of poses with nine: metres, and entries of rotations
 
 
@@ -94,14 +94,13 @@ def read_run(path: Path) -> SavedRun:
     config = path / "config.yaml"
     graph_config = resolve(SmootherConfig, config if config.is_file() else None, section="graph")
     reinsert(tables, camera, graph_config)
-    names = ["trajectory.txt", *sorted(p.name for p in path.glob("trajectory_segment_*.txt"))]
     run = SavedRun(
         path,
         tables,
         camera,
         graph_config,
         _keyframe_stamps(path / FRAMES, tables.keyframes.ids),
-        {name: read_tum(path / name) for name in names},
+        {file.name: read_tum(file) for file in trajectory_files(path)},
         read_tum(path / "keyframes.txt"),
         read_ply(path / "landmarks.ply"),
     )

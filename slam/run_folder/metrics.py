@@ -13,6 +13,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.run_folder.folder import RunFolder
+from bmask_slam.run_folder.frame_file import read_events
 from bmask_slam.run_folder.landmark_file import write_landmarks
 from bmask_slam.runtime.memory import peak_rss_mb
 from bmask_slam.system_interface import System
@@ -81,6 +82,9 @@ def measure(
     rows.append(row("landmarks", int(statistics["landmarks"]), "landmarks"))
     rows.append(row("loops_closed", int(statistics["loops_closed"]), "loops"))
     rows += _percentiles("isam2_update_ms", statistics["isam2_update_ms"])
+    for what, count in statistics["graph"].items():
+        words = what.replace(":", "").replace(",", "").split()
+        rows.append(row("_".join(("graph", *words)), count, words[0]))
     rows.append(row("peak_rss_mb", peak_rss_mb(), "MB"))
     return rows
 
@@ -114,7 +118,8 @@ def save(
         with whole_file(folder.path / name) as temporary:
             write(temporary)
     folder.write_text("metrics.json", format_json(rows))
-    plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title)
+    events = read_events(folder.path)
+    plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title, events)
     for name in files:
         size_mb = (folder.path / name).stat().st_size / 1e6
         logger.info("%s: %.1f MB", name, size_mb)

@@ -11,13 +11,20 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from bmask_slam.events import Event
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices, read_tum
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
-from bmask_slam.run_folder.folder import CHECKPOINT, FILES
-from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
+from bmask_slam.run_folder.folder import CHECKPOINT, FILES, trajectory_files
+from bmask_slam.run_folder.frame_file import (
+    FRAMES,
+    MAX_STAMP_ERROR_S,
+    FrameTable,
+    read_events,
+    read_frames,
+)
 from bmask_slam.run_folder.landmark_file import (
     LANDMARKS,
     DenseCloud,
@@ -31,7 +38,6 @@ from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, read_obje
 if TYPE_CHECKING:
     from bmask_slam.system_config import SystemConfig
 
-_MAX_STAMP_ERROR_S = 1e-5  # stamps have six decimals
 _DENSE = "dense"
 
 
@@ -102,8 +108,7 @@ class Run:
     @cached_property
     def trajectories(self) -> tuple[Trajectory, ...]:
         """Every map segment, each in a world frame of its own; the largest is first."""
-        others = sorted(self.path.glob("trajectory_segment_*.txt"))
-        return (self.trajectory, *(read_tum(path) for path in others))
+        return (self.trajectory, *map(read_tum, trajectory_files(self.path)[1:]))
 
     @cached_property
     def keyframes(self) -> Keyframes:
@@ -115,7 +120,7 @@ class Run:
         if len(made):
             near = made[nearest_indices(frames.timestamps_s[made], stamps_s)]
             late_s = np.abs(frames.timestamps_s[near] - stamps_s)
-            for k in np.flatnonzero(late_s <= _MAX_STAMP_ERROR_S).tolist():
+            for k in np.flatnonzero(late_s <= MAX_STAMP_ERROR_S).tolist():
                 ids[k], reasons[k] = frames.keyframe_ids[near[k]], frames.keyframe_reasons[near[k]]
         return Keyframes(ids, stamps_s, trajectory.poses_world_camera, tuple(reasons))
 
@@ -123,6 +128,11 @@ class Run:
     def frames(self) -> FrameTable:
         """Status, matches, inliers and times of every frame; of a run that goes on, so far."""
         return read_frames(self._file(FRAMES))
+
+    @cached_property
+    def events(self) -> tuple[Event, ...]:
+        """What happened, in order; empty for a run of an older version, which wrote no events."""
+        return read_events(self.path)
 
     @cached_property
     def landmarks(self) -> Landmarks:

@@ -7,6 +7,7 @@ from enum import Enum
 
 import numpy as np
 
+from bmask_slam.events import Event
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints
 
@@ -78,6 +79,7 @@ class FrameResult:
         keyframe_id: id of the keyframe made from this frame, or None.
         keyframe_reason: why it was made ("" when it was not).
         stage_ms: wall time of each stage in milliseconds, by name.
+        events: what happened since the result before; live, also what other processes sent.
     """
 
     index: int
@@ -93,6 +95,7 @@ class FrameResult:
     keyframe_id: int | None = None
     keyframe_reason: str = ""
     stage_ms: dict[str, float] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
 
     @property
     def covariance(self) -> Array | None:

@@ -6,12 +6,15 @@ import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.sequences.frame import Frame
@@ -65,6 +68,7 @@ class FakeSystem:
         self.camera = camera
         self.on_frame = on_frame or (lambda k: None)
         self.z_error_m = z_error_m
+        self.events = EventLog()
         self.numbers: list[int] = []
         self.finished = False
         self.restarts = 0
@@ -76,7 +80,11 @@ class FakeSystem:
         k = self.prepare(frame) if features is None else features
         self.on_frame(k)
         lost = k % 7 == 6
-        if not lost:
+        self.events.begin_frame(frame.index, frame.timestamp_s)
+        if lost:
+            self.events.lost(100 + k)
+        else:
+            self.events.tracked(90 + k)
             self.numbers.append(k)
         return FrameResult(
             index=frame.index,
@@ -88,10 +96,12 @@ class FakeSystem:
             keyframe_id=k // 5 if k % 5 == 0 else None,
             keyframe_reason="new view" if k % 5 == 0 else "",
             stage_ms={"tracking": 1000.0 + k, "keyframe": 5e6, "graph": 7e6},
+            events=self.events.take(),
         )
 
     def finish(self) -> None:
         self.finished = True
+        self.events.loop_removed((1, 2))
 
     def segments(self) -> dict[int, Trajectory]:
         return {0: self.trajectory()} if len(self.trajectory()) else {}
@@ -118,10 +128,14 @@ class FakeSystem:
         path.write_bytes(name.encode())
 
     def state(self) -> Arrays:
-        return {"numbers": np.array(self.numbers, np.int64)}
+        return {
+            "numbers": np.array(self.numbers, np.int64),
+            **nested(events=self.events.state()),
+        }
 
     def restore(self, state: Arrays, path: Path) -> None:
         self.numbers = state["numbers"].tolist()
+        self.events.restore(part(state, "events"))
 
     def restart(self) -> None:
         self.restarts += 1
@@ -129,12 +143,13 @@ class FakeSystem:
     def begin_session(self) -> None:
         raise NotImplementedError
 
-    def statistics(self) -> dict[str, float | list[float]]:
+    def statistics(self) -> dict[str, Any]:
         return {
             "keyframes": 4,
             "landmarks": 2,
             "loops_closed": 1,
             "isam2_update_ms": [1.0, 2.0, 9.0],
+            "graph": {"factors refused": 3, "factors refused: loop, not finite": 2},
         }
 
 

@@ -82,6 +82,7 @@ def system() -> SlamSystem:
         LoopConstraint(first, second, np.eye(4), np.eye(6), 30 + k, 1.5, pairs[k:])
         for k in range(2)
     ]
+    system.events.count({"landmarks dropped": 3, "observations pruned: mask": 40})
     system.semantics.await_masks(
         system.mapper.world.keyframes[first], kept_depth(FRAMES[3].depth_m)
     )
@@ -168,6 +169,17 @@ def test_a_state_of_an_older_version_is_restored(system: SlamSystem) -> None:
     names = ("semantics.labels.counts", "semantics.objects.labels.counts")
     older = {**system.state(), **{name: np.zeros(7, np.float32) for name in names}}
     assert list(differences(system, restored(older))) == []
+
+
+def test_a_state_without_events_is_restored(system: SlamSystem) -> None:
+    """Versions before events did not save them: nothing is counted, and nothing is lost."""
+    state, empty = system.state(), SlamSystem(CAMERA, CONFIG, Halves()).state()
+    events = {name for name in state if name.startswith("mapper.events.")}
+    older = restored({name: array for name, array in state.items() if name not in events})
+    assert len(events) == 3
+    for name, array in older.state().items():
+        expected = empty[name] if name in events else state[name]
+        np.testing.assert_array_equal(array, expected)
 
 
 def test_every_attribute_is_restored(system: SlamSystem) -> None:

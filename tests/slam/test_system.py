@@ -11,6 +11,7 @@ from repository import KITCHEN
 from synthetic_view import CAMERA, render_or_black, render_plane
 
 from bmask_slam.config.configuration import resolve
+from bmask_slam.events import EventKind
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
@@ -54,6 +55,14 @@ def largest_error_m(system: SlamSystem, poses: list[Array | None]) -> float:
     return float(np.linalg.norm(np.array(offsets)[:, 3:], axis=1).max())
 
 
+def story(results: list[FrameResult]) -> list[tuple[int, EventKind]]:
+    """The events but for those of loops and of the graph, and the frames that they are at."""
+    of_tracking = (EventKind.LOST, EventKind.FOUND, EventKind.SEGMENT, EventKind.JOINED)
+    events = [(r.index, e) for r in results for e in r.events]
+    assert all(index == event.frame for index, event in events)
+    return [(index, event.kind) for index, event in events if event.kind in of_tracking]
+
+
 def test_pose_agrees_with_the_truth_in_frame_unit_and_sign() -> None:
     system, poses = SlamSystem(CAMERA), path(25)
     results = process_views(system, poses)
@@ -76,6 +85,11 @@ def test_lost_frames_get_no_pose_and_tracking_recovers() -> None:
     assert len(system.trajectory()) == 20
     assert {r.segment for r in results} == {0}
     assert largest_error_m(system, poses) < 0.003
+    assert story(results) == [
+        (0, EventKind.SEGMENT),
+        (15, EventKind.LOST),
+        (20, EventKind.FOUND),
+    ]
 
 
 def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
@@ -94,6 +108,17 @@ def test_segments_are_kept_apart_until_one_is_recognised_in_the_other() -> None:
     assert list(joined) == [0]
     assert len(joined[0]) == sum(r.T_world_camera is not None for r in results)
     assert largest_error_m(system, poses) < 0.02  # a wrong join would be off by decimetres
+    begun = next(r.index for r in results if r.segment == 1)
+    last = max(r.index for r in results if r.segment == 1)
+    assert story(results) == [
+        (0, EventKind.SEGMENT),
+        (12, EventKind.LOST),
+        (begun, EventKind.SEGMENT),
+        (last + 1, EventKind.JOINED),
+    ]
+    (joining,) = (e for r in results for e in r.events if e.kind is EventKind.JOINED)
+    assert joining.text.startswith("segment 1 becomes part of segment 0, where ")
+    assert joining.timestamp_s == results[last + 1].timestamp_s
 
 
 def test_black_frames_before_the_first_keyframe_are_lost_not_fatal() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.trajectory import associate, nearest_indices, read_tum
+from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.run_folder.semantic_files import LABELS, read_labels
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
@@ -93,9 +93,9 @@ def depth_ratio(run: Path, sequence: Sequence) -> float | None:
 
 def keyframe_frames(run: Path) -> list[tuple[int, int]]:
     """(index of the frame, id) of every keyframe that was made."""
-    with (run / "frames.csv").open(encoding="utf-8", newline="") as file:
-        made = [row for row in csv.DictReader(file) if row["keyframe"]]
-    return [(int(row["index"]), int(row["keyframe"])) for row in made]
+    frames = read_frames(run / FRAMES)
+    made = frames.keyframe_ids >= 0
+    return list(zip(frames.index[made].tolist(), frames.keyframe_ids[made].tolist(), strict=True))
 
 
 def truth_from_world(poses_world_camera: Array, poses_truth_camera: Array) -> Array:

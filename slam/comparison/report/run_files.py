@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 from collections import defaultdict
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind
 from bmask_slam.comparison.report.section import Picture
 from bmask_slam.comparison.report.table import EMPTY, Entry, Table, TableRow
-from bmask_slam.run_folder.frame_file import STAGES
+from bmask_slam.run_folder.frame_file import FRAMES, STAGES, read_frames
 
 KEYFRAME_STAGES = ("keyframe", "graph", "loops", "semantics")
 PICTURE_WIDTH_PX = 900
@@ -50,14 +49,16 @@ def stage_table(comparison: Comparison, folder: Path) -> Table | None:
 
 def read_stage_times(cell: Cell, folder: Path, times: Times) -> None:
     """Append the times of a run's frames; of keyframe stages, those of keyframes only."""
-    path = folder / cell.folder / "frames.csv"
+    path = folder / cell.folder / FRAMES
     if cell.status is not CellStatus.DONE or not cell.folder or not path.is_file():
         return
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            for stage in STAGES:
-                if row.get(f"{stage}_ms") and (row["keyframe"] or stage not in KEYFRAME_STAGES):
-                    times[stage].append(float(row[f"{stage}_ms"]))
+    frames = read_frames(path)
+    for stage, stage_ms in frames.stage_ms.items():
+        chosen = np.isfinite(stage_ms)
+        if stage in KEYFRAME_STAGES:
+            chosen &= frames.keyframe_ids >= 0
+        if chosen.any():
+            times[stage] += stage_ms[chosen].tolist()
 
 
 def map_pictures(comparison: Comparison, sequence: str, folder: Path) -> list[Picture]:

@@ -80,6 +80,7 @@ def serve_map(
         segmenter,
         on_masks=channel.send,  # to tracking's side, where it is known what moves
     )
+    system.events.on_event = channel.send
     if state is not None:
         system.restore(read_arrays(state, STATE_FILE)[1], state)
     server = MapServer(system, channel.send)
@@ -155,6 +156,7 @@ class MapServer:
         )
         self._deltas.has_features(message.id)
         system.camera_tracker.segment = segment
+        system.events.begin_frame(frame.index, frame.timestamp_s)
         _, keyframe = system.insert(frame, tracked, message.local_ids)
         assert keyframe.id == message.id, "tracking and map count keyframes differently"
         if system.semantics.enabled:

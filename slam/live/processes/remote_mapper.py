@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
+from bmask_slam.events import Event, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
@@ -50,6 +51,7 @@ class RemoteMapper:
         world: the copy, with the keyframes that the process has not handled yet.
         history: of every tracked frame.
         places: index of the keyframes' descriptors, for relocalisation.
+        events: of tracking and, as they arrive, of the process.
         update_ms: time that the process took for each keyframe.
         changes: how often the copy was updated.
         reference: the keyframe that tracking refers to; set before ``insert``.
@@ -61,6 +63,7 @@ class RemoteMapper:
     ) -> None:
         self.world, self.history = WorldMap(), FrameHistory()
         self.places = DescriptorIndex(config.loops.index)
+        self.events = EventLog()
         self.update_ms: list[float] = []
         self.loops_closed = 0
         self.changes = 0
@@ -159,11 +162,17 @@ class RemoteMapper:
         return others
 
     def _apply_answers(self, messages: list[Any]) -> list[Any]:
-        """Apply the changes of the map; returns the other messages."""
+        """Apply the changes of the map, and keep events; returns the other messages."""
+        others = []
         for message in messages:
-            if isinstance(message, MapChanged):
-                self._apply(message)
-        return [message for message in messages if not isinstance(message, MapChanged)]
+            match message:
+                case MapChanged():
+                    self._apply(message)
+                case Event():
+                    self.events.receive(message)
+                case _:
+                    others.append(message)
+        return others
 
     def wait_until_ready(self, timeout_s: float) -> None:
         """Wait until the process is ready. Raises InputError if it cannot start."""

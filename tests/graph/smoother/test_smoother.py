@@ -240,4 +240,4 @@ def test_notes_list_refused_factors_with_reasons() -> None:
         )
     )
     assert "2 observations refused: not finite" in estimate.notes()
-    assert "1 loop factors refused: unknown keyframe" in estimate.notes()
+    assert "1 factors refused: loop, unknown keyframe" in estimate.notes()

@@ -101,7 +101,9 @@ def test_hidden_points_are_not_visible(office):
 def test_depth_against_the_sensor(run, office, monkeypatch):
     """A map that halves the sensor's error gives one half; NaN and outliers do not count."""
     sequence = open_sequence(office)
-    (run / "frames.csv").write_text("index,keyframe\n0,0\n1,\n2,1\n")
+    (run / "frames.csv").write_text(
+        "index,timestamp,status,keyframe\n0,0,OK,0\n1,1,OK,\n2,2,OK,1\n"
+    )
     (run / "dense").mkdir()
     (run / "dense/dense.json").write_text(json.dumps({}))
 

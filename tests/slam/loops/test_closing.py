@@ -11,6 +11,7 @@ from synthetic_view import CAMERA, add_keyframe, make_features, random_descripto
 import bmask_slam.back_end.mapper
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.back_end.mapper import BackEndConfig, Mapper
+from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, se3_log, so3_exp, transform
@@ -196,7 +197,7 @@ T_DRIFT = se3_exp(np.array([0.0, 0.03, 0.02, 0.3, 0.1, -0.2]))
 
 
 def test_consistent_loops_confirm_each_other() -> None:
-    world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig())
+    world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
     first = [displaced(world, k, 36, T_DRIFT) for k in (2, 3)]
     third = displaced(world, 4, 37, T_DRIFT)
     assert closer.confirm(first, world) == []
@@ -205,14 +206,14 @@ def test_consistent_loops_confirm_each_other() -> None:
 
 
 def test_loops_of_one_keyframe_do_not_confirm_each_other() -> None:
-    world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig())
+    world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
     loops = [displaced(world, k, 36, T_DRIFT) for k in (2, 3, 4, 5)]
     assert closer.confirm(loops, world) == []
     assert closer.waiting == loops
 
 
 def test_random_loops_are_never_confirmed() -> None:
-    world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig())
+    world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
     rng = np.random.default_rng(8)
     right = [displaced(world, k, 34 + k, T_DRIFT) for k in range(3)]
     entered: list[LoopConstraint] = []
@@ -226,7 +227,7 @@ def test_random_loops_are_never_confirmed() -> None:
 
 
 def test_loops_of_a_culled_keyframe_are_removed() -> None:
-    world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig())
+    world, closer = straight_world(40), LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
     closer.confirm([displaced(world, k, 36, T_DRIFT) for k in (2, 3)], world)
     closer.remove(2)
     assert [loop.keyframe_a for loop in closer.waiting] == [3]

@@ -21,10 +21,12 @@ import pytest
 from fake_run import FakeSystem, make_sequence, signal_at
 from repository import KITCHEN
 
+from bmask_slam.events import EventKind
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, resume, run
 from bmask_slam.run_folder import metrics as run_results
-from bmask_slam.run_folder.folder import CHECKPOINT, FILES, RunFolder
+from bmask_slam.run_folder.folder import CHECKPOINT, FILES, GROWING, RunFolder
+from bmask_slam.run_folder.frame_file import read_events
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.tracker import TrackingConfig
 
@@ -229,6 +231,35 @@ def test_a_frames_file_of_another_run_is_rejected(begun: Path, refused) -> None:
     refused(r"frames\.csv: not the file")
 
 
+def test_an_events_file_that_is_not_the_checkpoints_is_refused(begun: Path, refused) -> None:
+    (begun / "events.csv").write_text("index,timestamp,kind\n" * 20)
+    refused(r"events\.csv: not the file of the checkpoint, .* columns index,timestamp,kind,text;")
+
+
+def test_a_checkpoint_of_a_version_without_events_is_resumed(begun: Path) -> None:
+    """Its folder has no events.csv; what happened before the checkpoint is not known."""
+    rewrite_header(begun / CHECKPOINT, lambda header: header.pop("events_bytes"))
+    (begun / "events.csv").unlink()
+    assert resume(begun, make_system=FakeSystem).frames == 20
+    assert [(e.frame, e.kind) for e in read_events(begun)] == [
+        (13, EventKind.LOST),
+        (14, EventKind.FOUND),
+        (19, EventKind.LOOP_REMOVED),
+    ]
+
+
+def test_events_are_the_same_after_a_kill_in_a_loss(sequence: Path, tmp_path: Path) -> None:
+    """Frame 6 is lost and the checkpoint is after it: frame 7 is told to be found again."""
+    every = partial(RunOptions, sequence, quiet=True, checkpoint_every=7)
+    run(every(out=tmp_path / "whole"), FakeSystem)
+    deadly = partial(FakeSystem, on_frame=signal_at(9, signal.SIGKILL))
+    assert killed(lambda: run(every(out=tmp_path / "out"), deadly))
+    resume(tmp_path / "out", make_system=FakeSystem)
+    whole = (tmp_path / "whole/events.csv").read_bytes()
+    assert (tmp_path / "out/events.csv").read_bytes() == whole
+    assert b"7,0.700000,found again" in whole
+
+
 @pytest.mark.parametrize("length", [0, 50, -1])
 def test_a_damaged_checkpoint_is_refused(begun: Path, refused, length: int) -> None:
     path = begun / CHECKPOINT
@@ -238,10 +269,7 @@ def test_a_damaged_checkpoint_is_refused(begun: Path, refused, length: int) -> N
 
 def test_a_foreign_checkpoint_is_refused(begun: Path, refused) -> None:
     def rewrite(**changes: object) -> None:
-        with np.load(begun / CHECKPOINT) as file:
-            arrays = dict(file)
-        header = {**json.loads(str(arrays["header"])), **changes}
-        np.savez((begun / CHECKPOINT).open("wb"), **{**arrays, "header": json.dumps(header)})
+        rewrite_header(begun / CHECKPOINT, lambda header: header.update(changes))
 
     rewrite(counters={})
     rewrite(options={"sequence": "x"})
@@ -259,7 +287,7 @@ def test_the_systems_arrays_are_checked(begun: Path) -> None:
 
 
 def test_a_folder_in_use_is_refused(begun: Path, sequence: Path, refused) -> None:
-    other = RunFolder(begun, resume_bytes=len((begun / "frames.csv").read_bytes()))
+    other = RunFolder(begun, resume_bytes={n: (begun / n).stat().st_size for n in GROWING})
     refused(r"out: a process is writing a run there; wait for it")
     with pytest.raises(InputError, match=r"a process is writing a run there"):
         run(replace(options(sequence, begun), overwrite=True), FakeSystem)
@@ -275,6 +303,15 @@ def test_a_run_without_checkpoints_cannot_be_resumed(sequence: Path, tmp_path: P
     assert killed(lambda: run(plain, deadly))
     with pytest.raises(InputError, match=r"out: holds no checkpoint, .* with --overwrite"):
         resume(tmp_path / "out", make_system=FakeSystem)
+
+
+def rewrite_header(path: Path, change: Callable[[dict[str, object]], object]) -> None:
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(str(arrays["header"]))
+    change(header)
+    with path.open("wb") as file:
+        np.savez(file, **{**arrays, "header": json.dumps(header)})
 
 
 def kill_after_lines(command: list[str], frames: Path, lines: int, delay_s: float) -> None:

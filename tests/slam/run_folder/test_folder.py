@@ -30,7 +30,8 @@ def test_overwrite_removes_only_the_run(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with RunFolder(tmp_path, overwrite=True):
         pass
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["frames.csv", "log.txt", "notes.txt"]
+    names = ["events.csv", "frames.csv", "log.txt", "notes.txt"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
 
 
 def test_a_file_at_the_run_folders_path(tmp_path: Path) -> None:
