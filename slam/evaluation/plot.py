@@ -117,6 +117,8 @@ def draw_events(
     )
     for height, (kind, (symbol, colour, size)) in enumerate(MARKS.items()):
         stamps_s = np.array([event.timestamp_s for event in events if event.kind is kind])
+        if kind is EventKind.SEGMENT:  # the one that begins at the start is marked as such
+            stamps_s = stamps_s[~np.isin(stamps_s.round(6), estimate.timestamps_s[:1].round(6))]
         if not len(stamps_s):
             continue
         points = np.zeros((0, 2))

@@ -118,6 +118,8 @@ def test_metrics_are_complete_and_correct(sequence: Path, out: Path) -> None:
     options = RunOptions(sequence, out=out, quiet=True)
     summary = run(options, partial(FakeSystem, z_error_m=0.02))
     found = values(summary)
+    graph = {name: found.pop(name) for name in list(found) if name.startswith("graph_")}
+    assert graph == {"graph_factors_refused": 3, "graph_factors_refused_loop_not_finite": 2}
     assert list(found) == [name for name in METRICS if name != "rpe_rot_rmse_frame"]
     assert found["tracked_share"] == pytest.approx(18 / 20)
     assert found["ate_rmse"] == pytest.approx(0.01, rel=0.02)  # +-1 cm about the mean plane

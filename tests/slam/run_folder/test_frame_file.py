@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.errors import InputError
 from bmask_slam.run_folder.folder import RunFolder
-from bmask_slam.run_folder.frame_file import read_frames
+from bmask_slam.run_folder.frame_file import read_events, read_frames
+from bmask_slam.run_folder.reader import Run
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 RESULTS = (
@@ -66,3 +69,33 @@ def test_a_value_that_is_no_number_is_refused(tmp_path: Path) -> None:
         read_frames(path)
     with pytest.raises(InputError, match=r"none\.csv: no such file"):
         read_frames(tmp_path / "none.csv")
+
+
+EVENTS = (
+    Event(3, 1305031102.175304, EventKind.CALIBRATION, 'rolling shutter 17.0 ± 2.2 ms, "found"'),
+    Event(4, 1305031102.211214, EventKind.LOOP_REFUSED, "keyframes 3 and 9: too few, limit 15"),
+    Event(4, 1305031102.211214, EventKind.GRAPH, "2 observations refused: reprojection"),
+)
+
+
+def test_events_are_read_back_also_by_a_run(tmp_path: Path) -> None:
+    with RunFolder(tmp_path) as folder:
+        folder.write_events(EVENTS[:1])
+        folder.write_frame(replace(RESULTS[0], events=EVENTS[1:]))
+        assert read_events(tmp_path) == EVENTS  # on disk at once
+    assert Run(tmp_path).events == EVENTS
+    with (tmp_path / "events.csv").open("a") as file:
+        file.write("5,1305031102.2,lo")
+    assert read_events(tmp_path) == EVENTS  # a killed run's last line
+
+
+def test_a_run_of_a_version_without_events_has_none(tmp_path: Path) -> None:
+    (tmp_path / "frames.csv").write_text("index,timestamp,status,keyframe\n0,0.5,OK,0\n")
+    assert Run(tmp_path).events == ()
+
+
+def test_events_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
+    for line, what in (("x,1.0,lost,", "'x'"), ("1,1.0,found,", "'found' is not a valid")):
+        (tmp_path / "events.csv").write_text(f"index,timestamp,kind,text\n{line}\n")
+        with pytest.raises(InputError, match=rf"events\.csv: .*{what}.*; run again"):
+            read_events(tmp_path)
