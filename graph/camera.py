@@ -1,15 +1,54 @@
-"""The pinhole RGB-D camera: lens distortion and the pseudo-stereo model of its depth."""
+"""The pinhole RGB-D camera: lens distortion, the pseudo-stereo model and the noise of its depth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array
 
 UNDISTORTION_STEPS = 5
+KINECT_DISPARITY_SIGMA_PX = 0.08
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """The standard deviation a + b z + c z^2 of a depth z in metres: one pixel, a frontal surface.
+
+    Structured light and stereo have a constant error of the disparity, which is c alone (Khoshelham
+    and Elberink, Sensors 12, 2012, eq. 7); time of flight has mostly a and b.
+
+    Attributes:
+        a_m, b, c_per_m: the coefficients in metres, without unit and in 1/m.
+    """
+
+    a_m: float = 0.0
+    b: float = 0.0
+    c_per_m: float = 0.0
+
+    @classmethod
+    def of_disparity(cls, sigma_px: float, bf_px_m: float) -> DepthNoise:
+        """That of a disparity bf / z with a constant standard deviation: z^2 / bf sigma."""
+        return cls(c_per_m=sigma_px / bf_px_m)
+
+    def times(self, factor: float) -> DepthNoise:
+        """All standard deviations multiplied by a factor."""
+        return DepthNoise(factor * self.a_m, factor * self.b, factor * self.c_per_m)
+
+    def depth_sigma_m(self, depth_m: NDArray[Any]) -> NDArray[Any]:
+        """Standard deviation in metres of depths (...) in metres."""
+        return self.a_m + self.b * depth_m + self.c_per_m * depth_m**2
+
+    def inverse_depth_sigma(self, inverse_depth: Array) -> Array:
+        """Standard deviation in 1/m of inverse depths (...) in 1/m, to first order: sigma_z / z^2.
+
+        Times bf it is that of the disparity in pixels.
+        """
+        return self.c_per_m + self.b * inverse_depth + self.a_m * inverse_depth**2
 
 
 @dataclass(frozen=True)
@@ -24,6 +63,7 @@ class Camera:
     ``stereo_bf_px_m`` is the product of focal length and baseline of the pseudo-stereo pair that
     stands for the depth sensor: u_right = u_left - bf / z (ORB-SLAM2 eq. 1); for a Kinect
     about 40 px m (baseline 7.5 cm), so that one pixel of disparity noise is z^2/bf of depth noise.
+    ``depth_noise`` is the depth sensor's; None: not known, see ``noise_of_depth``.
     """
 
     width: int
@@ -39,6 +79,17 @@ class Camera:
     depth_offset_m: float = 0.0
     depth_time_offset_s: float = 0.0
     rolling_shutter_s: float = 0.0
+    depth_noise: DepthNoise | None = None
+
+    def noise_of_depth(self, disparity_sigma_px: float | None = None) -> DepthNoise:
+        """The noise by a constant error of the disparity, if given; else the sensor's own.
+
+        Where that is not known it is a Kinect's: 0.08 px of disparity at bf = 40 px m.
+        """
+        if disparity_sigma_px is None and self.depth_noise is not None:
+            return self.depth_noise
+        sigma_px = KINECT_DISPARITY_SIGMA_PX if disparity_sigma_px is None else disparity_sigma_px
+        return DepthNoise.of_disparity(sigma_px, self.stereo_bf_px_m)
 
     @property
     def K(self) -> Array:

@@ -62,7 +62,7 @@ class Steps:
         self.camera = run.camera
         loaded = [load_keyframe(run, k)[0] for k in run.keyframes]
         self.keyframes: list[DenseKeyframe] = [without_patches(k, lost) for k in loaded]
-        self.raw = [from_sensor(k.depth_m, run.camera, config.noise) for k in self.keyframes]
+        self.raw = [from_sensor(k.depth_m, run.camera, config.measurement) for k in self.keyframes]
         self.images = [
             torch.from_numpy(np.ascontiguousarray(cv2.blur(k.rgb, (3, 3)).transpose(2, 0, 1)))
             for k in self.keyframes

@@ -76,7 +76,7 @@ class _Single:
         window = [k for k in steps.keyframes[max(i - 6, 0) : i + 7] if k is not own]
         T = inverse(own.T_world_camera)
         maps = [regularise(m) for m in steps.raw]
-        self._own, self._camera, self._noise = own, run.camera, config.noise
+        self._own, self._camera, self._measurement = own, run.camera, config.measurement
         self._image = steps.images[i].float()
         self._views = [
             View(maps[index[k.id]], T @ k.T_world_camera, steps.images[index[k.id]].float())
@@ -105,7 +105,7 @@ class _Single:
         return self._points(with_calibrated_variance(regularise(fused.map), fused))
 
     def _sensor(self) -> Map:
-        return from_sensor(self._own.depth_m, self._camera, self._noise)
+        return from_sensor(self._own.depth_m, self._camera, self._measurement)
 
     def _fused(self, own: Map) -> Fused:
         return fuse(own, self._views, self._camera, self._image)

@@ -16,7 +16,11 @@ from torch import Tensor
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Image, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse
-from bmask_slam.mapping.inverse_depth.depth_map import DepthNoise, InverseDepthMap, from_sensor
+from bmask_slam.mapping.inverse_depth.depth_map import (
+    InverseDepthMap,
+    MeasurementConfig,
+    from_sensor,
+)
 from bmask_slam.mapping.inverse_depth.fusion import MAX_NEIGHBOURS, fuse, with_calibrated_variance
 from bmask_slam.mapping.inverse_depth.plane_sweep import fill_missing, sweep
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
@@ -78,7 +82,7 @@ class DenseConfig:
     """Configuration of the fusion.
 
     Attributes:
-        noise: of the depth sensor.
+        measurement: what of a depth image is used, and how certain it is.
         neighbours: largest number of keyframes that are fused with a keyframe.
         source: "sensor"; "stereo", the keyframes' right images; "motion", a plane sweep between
             keyframes; or "both": the sensor, and where it has no depth the right image, or without
@@ -86,7 +90,7 @@ class DenseConfig:
         device: torch's name of the device that computes it.
     """
 
-    noise: DepthNoise = field(default_factory=DepthNoise)
+    measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     neighbours: int = MAX_NEIGHBOURS
     source: DepthSource = "sensor"
     device: str = "cpu"
@@ -129,7 +133,7 @@ class DenseMapper:
         config, measured = self.config, None
         image = as_image(keyframe.rgb, config.device)
         if config.source in ("sensor", "both"):
-            measured = from_sensor(keyframe.depth_m, self.camera, config.noise, config.device)
+            measured = from_sensor(keyframe.depth_m, self.camera, config.measurement, config.device)
         if config.source != "sensor":
             matched = self._matched(keyframe, image)
             if keyframe.unmatched is not None:

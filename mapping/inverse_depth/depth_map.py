@@ -59,34 +59,37 @@ class InverseDepthMap:
 
 
 @dataclass(frozen=True)
-class DepthNoise:
-    """The noise model of a depth sensor.
+class MeasurementConfig:
+    """What of a depth image is used, and how certain it is.
 
     Attributes:
-        disparity_sigma_px: of the disparity bf / z; constant for structured light.
+        disparity_sigma_px: of the disparity bf / z; None: the noise of depth is the camera's.
         lateral_sigma_px: distance from a pixel's centre at which its depth may have been measured.
         min_depth_m, max_depth_m: depth outside this range counts as missing.
     """
 
-    disparity_sigma_px: float = 0.08
+    disparity_sigma_px: float | None = None
     lateral_sigma_px: float = 0.35
     min_depth_m: float = 0.3
     max_depth_m: float = 8.0
 
 
 def from_sensor(
-    depth_m: Floats, camera: Camera, noise: DepthNoise, device: str = "cpu"
+    depth_m: Floats, camera: Camera, config: MeasurementConfig, device: str = "cpu"
 ) -> InverseDepthMap:
     """The measurement (H, W) of a depth sensor as an inverse-depth map.
 
     rho = d / (f b) with d ~ N(d0, sigma_d^2) gives sigma_rho^2 = (sigma_d / (f b))^2 (paper eq. 6,
-    corrected), to which the lateral error adds (sigma_lateral |grad rho|)^2.
+    corrected), or another sensor's own, to which the lateral error adds
+    (sigma_lateral |grad rho|)^2.
     """
     z = torch.as_tensor(depth_m, dtype=torch.float32, device=device)
-    usable = torch.minimum(z - noise.min_depth_m, noise.max_depth_m - z)
+    usable = torch.minimum(z - config.min_depth_m, config.max_depth_m - z)
     rho = z.reciprocal().add_(nan_where_negative(usable))
-    disparity = (noise.disparity_sigma_px / camera.stereo_bf_px_m) ** 2
-    variance = squared_gradient(rho).mul_(noise.lateral_sigma_px**2).add_(disparity)
+    noise = camera.noise_of_depth(config.disparity_sigma_px)
+    sensor = noise.inverse_depth_sigma(1 / depth_m.astype(float)) ** 2
+    variance = squared_gradient(rho).mul_(config.lateral_sigma_px**2)
+    variance += torch.as_tensor(sensor, dtype=torch.float32, device=device)
     return InverseDepthMap(rho, variance)
 
 

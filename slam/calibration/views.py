@@ -12,6 +12,7 @@ import numpy as np
 from bmask_slam.calibration.motion import LandmarkMotion, as_exposed
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.model import CalibrationViews
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.sequences import Sequence
@@ -94,12 +95,11 @@ def make_views(
     keyframe_ids, keyframes = np.unique(observations.keyframe_ids, return_inverse=True)
     landmark_ids, landmarks = np.unique(observations.landmark_ids, return_inverse=True)
     pixels = camera.distort(as_exposed(observations.measurements[:, :2], motion, camera))
-    # The graph's disparity sigma includes the roughness of the surface, which is fitted here.
-    nominal = float(np.nanmin(observations.sigmas_px[:, 2])) / camera.stereo_bf_px_m
+    nominal = _sensor_sigmas(observations, camera)
     depths = _Depths.missing(len(observations))
     for k, keyframe in enumerate(keyframe_ids.tolist()):
         rows, index = np.flatnonzero(keyframes == k), frames[keyframe]
-        depths.measure(rows, pixels[rows], sequence, index, MAX_STEP_SIGMAS * nominal)
+        depths.measure(rows, pixels[rows], sequence, index, MAX_STEP_SIGMAS * nominal[rows])
     views = CalibrationViews(
         keyframes=keyframes,
         landmarks=landmarks,
@@ -112,6 +112,19 @@ def make_views(
         shutter_velocity=share_of_rows(pixels[:, 1], camera)[:, None] * motion.velocities,
     )
     return views, keyframe_ids, landmark_ids
+
+
+def _sensor_sigmas(observations: Observations, camera: Camera) -> Array:
+    """Sigmas (M,) of inverse depth in 1/m by the depth sensor alone; the median's without depth.
+
+    The graph's include the roughness of the surface, which is fitted here: the camera's noise model
+    is scaled to the smallest of them.
+    """
+    left, _, right = observations.measurements.T
+    sensor = camera.noise_of_depth().inverse_depth_sigma((left - right) / camera.stereo_bf_px_m)
+    graph = observations.sigmas_px[:, 2] / camera.stereo_bf_px_m
+    sigmas = float(np.nanmin(graph / sensor)) * sensor
+    return np.where(np.isfinite(sigmas), sigmas, np.nanmedian(sigmas))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +150,7 @@ class _Depths:
         return cls(inverse_depth, rms, rate, np.zeros(count))
 
     def measure(
-        self, rows: Ints, pixels: Array, sequence: Sequence, index: int, max_step: float
+        self, rows: Ints, pixels: Array, sequence: Sequence, index: int, max_step: Array
     ) -> None:
         """Measure at some pixels (m, 2) in the depth image of a frame; ``rows`` (m,) are theirs."""
         image = _raw_inverse_depth(sequence, index)
@@ -170,10 +183,10 @@ def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:
     return change, step_s
 
 
-def smooth_value(image: Array, pixels: Array, max_step: float) -> tuple[Array, Array]:
+def smooth_value(image: Array, pixels: Array, max_step: Array) -> tuple[Array, Array]:
     """A plane fitted to an image around pixels (M, 2): value and slopes (M, 3), and rms (M,).
 
-    NaN where few pixels are valid or one in the window is off the plane by ``max_step``.
+    NaN where few pixels are valid or one in the window is off the plane by ``max_step`` (M,).
     """
     values, offsets = _windows(image, pixels, VALUE_RADIUS_PX)
     plane, error = _fit_planes(values, offsets)
@@ -183,13 +196,13 @@ def smooth_value(image: Array, pixels: Array, max_step: float) -> tuple[Array, A
 
 
 def mean_on_plane(
-    change: Array, image: Array, pixels: Array, planes: Array, max_step: float
+    change: Array, image: Array, pixels: Array, planes: Array, max_step: Array
 ) -> Array:
     """The change (M,) at pixels, fitted over wide windows where the image is on these planes."""
     values, offsets = _windows(change, pixels, RATE_RADIUS_PX)
     around = _windows(image, pixels, RATE_RADIUS_PX)[0]
     expected = planes[:, :1] + (offsets @ planes[:, 1:, None])[..., 0]
-    values[~(np.abs(around - expected) < max_step)] = np.nan
+    values[~(np.abs(around - expected) < max_step[:, None])] = np.nan
     return _fit_planes(values, offsets)[0][:, 0]
 
 

@@ -70,7 +70,7 @@ def folder_settings(
         "without": list(options.excluded or ()),
         "moving": options.keep_excluded,
         "labels": list(labels.names),
-        "noise": asdict(fusion_config(options).noise),
+        "noise": asdict(fusion_config(options).measurement),
     }
     return settings if options.source == "sensor" else settings | {"stereo_bf": stereo_bf_px_m}
 

@@ -158,7 +158,7 @@ class KeyframeFusion:
     def _save_excluded(self, keyframe: DenseKeyframe, excluded: Mask) -> None:
         """Save the excluded pixels of a keyframe as the sensor measured them, not fused."""
         depth_m = np.where(excluded, keyframe.depth_m, np.float32(np.nan))
-        measured = from_sensor(depth_m, self._mapper.camera, self._mapper.config.noise)
+        measured = from_sensor(depth_m, self._mapper.camera, self._mapper.config.measurement)
         points = FusedKeyframe(keyframe, measured, excluded.astype(np.uint8))
         self._folder.write_excluded(make_submap(points, self._camera, self._options.voxel_m))
 

@@ -11,7 +11,7 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.errors import InputError
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseConfig, DepthSource
-from bmask_slam.mapping.inverse_depth.depth_map import DepthNoise
+from bmask_slam.mapping.inverse_depth.depth_map import MeasurementConfig
 from bmask_slam.semantics.beliefs.movability import read_priors
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
@@ -73,7 +73,7 @@ def resolve_options(options: MapOptions, labels: LabelSet) -> MapOptions:
 def fusion_config(options: MapOptions) -> DenseConfig:
     """The configuration of the fusion, with the run's own noise model of its depth sensor."""
     features = resolve(FeatureConfig, options.run / "config.yaml", section="features")
-    noise = DepthNoise(
+    measurement = MeasurementConfig(
         disparity_sigma_px=features.disparity_sigma_px, max_depth_m=features.max_depth_m
     )
-    return DenseConfig(noise=noise, source=options.source, device=options.device)
+    return DenseConfig(measurement=measurement, source=options.source, device=options.device)

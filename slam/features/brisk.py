@@ -25,8 +25,8 @@ class FeatureConfig:
     keypoints and a frame with much texture takes no longer. ``octaves`` is BRISK's: each adds a
     half-scale layer and an intra-octave. Keypoints nearer to the image border than ``border_px``
     have no descriptor. ``pixel_sigma`` is the standard deviation of a BRISK keypoint at scale 1.
-    ``disparity_sigma_px`` is the depth sensor's: for structured light a constant in disparity,
-    sigma_z = z^2 / bf * sigma_d, with 0.07 px the laboratory value (Nguyen 2012) at bf = 40 px m.
+    ``disparity_sigma_px`` is a constant error of the depth's disparity, sigma_z = z^2 / bf *
+    sigma_d, in place of what the camera says of its depth; None: the camera's own noise model.
     ``depth_window_px`` and ``depth_edge_ratio``: see sample_depth.
     """
 
@@ -36,7 +36,7 @@ class FeatureConfig:
     bucket_px: int = 40
     border_px: int = 20
     pixel_sigma: float = 0.7
-    disparity_sigma_px: float = 0.08
+    disparity_sigma_px: float | None = None
     depth_window_px: int = 2
     depth_edge_ratio: float = 0.04
     min_depth_m: float = 0.3
@@ -86,6 +86,7 @@ class BriskExtractor:
     def __init__(self, camera: Camera, config: FeatureConfig):
         self.camera = camera
         self.config = config
+        self._depth_noise = camera.noise_of_depth(config.disparity_sigma_px)
         self._describer = FixedSizeBrisk(FINEST_SIZE_PX)
         self._border_px = max(config.border_px, self._describer.reach_px)
         self._fast = {t: cv2.FastFeatureDetector_create(t) for t in config.thresholds}
@@ -192,8 +193,9 @@ class BriskExtractor:
         disparity = self.camera.stereo_bf_px_m / depth_m
         sigmas = np.empty((len(raw), 3))
         sigmas[:, :2] = (self.config.pixel_sigma * np.sqrt(scales))[:, None]
+        sensor = self.camera.stereo_bf_px_m * self._depth_noise.inverse_depth_sigma(1 / depth_m)
         depth_to_disparity = self.camera.stereo_bf_px_m / depth_m**2
-        sigmas[:, 2] = np.hypot(self.config.disparity_sigma_px, depth_to_disparity * spread_m)
+        sigmas[:, 2] = np.hypot(sensor, depth_to_disparity * spread_m)
         rows, columns = np.rint(raw[:, 1]).astype(int), np.rint(raw[:, 0]).astype(int)
         return Features(
             pixels=self.camera.undistort(raw),

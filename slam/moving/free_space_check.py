@@ -6,6 +6,7 @@ neither needs a match or a class. Points behind a surface are hidden, and their 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, DepthNoise
 from bmask_slam.graph.geometry import inverse
 
 PointMotions = NDArray[np.int8]
@@ -101,11 +102,10 @@ def thinned_view(depth_m: Floats, step: int, window_px: int) -> DepthView:
 class FreeSpaceCheck:
     """Compares points with depth views: pure functions of a camera and its depth noise."""
 
-    def __init__(self, camera: Camera, disparity_sigma_px: float, config: FreeSpaceCheckConfig):
+    def __init__(self, camera: Camera, noise: DepthNoise, config: FreeSpaceCheckConfig):
         self.camera = camera
         self.config = config
-        both = np.sqrt(2.0) * disparity_sigma_px / camera.stereo_bf_px_m
-        self._sigmas_per_m2 = config.depth_sigmas * both
+        self._both = noise.times(math.sqrt(2) * config.depth_sigmas)
 
     def judge(self, points_world: Array, view: DepthView, T_world_camera: Array) -> PointMotions:
         """The motion (N,) of points (N, 3) by one view; unknown for points that are NaN."""
@@ -203,7 +203,7 @@ class FreeSpaceCheck:
 
     def _margin_m(self, depth_m: Floats) -> Floats:
         """Largest difference of two depths of this size on one surface."""
-        return np.float32(self.config.margin_m) + np.float32(self._sigmas_per_m2) * depth_m**2
+        return np.float32(self.config.margin_m) + self._both.depth_sigma_m(depth_m)
 
     def _pixels(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
         """Columns and rows (K, N) in the image as recorded of points (K, N) before it."""

@@ -61,7 +61,9 @@ class MovingObjectFilter:
         self.recent_views = DepthViewBuffer(verification.recent, verification.interval_s)
         self._map = map_editor
         self._camera_tracker = camera_tracker
-        self._check = FreeSpaceCheck(camera, features.disparity_sigma_px, config.check)
+        self._check = FreeSpaceCheck(
+            camera, camera.noise_of_depth(features.disparity_sigma_px), config.check
+        )
         self.landmarks = LandmarkMotion(self._check, self.priors, config.movability, map_editor)
         self.static_verification = StaticVerification(
             self._check, verification, config.min_judged, config.mask_border_px

@@ -11,7 +11,7 @@ from collections.abc import Container
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 
 
@@ -27,7 +27,7 @@ class CameraPreset:
         depth_time_offset_s: from the depth image's stamp to when it was taken, in the colour
             image's clock.
         depth_range_m: recommended, from and to.
-        depth_noise: (a, b, c) of the standard deviation a + b z + c z^2 in metres at z metres.
+        depth_noise: standard deviation of a depth; None: the system's default, a Kinect's.
         depth_unit: stored depth values to the metre, as the driver gives them.
     """
 
@@ -36,7 +36,7 @@ class CameraPreset:
     rolling_shutter_s: float | None = None
     depth_time_offset_s: float | None = None
     depth_range_m: tuple[float, float] | None = None
-    depth_noise: tuple[float, float, float] | None = None
+    depth_noise: DepthNoise | None = None
     depth_unit: float = 1000.0
 
 
@@ -45,7 +45,7 @@ def _pinhole(width: int, height: int, focal_px: float, depth_scale: float = 1000
     return Camera(width, height, focal_px, focal_px, *centre, depth_scale=depth_scale)
 
 
-NGUYEN = (0.001504, -0.00152, 0.0019)
+NGUYEN = DepthNoise(0.001504, -0.00152, 0.0019)
 """0.0012 + 0.0019 (z - 0.4)^2: Nguyen, Izadi, Lovell, 3DIMPVT 2012, axial noise below 60 deg."""
 
 PRESETS = {
@@ -70,18 +70,18 @@ PRESETS = {
     # delay unless depth_delay_off_color_usec is set; no readout time is published (issue 1062).
     "azure-kinect": CameraPreset(
         "Microsoft Azure Kinect DK", None, depth_time_offset_s=0.0,
-        depth_range_m=(0.5, 3.86), depth_noise=(0.017, 0.0, 0.0),
+        depth_range_m=(0.5, 3.86), depth_noise=DepthNoise(0.017),
     ),
     # Field of view 69.4 deg, rolling colour shutter of unpublished time: D400 datasheet. Noise:
     # subpixel error 0.08 px, focal length 645 px at 1280 columns, baseline 50 mm (Intel, tuning).
     "realsense-d435": CameraPreset(
         "Intel RealSense D435", _pinhole(1920, 1080, 1386.0),
-        depth_range_m=(0.3, 3.0), depth_noise=(0.0, 0.0, 0.08 / (645 * 0.050)),
+        depth_range_m=(0.3, 3.0), depth_noise=DepthNoise.of_disparity(0.08, 645 * 0.050),
     ),
     # Field of view 90 deg, global shutter, baseline 95 mm: D400 datasheet; noise as above.
     "realsense-d455": CameraPreset(
         "Intel RealSense D455", _pinhole(1280, 800, 640.0), 0.0,
-        depth_range_m=(0.6, 6.0), depth_noise=(0.0, 0.0, 0.08 / (640 * 0.095)),
+        depth_range_m=(0.6, 6.0), depth_noise=DepthNoise.of_disparity(0.08, 640 * 0.095),
     ),
     # IMX378, field of view 66 deg, rolling shutter of unpublished time: docs.luxonis.com.
     "oak-d": CameraPreset(
@@ -90,7 +90,7 @@ PRESETS = {
     # Colour is the tablet's. Precision 0.5 mm at 0.4 m and 30 mm at 3 m, range: Occipital.
     "structure": CameraPreset(
         "Occipital Structure Sensor", None,
-        depth_range_m=(0.4, 3.5), depth_noise=(0.0, 0.0, 0.03 / 9),
+        depth_range_m=(0.4, 3.5), depth_noise=DepthNoise(c_per_m=0.03 / 9),
     ),
     # ARKit gives the intrinsics of every frame; range: Apple.
     "iphone-lidar": CameraPreset("Apple iPhone, iPad with LiDAR", None, depth_range_m=(0.3, 5.0)),
@@ -141,4 +141,7 @@ def completed(camera: Camera, keys_in_file: Container[str], name: str | None) ->
     if preset.depth_time_offset_s is not None and "depth_time_offset" not in keys_in_file:
         values = replace(values, depth_time_offset_s=preset.depth_time_offset_s)
         parts.append(f"depth_time_offset {1e3 * preset.depth_time_offset_s:g} ms")
+    if preset.depth_noise is not None and "depth_noise" not in said:
+        values = replace(values, depth_noise=preset.depth_noise)
+        parts.append("depth noise")
     return values, f"{', '.join(parts)} of {name}" if parts else ""

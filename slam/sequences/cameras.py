@@ -6,10 +6,13 @@ import logging
 import math
 import re
 from collections.abc import Container
+from dataclasses import astuple
 from pathlib import Path
 
+import numpy as np
+
 from bmask_slam.config.yaml import format_yaml, parse_yaml
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.sequences.camera_presets import (
@@ -50,9 +53,15 @@ OPTIONAL = {
     "rolling_shutter": "rolling_shutter_s",
 }
 """Optional numbers by the name of Camera's attribute."""
-KEYS = (*REQUIRED, "distortion", *OPTIONAL)
+KEYS = (*REQUIRED, "distortion", "depth_noise", *OPTIONAL)
 LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0, "rolling_shutter": 1.0}
 """Largest magnitudes in metres and seconds: a larger value is in another unit."""
+NOISE_DISTANCES_M = np.linspace(0.3, 8.0, 78)
+MAX_NOISE_SHARE = 0.2
+NOISE_CURE = (
+    "write [a, b, c] of its standard deviation a + b z + c z^2 in metres at z metres, such as "
+    "[0.0012, 0, 0.0019]"
+)
 
 
 def find_camera(folder: Path, given: Path | None = None) -> tuple[Camera, str]:
@@ -107,7 +116,7 @@ def given_camera(given: Path, own: Camera | None = None) -> Camera:
 
 
 def read_camera(path: Path) -> Camera:
-    """Read camera.yaml: the keys are REQUIRED, ``distortion`` and OPTIONAL.
+    """Read camera.yaml: the keys are REQUIRED, ``distortion``, ``depth_noise`` and OPTIONAL.
 
     Raises:
         InputError: naming the key, its value and the cure.
@@ -118,7 +127,8 @@ def read_camera(path: Path) -> Camera:
 def _read(path: Path) -> tuple[Camera, set[str]]:
     """The camera of a file, and the keys that the file has."""
     values = _values(path)
-    numbers = {k: _number(path, k, v) for k, v in values.items() if k != "distortion"}
+    lists = ("distortion", "depth_noise")
+    numbers = {k: _number(path, k, v) for k, v in values.items() if k not in lists}
     _check_range(path, numbers)
     optional = {name: numbers[key] for key, name in OPTIONAL.items() if key in numbers}
     camera = Camera(
@@ -126,6 +136,7 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
         height=int(numbers["height"]),
         **{key: numbers[key] for key in ("fx", "fy", "cx", "cy", "depth_scale")},
         distortion=_distortion(path, values.get("distortion", [0, 0, 0, 0, 0])),
+        depth_noise=_depth_noise(path, values["depth_noise"]) if "depth_noise" in values else None,
         **optional,
     )
     return camera, set(values)
@@ -162,6 +173,8 @@ def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
     values: dict[str, object] = {key: getattr(camera, key) for key in REQUIRED}
     values |= {"distortion": list(camera.distortion)}
     values |= {key: getattr(camera, name) for key, name in OPTIONAL.items()}
+    if camera.depth_noise is not None:
+        values["depth_noise"] = list(astuple(camera.depth_noise))
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines.append(format_yaml(values).rstrip())
     try:
@@ -205,3 +218,22 @@ def _distortion(path: Path, value: object) -> tuple[float, float, float, float, 
         raise InputError(f"{path}: distortion is {value!r}; write [k1, k2, p1, p2, k3]")
     k1, k2, p1, p2, k3 = [_number(path, "distortion", v) for v in [*value, 0][:5]]
     return k1, k2, p1, p2, k3
+
+
+def _depth_noise(path: Path, value: object) -> DepthNoise:
+    """The coefficients [a, b, c] of a standard deviation that a depth sensor can have."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise InputError(f"{path}: depth_noise is {value!r}; {NOISE_CURE}")
+    noise = DepthNoise(*(_number(path, "depth_noise", v) for v in value))
+    sigmas_m = noise.depth_sigma_m(NOISE_DISTANCES_M)
+    for wrong, said in (
+        (sigmas_m <= 0, "it must be positive"),
+        (sigmas_m > MAX_NOISE_SHARE * NOISE_DISTANCES_M, "more than a fifth of the depth"),
+    ):
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            raise InputError(
+                f"{path}: depth_noise is {value}, {sigmas_m[at]:.3g} m at "
+                f"{NOISE_DISTANCES_M[at]:.1f} m; {said}; {NOISE_CURE}"
+            )
+    return noise

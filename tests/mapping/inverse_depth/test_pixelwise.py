@@ -8,7 +8,7 @@ import torch
 from surface_scene import CAMERA
 
 from bmask_slam.mapping.inverse_depth.depth_map import (
-    DepthNoise,
+    MeasurementConfig,
     from_sensor,
 )
 from bmask_slam.mapping.inverse_depth.pixelwise import (
@@ -49,7 +49,7 @@ def test_two_estimates_agree_below_the_bound() -> None:
 def test_sensor_depth_is_used_within_its_range() -> None:
     depth_m = np.full((5, 5), 2.0, np.float32)
     depth_m[0] = 0.0, 0.29, 8.01, np.nan, np.inf
-    given = from_sensor(depth_m, CAMERA, DepthNoise())
+    given = from_sensor(depth_m, CAMERA, MeasurementConfig())
     np.testing.assert_array_equal(given.known.numpy(), depth_m == 2)
     np.testing.assert_array_equal(np.isnan(given.variance.numpy()), depth_m != 2)
     np.testing.assert_allclose(given.rho.numpy()[1:], 0.5)

@@ -121,13 +121,13 @@ def test_a_plane_is_fitted_between_pixels_and_an_edge_is_rejected() -> None:
     v, u = np.mgrid[:60, :80].astype(float)
     image = 0.5 + 0.002 * u - 0.001 * v
     pixels = np.array([[20.3, 30.7], [41.8, 12.2], [1.0, 1.0]])
-    planes, rms = smooth_value(image, pixels, 0.01)
+    planes, rms = smooth_value(image, pixels, np.full(3, 0.01))
     value = planes[:, 0]
     expected = 0.5 + 0.002 * pixels[:2, 0] - 0.001 * pixels[:2, 1]
     np.testing.assert_allclose(value[:2], expected, atol=1e-9)
     assert (rms[:2] < 1e-9).all() and np.isnan(value[2])  # most of its window is outside
     image[:, 40:] *= 0.8
-    assert np.isnan(smooth_value(image, pixels, 0.01)[0][1]).all()
+    assert np.isnan(smooth_value(image, pixels, np.full(3, 0.01))[0][1]).all()
 
 
 # --- bad input ------------------------------------------------------------------------------------
