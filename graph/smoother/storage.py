@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
@@ -151,6 +151,8 @@ def read_camera(header: Header, path: Path) -> Camera:
     try:
         fields = dict(header["camera"])
         fields["distortion"] = tuple(fields["distortion"])
+        if noise := fields.get("depth_noise"):
+            fields["depth_noise"] = DepthNoise(**noise)
         return Camera(**fields)
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: its camera cannot be read ({error}); save it again") from error

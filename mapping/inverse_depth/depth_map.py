@@ -87,7 +87,7 @@ def from_sensor(
     usable = torch.minimum(z - config.min_depth_m, config.max_depth_m - z)
     rho = z.reciprocal().add_(nan_where_negative(usable))
     noise = camera.noise_of_depth(config.disparity_sigma_px)
-    sensor = noise.inverse_depth_sigma(1 / depth_m.astype(float)) ** 2
+    sensor = noise.inverse_depth_sigma(rho.cpu().numpy().astype(float)) ** 2
     variance = squared_gradient(rho).mul_(config.lateral_sigma_px**2)
     variance += torch.as_tensor(sensor, dtype=torch.float32, device=device)
     return InverseDepthMap(rho, variance)

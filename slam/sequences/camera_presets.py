@@ -11,7 +11,7 @@ from collections.abc import Container
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bmask_slam.graph.camera import Camera, DepthNoise
+from bmask_slam.graph.camera import KINECT_DISPARITY_SIGMA_PX, Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 
 
@@ -45,21 +45,23 @@ def _pinhole(width: int, height: int, focal_px: float, depth_scale: float = 1000
     return Camera(width, height, focal_px, focal_px, *centre, depth_scale=depth_scale)
 
 
-NGUYEN = DepthNoise(0.001504, -0.00152, 0.0019)
-"""0.0012 + 0.0019 (z - 0.4)^2: Nguyen, Izadi, Lovell, 3DIMPVT 2012, axial noise below 60 deg."""
+KINECT = DepthNoise.of_disparity(KINECT_DISPARITY_SIGMA_PX, 40.0)
+"""2.0 mm z^2, not what laboratories find on a still wall (Khoshelham and Elberink 2012: 1.4 mm z^2;
+Nguyen, Izadi, Lovell 2012: 1.2 mm + 1.9 mm (z - 0.4)^2): the depths of one point from two keyframes
+differ by 0.9 to 1.4 times this on real recordings, and smaller values lose tracked frames."""
 
 PRESETS = {
     # OpenNI's default focal length; rows 54.21 us apart at 30 Hz, 480 of them (measured on the
     # MT9M112 by exposure, libfreenect pull request 670); range: Kinect for Windows SDK 1.8.
     "kinect-v1": CameraPreset(
         "Microsoft Kinect for Xbox 360", _pinhole(640, 480, 525.0), 0.0260,
-        depth_range_m=(0.8, 4.0), depth_noise=NGUYEN,
+        depth_range_m=(0.8, 4.0), depth_noise=KINECT,
     ),
     # The same reference design. Readout: nothing published; 24.8 +- 3.3 ms by this project's
     # calibrate on Bonn's rgbd_bonn_crowd; range: ASUS.
     "xtion": CameraPreset(
         "ASUS Xtion Pro Live", _pinhole(640, 480, 525.0), 0.0248,
-        depth_range_m=(0.8, 3.5), depth_noise=NGUYEN,
+        depth_range_m=(0.8, 3.5), depth_noise=KINECT,
     ),
     # Colour camera: libfreenect2's defaults; range: Microsoft.
     "kinect-v2": CameraPreset(

@@ -1,10 +1,12 @@
 """The pinhole, its lens distortion and its pseudo-stereo: axes, signs and units."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 
-from bmask_slam.graph.camera import Camera, distort_normalised, distortion_terms
+from bmask_slam.graph.camera import Camera, DepthNoise, distort_normalised, distortion_terms
 
 CAMERA = Camera(640, 480, fx=525.0, fy=510.0, cx=318.5, cy=241.5, stereo_bf_px_m=40.0)
 FREIBURG1 = Camera(
@@ -111,3 +113,33 @@ def test_distortion_is_linear_in_its_coefficients() -> None:
     normalised = RNG.uniform(-0.6, 0.6, (50, 2))
     linear = normalised + distortion_terms(normalised) @ LENS
     np.testing.assert_allclose(linear, distort_normalised(normalised, LENS), rtol=1e-12)
+
+
+# --- noise of depth -------------------------------------------------------------------------------
+
+
+def test_noise_in_metres() -> None:
+    noise = DepthNoise(0.001, 0.002, 0.003)
+    np.testing.assert_allclose(noise.depth_sigma_m(np.array([1.0, 2.0])), [0.006, 0.017])
+    assert noise.depth_sigma_m(np.ones(2, np.float32)).dtype == np.float32
+
+
+def test_noise_of_inverse_depth_is_that_of_samples() -> None:
+    noise, depth_m = DepthNoise(0.001, 0.002, 0.003), np.array([0.5, 2.0, 4.0])
+    sampled = depth_m + 0.1 * noise.depth_sigma_m(depth_m) * RNG.standard_normal((20000, 3))
+    found = (1 / sampled).std(axis=0) / 0.1
+    np.testing.assert_allclose(noise.inverse_depth_sigma(1 / depth_m), found, rtol=0.02)
+
+
+def test_a_constant_error_of_the_disparity_grows_with_the_square_of_depth() -> None:
+    noise = DepthNoise.of_disparity(0.08, 40.0)
+    np.testing.assert_allclose(noise.depth_sigma_m(np.array([1.0, 3.0])), [0.002, 0.018])
+    np.testing.assert_allclose(40.0 * noise.inverse_depth_sigma(1 / np.array([1.0, 3.0])), 0.08)
+
+
+def test_the_noise_set_by_hand_wins_over_the_sensors_and_that_over_a_kinects() -> None:
+    own = DepthNoise(0.01)
+    camera = dataclasses.replace(CAMERA, depth_noise=own)
+    assert camera.noise_of_depth() == own
+    assert camera.noise_of_depth(0.2) == DepthNoise(c_per_m=0.2 / 40.0)
+    assert CAMERA.noise_of_depth() == DepthNoise(c_per_m=0.08 / 40.0)

@@ -5,16 +5,19 @@ import os
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from synthetic_room import CAMERA, make_room
 
+from bmask_slam.graph.camera import DepthNoise
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.graph.smoother.storage import read_graph
 
 ROOM = make_room(keyframes=8, noise_px=0.4, mono_share=0.2)
 
@@ -81,6 +84,12 @@ def test_an_empty_graph_is_saved_too(tmp_path: Path) -> None:
     for update in ROOM.updates():
         estimate = loaded.update(update)
     assert len(estimate.keyframe_ids) == 8
+
+
+def test_the_depth_noise_of_the_camera_is_saved(tmp_path: Path) -> None:
+    camera = replace(CAMERA, depth_noise=DepthNoise(0.001, 0.0, 0.002))
+    Smoother(camera).save(tmp_path / "graph")
+    assert read_graph(tmp_path / "graph")[1] == camera
 
 
 @pytest.mark.parametrize("cut", [0, 10, 1000, -30])

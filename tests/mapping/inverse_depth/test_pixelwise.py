@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from surface_scene import CAMERA
 
+from bmask_slam.graph.camera import DepthNoise
 from bmask_slam.mapping.inverse_depth.depth_map import (
     MeasurementConfig,
     from_sensor,
@@ -44,6 +47,17 @@ def test_two_estimates_agree_below_the_bound() -> None:
     squared = torch.tensor([0.0, np.nextafter(bound, np.float32(0)), bound, 1e12, np.inf])
     found = agreement(torch.ones(5), squared, 8.0)
     np.testing.assert_array_equal(found.numpy(), [8, 8, 0, 0, 0])
+
+
+def test_the_variance_is_that_of_the_cameras_depth() -> None:
+    """sigma_rho = sigma_z / z^2 on a frontal plane, or by a constant error of the disparity."""
+    camera = replace(CAMERA, depth_noise=DepthNoise(0.003, 0.002, 0.001))
+    depth_m = np.full((5, 5), 2.0, np.float32)
+    found = from_sensor(depth_m, camera, MeasurementConfig()).variance.numpy()
+    np.testing.assert_allclose(found, ((0.003 + 0.004 + 0.004) / 4) ** 2, rtol=1e-6)
+    by_disparity = MeasurementConfig(disparity_sigma_px=0.2)
+    found = from_sensor(depth_m, camera, by_disparity).variance.numpy()
+    np.testing.assert_allclose(found, (0.2 / camera.stereo_bf_px_m) ** 2, rtol=1e-6)
 
 
 def test_sensor_depth_is_used_within_its_range() -> None:

@@ -16,7 +16,7 @@ from bmask_slam.features.brisk import (
     spread_order,
 )
 from bmask_slam.features.matching import hamming
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import KINECT_DISPARITY_SIGMA_PX, Camera, DepthNoise
 from bmask_slam.graph.geometry import make_pose, se3_exp, so3_exp
 from bmask_slam.sequences.frame import Frame
 
@@ -152,12 +152,28 @@ def test_depth_and_disparity_of_a_plane() -> None:
 
 def test_sigmas_grow_with_the_square_root_of_scale() -> None:
     frontal = extract(FRONTAL, dataclasses.replace(CONFIG, octaves=2))
-    np.testing.assert_allclose(frontal.sigmas_px[:, 2], CONFIG.disparity_sigma_px, rtol=1e-3)
+    np.testing.assert_allclose(frontal.sigmas_px[:, 2], KINECT_DISPARITY_SIGMA_PX, rtol=1e-3)
     np.testing.assert_array_equal(frontal.sigmas_px[:, 0], frontal.sigmas_px[:, 1])
     expected = CONFIG.pixel_sigma * np.sqrt(frontal.scales)
     np.testing.assert_allclose(frontal.sigmas_px[:, 0], expected, rtol=1e-12)
     assert frontal.scales.max() > 1.5
     assert frontal.sigmas_px[:, 0].min() == pytest.approx(CONFIG.pixel_sigma)
+
+
+@pytest.mark.parametrize(
+    "noise", [DepthNoise(0.01), DepthNoise(b=0.004), DepthNoise(0.0015, -0.0015, 0.0019)]
+)
+def test_disparity_sigma_is_that_of_the_cameras_depth(noise: DepthNoise) -> None:
+    """Depths off by one sigma have disparities off by one sigma."""
+    camera = dataclasses.replace(CAMERA, depth_noise=noise)
+    features = extract(FRONTAL, camera=camera)
+    sigma_m = noise.a_m + noise.b * PLANE_Z_M + noise.c_per_m * PLANE_Z_M**2
+    off_m = PLANE_Z_M + 0.01 * sigma_m
+    off_px = 100 * CAMERA.stereo_bf_px_m * (1 / PLANE_Z_M - 1 / off_m)
+    np.testing.assert_allclose(features.sigmas_px[:, 2], off_px, rtol=0.01)
+    set_by_hand = dataclasses.replace(CONFIG, disparity_sigma_px=0.3)
+    features = extract(FRONTAL, set_by_hand, camera)
+    np.testing.assert_allclose(features.sigmas_px[:, 2], 0.3, rtol=1e-3)
 
 
 def test_disparity_sigma_of_a_slanted_plane_has_the_depth_change_of_a_pixel() -> None:
@@ -170,8 +186,8 @@ def test_disparity_sigma_of_a_slanted_plane_has_the_depth_change_of_a_pixel() ->
     columns, rows = np.rint(features.image_pixels[finite]).astype(int).T
     slope_m = (frame.depth_m[rows, columns + 1] - frame.depth_m[rows, columns - 1]) / 2
     change_px = CAMERA.stereo_bf_px_m / features.depth_m[finite] ** 2 * slope_m
-    expected = np.hypot(CONFIG.disparity_sigma_px, change_px)
-    assert expected.max() > 1.05 * CONFIG.disparity_sigma_px
+    expected = np.hypot(KINECT_DISPARITY_SIGMA_PX, change_px)
+    assert expected.max() > 1.05 * KINECT_DISPARITY_SIGMA_PX
     np.testing.assert_allclose(features.sigmas_px[finite, 2], expected, rtol=0.01)
 
 

@@ -25,7 +25,9 @@ CAMERA = Camera(640, 480, fx=525.0, fy=480.0, cx=319.5, cy=239.5, fps=30.0, ster
 
 def check() -> FeatureMotion:
     return FeatureMotion(
-        CAMERA, FreeSpaceCheck(CAMERA, 0.08, FreeSpaceCheckConfig()), DepthSegmentConfig()
+        CAMERA,
+        FreeSpaceCheck(CAMERA, CAMERA.noise_of_depth(), FreeSpaceCheckConfig()),
+        DepthSegmentConfig(),
     )
 
 

@@ -18,7 +18,7 @@ from bmask_slam.moving.free_space_check import (
 )
 
 CAMERA = Camera(160, 120, fx=130.0, fy=130.0, cx=79.5, cy=59.5)
-CHECK = FreeSpaceCheck(CAMERA, 0.08, FreeSpaceCheckConfig())
+CHECK = FreeSpaceCheck(CAMERA, CAMERA.noise_of_depth(), FreeSpaceCheckConfig())
 T_WORLD_CAMERA = se3_exp(np.array([0.3, -0.7, 0.2, 1.0, 2.0, -0.5]))
 
 

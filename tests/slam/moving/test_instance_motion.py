@@ -23,7 +23,7 @@ SIZE = (CAMERA.height, CAMERA.width)
 
 
 def instance_motion() -> InstanceMotion:
-    check = FreeSpaceCheck(CAMERA, 0.1, FreeSpaceCheckConfig())
+    check = FreeSpaceCheck(CAMERA, CAMERA.noise_of_depth(0.1), FreeSpaceCheckConfig())
     return InstanceMotion(CAMERA, check, read_priors("movability"), 2.0, 20)
 
 

@@ -21,7 +21,7 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 NAMES = label_set(("person",))
 WALL_M, BODY_M = 3.0, 2.0
 TOP, LEFT, SIDE = 120, 200, 160
-CHECK = FreeSpaceCheck(CAMERA, 0.08, FreeSpaceCheckConfig())
+CHECK = FreeSpaceCheck(CAMERA, CAMERA.noise_of_depth(), FreeSpaceCheckConfig())
 CONFIG = StaticVerificationConfig(stands_s=0.4)
 
 

@@ -1,14 +1,17 @@
 """camera.yaml and the cameras that are built in."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.camera_presets import FOLDERS, PRESETS
 from bmask_slam.sequences.cameras import CAMERA_EXAMPLE, find_camera, given_camera, read_camera
+from bmask_slam.sequences.cameras import write_camera as write_file
 
 LINES = {
     "width": "640",
@@ -72,6 +75,15 @@ def test_the_example_in_the_messages_is_valid(tmp_path):
         ({"depth_offset": "12"}, "depth_offset is 12, more than 1 either way; .* in metres"),
         ({"depth_time_offset": "-10"}, "depth_time_offset is -10, more than 1 .* in seconds"),
         ({"rolling_shutter": "25"}, "rolling_shutter is 25, more than 1 .* in seconds"),
+        (
+            {"depth_noise": "[1.5, -1.5, 1.9]"},
+            r"depth_noise is .* 1.22 m at 0.3 m; more than a fif",
+        ),
+        ({"depth_noise": "[0, 0, 2]"}, "more than a fifth of the depth; write .* in metres"),
+        ({"depth_noise": "[0, 0, 0]"}, r"0 m at 0.3 m; it must be positive; write \[a, b, c\]"),
+        ({"depth_noise": "[0.001, -0.001, 0.0001]"}, "positive"),
+        ({"depth_noise": "0.002"}, r"depth_noise is 0.002; write \[a, b, c\]"),
+        ({"depth_noise": "[0.1, x, 0]"}, "depth_noise is 'x'"),
         ({"focal": "500"}, "unknown key 'focal'; the keys are width"),
         ({"fx": "[1, 2"}, "not YAML"),
     ],
@@ -181,6 +193,29 @@ def test_a_preset_alone_is_a_camera_where_intrinsics_are_published(tmp_path, cap
         find_camera(tmp_path, Path("kinectv1"))
 
 
+def test_the_depth_noise_is_the_files_then_the_presets(tmp_path):
+    folder = tmp_path / "rgbd_dataset_freiburg1_rpy"
+    folder.mkdir()
+    write_camera(folder)
+    assert read_camera(folder / "camera.yaml").depth_noise is None
+    camera, source = find_camera(folder)
+    assert camera.depth_noise == PRESETS["kinect-v1"].depth_noise
+    assert source.endswith("depth noise of kinect-v1")
+    write_camera(folder, depth_noise="[0.001, 0, 0.002]")
+    camera, source = find_camera(folder, Path("realsense-d455"))
+    assert camera.depth_noise == DepthNoise(0.001, 0.0, 0.002)
+    assert "depth noise" not in source
+
+
+def test_a_camera_is_read_as_it_was_written(tmp_path):
+    camera = Camera(
+        640, 480, 527.5, 528.5, 321.5, 237.5, depth_noise=DepthNoise(0.001, -1e-4, 2e-3)
+    )
+    for written in (camera, replace(camera, depth_noise=None)):
+        write_file(tmp_path / "camera.yaml", written)
+        assert read_camera(tmp_path / "camera.yaml") == written
+
+
 def test_a_device_overrides_the_preset():
     own = Camera(640, 480, 611.0, 612.0, 320.0, 240.0)
     camera = given_camera(Path("xtion"), own)
@@ -195,5 +230,4 @@ def test_all_presets_are_valid_cameras():
         if preset.rolling_shutter_s is not None:
             assert 0 <= preset.rolling_shutter_s < 1 / 30, name
         if preset.depth_noise is not None:  # between a tenth of a millimetre and 5 cm at 2 m
-            a, b, c = preset.depth_noise
-            assert 1e-4 < a + 2 * b + 4 * c < 0.05, name
+            assert 1e-4 < preset.depth_noise.depth_sigma_m(np.array(2.0)) < 0.05, name
