@@ -143,7 +143,7 @@ def completed(camera: Camera, keys_in_file: Container[str], name: str | None) ->
     if preset.depth_time_offset_s is not None and "depth_time_offset" not in keys_in_file:
         values = replace(values, depth_time_offset_s=preset.depth_time_offset_s)
         parts.append(f"depth_time_offset {1e3 * preset.depth_time_offset_s:g} ms")
-    if preset.depth_noise is not None and "depth_noise" not in said:
+    if preset.depth_noise is not None and "depth_noise" not in keys_in_file:
         values = replace(values, depth_noise=preset.depth_noise)
         parts.append("depth noise")
     return values, f"{', '.join(parts)} of {name}" if parts else ""
