@@ -132,7 +132,7 @@ def nominal_camera(name: str) -> Camera:
 def completed(camera: Camera, keys_in_file: Container[str], name: str | None) -> tuple[Camera, str]:
     """The camera with what a preset knows and nothing else said, and that as text.
 
-    ``keys_in_file`` are the keys of camera.yaml that are known already; a value there, also 0, stays.
+    ``keys_in_file`` are the keys of camera.yaml that are known; a value there, also 0, stays.
     """
     if name is None:
         return camera, ""
