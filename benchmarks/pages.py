@@ -57,3 +57,18 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
         if len(line) != len(header):
             raise ValueError(f"{len(line)} cells under {len(header)} headings: {line}")
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def fill_block(path: Path, block: str) -> None:
+    """Replace what stands between the first and the last line of a block in a page.
+
+    Raises:
+        SystemExit: the page lacks one of these lines.
+    """
+    text = path.read_text(encoding="utf-8")
+    begin, end = block.partition("\n")[0], block.rpartition("\n")[2]
+    before, found, rest = text.partition(begin)
+    _, closed, after = rest.partition(end)
+    if not (found and closed):
+        raise SystemExit(f"error: {path}: lacks the lines '{begin}' and '{end}'")
+    path.write_text(before + block + after, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Measure everything and write docs/results/benchmarks.md; ``make bench`` calls it.
+"""Measure everything: docs/results/benchmarks.md, real-cameras.md; ``make bench`` calls it.
 
     python -m benchmarks.run                  all sequences; also the table in README.md
     python -m benchmarks.run --quick          the first frames of two sequences, in a minute or two
@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import brisk_ms, describe_commit, describe_machine, load_average, now
-from benchmarks.pages import WRITTEN
-from benchmarks.paths import KITCHEN, RESULTS, ROOT
+from benchmarks.pages import WRITTEN, fill_block
+from benchmarks.paths import KITCHEN, RESULTS, ROOT, SHARED
+from benchmarks.section_report import REPORTS, make_section, replace_section
 from benchmarks.suite.figures import growth_rows, plot_growth, read_growth
 from benchmarks.suite.measure import (
     Job,
@@ -32,7 +33,7 @@ from benchmarks.suite.measure import (
     render,
     shown,
 )
-from benchmarks.suite.report import fill_readme, write_report
+from benchmarks.suite.report import example_block, write_report
 
 logger = logging.getLogger("benchmarks")
 
@@ -191,8 +192,20 @@ def main() -> None:
     results = json.loads(store.read_text(encoding="utf-8"))
     write_report(results, arguments.report)
     if arguments.whole:
-        fill_readme(results, ROOT / "README.md")
+        fill_block(ROOT / "README.md", example_block(results))
+        measure_real_cameras(arguments)
     print(arguments.report)
+
+
+def measure_real_cameras(arguments: argparse.Namespace) -> None:
+    """The tables of docs/results/real-cameras.md and README; none where there are no data."""
+    if not SHARED.is_dir():
+        return
+    report, command = REPORTS["real-cameras"], ["-m", "benchmarks.cameras.real_sequences"]
+    if not arguments.report_only:
+        replace_section(report, make_section(report, "table", arguments.work))
+    printed = ["--report-only", "--work", str(arguments.work), "--readme", str(ROOT / "README.md")]
+    print(call([*command, *printed]).partition("\n\n")[0])
 
 
 if __name__ == "__main__":

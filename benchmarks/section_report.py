@@ -157,7 +157,7 @@ REPORTS = {
         },
     }),
     "real-cameras": Report(RESULTS / "real-cameras.md", "Results: real cameras", {
-        "table": ("Real sequences", "suite.real_cameras --work {sequences}"),
+        "table": ("Real sequences", "cameras.real_sequences --work {sequences}"),
         "reading": ("What the figures say", ""),
         "hard": ("Hard inputs: never lost", ""),
         "loops": ("Loop closures", ""),

@@ -11,8 +11,6 @@ from benchmarks.suite.targets import target_rows
 from bmask_slam.evaluation import format_table
 
 Results = dict[str, Any]
-BEGIN = "<!-- results: written by benchmarks/run.py -->"
-END = "<!-- end of results -->"
 EXAMPLE_BEGIN = "<!-- example: written by benchmarks/run.py -->"
 EXAMPLE_END = "<!-- end of example -->"
 BUSY_LOAD = 1.0
@@ -31,9 +29,12 @@ def title(sequence: str) -> str:
 
 
 def results_block(results: Results) -> str:
-    """The main table between its markers, the same in the report and in README.md."""
-    header = ("sequence", "frames tracked", "ATE", "RPE a second", "end drift",
-              "ms a frame: median, 95 %", "frames/s", "keyframes", "memory")  # fmt: skip
+    """The main table, and how it was measured."""
+    header = (
+        "sequence, run with `--segmenter none`",  # as the systems beside it
+        *("frames tracked", "ATE", "RPE a second", "end drift"),
+        *("ms a frame: median, 95 %", "frames/s", "keyframes", "memory"),
+    )
     rows = [_result_row(run) for run in results["runs"] if run["variant"] == "default"]
     machine, (commit, *changes) = results["machine"], results["commit"].split(" with ")
     where = (
@@ -41,7 +42,7 @@ def results_block(results: Results) -> str:
         f"commit {commit}{' and uncommitted changes' if changes else ''}; "
         f"{results['date']}; by `{results['command']}`."
     )
-    return "\n".join([BEGIN, table(header, rows), "", where, END])
+    return "\n".join([table(header, rows), "", where])
 
 
 def _result_row(run: dict[str, Any]) -> tuple[str, ...]:
@@ -77,19 +78,6 @@ def example_block(results: Results) -> str:
     run = next(run for run in results["runs"] if run["sequence"] == "office")
     printed = format_table(run["printed"])
     return f"{EXAMPLE_BEGIN}\n```\n$ {run['command']}\n{printed}\n```\n{EXAMPLE_END}"
-
-
-def fill_readme(results: Results, path: Path) -> None:
-    """Replace what stands between the markers in README.md."""
-    text = path.read_text(encoding="utf-8")
-    for block in (results_block(results), example_block(results)):
-        begin, end = block.partition("\n")[0], block.rpartition("\n")[2]
-        before, found, rest = text.partition(begin)
-        _, closed, after = rest.partition(end)
-        if not (found and closed):
-            raise SystemExit(f"error: {path}: lacks the lines '{begin}' and '{end}'")
-        text = before + block + after
-    path.write_text(text, encoding="utf-8")
 
 
 def write_report(results: Results, path: Path) -> None:

@@ -119,7 +119,7 @@ def process_frames(run: ActiveRun) -> None:
     start_s = time.perf_counter() - counters.wall_s
     done = len(run.indices) - len(remaining)
     with (
-        closing(frames),  # type: ignore[type-var]
+        closing(frames),
         Progress(len(run.indices), run.options.quiet, done) as bar,
         _snapshots(run) as snapshot,
     ):

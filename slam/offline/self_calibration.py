@@ -125,7 +125,7 @@ class SelfCalibrator:
             return None
         frames = sequence.frames(stretch.start, stretch.stop, stretch.step, prepare=system.prepare)
         keyframes = lost = 0
-        with closing(frames), Progress(len(stretch), quiet) as bar:  # type: ignore[type-var]
+        with closing(frames), Progress(len(stretch), quiet) as bar:
             for frame, features in frames:
                 result = system.process(frame, features)
                 keyframes += result.keyframe_id is not None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -116,7 +116,7 @@ class Sequence:
     @overload
     def frames(
         self, start: int = 0, stop: int | None = None, stride: int = 1, prefetch: int = 4
-    ) -> Iterator[Frame]: ...
+    ) -> Generator[Frame, None, None]: ...
 
     @overload
     def frames(
@@ -127,7 +127,7 @@ class Sequence:
         prefetch: int = 4,
         *,
         prepare: Callable[[Frame], T],
-    ) -> Iterator[tuple[Frame, T]]: ...
+    ) -> Generator[tuple[Frame, T], None, None]: ...
 
     def frames(
         self,
@@ -137,7 +137,7 @@ class Sequence:
         prefetch: int = 4,
         *,
         prepare: Callable[[Frame], Any] | None = None,
-    ) -> Iterator[Any]:
+    ) -> Generator[Any, None, None]:
         """Decode the frames ``start:stop:stride`` in a thread, up to ``prefetch`` ahead.
 
         With ``prepare`` that function is applied in the same thread, and pairs (frame, result)
