@@ -186,9 +186,12 @@ def in_its_own_process(method: str, folder: Path, out: Path, wheels: Path) -> No
         found = [str(target), environment.get("PYTHONPATH", "")]
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, found))
     command = ["-m", MODULE, method, str(folder.resolve()), "--out", str(out.resolve())]
-    subprocess.run(
-        [sys.executable, *command], cwd=ROOT, env=environment, check=True, capture_output=True
+    whole = [sys.executable, *command]
+    done = subprocess.run(
+        whole, cwd=ROOT, env=environment, check=False, capture_output=True, text=True
     )
+    if done.returncode:
+        raise SystemExit(f"error: {' '.join(command)} failed:\n{done.stderr[-2000:]}")
 
 
 def main() -> None:

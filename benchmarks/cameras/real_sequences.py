@@ -66,7 +66,7 @@ def folder_of(name: str, work: Path) -> Path:
     if name in FOLDERS:
         return FOLDERS[name]
     if name == "rpy-unknown":
-        return _unnamed(FOLDERS["rpy"], work / "real" / "recording")
+        return _unnamed(FOLDERS["rpy"], work / "recording")
     office = work / "office-300"
     render(office, "office", ("--frames", "300", "--true-depth"))
     return office if name == "office" else _rolling(work)
@@ -83,9 +83,9 @@ def _unnamed(source: Path, folder: Path) -> Path:
 
 def _rolling(work: Path) -> Path:
     """The office with rows exposed in turn and late depth; its camera.yaml says nothing of it."""
-    out = work / "real" / "office-rolling"
+    out = work / "office-rolling"
     if not out.is_dir():
-        late = work / "real" / "office-late"
+        late = work / "office-late"
         if not late.is_dir():
             from bmask_slam.rendering.sequence import RenderConfig, render_sequence  # noqa: PLC0415
 
