@@ -83,8 +83,8 @@ class Figures:
     ate_m: float
     hand_eye_m: float | None
     rpe_m: float
-    median_ms: float
-    high_ms: float
+    median_ms: float | None
+    high_ms: float | None
     whole_s: float
     said: str
     stamp: str
@@ -150,7 +150,7 @@ def _line(row: Figures) -> tuple[str, ...]:
         LIBRARIES.get(row.system) or f"**{OURS}**, {_how(row.name)}",
         f"{100 * row.tracked:.1f}{weak}",
         _ate(row), f"{1e3 * row.rpe_m:.1f}",
-        f"{row.median_ms:.0f}, {row.high_ms:.0f}",
+        "" if row.median_ms is None else f"{row.median_ms:.0f}, {row.high_ms:.0f}",
         f"{row.whole_s:.0f}" if row.system == OURS else "",
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class Input:
     source: str
     hardship: Hardship | None = None
     stride: int = 1
-    timing: dict[str, float] | None = None
+    timing: dict[str, Any] | None = None
     hand_eye: bool = False
 
 

@@ -38,7 +38,7 @@ class RecordingSystem(SlamSystem):
                 {
                     "frame": frame.index,
                     "keyframes": len(graph.keyframe_ids),
-                    "landmarks": int(map_now["landmarks"]),  # type: ignore[arg-type]
+                    "landmarks": int(map_now["landmarks"]),
                     "graph_landmarks": len(graph.landmark_ids),
                     "factors": graph.factors,
                     "update_ms": round(update_ms[-1], 3),
