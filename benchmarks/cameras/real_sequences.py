@@ -55,7 +55,8 @@ FOLDERS = {
     "bonn": SHARED / "bonn_crowd", "kitchen": KITCHEN,
 }  # fmt: skip
 SAID = re.compile(
-    r"offline\.runner: (?:camera from [^,\n]+, ([^:\n]+): Camera|calibration: ([^\n]+))"
+    r"(?:runner|events): (?:frame \d+, [\d.]+ s: )?"
+    r"(?:camera from [^,\n]+, ([^:\n]+): Camera|calibration: ([^\n]+))"
 )
 """What a run's log says of a preset, and of what it found of the camera."""
 NOT_DRAWN = ("rpy-unknown", "rpy-none")
