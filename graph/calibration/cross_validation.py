@@ -52,7 +52,7 @@ def cross_validate(problem: CalibrationProblem) -> CrossValidation | None:
     """Calibrate from each half of the keyframes, and judge by the other; None: too few views."""
     count = len(problem.poses_world_camera)
     late = np.arange(count) >= count // 2
-    halves = [_part(problem, ~late), _part(problem, late)]
+    halves = [part_of(problem, ~late), part_of(problem, late)]
     if any(half is None for half in halves):
         return None
     first, second = (half for half in halves if half is not None)
@@ -68,7 +68,7 @@ def cross_validate(problem: CalibrationProblem) -> CrossValidation | None:
     )
 
 
-def _part(problem: CalibrationProblem, keyframes: Mask) -> CalibrationProblem | None:
+def part_of(problem: CalibrationProblem, keyframes: Mask) -> CalibrationProblem | None:
     """The problem of some keyframes (K,), with landmarks that two of them see."""
     views = problem.views
     keep = keyframes[views.keyframes]

@@ -131,4 +131,4 @@ def format_summary(rows: list[Row]) -> str:
     from bmask_slam.evaluation import format_table
 
     told = [row for row in rows if row["name"] not in DETAILS]
-    return format_table([row for row in told if not row["name"].startswith("graph_")])
+    return format_table([row for row in told if not row["name"].startswith(("graph_", "camera_"))])

@@ -133,6 +133,8 @@ def _print_summary(summary: RunSummary, quiet: bool) -> None:
     print(format_summary(summary.rows))
     if summary.calibration:
         print(f"\nCamera      {summary.calibration}")
+    for warning in summary.warnings:
+        print(f"\nWarning     {warning}")
     if summary.skipped:
         print(f"\n{summary.skipped} broken frames were skipped, see log.txt")
     if summary.stopped_by:

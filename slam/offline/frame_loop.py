@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from bmask_slam.calibration.adoption import SelfCalibration
+from bmask_slam.calibration.camera_check import CameraCheck, check_camera
 from bmask_slam.evaluation import Row
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.offline.checkpoint import Checkpoints
 from bmask_slam.offline.options import RunOptions
@@ -87,6 +89,7 @@ class RunSummary:
         skipped: frames that were broken, not counted in ``frames``.
         stopped_by: the signal that ended the run early, or None.
         calibration: what was found of the camera, in one line; "" if nothing was tried.
+        warnings: what the run says against its camera, each with its evidence.
         resumable: the run can be resumed from its last checkpoint, since it was stopped.
     """
 
@@ -97,6 +100,7 @@ class RunSummary:
     stopped_by: signal.Signals | None = None
     resumable: bool = False
     calibration: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 def report_calibration(run: ActiveRun) -> None:
@@ -150,6 +154,8 @@ def finish_run(run: ActiveRun) -> RunSummary:
     run.system.finish()
     run.folder.write_events(run.system.events.take())
     rows = measure(run.system, run.reference, counters, options.stride)
+    checked = _camera_checked(run)
+    rows += checked.rows
     title = "-".join(filter(None, (run.sequence.name, options.config_name)))
     save(run.system, run.folder, rows, run.reference, title)
     if options.dense:
@@ -162,7 +168,33 @@ def finish_run(run: ActiveRun) -> RunSummary:
     skipped = sum(index < counters.next_index for index, _ in run.sequence.skipped)
     resumable = stopped_by is not None and options.checkpoint_every is not None
     text = run.calibration.text
-    return RunSummary(run.folder.path, rows, counters.frames, skipped, stopped_by, resumable, text)
+    return RunSummary(
+        run.folder.path,
+        rows,
+        counters.frames,
+        skipped,
+        stopped_by,
+        resumable,
+        text,
+        checked.warnings,
+    )
+
+
+def _camera_checked(run: ActiveRun) -> CameraCheck:
+    """What a run that was not stopped says against its camera, which is logged too."""
+    nothing = CameraCheck((), (), ())
+    if not isinstance(run.system, SlamSystem) or run.stop.signal is not None:
+        return nothing
+    try:
+        checked = check_camera(run.system.as_run(), run.sequence)
+    except InputError as error:
+        logger.info("camera not checked: %s", error)
+        return nothing
+    for text in checked.notes:
+        logger.info("camera: %s", text)
+    for text in checked.warnings:
+        logger.warning("camera: %s", text)
+    return checked
 
 
 def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:

@@ -1,0 +1,150 @@
+"""What a run says of a wrong camera: faults put into recordings, and the warnings of the run.
+
+    python -m benchmarks.suite.wrong_cameras [--into DIR] [--only NAME ...] [--faults NAME ...]
+
+Faulty copies of the recordings under ../shared/data and a rendered office are made in ``--into``;
+images that stay as they are are linked. Nothing of them belongs into the repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+
+from benchmarks.pages import table
+from benchmarks.paths import SHARED
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.camera import Camera
+from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.sequences import read_camera, write_camera
+from bmask_slam.system_config import SystemConfig
+
+NAMES = ("tum_fr1_rpy", "bonn_crowd", "redkitchen", "office")
+MAX_FRAMES = 300
+CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
+Fault = Callable[[Path, Camera], Camera]
+"""Changes the images or lists of a copied folder, and returns the camera to write into it."""
+
+
+def _focal(share: float) -> Fault:
+    return lambda folder, camera: replace(
+        camera, fx=camera.fx * (1 + share), fy=camera.fy * (1 + share)
+    )
+
+
+def _depth_scale(share: float) -> Fault:
+    return lambda folder, camera: replace(camera, depth_scale=camera.depth_scale * (1 + share))
+
+
+def _stamps(shift_s: float) -> Fault:
+    def fault(folder: Path, camera: Camera) -> Camera:
+        lines = []
+        for line in (folder / "depth.txt").read_text(encoding="utf-8").splitlines():
+            if line and not line.startswith("#"):
+                stamp, name = line.split(maxsplit=1)
+                lines.append(f"{float(stamp) + shift_s:.6f} {name}\n")
+        (folder / "depth.txt").unlink()
+        (folder / "depth.txt").write_text("".join(lines), encoding="utf-8")
+        return camera
+
+    return fault
+
+
+def _moved(baseline_m: float, scale: float, shift_px: tuple[float, float] = (0, 0)) -> Fault:
+    """Depth as of a camera beside the colour camera, with ``scale`` times its focal lengths."""
+
+    def fault(folder: Path, camera: Camera) -> Camera:
+        files = sorted((folder / "depth").iterdir())
+        (folder / "depth").unlink()
+        (folder / "depth").mkdir()
+        for path in files:
+            stored = cv2.imread(str(path.resolve()), cv2.IMREAD_UNCHANGED)
+            v, u = np.nonzero(stored)
+            beside_px = camera.fx * baseline_m * camera.depth_scale / stored[v, u]
+            to_u = scale * (u - camera.cx + beside_px) + camera.cx + shift_px[0]
+            to_v = scale * (v - camera.cy) + camera.cy + shift_px[1]
+            moved = _nearest(stored[v, u], to_u, to_v, stored.shape)
+            cv2.imwrite(str(folder / "depth" / path.name), moved)
+        return camera
+
+    return fault
+
+
+def _nearest(values: Array, u: Array, v: Array, shape: tuple[int, ...]) -> Array:
+    """An image in which each value is at the pixels around its place, the nearest in front."""
+    image = np.full(shape, np.iinfo(np.uint16).max, np.uint16)
+    for du, dv in ((-0.3, -0.3), (-0.3, 0.3), (0.3, -0.3), (0.3, 0.3)):
+        column, row = np.rint(u + du).astype(int), np.rint(v + dv).astype(int)
+        inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+        np.minimum.at(image, (row[inside], column[inside]), values[inside])
+    image[image == np.iinfo(np.uint16).max] = 0
+    return image
+
+
+FAULTS: dict[str, Fault] = {
+    "none": lambda folder, camera: camera,
+    "focal length +3 %": _focal(0.03),
+    "focal length -3 %": _focal(-0.03),
+    "depth moved by (12, 3) px": _moved(0.0, 1.0, (12, 3)),
+    "depth camera 25 mm beside": _moved(0.025, 1.0),
+    "and its focal length 11 % larger": _moved(0.025, 1.11),
+    "depth stamps +30 ms": _stamps(0.03),
+    "depth stamps -30 ms": _stamps(-0.03),
+    "depth scale +2 %": _depth_scale(0.02),
+}
+
+
+def faulty(source: Path, fault: Fault, folder: Path) -> Path:
+    """A copy of a sequence, with links to its images, with a fault in it."""
+    folder.mkdir(parents=True)
+    for path in source.iterdir():
+        if path.name != "camera.yaml":
+            (folder / path.name).symlink_to(path.resolve())
+    write_camera(folder / "camera.yaml", fault(folder, read_camera(source / "camera.yaml")))
+    return folder
+
+
+def said(folder: Path, out: Path) -> str:
+    """The warnings of a run in short, and its ATE."""
+    # The camera's readout time, which its name gives, is that of the recording without the fault.
+    options = RunOptions(folder, CONFIG, out=out, max_frames=MAX_FRAMES, quiet=True)
+    done = run(options)
+    rows = {row["name"]: row["value"] for row in done.rows}
+    warnings = [warning.partition(";")[0] for warning in done.warnings] or ["-"]
+    return f"{'; '.join(warnings)} (ATE {1e3 * rows['ate_rmse']:.1f} mm)"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--into", type=Path)
+    parser.add_argument("--only", nargs="+", default=list(NAMES), choices=NAMES)
+    parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=list(FAULTS))
+    arguments = parser.parse_args()
+    with TemporaryDirectory() as temporary:
+        into = arguments.into or Path(temporary)
+        sources = {name: SHARED / name for name in arguments.only}
+        if "office" in sources:
+            sources["office"] = into / "source" / "office"
+            if not sources["office"].is_dir():
+                render_sequence(RenderConfig("office", MAX_FRAMES), sources["office"])
+        lines = []
+        for number, name in enumerate(arguments.faults):
+            for source in sources.values():
+                folder = faulty(source, FAULTS[name], into / str(number) / source.name)
+                lines.append(
+                    (name, source.name, said(folder, into / "runs" / f"{number}-{source.name}"))
+                )
+                print(" | ".join(lines[-1]), flush=True)
+        print(table(("fault", "sequence", "said"), lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,174 @@
+"""How well the edges of depth images fit those of colour images, for shifts in all directions.
+
+An edge of depth is where the surface in front ends; what lies behind it has mostly another colour.
+Depth that is registered to colour has its edges where colour has some, within 3 px with the depth
+cameras tried; so neither tracking nor its camera decide what is found here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from bmask_slam.calibration.motion import twists_at
+from bmask_slam.graph.arrays import Array, Floats, Image, Ints
+from bmask_slam.graph.calibration.registration import EdgeScores, strength_of
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.trajectory import Trajectory, nearest_indices
+from bmask_slam.sequences import Sequence
+from bmask_slam.sequences.images import read_depth, read_rgb
+from bmask_slam.tracking.rolling_shutter import velocities
+
+FRAMES = 32
+RADIUS = 20
+"""Steps of the largest shift; a step is about 1/320 of the image's width."""
+WIDTH_STEPS = 320
+JUMP = 0.1
+"""Relative change of depth from a pixel to the next that is an edge."""
+MAX_HOLE_SHARE = 0.075
+"""Of the width: a wider hole in the depth is no shadow beside an edge."""
+CONTRAST_PX, MAX_CONTRAST = 41, 4.0
+FLOW_POINTS = 500
+SCALES = (0.8, 0.84, 0.88, 0.92, 0.96, 1.0, 1.04, 1.08, 1.12, 1.16, 1.2)
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeImages:
+    """Edges of a frame, as float32 images (H, W).
+
+    Attributes:
+        depth: edges of depth, across columns and across rows; 0 or more.
+        colour: gradients of grey, by column and by row, over their mean around.
+    """
+
+    depth: tuple[Floats, Floats]
+    colour: tuple[Floats, Floats]
+
+
+def edge_scores(sequence: Sequence, path: Trajectory) -> EdgeScores:
+    """Scores of FRAMES frames of a sequence, spread over the frames that have poses and velocities.
+
+    Depth images are taken as they are, so that the lags are those of their stamps.
+    """
+    chosen, twists = _chosen_frames(sequence, path)
+    camera = sequence.camera
+    step = max(round(camera.width / WIDTH_STEPS), 1)
+    scores, flows = [], []
+    for i, twist in zip(chosen.tolist(), twists, strict=True):
+        depth_m = read_depth(sequence.pairs.depth_files[i], camera).astype(float)
+        edges = edges_of(read_rgb(sequence.pairs.rgb_files[i], camera), depth_m)
+        scores.append(correlation(edges, step))
+        flows.append(_flow(edges, depth_m, twist, camera))
+    size = 2 * RADIUS + 1
+    return EdgeScores(
+        np.array(scores).reshape(-1, size, size),
+        float(step),
+        np.array(flows).reshape(-1, 2),
+        sequence.pairs.lags_s[chosen],
+    )
+
+
+def best_scale(sequence: Sequence, path: Trajectory) -> tuple[float, float]:
+    """The scale about the image's middle with which depth fits colour best, and its strength.
+
+    A depth camera that is not registered to colour often has another focal length.
+    """
+    chosen, _ = _chosen_frames(sequence, path)
+    camera = sequence.camera
+    step = 2 * max(round(camera.width / WIDTH_STEPS), 1)
+    total = np.zeros((len(SCALES), 2 * RADIUS + 1, 2 * RADIUS + 1))
+    for i in chosen[::2].tolist():
+        depth_m = read_depth(sequence.pairs.depth_files[i], camera).astype(float)
+        edges = edges_of(read_rgb(sequence.pairs.rgb_files[i], camera), depth_m)
+        total += [correlation(_scaled(edges, scale), step) for scale in SCALES]
+    strengths = [strength_of(scores) for scores in total]
+    best = int(np.argmax(strengths))
+    return SCALES[best], strengths[best]
+
+
+def _chosen_frames(sequence: Sequence, path: Trajectory) -> tuple[Ints, Array]:
+    """Indices (n,) of frames and the camera's velocities (n, 6) there."""
+    if not len(path):
+        return np.zeros(0, np.int64), np.zeros((0, 6))
+    at = np.unique(nearest_indices(sequence.timestamps_s, path.timestamps_s))
+    twists = twists_at(path, sequence.timestamps_s[at])
+    moving = np.flatnonzero(twists.any(axis=1))
+    places = np.linspace(0, len(moving) - 1, min(FRAMES, len(moving))).round().astype(int)
+    return at[moving[places]], twists[moving[places]]
+
+
+def edges_of(rgb: Image, depth_m: Array) -> EdgeImages:
+    """The edges of a colour image (H, W, 3) and a depth image (H, W)."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    by_column, by_row = (
+        np.abs(cv2.Sobel(grey, cv2.CV_32F, *order, scale=1 / 8)) for order in ((1, 0), (0, 1))
+    )
+    return EdgeImages(
+        (_depth_edges(depth_m), np.ascontiguousarray(_depth_edges(depth_m.T).T)),
+        (_normalised(by_column), _normalised(by_row)),
+    )
+
+
+def _normalised(gradient: Floats) -> Floats:
+    """A gradient over its mean around, so that textures do not outweigh outlines."""
+    mean = cv2.blur(gradient, (CONTRAST_PX, CONTRAST_PX))
+    return np.asarray(np.minimum(gradient / (mean + 1.0), MAX_CONTRAST), np.float32)
+
+
+def _depth_edges(depth_m: Array) -> Floats:
+    """1/2 on both sides of each jump along the rows (H, W).
+
+    Beside a surface in front a structured-light camera has a shadow without depth; it belongs to
+    what is behind, so holes are filled with the larger of the depths at their two ends.
+    """
+    width = depth_m.shape[1]
+    columns, valid = np.arange(width), np.isfinite(depth_m)
+    left = np.maximum.accumulate(np.where(valid, columns, -1), axis=1)
+    right = np.minimum.accumulate(np.where(valid, columns, width)[:, ::-1], axis=1)[:, ::-1]
+    hole = (left >= 0) & (right < width) & (right - left < MAX_HOLE_SHARE * width)
+    ends = [np.take_along_axis(depth_m, np.clip(at, 0, width - 1), 1) for at in (left, right)]
+    filled = np.where(hole, np.maximum(*ends), np.nan)
+    jump = np.abs(np.diff(np.log(filled), axis=1)) > JUMP
+    edges = np.zeros(depth_m.shape, np.float32)
+    edges[:, :-1] += 0.5 * jump
+    edges[:, 1:] += 0.5 * jump
+    return edges
+
+
+def correlation(edges: EdgeImages, step: int) -> Array:
+    """Scores (2R + 1, 2R + 1) of shifts of depth by -R to R steps of some pixels, rows first."""
+    total = np.zeros((2 * RADIUS + 1,) * 2)
+    for depth, colour in zip(edges.depth, edges.colour, strict=True):
+        height, width = depth.shape
+        size = (width // step, height // step)
+        small, other = (cv2.resize(e, size, interpolation=cv2.INTER_AREA) for e in (depth, colour))
+        shape = [cv2.getOptimalDFTSize(n + 2 * RADIUS) for n in small.shape]
+        spectrum = np.conj(np.fft.rfft2(small, shape)) * np.fft.rfft2(other - other.mean(), shape)
+        scores = np.roll(np.fft.irfft2(spectrum, shape), (RADIUS, RADIUS), (0, 1))
+        total += scores[: len(total), : len(total)]
+    return total
+
+
+def _scaled(edges: EdgeImages, scale: float) -> EdgeImages:
+    """The edges of depth larger by a scale about the image's middle."""
+    height, width = edges.depth[0].shape
+    about = (1 - scale) * np.array([width - 1, height - 1]) / 2
+    M = np.array([[scale, 0, about[0]], [0, scale, about[1]]])
+    first, second = (cv2.warpAffine(e, M, (width, height)) for e in edges.depth)
+    return EdgeImages((first, second), edges.colour)
+
+
+def _flow(edges: EdgeImages, depth_m: Array, twist: Array, camera: Camera) -> Array:
+    """Velocity (2,) of the image in px/s at the edges of depth: the median."""
+    rows, columns = np.nonzero((edges.depth[0] + edges.depth[1] > 0) & np.isfinite(depth_m))
+    some = slice(None, None, max(len(rows) // FLOW_POINTS, 1))
+    pixels = np.column_stack([columns, rows])[some].astype(float)
+    if not len(pixels):
+        return np.zeros(2)
+    points = camera.backproject(pixels, depth_m[rows, columns][some])
+    moved = velocities(points, twist)
+    slopes = (moved[:, :2] - points[:, :2] / points[:, 2:] * moved[:, 2:]) / points[:, 2:]
+    return np.median(slopes * (camera.fx, camera.fy), axis=0)

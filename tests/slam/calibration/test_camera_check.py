@@ -1,0 +1,138 @@
+"""Faults put into a camera, its depth or its stamps, and what a run says of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from bmask_slam.calibration.camera_check import CameraCheck, check_camera
+from bmask_slam.calibration.edge_scores import correlation, edges_of
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.camera import Camera
+from bmask_slam.offline.runner import RunOptions, RunSummary, run
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+from bmask_slam.run_folder.map_file import read_run
+from bmask_slam.sequences import open_sequence, read_camera, write_camera
+from bmask_slam.system_config import SystemConfig
+
+CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
+FRAMES, FPS = 100, 15.0
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("check") / "office"
+    config = RenderConfig("office", FRAMES, fps=FPS, width=320, height=240, sweeping=True)
+    return render_sequence(config, folder)
+
+
+@pytest.fixture(scope="module")
+def right(office: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+    out = tmp_path_factory.mktemp("check") / "run"
+    return run(RunOptions(office, CONFIG, out=out, quiet=True, calibrate="off"))
+
+
+def _with_depth(office: Path, folder: Path, shift: tuple[int, int] = (0, 0), scale: float = 1.0):
+    """A copy whose depth images are moved by (u, v) pixels, and larger by a scale."""
+    folder.mkdir()
+    for name in ("rgb", "rgb.txt", "depth.txt", "camera.yaml"):
+        (folder / name).symlink_to(office / name)
+    (folder / "depth").mkdir()
+    for path in (office / "depth").iterdir():
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        height, width = depth.shape
+        about = (1 - scale) * np.array([width - 1, height - 1]) / 2
+        M = np.array([[scale, 0, about[0] + shift[0]], [0, scale, about[1] + shift[1]]])
+        moved = cv2.warpAffine(depth, M, (width, height), flags=cv2.INTER_NEAREST)
+        cv2.imwrite(str(folder / "depth" / path.name), moved)
+    return folder
+
+
+def _checked(right: RunSummary, sequence: Path, camera: Camera | None = None) -> CameraCheck:
+    """What the right camera's run says with the images of another folder."""
+    saved = read_run(right.folder)
+    camera = camera or saved.camera
+    return check_camera(
+        dataclasses.replace(saved, camera=camera), open_sequence(sequence, camera=camera)
+    )
+
+
+def test_a_right_camera_gets_no_warning_and_figures_in_the_metrics(right: RunSummary) -> None:
+    assert right.warnings == ()
+    rows = {row["name"]: row["value"] for row in right.rows}
+    assert rows["camera_warnings"] == 0
+    assert abs(rows["camera_focal_change"]) < 0.5
+    assert abs(rows["camera_depth_shift_u"]) < 2 and abs(rows["camera_depth_delay_ms"]) < 8
+    log = (right.folder / "log.txt").read_text()
+    assert "camera: focal length" in log and "depth scale: not observable" in log
+
+
+@pytest.mark.parametrize("share", [0.04, -0.04])
+def test_a_wrong_focal_length_is_named(office: Path, tmp_path: Path, share: float) -> None:
+    camera = read_camera(office / "camera.yaml")
+    wrong = dataclasses.replace(camera, fx=camera.fx * (1 + share), fy=camera.fy * (1 + share))
+    write_camera(tmp_path / "camera.yaml", wrong)
+    options = RunOptions(office, CONFIG, camera=tmp_path / "camera.yaml", calibrate="off")
+    done = run(dataclasses.replace(options, out=tmp_path / "run", quiet=True))
+    (warning,) = done.warnings
+    assert warning.startswith("focal length") and "bmask-slam calibrate" in warning
+    assert (" % less than" if share > 0 else " % more than") in warning
+
+
+def test_shifted_depth_is_named_with_the_shift_that_cures(
+    office: Path, right: RunSummary, tmp_path: Path
+) -> None:
+    found = _checked(right, _with_depth(office, tmp_path / "shifted", shift=(8, -3)))
+    (warning,) = (w for w in found.warnings if w.startswith("registration"))
+    rows = {row["name"]: row["value"] for row in found.rows}
+    assert rows["camera_depth_shift_u"] == pytest.approx(-8, abs=1)
+    assert rows["camera_depth_shift_v"] == pytest.approx(3, abs=1)
+    assert "register depth to colour" in warning
+
+
+def test_depth_of_another_focal_length_is_named(
+    office: Path, right: RunSummary, tmp_path: Path
+) -> None:
+    found = _checked(right, _with_depth(office, tmp_path / "larger", scale=1.12))
+    assert any("scaled by 0.8" in w or "scaled by 0.9" in w for w in found.warnings), found
+
+
+@pytest.mark.parametrize("frames", [1, -1])
+def test_stamps_of_depth_that_are_wrong_are_named(
+    office: Path, right: RunSummary, tmp_path: Path, frames: int
+) -> None:
+    lines = []
+    for line in (office / "depth.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            stamp, name = line.split(maxsplit=1)
+            lines.append(f"{float(stamp) + frames / FPS:.6f} {name}")
+    for name in ("rgb", "depth", "rgb.txt", "camera.yaml"):
+        (tmp_path / name).symlink_to(office / name)
+    (tmp_path / "depth.txt").write_text("\n".join(lines) + "\n")
+    (warning,) = (w for w in _checked(right, tmp_path).warnings if w.startswith("stamps"))
+    assert ("ms earlier" if frames > 0 else "ms later") in warning
+
+
+def test_depth_edges_are_where_the_surface_in_front_ends() -> None:
+    depth_m = np.full((120, 160), 3.0)
+    depth_m[30:90, 60:100] = 1.0
+    depth_m[30:90, 52:60] = np.nan  # the shadow of what is in front
+    rgb = np.full((120, 160, 3), 200, np.uint8)
+    rgb[30:90, 60:100] = 50
+    edges = edges_of(rgb, depth_m)
+    assert set(np.flatnonzero(edges.depth[0][60])) == {59, 60, 99, 100}
+    assert set(np.flatnonzero(edges.depth[1][:, 80])) == {29, 30, 89, 90}
+    scores = correlation(edges, 1)
+    middle = len(scores) // 2
+    assert _best(scores) == pytest.approx((middle, middle), abs=1)
+    moved = edges_of(np.roll(rgb, (2, 5), (0, 1)), depth_m)
+    scores = correlation(moved, 1)
+    assert _best(scores) == pytest.approx((middle + 2, middle + 5), abs=1)
+
+
+def _best(scores) -> tuple[int, ...]:
+    return tuple(int(i) for i in np.unravel_index(scores.argmax(), scores.shape))
