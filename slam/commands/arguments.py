@@ -104,7 +104,7 @@ def chosen_config(arguments: argparse.Namespace) -> ChosenConfig:
 
 
 def add_view_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add where it goes: --record or --serve."""
+    """Add where it goes: --record, or --serve and --host."""
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--record", type=Path, metavar="F.rrd", help="write a Rerun recording")
     where.add_argument(
@@ -116,6 +116,12 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PORT",
         help=f"show it in a browser (port {WEB_PORT})",
     )
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="address that --serve listens on; others than this machine's own let everyone in",
+    )
 
 
 def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
@@ -123,7 +129,8 @@ def view_options(arguments: argparse.Namespace, window: bool) -> ViewOptions:
     from bmask_slam.viewer.scene import ViewOptions
 
     other_output = arguments.record is not None or arguments.serve > 0
-    return ViewOptions(arguments.record, arguments.serve, window and not other_output)
+    window = window and not other_output
+    return ViewOptions(arguments.record, arguments.serve, window, arguments.host)
 
 
 def format_summary(rows: list[Row]) -> str:

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bmask_slam.commands.arguments import Commands, add_view_arguments, view_options
-
-if TYPE_CHECKING:
-    pass
 
 TEXT = "show a finished run in Rerun"
 MORE = """\
@@ -32,10 +28,12 @@ def _view(arguments: argparse.Namespace) -> int:
     scene = Scene(arguments.run.name, view_options(arguments, window=True))
     count = replay(arguments.run, scene)
     print(f"{count} frames of {arguments.run}")
-    if arguments.serve:
-        print(f"in a browser: http://localhost:{arguments.serve}  (Ctrl-C ends it)")
-        _wait()
-    scene.close()
+    try:
+        if arguments.serve:
+            print(f"in a browser: {scene.url}  (Ctrl-C ends it)", flush=True)
+            _wait()
+    finally:
+        scene.close()
     return 0
 
 

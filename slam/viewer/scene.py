@@ -29,6 +29,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
+from bmask_slam.viewer.web_viewer import LOCAL, WebViewer
 
 logger = logging.getLogger(__name__)
 
@@ -42,11 +43,15 @@ STATUS = {TrackingStatus.OK: 2, TrackingStatus.WEAK: 1, TrackingStatus.LOST: 0}
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Where the scene is shown: a recording, a browser on a port (0: none), or Rerun's window."""
+    """Where the scene is shown: a recording, a browser on a port (0: none), or Rerun's window.
+
+    ``host`` is the address that the server for the browser listens on.
+    """
 
     record: Path | None = None
     serve: int = 0
     window: bool = False
+    host: str = LOCAL
 
     @property
     def enabled(self) -> bool:
@@ -67,22 +72,33 @@ class Scene:
     """Sends a map and frames to Rerun; the arrays given are not changed."""
 
     def __init__(self, name: str, options: ViewOptions) -> None:
-        """Raises InputError: Rerun is not installed, or the recording's folder is not there."""
+        """Show it as asked for.
+
+        Raises:
+            InputError: Rerun is not installed, the recording's folder is not there, or the port is
+                taken.
+        """
         self._rr = _import_rerun()
+        self._viewer: WebViewer | None = None
         self._stream = self._rr.RecordingStream(f"bmask-slam {name}")
         if options.record is not None:
             if not options.record.parent.is_dir():
                 raise InputError(f"{options.record.parent}: no such folder; make it first")
             self._stream.save(str(options.record))
         elif options.serve:
-            address = self._stream.serve_grpc()
-            self._rr.serve_web_viewer(
-                web_port=options.serve, open_browser=False, connect_to=address
-            )
+            import rerun_cli  # noqa: PLC0415 - a part of Rerun
+
+            self._viewer = WebViewer(rerun_cli, options.host, options.serve)
+            self._stream.connect_grpc(self._viewer.address)
         elif options.window:
             self._stream.spawn()
         self._path: list[Array] = []
         self._log("world", self._rr.ViewCoordinates.RDF, static=True)
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser; "" if it is not served."""
+        return self._viewer.url if self._viewer else ""
 
     def log_camera(self, camera: Camera) -> None:
         """Show the camera's field of view."""
@@ -175,6 +191,8 @@ class Scene:
         except RuntimeError as error:
             logger.warning("the viewer did not take all data: %s", error)
         self._stream.disconnect()
+        if self._viewer is not None:
+            self._viewer.close()
 
     def _pose(self, T: Array) -> Any:
         return self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])

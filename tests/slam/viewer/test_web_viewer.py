@@ -1,0 +1,79 @@
+"""The server for the browser: where it listens, and that it ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.viewer.web_viewer import WebViewer
+
+rerun_cli = pytest.importorskip("rerun_cli")
+pytestmark = pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="needs Linux's /proc")
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def listening(port: int) -> list[str]:
+    """The addresses, in hexadecimal, on which somebody listens on a port."""
+    rows = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
+    ]
+    ends = [row[1].split(":") for row in rows if row[3] == "0A"]
+    return [address for address, number in ends if int(number, 16) == port]
+
+
+def ports_of(viewer: WebViewer) -> tuple[int, int]:
+    return int(viewer.address.split(":")[2].split("/")[0]), int(viewer.url.split(":")[2][:5])
+
+
+def test_it_listens_on_this_machine_only_and_ends() -> None:
+    viewer = WebViewer(rerun_cli, "127.0.0.1", free_port())
+    ports = ports_of(viewer)
+    assert [listening(port) for port in ports] == [["0100007F"]] * 2
+    viewer.close()
+    assert [listening(port) for port in ports] == [[]] * 2
+
+
+def test_another_address_is_warned_about(caplog: pytest.LogCaptureFixture) -> None:
+    viewer = WebViewer(rerun_cli, "0.0.0.0", free_port())
+    assert listening(ports_of(viewer)[1]) == ["00000000"]
+    assert "0.0.0.0: everyone who reaches" in caplog.text
+    viewer.close()
+
+
+def test_a_taken_port_is_one_line() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"port {port} of 127"):
+            WebViewer(rerun_cli, "127.0.0.1", port)
+
+
+def test_it_ends_with_a_killed_parent() -> None:
+    code = (
+        "import sys, time, rerun_cli; from bmask_slam.viewer.web_viewer import WebViewer; "
+        f"WebViewer(rerun_cli, '127.0.0.1', {(port := free_port())}); print('up', flush=True); "
+        "time.sleep(60)"
+    )
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "up\n"
+        assert listening(port)
+        os.kill(parent.pid, signal.SIGKILL)
+    end_s = time.monotonic() + 10
+    while listening(port) and time.monotonic() < end_s:
+        time.sleep(0.1)
+    assert not listening(port)
