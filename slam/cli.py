@@ -10,7 +10,11 @@ import errno
 import os
 import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Any
 
 from bmask_slam import __version__
 from bmask_slam.commands.calibrate import add_calibrate
@@ -25,6 +29,7 @@ from bmask_slam.commands.segmentation import add_evaluate_segmentation, add_segm
 from bmask_slam.commands.sequences import add_download, add_info, add_render
 from bmask_slam.commands.view import add_view
 from bmask_slam.graph.errors import InputError
+from bmask_slam.runtime.stop_request import SIGNALS
 
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
 EPILOG = """\
@@ -34,6 +39,8 @@ first steps:
   bmask-slam evaluate runs/office --reference office   compare a trajectory with a reference
 """
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+MAX_LINE = 480
+"""Characters of an error: what a file holds may be of any length."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,23 +49,64 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = make_parser().parse_args(argv)
     try:
-        return int(arguments.handler(arguments))
+        with _terminations():
+            return int(arguments.handler(arguments))
     except InputError as error:
         return _fail(str(error))
     except BrokenPipeError:  # `bmask-slam info ... | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except OSError as error:
-        if error.errno not in DISK_ERRORS:
-            raise
-        return _fail(f"{error.filename or 'output'}: {error.strerror}; free some space")
+        return _after_os_error(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 128 + signal.SIGINT
+    except _Terminated as ended:
+        with suppress(OSError):
+            print(f"ended by {ended.number.name}", file=sys.stderr)
+        return 128 + ended.number
+
+
+def _after_os_error(error: OSError) -> int:
+    """The exit status after a full disk or a closed terminal; another error is raised again."""
+    if error.errno == errno.EIO and error.filename is None:
+        return 128 + signal.SIGHUP
+    if error.errno not in DISK_ERRORS:
+        raise error
+    return _fail(f"{error.filename or 'output'}: {error.strerror}; free some space")
+
+
+class _Terminated(BaseException):
+    """A signal that ends a process came where nothing waits for it, as during start-up."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self.number = number
+
+
+@contextmanager
+def _terminations() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise _Terminated, unless the caller of the program ignores them."""
+    previous: dict[signal.Signals, Any] = {}
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise _Terminated(signal.Signals(number))
+
+    if threading.current_thread() is threading.main_thread():
+        for number in SIGNALS:
+            if signal.getsignal(number) is signal.SIG_DFL:
+                previous[number] = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _fail(message: str) -> int:
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    line = " ".join(message.split())
+    if len(line) > MAX_LINE:
+        line = f"{line[: MAX_LINE - 3]}..."
+    print(f"error: {line}", file=sys.stderr)
     return 1
 
 

@@ -101,6 +101,8 @@ def _live(arguments: argparse.Namespace) -> int:
         options = _live_options(arguments, source)
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
+            if slam.viewer_url:
+                print(f"in a browser: {slam.viewer_url}", flush=True)
             ended_by = play(slam, source, PlayOptions(not source.waits, quiet=arguments.quiet))
     if arguments.quiet:
         print(options.out)

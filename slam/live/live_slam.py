@@ -65,6 +65,7 @@ class LiveSlam:
         frames_dropped: by the source, which sets it.
         source_counts: of the source, for ``health``.
         rows: what metrics.json holds, after ``close``.
+        viewer_url: to open in a browser, if the view is served.
         dense: how the dense map ended, after ``close``; None without one.
     """
 
@@ -82,6 +83,7 @@ class LiveSlam:
         self.frames_dropped = 0
         self.source_counts = SourceCounts()
         self.rows: list[Row] = []
+        self.viewer_url = ""
         self.dense: MapWritten | None = None
         self._counters, self._meter = RunCounters(), FrameMeter()
         self._begin_s = time.monotonic()
@@ -115,6 +117,7 @@ class LiveSlam:
             return None
         scene = Scene(self.options.title, self.options.view)
         stack.callback(scene.close)
+        self.viewer_url = scene.url
         scene.log_camera(self.camera)
         return Display(scene)
 

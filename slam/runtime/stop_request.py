@@ -1,4 +1,7 @@
-"""Stops a run on Ctrl-C or SIGTERM between two frames, so that everything can be saved."""
+"""Stops a run on Ctrl-C, SIGTERM or SIGHUP between two frames, so that everything can be saved.
+
+SIGHUP comes when a terminal is closed or a remote login is lost.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,16 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
+SIGNALS = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+]
+
 
 class StopRequest:
-    """In its block the first SIGINT or SIGTERM only sets ``signal``; a second one acts as usual.
+    """In its block the first of these signals only sets ``signal``; a second one acts as usual.
 
-    Outside the main thread, where Python allows no handlers, ``signal`` is never set.
+    Outside the main thread, where Python allows no handlers, ``signal`` is never set. A SIGHUP that
+    the caller ignores, as under nohup, stays ignored.
     """
 
     def __init__(self) -> None:
@@ -23,8 +31,9 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._note)
+            for number in SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._previous[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:

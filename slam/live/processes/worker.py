@@ -25,6 +25,7 @@ from typing import Any
 
 from bmask_slam.live.channel import Channel, ForwardedLog
 from bmask_slam.live.shared_memory import SIZE, Ring, anonymous_file
+from bmask_slam.runtime.stop_request import SIGNALS
 
 logger = logging.getLogger(__name__)
 
@@ -117,7 +118,9 @@ def safe_import_path() -> dict[str, str]:
 
 def serve(connection: int, child_socket: int, parent_end: int) -> None:
     """Main function of the child, given descriptors; the first message says what to run."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in SIGNALS:  # the process that started it decides
+        if number is not signal.SIGTERM:
+            signal.signal(number, signal.SIG_IGN)
     channel = Channel(Connection(connection), (Ring(parent_end), Ring(child_socket)))
     os.close(child_socket)
     os.close(parent_end)
