@@ -13,9 +13,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
@@ -78,7 +80,7 @@ def _moved(baseline_m: float, scale: float, shift_px: tuple[float, float] = (0, 
     return fault
 
 
-def _nearest(values: Array, u: Array, v: Array, shape: tuple[int, ...]) -> Array:
+def _nearest(values: NDArray[Any], u: Array, v: Array, shape: tuple[int, ...]) -> NDArray[Any]:
     """An image in which each value is at the pixels around its place, the nearest in front."""
     image = np.full(shape, np.iinfo(np.uint16).max, np.uint16)
     for du, dv in ((-0.3, -0.3), (-0.3, 0.3), (0.3, -0.3), (0.3, 0.3)):
