@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
@@ -80,7 +79,9 @@ def _moved(baseline_m: float, scale: float, shift_px: tuple[float, float] = (0, 
     return fault
 
 
-def _nearest(values: NDArray[Any], u: Array, v: Array, shape: tuple[int, ...]) -> NDArray[Any]:
+def _nearest(
+    values: NDArray[Any], u: NDArray[Any], v: NDArray[Any], shape: tuple[int, ...]
+) -> NDArray[Any]:
     """An image in which each value is at the pixels around its place, the nearest in front."""
     image = np.full(shape, np.iinfo(np.uint16).max, np.uint16)
     for du, dv in ((-0.3, -0.3), (-0.3, 0.3), (0.3, -0.3), (0.3, 0.3)):

@@ -75,6 +75,8 @@ FILES = (
 )
 CAMERA = "camera.yaml"
 CHECKPOINT = "checkpoint"
+SEQUENCE_FILES = ("rgb.txt", "depth.txt", "associations.txt")
+"""What is only in a folder that nothing may be removed from."""
 HEALTH = "health.json"
 SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, *SEMANTIC_FILES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
@@ -215,6 +217,9 @@ class RunFolder:
 
 def _clear(path: Path, overwrite: bool) -> None:
     """Remove the run in a folder, its checkpoint first. Raises InputError."""
+    for name in SEQUENCE_FILES:
+        if (path / name).exists():
+            raise InputError(f"{path}: is a sequence ({name}), not a run; choose another --out")
     held = [name for name in (*SOMETIMES, *FILES) if os.path.lexists(path / name)]
     if held and not overwrite:
         cure = "go on with --resume, " if held[0] == CHECKPOINT else ""

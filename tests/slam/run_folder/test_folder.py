@@ -114,3 +114,12 @@ def test_free_paths_are_numbered(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a-2").write_text("")
     assert free_run_path("a", tmp_path) == tmp_path / "a-3"
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_sequence_is_not_overwritten(tmp_path: Path, overwrite: bool) -> None:
+    for name in ("rgb.txt", "camera.yaml", "depth.txt"):
+        (tmp_path / name).write_text("mine")
+    with pytest.raises(InputError, match="is a sequence"):
+        RunFolder(tmp_path, overwrite=overwrite)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["camera.yaml", "depth.txt", "rgb.txt"]
