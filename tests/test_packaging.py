@@ -202,6 +202,8 @@ def test_every_import_is_a_declared_dependency() -> None:
         "faiss": "faiss-cpu",
         "mpl_toolkits": "matplotlib",
         "rerun": "rerun-sdk",
+        "rerun_cli": "rerun-sdk",
+        "PIL": "pillow",
         "ruamel": "ruamel.yaml",
     }
     optional = [t for k, v in PROJECT["optional-dependencies"].items() if k != "dev" for t in v]

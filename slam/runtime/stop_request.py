@@ -32,7 +32,8 @@ class StopRequest:
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
-                if signal.getsignal(number) is not signal.SIG_IGN:
+                is_nohup = number.name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN
+                if not is_nohup:
                     self._previous[number] = signal.signal(number, self._note)
         return self
 

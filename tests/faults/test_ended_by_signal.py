@@ -17,6 +17,11 @@ from bmask_slam.rendering.sequence import RenderConfig
 
 FRAMES = 60
 COMMAND = [sys.executable, "-m", "bmask_slam"]
+USUAL = (
+    "import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+    "os.execvp(sys.argv[1], sys.argv[1:])"
+)
+"""Starts a command that SIGHUP ends, also where these tests themselves run under nohup."""
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +43,7 @@ def test_a_closed_terminal_ends_a_run_with_everything_saved(
     command = [*COMMAND, *words, str(recording), "--segmenter", "none", "--out", str(out)]
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
-        ["setsid", "--ctty", *command],
+        ["setsid", "--ctty", sys.executable, "-c", USUAL, *command],
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
@@ -76,7 +81,10 @@ sys.exit(cli.main())
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_during_the_start_is_one_line(number: signal.Signals) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", USUAL, sys.executable, "-c", SLEEPER],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "started\n"
