@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Self
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.whole_file import remove
 from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
@@ -56,7 +56,7 @@ class ObjectClouds(ExitStack):
         self._writers: dict[int, CloudWriter] = {}
 
     def __enter__(self) -> Self:
-        shutil.rmtree(self.folder, ignore_errors=True)
+        remove(self.folder)
         return super().__enter__()
 
     def write(self, cloud: Cloud) -> None:
