@@ -50,12 +50,9 @@ class CrossValidation:
 
 def cross_validate(problem: CalibrationProblem) -> CrossValidation | None:
     """Calibrate from each half of the keyframes, and judge by the other; None: too few views."""
-    count = len(problem.poses_world_camera)
-    late = np.arange(count) >= count // 2
-    halves = [part_of(problem, ~late), part_of(problem, late)]
-    if any(half is None for half in halves):
+    first, second = halves_of(problem)
+    if first is None or second is None:
         return None
-    first, second = (half for half in halves if half is not None)
     found = [calibrate(half, ESTIMATE) for half in (first, second)]
     gains = [
         _gains(judge, result.calibration)
@@ -68,7 +65,16 @@ def cross_validate(problem: CalibrationProblem) -> CrossValidation | None:
     )
 
 
-def part_of(problem: CalibrationProblem, keyframes: Mask) -> CalibrationProblem | None:
+def halves_of(
+    problem: CalibrationProblem,
+) -> tuple[CalibrationProblem | None, CalibrationProblem | None]:
+    """The problems of the first and the last half of the keyframes; None for too few views."""
+    count = len(problem.poses_world_camera)
+    late = np.arange(count) >= count // 2
+    return _part_of(problem, ~late), _part_of(problem, late)
+
+
+def _part_of(problem: CalibrationProblem, keyframes: Mask) -> CalibrationProblem | None:
     """The problem of some keyframes (K,), with landmarks that two of them see."""
     views = problem.views
     keep = keyframes[views.keyframes]

@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationConfig, calibrate
-from bmask_slam.graph.calibration.cross_validation import part_of
+from bmask_slam.graph.calibration.cross_validation import halves_of
 from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, F
 from bmask_slam.graph.calibration.problem import CalibrationProblem
 
@@ -59,11 +59,9 @@ def check_focal(problem: CalibrationProblem) -> FocalCheck | None:
 
 
 def _in_whole_and_halves(problem: CalibrationProblem) -> FocalCheck:
-    count = len(problem.poses_world_camera)
     change, sigma = _common_change(problem)
-    late = np.arange(count) >= count // 2
-    parts = (part_of(problem, ~late), part_of(problem, late))
-    first, second = (_common_change(half)[0] if half else float("nan") for half in parts)
+    halves = halves_of(problem)
+    first, second = (_common_change(half)[0] if half else float("nan") for half in halves)
     return FocalCheck(change, sigma, (first, second))
 
 

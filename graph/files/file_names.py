@@ -44,6 +44,12 @@ def _fault(name: str) -> str:
     return ""
 
 
+def refuse_link(path: Path, cure: str = "remove it") -> None:
+    """Raise InputError if a file or folder that would be written to is a link."""
+    if path.is_symlink():
+        raise InputError(f"{path}: is a link; nothing is written through it, {cure}")
+
+
 def target_below(root: Path, name: str) -> Path:
     """A path below ``root`` to write a file to; folders are made, links are not followed.
 
@@ -52,9 +58,7 @@ def target_below(root: Path, name: str) -> Path:
     """
     path = root / check_name(name, str(root))
     for folder in reversed(path.relative_to(root).parents):
-        if (root / folder).is_symlink() and folder.parts:
-            raise InputError(
-                f"{root / folder}: is a link; nothing is written through it, remove it"
-            )
+        if folder.parts:
+            refuse_link(root / folder)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

@@ -34,6 +34,7 @@ from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
+from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.json_file import read_json
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.inverse_depth.depth_map import (
@@ -102,8 +103,7 @@ class DenseFolder:
         """
         self.path = run / "dense"
         for path in (self.path, *(self.path / name for name in PARTS)):
-            if path.is_symlink():
-                raise InputError(f"{path}: is a link; nothing is written through it, remove it")
+            refuse_link(path)
         try:
             self.path.mkdir(exist_ok=True)
             self._clear_unless(settings)

@@ -45,6 +45,7 @@ from typing import IO, Any
 
 from bmask_slam.events import Event
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.graph.whole_file import remove, remove_partial, whole_file
 from bmask_slam.run_folder.covariance_file import COVARIANCES
@@ -129,7 +130,8 @@ class RunFolder:
         if resume_bytes is None:
             _clear(path, overwrite)
         else:
-            _check_no_links(path)
+            for name in (*GROWING, "log.txt"):
+                refuse_link(path / name, "start the run again with --overwrite")
         for name, size in kept.items():
             check_grown(path / name, GROWING[name], size)
         try:
@@ -248,16 +250,6 @@ def _lock(file: IO[Any], path: Path) -> None:
         raise InputError(
             f"{path}: a process is writing a run there; wait for it, or choose another --out"
         ) from error
-
-
-def _check_no_links(folder: Path) -> None:
-    """Raise InputError if a file that a resumed run goes on with is a link."""
-    for name in (*GROWING, "log.txt"):
-        if (folder / name).is_symlink():
-            raise InputError(
-                f"{folder / name}: is a link; nothing is written through it, start the run again "
-                "with --overwrite"
-            )
 
 
 def _make_folder(path: Path) -> list[Path]:
