@@ -182,9 +182,9 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     """Measure, write the report, and the README's table if everything was measured."""
+    arguments = parse()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     logging.getLogger("bmask_slam").setLevel(logging.WARNING)
-    arguments = parse()
     arguments.work.mkdir(parents=True, exist_ok=True)
     store = arguments.work / "results.json"
     if not arguments.report_only:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -60,13 +59,3 @@ def office(rendered: Callable[[RenderConfig], Path]) -> Path:
     from bmask_slam.rendering.sequence import RenderConfig
 
     return rendered(RenderConfig("office", frames=15, width=160, height=120, true_depth=True))
-
-
-@pytest.fixture(autouse=True)
-def plain_loggers() -> None:
-    """Loggers as at the start: some test leaves them quieter, which hid what others look for."""
-    for name, logger in logging.root.manager.loggerDict.items():
-        if name.startswith("bmask_slam") and isinstance(logger, logging.Logger):
-            logger.setLevel(logging.NOTSET)
-            logger.disabled, logger.propagate = False, True
-    logging.disable(logging.NOTSET)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import re
 import subprocess
 import sys
@@ -31,6 +32,7 @@ def test_every_script_starts(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
                 code.main()
             assert end.value.code == 0, module
             assert "usage:" in capsys.readouterr().out
+        assert logging.getLogger("bmask_slam").level == logging.NOTSET, module
 
 
 def test_a_script_runs_as_its_description_says() -> None:
