@@ -10,14 +10,19 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Arrays
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.files.growing_table import read_table
 
 logger = logging.getLogger(__name__)
 
+EVENTS = "events.csv"
+EVENT_COLUMNS = ("index", "timestamp", "kind", "text")
 TOTALS = (
     *("observations refused", "keyframes refused", "factors refused"),
     *("landmarks dropped", "keyframes dropped", "keyframes anchored", "rebuilds"),
@@ -182,6 +187,33 @@ class EventLog:
             return
         logger.log(level, "%s", event)
         self._events.append(event)
+
+
+def event_row(event: Event) -> dict[str, object]:
+    """The values of an event's line by column."""
+    stamp, kind = f"{event.timestamp_s:.6f}", event.kind.value
+    return {"index": event.frame, "timestamp": stamp, "kind": kind, "text": event.text}
+
+
+def read_events(run: Path) -> tuple[Event, ...]:
+    """The events of a run folder so far; none if an older version wrote it, without events.csv.
+
+    Raises:
+        InputError: a column that is missing, a value that is no number, or an unknown kind.
+    """
+    path = run / EVENTS
+    if not path.is_file():
+        return ()
+    columns = read_table(path, EVENT_COLUMNS)
+    try:
+        return tuple(
+            Event(int(index), float(stamp), EventKind(kind), text)
+            for index, stamp, kind, text in zip(
+                *(columns[name] for name in EVENT_COLUMNS), strict=True
+            )
+        )
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; run again") from error
 
 
 def totals(counts: Mapping[str, int]) -> dict[str, int]:

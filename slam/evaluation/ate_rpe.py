@@ -11,6 +11,7 @@ from typing import TypedDict
 
 import numpy as np
 
+from bmask_slam.events import read_events
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import so3_log
@@ -117,8 +118,9 @@ def evaluate(
     """Evaluate a run folder or a trajectory against a trajectory or a sequence folder.
 
     Trajectories are in the format of TUM, EuRoC or KITTI; stamps of the latter are read from the
-    file ``times``, or are those of the run's frames. ``with_body``: the reference is of another
-    body, such as markers or an IMU; its pose on the camera is estimated and its path compared.
+    file ``times``, or are those of the run's frames. ``plot`` shows a run's events. ``with_body``:
+    the reference is of another body, such as markers or an IMU, whose pose on the camera is
+    estimated.
 
     Raises:
         InputError: a missing or broken file, trajectories without common times, or ``with_body``
@@ -142,7 +144,8 @@ def evaluate(
     if plot is not None:
         from bmask_slam.evaluation.plot import plot_trajectory  # noqa: PLC0415 - matplotlib loads slowly
 
-        plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, (), with_scale)
+        events = () if frames_s is None else read_events(file.parent)
+        plot_trajectory(plot, estimate, truth, run_or_trajectory.resolve().stem, events, with_scale)
     return result
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from bmask_slam import __version__
 from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.config.configuration import dump, from_text, resolve
+from bmask_slam.events import EVENTS
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -26,7 +27,7 @@ from bmask_slam.graph.files.array_file import FileKind, nested, part, read_array
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
-from bmask_slam.run_folder.frame_file import EVENTS, FRAMES
+from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.sequences import Sequence
 from bmask_slam.system_config import SystemConfig

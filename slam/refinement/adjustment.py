@@ -16,6 +16,7 @@ from bmask_slam.evaluation import (
     read_reference,
 )
 from bmask_slam.evaluation.plot import plot_trajectory
+from bmask_slam.events import EVENTS, read_events
 from bmask_slam.graph.batch.bundle_adjustment import Adjustment, AdjustmentConfig, Stage, adjust
 from bmask_slam.graph.batch.iteration import Progress
 from bmask_slam.graph.errors import InputError
@@ -26,7 +27,7 @@ from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.refinement.adjustment_plot import GraphSnapshot, check_picture, draw_adjustment
 from bmask_slam.refinement.carried_along import adjusted_map, move_frames, move_landmarks
 from bmask_slam.run_folder.folder import RunFolder
-from bmask_slam.run_folder.frame_file import EVENTS, FRAMES, read_events
+from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.landmark_file import LANDMARKS_COMMENT
 from bmask_slam.run_folder.map_file import MAP, SavedRun, read_map, read_run, write_map
 from bmask_slam.run_folder.metrics import EVALUATION_ROWS

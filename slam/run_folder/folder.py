@@ -43,21 +43,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-from bmask_slam.events import Event
+from bmask_slam.events import EVENT_COLUMNS, EVENTS, Event, event_row
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
+from bmask_slam.graph.files.growing_table import GrowingTable, check_grown
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.graph.whole_file import remove, remove_partial, whole_file
 from bmask_slam.run_folder.covariance_file import COVARIANCES
-from bmask_slam.run_folder.frame_file import (
-    COLUMNS,
-    EVENT_COLUMNS,
-    EVENTS,
-    FRAMES,
-    event_row,
-    frame_row,
-)
-from bmask_slam.run_folder.growing_table import GrowingTable, check_grown
+from bmask_slam.run_folder.frame_file import COLUMNS, FRAMES, frame_row
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
 from bmask_slam.tracking.results import FrameResult
 

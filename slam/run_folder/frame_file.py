@@ -1,4 +1,4 @@
-"""frames.csv and events.csv: lines that are written while a run goes on, and read back."""
+"""frames.csv: a line a frame, written while a run goes on, and read back."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.errors import InputError
-from bmask_slam.run_folder.growing_table import read_table
+from bmask_slam.graph.files.growing_table import read_table
 from bmask_slam.tracking.results import FrameResult
 
-FRAMES, EVENTS = "frames.csv", "events.csv"
+FRAMES = "frames.csv"
 STAGES = ("features", "moving", "tracking", "keyframe", "graph", "loops", "semantics")
 COLUMNS = (
     *("index", "timestamp", "status", "segment", "matches", "inliers"),
@@ -24,7 +23,6 @@ COLUMNS = (
     *("keyframe", "keyframe_reason"),
 )
 MAX_STAMP_ERROR_S = 1e-5  # of stamps with six decimals
-EVENT_COLUMNS = ("index", "timestamp", "kind", "text")
 _NEEDED = ("index", "timestamp", "status", "keyframe")
 
 
@@ -109,30 +107,3 @@ def _table(columns: dict[str, tuple[str, ...]]) -> FrameTable:
         keyframe_reasons=columns["keyframe_reason"],
         stage_ms={stage: numbers(f"{stage}_ms", np.nan, float) for stage in STAGES},
     )
-
-
-def event_row(event: Event) -> dict[str, object]:
-    """The values of an event's line by column."""
-    stamp, kind = f"{event.timestamp_s:.6f}", event.kind.value
-    return {"index": event.frame, "timestamp": stamp, "kind": kind, "text": event.text}
-
-
-def read_events(run: Path) -> tuple[Event, ...]:
-    """The events of a run folder so far; none if an older version wrote it, without events.csv.
-
-    Raises:
-        InputError: a column that is missing, a value that is no number, or an unknown kind.
-    """
-    path = run / EVENTS
-    if not path.is_file():
-        return ()
-    columns = read_table(path, EVENT_COLUMNS)
-    try:
-        return tuple(
-            Event(int(index), float(stamp), EventKind(kind), text)
-            for index, stamp, kind, text in zip(
-                *(columns[name] for name in EVENT_COLUMNS), strict=True
-            )
-        )
-    except ValueError as error:
-        raise InputError(f"{path}: {error}; run again") from error

@@ -9,11 +9,11 @@ import numpy as np
 
 from bmask_slam.evaluation import Row, evaluate_trajectory, format_json
 from bmask_slam.evaluation.plot import plot_trajectory
+from bmask_slam.events import read_events
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.run_folder.folder import RunFolder
-from bmask_slam.run_folder.frame_file import read_events
 from bmask_slam.run_folder.landmark_file import write_landmarks
 from bmask_slam.runtime.memory import peak_rss_mb
 from bmask_slam.system_interface import System

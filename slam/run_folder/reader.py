@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bmask_slam.events import Event
+from bmask_slam.events import Event, read_events
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -22,7 +22,6 @@ from bmask_slam.run_folder.frame_file import (
     FRAMES,
     MAX_STAMP_ERROR_S,
     FrameTable,
-    read_events,
     read_frames,
 )
 from bmask_slam.run_folder.landmark_file import (

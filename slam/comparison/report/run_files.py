@@ -1,17 +1,18 @@
-"""Times of the stages and pictures of the maps, from run folders."""
+"""Times of the stages, events and pictures of the maps, from run folders."""
 
 from __future__ import annotations
 
 import logging
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison, Kind
-from bmask_slam.comparison.report.section import Picture
+from bmask_slam.comparison.report.section import Picture, slug
 from bmask_slam.comparison.report.table import EMPTY, Entry, Table, TableRow
+from bmask_slam.events import EventKind, read_events
 from bmask_slam.run_folder.frame_file import FRAMES, STAGES, read_frames
 
 KEYFRAME_STAGES = ("keyframe", "graph", "loops", "semantics")
@@ -45,6 +46,25 @@ def stage_table(comparison: Comparison, folder: Path) -> Table | None:
     return (
         Table("stages", "Time of each stage (ms)", caption, STAGES, tuple(rows)) if rows else None
     )
+
+
+def event_table(comparison: Comparison, sequence: str, folder: Path) -> Table | None:
+    """Events of each kind by method, mean over its runs; None if nothing happened."""
+    counted: dict[str, tuple[Counter[EventKind], int]] = {}
+    for method in comparison.methods:
+        cells = [c for c in comparison.of(sequence, method.name) if c.status is CellStatus.DONE]
+        runs = [folder / c.folder for c in cells if c.folder and method.kind is Kind.RUN]
+        if runs:
+            counts = Counter(event.kind for run in runs for event in read_events(run))
+            counted[method.name] = (counts, len(runs))
+    kinds = [kind for kind in EventKind if any(counts[kind] for counts, _ in counted.values())]
+    rows = [
+        TableRow(name, tuple(Entry(f"{counts[kind] / runs:.3g}") for kind in kinds))
+        for name, (counts, runs) in counted.items()
+    ]
+    name, columns = f"events-{slug(sequence)}", tuple(kind.value for kind in kinds)
+    caption = "Events in a run, mean over runs."
+    return Table(name, "Events", caption, columns, tuple(rows)) if kinds else None
 
 
 def read_stage_times(cell: Cell, folder: Path, times: Times) -> None:

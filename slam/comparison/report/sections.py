@@ -10,7 +10,7 @@ from typing import Any
 from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison
 from bmask_slam.comparison.report.curves import network_pictures
 from bmask_slam.comparison.report.figures import error_pictures
-from bmask_slam.comparison.report.run_files import map_pictures, stage_table
+from bmask_slam.comparison.report.run_files import event_table, map_pictures, stage_table
 from bmask_slam.comparison.report.section import Listing, Section
 from bmask_slam.comparison.report.table import (
     ATE,
@@ -111,7 +111,11 @@ def _failures(comparison: Comparison, folder: Path) -> Section:
 
 def _error_figures(comparison: Comparison, folder: Path) -> list[Section]:
     return [
-        Section(f"Errors on {name}", pictures=tuple(error_pictures(comparison, name, folder)))
+        Section(
+            f"Errors on {name}",
+            tables=tuple(filter(None, [event_table(comparison, name, folder)])),
+            pictures=tuple(error_pictures(comparison, name, folder)),
+        )
         for name in comparison.sequences
     ]
 

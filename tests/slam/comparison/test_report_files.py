@@ -14,7 +14,7 @@ from small_comparison import make_comparison
 from bmask_slam.comparison.experiment.result import Comparison
 from bmask_slam.comparison.report import write_report
 from bmask_slam.comparison.report.curves import network_pictures, read_losses, read_precision
-from bmask_slam.comparison.report.run_files import map_pictures, stage_table
+from bmask_slam.comparison.report.run_files import event_table, map_pictures, stage_table
 from bmask_slam.run_folder.frame_file import COLUMNS, STAGES
 from bmask_slam.semantics.segmenters.evaluation import ApCurve, SegmentationResult, write_curves
 
@@ -51,6 +51,18 @@ def test_stage_times_are_over_frames_or_keyframes_of_all_runs(comparison, tmp_pa
 
 def test_without_run_folders_there_is_no_stage_table(comparison, tmp_path):
     assert stage_table(comparison, tmp_path) is None
+
+
+def test_events_are_counted_by_kind_as_a_mean_over_runs(comparison, tmp_path):
+    assert event_table(comparison, "one", tmp_path) is None
+    lost = '3,0.1,lost,"7 matches give no pose, nor is it recognised"\n'
+    for k, count in enumerate((2, 1)):
+        text = "index,timestamp,kind,text\n0,0.0,new segment,it begins\n" + count * lost
+        (tmp_path / f"run{k}/events.csv").write_text(text)
+    table = event_table(comparison, "one", tmp_path)
+    assert table.columns == ("lost", "new segment")
+    assert [entry.text for entry in table.rows[0].entries] == ["1.5", "1"]
+    assert "Events in a run" in write_report(comparison, tmp_path)[0].read_text()
 
 
 def test_map_pictures_are_of_the_first_run_with_maps_and_scaled(comparison, tmp_path):

@@ -110,6 +110,19 @@ def test_run_folder_against_sequence_folder(tmp_path):
     assert direct.rows == result.rows
 
 
+def test_the_picture_of_a_run_marks_its_events(tmp_path):
+    write_tum(tmp_path / "groundtruth.txt", arc())
+    write_tum(tmp_path / "trajectory.txt", shaken(arc()))
+    (tmp_path / "frames.csv").write_text("index,timestamp\n" + "0,0\n" * 300)
+    evaluate(tmp_path, tmp_path, tmp_path / "plain.svg")
+    lost = f"10,{arc().timestamps_s[10]:.6f},lost,why\n"
+    (tmp_path / "events.csv").write_text("index,timestamp,kind,text\n" + 2 * lost)
+    evaluate(tmp_path, tmp_path, tmp_path / "marked.svg")
+    colour = "#b0151b"  # of a loss
+    assert colour not in (tmp_path / "plain.svg").read_text()
+    assert colour in (tmp_path / "marked.svg").read_text()
+
+
 def test_bad_input(tmp_path):
     write_tum(tmp_path / "late.txt", Trajectory(arc().timestamps_s + 50, arc().poses_world_camera))
     write_tum(tmp_path / "groundtruth.txt", arc())

@@ -21,12 +21,11 @@ import pytest
 from fake_run import FakeSystem, make_sequence, signal_at
 from repository import KITCHEN
 
-from bmask_slam.events import EventKind
+from bmask_slam.events import EventKind, read_events
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline.runner import RunOptions, resume, run
 from bmask_slam.run_folder import metrics as run_results
 from bmask_slam.run_folder.folder import CHECKPOINT, FILES, GROWING, RunFolder
-from bmask_slam.run_folder.frame_file import read_events
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.tracker import TrackingConfig
 

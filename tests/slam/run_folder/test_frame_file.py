@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bmask_slam.events import Event, EventKind
+from bmask_slam.events import Event, EventKind, read_events
 from bmask_slam.graph.errors import InputError
 from bmask_slam.run_folder.folder import RunFolder
-from bmask_slam.run_folder.frame_file import read_events, read_frames
+from bmask_slam.run_folder.frame_file import read_frames
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 

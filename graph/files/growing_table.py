@@ -1,4 +1,4 @@
-"""Tables of a run folder that grow by lines while a run goes on: frames.csv and events.csv."""
+"""Tables that grow by lines while a run goes on, such as frames.csv and events.csv."""
 
 from __future__ import annotations
 
