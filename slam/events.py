@@ -122,7 +122,7 @@ class EventLog:
         self._frame, self._timestamp_s = frame, timestamp_s
 
     def calibration(self, text: str) -> None:
-        """What was found of the camera before the run, and what became of it."""
+        """What was found of the camera, before the run or live, and what became of it."""
         self._add(EventKind.CALIBRATION, text)
 
     def lost(self, matches: int) -> None:

@@ -99,6 +99,16 @@ class ObservationTable:
             self.of_landmark.setdefault(landmark, {})[keyframe] = row
         return rows
 
+    def remeasure(self, observations: Observations) -> None:
+        """Replace the measurements of those of the observations that are in the table."""
+        pairs = zip(
+            observations.keyframe_ids.tolist(), observations.landmark_ids.tolist(), strict=True
+        )
+        rows = [self.row(*pair) for pair in pairs]
+        known = np.array([row is not None for row in rows], bool)
+        at = np.array([row for row in rows if row is not None], np.int64)
+        self._columns.measurements[at] = observations.measurements[known]
+
     def remove(self, rows: Ints) -> None:
         """Remove rows; each must be in use."""
         pairs = zip(

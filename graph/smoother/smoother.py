@@ -23,7 +23,7 @@ from bmask_slam.graph.factors.graph_estimate import (
     ObservationErrors,
     RelativePoseErrors,
 )
-from bmask_slam.graph.factors.graph_update import GraphUpdate, RelativePose
+from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.marginals.covariances import Marginals
 from bmask_slam.graph.marginals.landmark_marginalisation import (
@@ -48,6 +48,9 @@ from bmask_slam.graph.smoother.validation import Validated, validate
 
 __all__ = ["Smoother", "SmootherConfig"]
 logger = logging.getLogger(__name__)
+
+REMEASURED_ITERATIONS = 20
+"""Of the adjustment after the camera's times were changed, which is a small change."""
 
 
 class Smoother:
@@ -121,6 +124,16 @@ class Smoother:
         before, after = costs[-1]
         estimate = report.estimate(self._tables, self._solver.elapsed_s)
         return dataclasses.replace(estimate, cost_before=before, cost_after=after)
+
+    def remeasure(self, camera: Camera, observations: Observations) -> GraphEstimate:
+        """Replace measurements, as another camera gives them, and optimise the whole graph.
+
+        Observations that are not in the graph are passed over.
+        """
+        self._camera, self._solver = camera, Solver(camera, self._config)
+        reinsert(self._tables, camera, self._config)
+        self._tables.observations.remeasure(observations)
+        return self.optimise_batch(REMEASURED_ITERATIONS)
 
     def estimate(self) -> GraphEstimate:
         """The current estimate, without optimising."""

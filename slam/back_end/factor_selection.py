@@ -177,6 +177,17 @@ def was_sent(world: WorldMap) -> Mask:
     return sent[:-1]
 
 
+def sent_observations(world: WorldMap) -> Observations:
+    """Every observation that was sent to the graph, as the keyframes' features have it now."""
+    parts = []
+    for keyframe in world.keyframes.values():
+        rows = np.flatnonzero(
+            (keyframe.sent_ids >= 0) & (keyframe.sent_ids == keyframe.landmark_ids)
+        )
+        parts.append(observations_of(keyframe, rows, keyframe.sent_ids[rows]))
+    return concatenate(parts)
+
+
 def segment_prior(keyframe: Keyframe) -> PosePrior:
     """The first keyframe of a segment fixes the segment's frame."""
     return PosePrior(keyframe.id, keyframe.T_world_camera, np.eye(6) * 1e-8)

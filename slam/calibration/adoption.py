@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 FREE = (SHUTTER, TIME)
 """The parameters that are estimated, by their places in PARAMETERS."""
 FIXED = tuple(name for i, name in enumerate(PARAMETERS) if i not in FREE)
+CALIBRATE = ("auto", "report", "off")
+"""Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
 MIN_STEP_S, MAX_SHARE = 0.002, 0.6
 
@@ -119,10 +121,16 @@ class CalibrationRounds:
 
     Args:
         given: the camera of the first round.
+        free: the parameters that may be adopted, by their places in PARAMETERS.
     """
 
-    def __init__(self, given: Camera, config: SelfCalibrationConfig | None = None) -> None:
-        self._given, self._config = given, config or SelfCalibrationConfig()
+    def __init__(
+        self,
+        given: Camera,
+        config: SelfCalibrationConfig | None = None,
+        free: tuple[int, ...] = FREE,
+    ) -> None:
+        self._given, self._config, self._free = given, config or SelfCalibrationConfig(), free
         self._sure: list[int] = []
         self._rounds: list[Estimate] = []
 
@@ -158,7 +166,7 @@ class CalibrationRounds:
 
     def _newly_sure(self, estimate: Estimate, known: Iterable[int]) -> list[int]:
         """The parameters that are to be adopted beside those that already are."""
-        sure = [i for i in FREE if i not in known and estimate.differs(i, self._config)]
+        sure = [i for i in self._free if i not in known and estimate.differs(i, self._config)]
         halves = cross_validate(estimate.problem) if sure else None
         if halves is None:
             return []

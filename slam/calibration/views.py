@@ -95,7 +95,7 @@ def make_views(
     keyframe_ids, keyframes = np.unique(observations.keyframe_ids, return_inverse=True)
     landmark_ids, landmarks = np.unique(observations.landmark_ids, return_inverse=True)
     pixels = camera.distort(as_exposed(observations.measurements[:, :2], motion, camera))
-    nominal = _sensor_sigmas(observations, camera)
+    nominal = sensor_sigmas(observations, camera)
     depths = _Depths.missing(len(observations))
     for k, keyframe in enumerate(keyframe_ids.tolist()):
         rows, index = np.flatnonzero(keyframes == k), frames[keyframe]
@@ -114,7 +114,7 @@ def make_views(
     return views, keyframe_ids, landmark_ids
 
 
-def _sensor_sigmas(observations: Observations, camera: Camera) -> Array:
+def sensor_sigmas(observations: Observations, camera: Camera) -> Array:
     """Sigmas (M,) of inverse depth in 1/m by the depth sensor alone; the median's without depth.
 
     The graph's include the roughness of the surface, which is fitted here: the camera's noise model

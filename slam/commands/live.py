@@ -48,6 +48,8 @@ def add_live(commands: Commands) -> None:
     _add_source_arguments(parser)
     add_config_arguments(parser)
     add_camera_argument(parser)
+    text = "find readout time and depth delay while it runs; auto: use them (default: report)"
+    parser.add_argument("--calibrate", default="report", metavar="auto|off|report", help=text)
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
     parser.add_argument("--map", action="store_true", help="also a dense map, as by bmask-slam map")
     add_segmenter_arguments(parser, "light")
@@ -126,11 +128,16 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         images=folder if folder.is_dir() and not is_bag(folder) else Path(),
         title=source.name,
         dense=arguments.map,
+        calibrate=arguments.calibrate,
+        interpolates=source.use is not None,
     )
 
 
 def _print_summary(slam: LiveSlam, source: Source) -> None:
-    print(f"{format_summary(slam.rows)}\n\nRun folder  {slam.options.out}")
+    print(format_summary(slam.rows))
+    if slam.calibration:
+        print(f"\nCamera      {slam.calibration}")
+    print(f"\nRun folder  {slam.options.out}")
     if slam.dense is not None:
         print(f"Dense map   {slam.options.out}/dense, {slam.dense.points} points")
     if counts := source.counts.line():

@@ -62,6 +62,7 @@ class LiveSlam:
     A context manager: leaving it ends the processes and saves everything, also after an error.
 
     Attributes:
+        camera: of the frames; another one once calibration has found its times.
         frames_dropped: by the source, which sets it.
         source_counts: of the source, for ``health``.
         rows: what metrics.json holds, after ``close``.
@@ -134,6 +135,7 @@ class LiveSlam:
         depth_m: Floats,
         prepared: Prepared | None = None,
         name: str = "",
+        depth_lag_s: float = 0.0,
     ) -> FrameResult:
         """Track a frame: its pose ``T_world_camera`` (4, 4), status and covariance.
 
@@ -145,6 +147,7 @@ class LiveSlam:
             depth_m: (H, W) float z-depth in metres, NaN or 0 where missing, registered to rgb.
             prepared: from ``prepare``, if the features were extracted ahead.
             name: of the image, for a segmenter that looks masks up.
+            depth_lag_s: stamp of the depth image less ``timestamp_s``, to find the depth's delay.
 
         Raises:
             InputError: a frame that ``check_frame`` refuses. It is not used; the next one may be.
@@ -152,7 +155,7 @@ class LiveSlam:
         arrived_s = time.monotonic() if prepared is None else prepared.arrived_s
         if not self._meter.frames:
             self._begin_s = arrived_s
-        frame = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name)
+        frame = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name, depth_lag_s)
         try:
             result = self._system.process(frame, prepared.features if prepared else None)
         except InputError:
@@ -160,13 +163,32 @@ class LiveSlam:
             raise
         if prepared is not None:
             result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
+        self._follow_camera()
         self._counters.count(result)
         self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
+        self._show(result, rgb)
+        return result
+
+    def _show(self, result: FrameResult, rgb: Image) -> None:
+        """Write and display a frame."""
         if self._recorder is not None:
             self._recorder.frame(result, self.health, self.trajectory)
         if self._display is not None and self._display.frame(result, rgb, self._system):
             self._display.map(self._system, self.health())
-        return result
+
+    def _follow_camera(self) -> None:
+        """Take over the camera that calibration has found, and keep it in the run folder."""
+        if self._system.camera == self.camera:
+            return
+        self.camera = self._system.camera
+        if self._recorder is not None:
+            self._recorder.camera(self.camera, self.calibration)
+
+    @property
+    def calibration(self) -> str:
+        """What was found of the camera, in one line; "" if nothing, or if it was not tried."""
+        found = self._system.calibration
+        return "" if found is None else found.text
 
     def trajectory(self) -> Trajectory:
         """Every frame of the largest map segment so far, from the keyframes' present poses."""
@@ -226,6 +248,7 @@ class LiveSlam:
             return
         try:
             self._system.finish()
+            self._follow_camera()
         except InputError as error:
             logger.error("the map is lost, the trajectory is saved: %s", error)
             return

@@ -5,12 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import FileKind
 from bmask_slam.live.replica import WorldDelta
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.frame_history import Entries
 from bmask_slam.world.landmark_table import Patches
+
+STATE_FILE = FileKind("live state", 6)
+"""What the map's process saves: its system's state, and the camera in the header."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +138,17 @@ class RestoreObservations:
     patches: Patches
 
 
+@dataclass(frozen=True, eq=False)
+class UseCamera:
+    """To the map: later keyframes are of a camera with other times; known keyframes follow it.
+
+    ``motions`` by keyframe.
+    """
+
+    camera: Camera
+    motions: dict[int, KeyframeMotion]
+
+
 @dataclass(frozen=True)
 class SaveState:
     """To the map: write its state to a file."""
@@ -167,6 +184,35 @@ class StateSaved:
 
     number: int
     path: Path
+
+
+@dataclass(frozen=True)
+class EstimateTimes:
+    """To the calibration: estimate from a saved state of the map.
+
+    Only keyframes from ``first_keyframe`` on are used: those before were tracked with another
+    camera.
+    """
+
+    state: Path
+    first_keyframe: int
+
+
+@dataclass(frozen=True, eq=False)
+class TimesEstimated:
+    """From the calibration: what was found.
+
+    Attributes:
+        camera: to go on with; None: with the one that there is.
+        motions: of the keyframes in the map, for ``UseCamera``.
+        text: one line for the log and the summary; "" if nothing can be said yet.
+        done: whether no further estimate is needed.
+    """
+
+    camera: Camera | None
+    motions: dict[int, KeyframeMotion]
+    text: str
+    done: bool
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
                 slam.catch_up(WAITING)
                 prepared = replace(ahead, arrived_s=time.monotonic())
             try:
-                slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, prepared, frame.name)
+                _track(slam, source, frame, prepared)
             except InputError as error:
                 logger.warning("%s", error)
             if not options.quiet:
@@ -72,6 +72,14 @@ def play(slam: LiveSlam, source: Source, options: PlayOptions) -> signal.Signals
             if stop.signal is not None:
                 break
     return stop.signal
+
+
+def _track(slam: LiveSlam, source: Source, frame: Frame, prepared: Prepared) -> None:
+    """Track a frame; the source goes on with the camera that may have been found meanwhile."""
+    camera, images = slam.camera, (frame.rgb, frame.depth_m)
+    slam.track(frame.timestamp_s, *images, prepared, frame.name, frame.depth_lag_s)
+    if slam.camera != camera and source.use is not None:
+        source.use(slam.camera)
 
 
 def _with_features(slam: LiveSlam, source: Source) -> _Pairs:

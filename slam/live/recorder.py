@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.live.health import Health
-from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
+from bmask_slam.run_folder.folder import CAMERA, DISK_ERRORS, HEALTH, RunFolder
+from bmask_slam.sequences import write_camera
 from bmask_slam.tracking.results import FrameResult
 
 logger = logging.getLogger(__name__)
@@ -40,6 +42,10 @@ class Recorder:
         self._health_s = time.monotonic()
         self._snapshot_due_s = self._health_s + SNAPSHOT_S
 
+    def camera(self, camera: Camera, text: str) -> None:
+        """Write the camera that was found, with a comment that says how."""
+        self._guarded(lambda: write_camera(self.folder.path / CAMERA, camera, text))
+
     def frame(
         self,
         result: FrameResult,
@@ -47,8 +53,11 @@ class Recorder:
         trajectory: Callable[[], Trajectory],
     ) -> None:
         """Write a frame, and the other files when they are due; a full disk is logged."""
+        self._guarded(lambda: self._write(result, health, trajectory))
+
+    def _guarded(self, write: Callable[[], None]) -> None:
         try:
-            self._write(result, health, trajectory)
+            write()
         except OSError as error:
             if error.errno not in DISK_ERRORS:
                 raise

@@ -6,10 +6,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from bmask_slam.calibration.adoption import CALIBRATE, SelfCalibrationConfig
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.live.processes.calibration_process import CalibrationSetup
 from bmask_slam.live.processes.dense_messages import DenseSetup
+from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.system import LiveSystem
@@ -36,6 +39,10 @@ class LiveOptions:
             ``bmask-slam map`` reads it.
         title: of the plot of the trajectory.
         dense: make a dense map as well; needs ``out``.
+        calibrate: whether readout time and depth delay are found while it runs: ``auto`` uses what
+            is found, ``report`` only says so, ``off``.
+        interpolates: whether the source gives depth at the colour image's time where the camera has
+            a delay, also one that is found; if not, a delay is not used.
     """
 
     out: Path | None = None
@@ -45,11 +52,26 @@ class LiveOptions:
     images: Path = Path()
     title: str = "live"
     dense: bool = False
+    calibrate: str = "off"
+    interpolates: bool = False
+
+    def __post_init__(self) -> None:
+        if self.calibrate not in CALIBRATE:
+            raise InputError(f"--calibrate {self.calibrate}: is not one of {', '.join(CALIBRATE)}")
 
     @property
     def origin(self) -> Origin:
         """The sequence folder that the frames come from, if any, for config.yaml."""
         return Origin(None if self.images == Path() else self.images)
+
+
+def start_calibration(
+    camera: Camera, config: SystemConfig, options: LiveOptions
+) -> RemoteCalibration:
+    """The process that estimates the camera's times."""
+    rules, adopt = SelfCalibrationConfig(), options.calibrate == "auto"
+    setup = CalibrationSetup(camera, config.graph, rules, options.interpolates)
+    return RemoteCalibration(setup, adopt)
 
 
 def start_system(
@@ -73,6 +95,10 @@ def start_system(
             points = PREVIEW_POINTS if options.view.enabled else 0
             dense = RemoteDenseMapper(DenseSetup(options.out, camera, masks, labels.names, points))
             undo.callback(dense.close)
-        system = LiveSystem(camera, config, scratch, segmenter, dense)
+        calibration = None
+        if options.calibrate != "off":
+            calibration = start_calibration(camera, config, options)
+            undo.callback(calibration.close)
+        system = LiveSystem(camera, config, scratch, segmenter, dense, calibration)
         undo.pop_all()
         return system

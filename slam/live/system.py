@@ -18,8 +18,9 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, read_arrays
 from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
-from bmask_slam.live.messages import ImageToSegment
-from bmask_slam.live.processes.map_process import STATE_FILE, LabelsOnly
+from bmask_slam.live.messages import STATE_FILE, ImageToSegment, TimesEstimated, UseCamera
+from bmask_slam.live.processes.map_process import LabelsOnly
+from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
@@ -38,6 +39,8 @@ SWITCH_S = 0.0005
 """Longest time that another thread keeps Python's lock, which tracking needs often in a frame."""
 MASKS_S = 10.0
 """Longest wait for the masks of the last keyframes at the end."""
+CALIBRATION_S = 15.0
+"""Longest wait for an estimate of the camera's times that is under way at the end."""
 FINISH_S = 600.0
 
 
@@ -68,6 +71,7 @@ class LiveSystem(SlamSystem):
         remote: the copy of the map, and the process that owns the map.
         segmenter: the process that makes masks, if any.
         dense: the process that makes submaps, if any.
+        calibration: the process that estimates the camera's times, if any.
     """
 
     def __init__(
@@ -77,8 +81,9 @@ class LiveSystem(SlamSystem):
         folder: Path,
         segmenter: RemoteSegmenter | None = None,
         dense: RemoteDenseMapper | None = None,
+        calibration: RemoteCalibration | None = None,
     ) -> None:
-        self.segmenter, self.dense = segmenter, dense
+        self.segmenter, self.dense, self.calibration = segmenter, dense, calibration
         self._names = (segmenter or NoSegmenter).labels.names
         with ExitStack() as undo:
             self.remote = RemoteMapper(camera, config, self._names, folder)
@@ -95,6 +100,8 @@ class LiveSystem(SlamSystem):
         """Apply the other processes' results, then do the same step as offline."""
         self.catch_up()
         result = super().process(frame, features)
+        if self.calibration is not None:
+            self.calibration.add_frame(frame, self._keyframe(result))
         first = self.camera_tracker.reference
         if result.keyframe_id is None or first is None:
             return result
@@ -103,6 +110,17 @@ class LiveSystem(SlamSystem):
             self.remote.wait_for(first, FIRST_MAP_S)
             self._follow_map(first, T_before)
         return result
+
+    def _keyframe(self, result: FrameResult) -> Keyframe | None:
+        """The keyframe that a frame has become, if it has."""
+        made = result.keyframe_id
+        return None if made is None else self.remote.world.keyframes.get(made)
+
+    def use_camera(self, found: TimesEstimated) -> None:
+        """Track with a camera of other times from the next frame on, and tell the map."""
+        if found.camera is not None:
+            self.camera = self.camera_tracker.tracker.camera = found.camera
+            self.remote.send(UseCamera(found.camera, found.motions))
 
     def catch_up(self) -> None:
         """Update the copy of the map, pass masks on, and move tracking with the map."""
@@ -118,6 +136,11 @@ class LiveSystem(SlamSystem):
             self._update_dense(self.dense, moved=self.remote.changes != changes)
         if reference is not None and T_before is not None and self.remote.changes != changes:
             self._follow_map(reference, T_before)
+        if self.calibration is not None:
+            times = self.calibration.update(self.remote)
+            if times is not None:
+                self.use_camera(times)
+                self.events.calibration(self.calibration.text)
 
     def _follow_map(self, reference: Keyframe, T_before: Array) -> None:
         """Move tracking with a keyframe whose pose was T_before (4, 4).
@@ -147,13 +170,22 @@ class LiveSystem(SlamSystem):
     def wait_for_map(self, waiting: float, timeout_s: float) -> None:
         """Catch up until at most ``waiting`` keyframes wait for the map, or until the timeout.
 
-        With a finite ``waiting`` it also waits while the dense map would drop a keyframe.
+        With a finite ``waiting`` it also waits while the dense map would drop a keyframe, and, for
+        as long as that takes, for an estimate of the camera's times.
         """
         deadline_s = time.monotonic() + timeout_s
         self.catch_up()
-        while self._is_behind(waiting) and time.monotonic() < deadline_s:
+        while self._is_estimating(waiting) or (
+            self._is_behind(waiting) and time.monotonic() < deadline_s
+        ):
             time.sleep(0.001)
             self.catch_up()
+
+    def _is_estimating(self, waiting: float) -> bool:
+        calibration = self.calibration
+        if calibration is None or not calibration.adopts:
+            return False
+        return waiting < np.inf and calibration.busy
 
     def _is_behind(self, waiting: float) -> bool:
         is_full = waiting < np.inf and self.dense is not None and self.dense.full
@@ -167,8 +199,12 @@ class LiveSystem(SlamSystem):
 
     def finish(self) -> None:
         """Let the other processes finish; afterwards this is an offline system with the map."""
-        deadline_s = time.monotonic() + MASKS_S
-        while self.segmenter and self.segmenter.waiting and time.monotonic() < deadline_s:
+        begin_s = time.monotonic()
+        while self.segmenter and self.segmenter.waiting and time.monotonic() < begin_s + MASKS_S:
+            time.sleep(0.02)
+            self.catch_up()
+        calibration = self.calibration
+        while calibration and calibration.busy and time.monotonic() < begin_s + CALIBRATION_S:
             time.sleep(0.02)
             self.catch_up()
         path = self.remote.finish(FINISH_S)
@@ -183,8 +219,9 @@ class LiveSystem(SlamSystem):
     def close(self) -> None:
         """Kill the other processes; what they have not sent is lost."""
         self._stop_workers()
-        if self.dense is not None:
-            self.dense.close()
+        for worker in (self.dense, self.calibration):
+            if worker is not None:
+                worker.close()
 
     def _stop_workers(self) -> None:
         """Kill the map's and the segmenter's process, and restore the settings."""

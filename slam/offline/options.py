@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from bmask_slam.calibration.adoption import CALIBRATE
 from bmask_slam.graph.errors import InputError
 from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.system_config import SystemConfig
@@ -16,7 +17,6 @@ _RECORDED = (
     *(*_PATHS, "config_name", "max_frames", "stride", "checkpoint_every", "dense"),
     "calibrate",
 )
-CALIBRATE = ("auto", "report", "off")
 _FLAGS = {"map": "--continue", "dense": "--map"}
 """Flags that differ from the name of their field."""
 

@@ -25,6 +25,9 @@ class Frame:
         rgb: (H, W, 3) uint8, red first.
         depth_m: (H, W) float32 z-depth in metres, NaN where missing.
         name: file name of the colour image relative to its sequence, for looking up its masks.
+        depth_lag_s: stamp of the depth image less that of the colour image. Depth that was
+            interpolated at the colour image's time, for a camera with ``depth_time_offset_s``, has
+            the lag ``-depth_time_offset_s``.
     """
 
     index: int
@@ -32,6 +35,7 @@ class Frame:
     rgb: Image
     depth_m: Floats
     name: str = ""
+    depth_lag_s: float = 0.0
 
 
 def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -> Frame:

@@ -92,26 +92,40 @@ class Sequence:
         Raises:
             InputError: its colour or depth image is broken.
         """
+        depth_m, lag_s = self._depth(index)
         return Frame(
             index,
             float(self.pairs.timestamps_s[index]),
             read_rgb(self.pairs.rgb_files[index], self.camera),
-            self._depth(index),
+            depth_m,
             image_name(self.pairs.rgb_files[index], self.folder),
+            lag_s,
         )
 
-    def _depth(self, index: int) -> Floats:
-        """The depth, interpolated at the colour image's stamp where depth has a time offset."""
+    def with_camera(self, camera: Camera) -> Sequence:
+        """The same images, paired by another camera's ``depth_time_offset_s``."""
+        limit_s = self.config.max_time_difference_s
+        pairs = read_pairs(self.folder, limit_s, camera.depth_time_offset_s)
+        source, truth = self.camera_source, self.groundtruth
+        return Sequence(self.folder, camera, source, pairs, truth, self.config)
+
+    def _depth(self, index: int) -> tuple[Floats, float]:
+        """The depth, interpolated at the colour image's stamp where depth has a time offset.
+
+        And its lag, as in `Frame`.
+        """
         depth_m = self._read_depth(self.pairs.depth_files[index])
-        other = self.pairs.neighbour_files[index]
-        if self.camera.depth_time_offset_s == 0 or other is None:
-            return depth_m
+        other, offset_s = self.pairs.neighbour_files[index], self.camera.depth_time_offset_s
+        lag_s = float(self.pairs.lags_s[index]) - offset_s
+        if offset_s == 0 or other is None:
+            return depth_m, lag_s
         try:
             other_m = self._read_depth(other)
         except InputError as error:
             logger.warning("frame %d: its depth is not interpolated: %s", index, error)
-            return depth_m
-        return depth_between(depth_m, other_m, float(self.pairs.neighbour_shares[index]))
+            return depth_m, lag_s
+        share = float(self.pairs.neighbour_shares[index])
+        return depth_between(depth_m, other_m, share), -offset_s
 
     @overload
     def frames(

@@ -74,7 +74,7 @@ def at_one_moment(features: Features, camera: Camera, motion: Motion | None) -> 
     """
     if motion is None or len(features) == 0:
         return features
-    later_s = _after_mean_row_s(features, camera)
+    later_s = after_mean_row_s(features, camera)
     known = np.isfinite(features.depth_m)
     usual_m = np.median(features.depth_m[known]) if known.any() else FAR_M
     points = camera.backproject(features.pixels, np.where(known, features.depth_m, usual_m))
@@ -105,13 +105,14 @@ def corrected(
     noise = np.array([estimate.noise_scale, estimate.noise_scale, 1.0])
     weight = np.where(known, 1 / (seen.sigmas_px * noise), 0.0)
     J_pose = jacobian(points_camera, camera) * weight[..., None]
-    later_s = _after_mean_row_s(seen, camera)
+    later_s = after_mean_row_s(seen, camera)
     J = np.concatenate([J_pose, later_s[:, None, None] * J_pose], axis=2).reshape(-1, 12)
     H = J.T @ J + np.diag(np.repeat([0.0, motion.sigma**-2], 6))
     step = -np.linalg.solve(H, J.T @ (r * weight).ravel())
     return replace(motion, twist=motion.twist + step[6:])
 
 
-def _after_mean_row_s(features: Features, camera: Camera) -> Array:
+def after_mean_row_s(features: Features, camera: Camera) -> Array:
+    """Seconds (N,) from the exposure of the keypoints' mean row to that of each."""
     later_s = exposed_after_s(features.image_pixels[:, 1], camera)
     return later_s - later_s.mean()

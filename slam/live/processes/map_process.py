@@ -11,19 +11,22 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bmask_slam.back_end.reinterpretation import use_camera
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
+from bmask_slam.graph.files.array_file import read_arrays, write_arrays
 from bmask_slam.graph.geometry import carried_along
+from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import (
+    STATE_FILE,
     Finish,
     LostKeyframe,
     MapChanged,
@@ -36,6 +39,7 @@ from bmask_slam.live.messages import (
     SaveState,
     Started,
     StateSaved,
+    UseCamera,
     VisibilityCounts,
 )
 from bmask_slam.live.replica import DeltaMaker
@@ -50,7 +54,6 @@ from bmask_slam.world.frame_history import NO_KEYFRAME
 
 logger = logging.getLogger(__name__)
 
-STATE_FILE = FileKind("live state", 5)
 NICENESS = 5
 """Tracking has priority where there are too few cores."""
 
@@ -72,6 +75,10 @@ def serve_map(
     """Handle messages until the channel ends, from a saved state on if there is one."""
     os.nice(NICENESS)
     segmenter = LabelsOnly(names)
+    saved = None
+    if state is not None:
+        header, saved = read_arrays(state, STATE_FILE)
+        camera = read_camera(header, state)
     system = SlamSystem(camera, config, segmenter)
     system.semantics = SemanticMapper(
         camera,
@@ -81,11 +88,11 @@ def serve_map(
         on_masks=channel.send,  # to tracking's side, where it is known what moves
     )
     system.events.on_event = channel.send
-    if state is not None:
-        system.restore(read_arrays(state, STATE_FILE)[1], state)
+    if state is not None and saved is not None:
+        system.restore(saved, state)
     server = MapServer(system, channel.send)
     channel.send(Ready())
-    if state is not None:
+    if saved is not None:
         server.send_changes(-1, done=False)
     for number, message in channel.messages():
         server.handle(number, message)
@@ -120,25 +127,43 @@ class MapServer:
                 back = message.keypoints, message.patches
                 self.system.map.restore_observations(message.keyframe_id, *back)
                 self.send_changes(-1, done=False)
+            case UseCamera():
+                self.use_camera(message)
             case SaveState():
                 self.save(number, message.path)
             case Finish():
                 self.system.mapper.history.extend(message.history)
                 self.system.finish()
-                write_arrays(message.path, STATE_FILE, {}, self.system.state())
+                self._write(message.path)
                 self._send(StateSaved(number, message.path))
             case _:
                 raise TypeError(f"not a message for the map: {message!r}")
 
+    def use_camera(self, message: UseCamera) -> None:
+        """Go on with a camera of other times, and send the map that was adjusted to it."""
+        started_s = time.perf_counter()
+        system = self.system
+        system.camera = system.camera_tracker.tracker.camera = message.camera
+        use_camera(system.mapper, message.camera, message.motions)
+        self.send_changes(-1, done=False)
+        elapsed_ms = 1e3 * (time.perf_counter() - started_s)
+        logger.info(
+            "camera: %d keyframes interpreted anew in %.0f ms", len(message.motions), elapsed_ms
+        )
+
     def save(self, number: int, path: Path) -> None:
         """Save the state; messages up to this number are then not needed any more."""
         try:
-            write_arrays(path, STATE_FILE, {}, self.system.state())
+            self._write(path)
         except OSError as error:  # a later state may be written
             logger.warning("%s: cannot be written (%s)", path, error.strerror)
         else:
             self._send(StateSaved(number, path))
         give_back_memory()  # of the state, and of what the graph has changed since
+
+    def _write(self, path: Path) -> None:
+        header = {"camera": asdict(self.system.camera)}
+        write_arrays(path, STATE_FILE, header, self.system.state())
 
     def add_keyframe(self, message: NewKeyframe) -> None:
         """Add a keyframe that tracking made; changes are sent before and after optimisation."""

@@ -29,6 +29,8 @@ class MapWorker:
 
     Attributes:
         crashes: how often the process has died.
+        state: the file of the last saved state, None before the first.
+        saves: how many states were saved.
     """
 
     def __init__(self, arguments: tuple[Any, ...], replacement: Callable[[Any], Any]) -> None:
@@ -41,7 +43,8 @@ class MapWorker:
         """
         self.crashes = 0
         self._arguments, self._replacement = arguments, replacement
-        self._state: Path | None = None
+        self.state: Path | None = None
+        self.saves = 0
         self._journal: dict[int, Any] = {}
         self._number = 0
         self._crashes_in_a_row = 0
@@ -130,7 +133,7 @@ class MapWorker:
         self._worker.kill()
 
     def _start(self) -> Worker:
-        return Worker("map", TARGET, *self._arguments, self._state)
+        return Worker("map", TARGET, *self._arguments, self.state)
 
     def _without_own(self, messages: list[Any]) -> list[Any]:
         """Handle the messages about the process itself; returns the others."""
@@ -141,7 +144,8 @@ class MapWorker:
                     self._started = message.number
                 case StateSaved():
                     self._journal = {n: m for n, m in self._journal.items() if n > message.number}
-                    self._state, self._crashes_in_a_row = message.path, 0
+                    self.state, self._crashes_in_a_row = message.path, 0
+                    self.saves += 1
                 case Ready():
                     self._is_ready = True
                 case Failure():

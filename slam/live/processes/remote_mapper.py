@@ -150,6 +150,15 @@ class RemoteMapper:
         """Send a message, which is sent again to a new process if this one dies."""
         self.worker.send(message)
 
+    def save_state(self) -> None:
+        """Let the process save its state, from which it can be started again."""
+        self.send(SaveState(self._folder / ".live-state"))
+
+    @property
+    def saved(self) -> tuple[int, Path | None]:
+        """How many states were saved, and the file of the last."""
+        return self.worker.saves, self.worker.state
+
     def catch_up(self, timeout_s: float = 0.0) -> list[Any]:
         """Apply the process's answers to the copy; waits at most so long for the first.
 
@@ -234,7 +243,7 @@ class RemoteMapper:
         self._pending -= set(message.delta.keyframe_ids.tolist()) | {message.keyframe_id}
         if message.keyframe_id + 1 - self._saved_keyframes >= SAVE_EVERY:
             self._saved_keyframes = message.keyframe_id + 1
-            self.send(SaveState(self._folder / ".live-state"))
+            self.save_state()
 
     def _visibility_counts(self) -> VisibilityCounts:
         landmarks = self.world.landmarks

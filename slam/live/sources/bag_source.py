@@ -61,6 +61,8 @@ class BagSource:
         waits: see ``Source``; False if ``realtime``.
     """
 
+    use = None
+
     def __init__(
         self,
         path: Path,
@@ -101,7 +103,8 @@ class BagSource:
                 self.counts.broken += 1
                 logger.warning("skipped: %s", error)
                 continue
-            yield Frame(index, pair.stamp_s, rgb, depth_in_metres(stored, self.camera))
+            depth_m = depth_in_metres(stored, self.camera)
+            yield Frame(index, pair.stamp_s, rgb, depth_m, depth_lag_s=pair.lag_s)
             index += 1
 
     def _pairs(self) -> Iterator[Pair[Any]]:

@@ -37,6 +37,7 @@ class CameraSource(ABC):
 
     camera: Camera
     waits = False
+    use = None
 
     def __init__(self, name: str, silence_s: float) -> None:
         self.name = name

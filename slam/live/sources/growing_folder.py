@@ -87,6 +87,7 @@ class _ListedPair(NamedTuple):
     stamp_s: float
     rgb: Path
     depth: Path
+    lag_s: float
     listed_s: float
 
 
@@ -102,6 +103,7 @@ class GrowingFolder:
     """
 
     waits = False
+    use = None
 
     def __init__(
         self, folder: Path, camera: Path | None = None, options: FollowOptions | None = None
@@ -177,7 +179,7 @@ class GrowingFolder:
             pairs += self._pairer.add(stream, stamp_s, path)
         if finished:
             pairs += self._pairer.finish()
-        return [_ListedPair(pair.stamp_s, pair.rgb, pair.depth, listed_s) for pair in pairs]
+        return [_ListedPair(*pair, listed_s) for pair in pairs]
 
     def _images(self, kind: int | None, line: str, listed: ListFollower) -> list[_Image]:
         """The images on a line; none of a broken line, which is counted.
@@ -222,7 +224,8 @@ class GrowingFolder:
             self.counts.broken += 1
             logger.warning("skipped: %s", error)
             return True
-        return Frame(index, pair.stamp_s, rgb, depth_m, image_name(pair.rgb, self._folder))
+        name = image_name(pair.rgb, self._folder)
+        return Frame(index, pair.stamp_s, rgb, depth_m, name, pair.lag_s)
 
 
 def _find_lists(folder: Path) -> list[Path]:

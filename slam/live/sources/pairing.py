@@ -27,11 +27,15 @@ MAX_WAITING = 30
 
 
 class Pair(NamedTuple, Generic[T]):
-    """A colour and a depth image of one frame; the stamp is the colour image's."""
+    """A colour and a depth image of one frame; the stamp is the colour image's.
+
+    ``lag_s``: stamp of the depth image less that of the colour image.
+    """
 
     stamp_s: float
     rgb: T
     depth: T
+    lag_s: float
 
 
 class StreamClock:
@@ -157,7 +161,11 @@ class Pairer(Generic[T]):
         i, j = associate_stamps(rgb_s, depth_s, self._max_s)
         self._counts.unpaired_rgb += rgb_count - len(i)
         self._counts.unpaired_depth += depth_count - len(j)
-        pairs = [Pair(rgb[k][0], rgb[k][1], depth[m][1]) for k, m in zip(i, j, strict=True)]
+        lags_s = depth_s[j] - self._offsets_s[DEPTH] - rgb_s[i]
+        pairs = [
+            Pair(rgb[k][0], rgb[k][1], depth[m][1], float(lag_s))
+            for k, m, lag_s in zip(i, j, lags_s, strict=True)
+        ]
         for pair in pairs:
             self._gaps.count(pair.stamp_s)
         return pairs

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import Generic, Protocol, TypeVar
+
+import numpy as np
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory
@@ -68,6 +71,13 @@ class Source(Protocol):
     counts: SourceCounts
     waits: bool
 
+    @property
+    def use(self) -> Callable[[Camera], None] | None:
+        """Gives later frames their depth by another ``depth_time_offset_s``, from any thread.
+
+        None where depth is not interpolated at the colour image's time.
+        """
+
     def frames(self) -> Iterator[Frame]:
         """Frames in the order of their stamps, each as soon as it is available."""
 
@@ -89,10 +99,28 @@ class RecordedSource:
 
     def frames(self) -> Iterator[Frame]:
         """Each frame, not before its time if ``realtime``."""
-        frames = self._sequence.frames()
-        for frame in frames if self.waits else paced(frames):
-            self.counts.broken = len(self._sequence.skipped)
-            yield frame
+        return self._frames() if self.waits else paced(self._frames())
+
+    def use(self, camera: Camera) -> None:
+        """Later frames have their depth at the colour image's time by this camera."""
+        self.camera = camera
+
+    def _frames(self) -> Iterator[Frame]:
+        """The frames, from the sequence with the camera that is used when each is read."""
+        sequence, start, last_s = self._sequence, 0, -np.inf
+        while start < len(sequence):
+            camera = sequence.camera
+            with closing(sequence.frames(start)) as frames:
+                for frame in frames:
+                    start, last_s = frame.index + 1, frame.timestamp_s
+                    self.counts.broken = len(sequence.skipped)
+                    yield frame
+                    if self.camera != camera:
+                        break
+                else:
+                    return
+            sequence = sequence.with_camera(self.camera)
+            start = int(np.searchsorted(sequence.timestamps_s, last_s, side="right"))
 
     def close(self) -> None:
         """Nothing to release: each frame opens and closes its own files."""
@@ -105,6 +133,7 @@ class Limited:
         self.name, self.camera = source.name, source.camera
         self.groundtruth = source.groundtruth
         self.counts, self.waits = source.counts, source.waits
+        self.use = source.use
         self._source, self._max_frames = source, max_frames
 
     def frames(self) -> Iterator[Frame]:

@@ -86,6 +86,7 @@ class Camera:
     name = "camera"
     camera = CAMERA
     waits = False
+    use = None
     groundtruth = None
 
     def __init__(self, frames: int) -> None:

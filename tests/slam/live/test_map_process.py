@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from synthetic_view import CAMERA, render_plane
+from synthetic_view import CAMERA, render_plane, sideways_path
 
+from bmask_slam.back_end.reinterpretation import KeyframeMotion
+from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.files.array_file import read_arrays
 from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.live.messages import (
+    STATE_FILE,
     LostKeyframe,
     MapChanged,
     NewKeyframe,
     PruneMask,
     RestoreObservations,
+    SaveState,
+    UseCamera,
     VisibilityCounts,
 )
 from bmask_slam.live.processes.map_process import MapServer
 from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import untracked
 from bmask_slam.world.frame_history import ENTRY, NO_KEYFRAME
 
@@ -97,3 +106,27 @@ def test_observations_removed_under_a_mask_are_restored() -> None:
     server.handle(5, RestoreObservations(7, under, all_patches[under]))  # culled meanwhile
     server.handle(6, keyframe(system, 2, (1, one.T_world_camera)))
     assert list(system.mapper.world.keyframes) == [0, 1, 2]
+
+
+def test_another_camera_reaches_the_map_its_keyframes_and_the_saved_state(tmp_path) -> None:
+    often = ("keyframes.min_interval_frames=2", "keyframes.max_shared=0.9")
+    config = resolve(SystemConfig, None, often)
+    system = SlamSystem(CAMERA, config)
+    for number, pose in enumerate(sideways_path(0.02 * np.arange(16))):
+        system.process(render_plane(pose, number))
+    server, mapper = MapServer(system, lambda answer: None), system.mapper
+    one, two = list(mapper.world.keyframes.values())[:2]
+    before, untouched = two.features.pixels, one.features.pixels
+    found = replace(CAMERA, rolling_shutter_s=0.02)
+    motion = KeyframeMotion(np.array([0, 0, 0, 0.6, 0, 0]))
+    server.handle(1, UseCamera(found, {two.id: motion, 99: motion}))  # 99 was culled meanwhile
+    np.testing.assert_array_equal(one.features.pixels, untouched)
+    shift = two.features.pixels[:, 0] - before[:, 0]  # rows below the mean were exposed later
+    assert np.corrcoef(shift, before[:, 1])[0, 1] > 0.9 and np.abs(shift).max() > 1
+    graph = mapper.smoother.tables.observations.all()
+    rows = np.flatnonzero(graph.keyframe_ids == two.id)
+    assert len(rows) and np.isin(graph.measurements[rows, 0], two.features.pixels[:, 0]).all()
+    assert system.camera_tracker.tracker.camera == mapper.camera == found
+    server.handle(2, SaveState(tmp_path / "state"))
+    header, _ = read_arrays(tmp_path / "state", STATE_FILE)
+    assert read_camera(header, tmp_path) == found

@@ -29,7 +29,7 @@ FRAMES = [render_plane(pose, index) for index, pose in enumerate(POSES)]
 class FakeSource:
     """A source that gives these frames."""
 
-    name, camera, groundtruth = "given", CAMERA, None
+    name, camera, groundtruth, use = "given", CAMERA, None, None
 
     def __init__(self, frames: list[Frame]) -> None:
         self._frames = frames

@@ -56,12 +56,14 @@ def test_pairs_are_those_of_all_stamps_at_once(seed: int) -> None:
 def test_a_pair_is_returned_as_soon_as_it_is_final() -> None:
     pairer = Pairer[str](SourceCounts())
     assert not pairer.add(DEPTH, 1.000, "d0")
-    assert pairer.add(RGB, 1.000, "c0") == [Pair(1.000, "c0", "d0")]
+    assert pairer.add(RGB, 1.000, "c0") == [Pair(1.000, "c0", "d0", 0.0)]
     assert not pairer.add(RGB, 1.033, "c1")
     assert not pairer.add(DEPTH, 1.045, "d1")  # the next colour image might lie nearer
-    assert pairer.add(RGB, 1.066, "c2") == [Pair(1.033, "c1", "d1")]
+    (pair,) = pairer.add(RGB, 1.066, "c2")
+    assert pair[:3] == (1.033, "c1", "d1") and pair.lag_s == pytest.approx(0.012)
     assert not pairer.add(DEPTH, 1.060, "d2")  # and here the next depth image
-    assert pairer.add(DEPTH, 1.078, "d3") == [Pair(1.066, "c2", "d2")]
+    (pair,) = pairer.add(DEPTH, 1.078, "d3")
+    assert pair[:3] == (1.066, "c2", "d2") and pair.lag_s == pytest.approx(-0.006)
 
 
 def test_images_too_far_apart_in_time_are_not_paired() -> None:
@@ -76,7 +78,9 @@ def test_a_known_delay_of_depth_is_added_to_its_stamps() -> None:
     pairer = Pairer[str](SourceCounts(), depth_offset_s=-0.05)
     assert not pairer.add(RGB, 1.00, "c0")
     assert not pairer.add(DEPTH, 1.00, "of 0.95")
-    assert pairer.add(DEPTH, 1.05, "of 1.00") == [Pair(1.00, "c0", "of 1.00")]
+    (pair,) = pairer.add(DEPTH, 1.05, "of 1.00")
+    assert pair[:3] == (1.00, "c0", "of 1.00")
+    assert pair.lag_s == pytest.approx(0.05)  # of the stamps
 
 
 def test_duplicates_and_late_images_are_skipped_and_counted() -> None:

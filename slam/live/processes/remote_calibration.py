@@ -1,0 +1,127 @@
+"""Tracking's side of calibration: when the camera's times are estimated, and what came of it.
+
+The process gets the depth images around each keyframe. After so many frames with one camera the
+map's process is asked for a state, and the calibration's process estimates from that. Neither
+tracking nor the map waits for it, and a process that dies is not started again.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+
+from bmask_slam.calibration.keyframe_depth import DepthImage, KeyframeImages
+from bmask_slam.graph.arrays import Array
+from bmask_slam.live.messages import EstimateTimes, TimesEstimated
+from bmask_slam.live.processes.calibration_process import CalibrationSetup
+from bmask_slam.live.processes.remote_mapper import RemoteMapper
+from bmask_slam.live.processes.worker import Failure, Worker
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.world.world_map import Keyframe
+
+logger = logging.getLogger(__name__)
+
+TARGET = "bmask_slam.live.processes.calibration_process:serve_calibration"
+
+
+@dataclass(frozen=True, eq=False)
+class _Pending:
+    """A keyframe that waits for the depth image after it."""
+
+    id: int
+    pixels: Array
+    lag_s: float
+
+
+class RemoteCalibration:
+    """Sends depth images of keyframes to a process, and asks it for estimates.
+
+    Attributes:
+        done: no further estimate will come.
+        busy: an estimate is under way.
+        adopts: whether what is found is used.
+        text: the last of what was found, in one line; "" before.
+    """
+
+    def __init__(self, setup: CalibrationSetup, adopt: bool = True) -> None:
+        """Start the process; with ``adopt`` False nothing that it finds is used."""
+        self.done = self.busy = False
+        self.text = ""
+        self._frames_each = setup.config.frames
+        self._tries_left = setup.config.stretches
+        self.adopts = adopt
+        self._worker = Worker("calibration", TARGET, setup)
+        self._frames = 0  # since the camera was changed, or since the last estimate
+        self._first_keyframe = 0
+        self._awaited_save: int | None = None
+        self._last: list[DepthImage] = []
+        self._pending: _Pending | None = None
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._worker.pid
+
+    def add_frame(self, frame: Frame, keyframe: Keyframe | None) -> None:
+        """Add a tracked frame, and the keyframe that it has become, if it has."""
+        self._frames += 1
+        if self.done or self.busy:
+            self._last, self._pending = [], None
+            return
+        taken_s = frame.timestamp_s + frame.depth_lag_s
+        self._last = [*self._last[-2:], DepthImage(frame.depth_m.copy(), taken_s)]
+        before, pending = self._last[:-1], self._pending
+        if pending is not None and len(before) == 2:
+            images = before[1], before[0], self._last[-1]
+            self._worker.send(KeyframeImages(pending.id, pending.pixels, *images, pending.lag_s))
+        self._pending = None
+        if keyframe is not None and before:
+            pixels = keyframe.features.image_pixels
+            self._pending = _Pending(keyframe.id, pixels, frame.depth_lag_s)
+
+    def update(self, mapper: RemoteMapper) -> TimesEstimated | None:
+        """Ask for an estimate when it is due; returns one that has come."""
+        if self.done:
+            return None
+        saves, state = mapper.saved
+        if not self.busy and self._frames >= self._frames_each:
+            self.busy, self._awaited_save = True, saves + 1
+            mapper.save_state()
+        if self._awaited_save is not None and saves >= self._awaited_save and state is not None:
+            self._awaited_save = None
+            self._worker.send(EstimateTimes(state, self._first_keyframe))
+        for message in self._worker.receive():
+            match message:
+                case TimesEstimated():
+                    return self._answered(message, mapper)
+                case Failure():
+                    logger.error("the calibration failed: %s", message.text)
+        if not self._worker.is_running:
+            logger.warning("the calibration's process died; the camera stays as it is")
+            self.end()
+        return None
+
+    def end(self) -> None:
+        """End the process, without waiting for it."""
+        self.done, self.busy = True, False
+        threading.Thread(target=self._worker.kill, daemon=True).start()
+
+    def close(self) -> None:
+        """Kill the process."""
+        self._worker.kill()
+
+    def _answered(self, found: TimesEstimated, mapper: RemoteMapper) -> TimesEstimated:
+        self.busy, self._frames = False, 0
+        if found.camera is not None and not self.adopts:
+            text = found.text.replace("found and applied", "found, not applied")
+            found = TimesEstimated(None, {}, text, True)
+        self.text = found.text or self.text
+        logger.info("calibration: %s", found.text or "nothing new")
+        if found.camera is not None:
+            self._first_keyframe = mapper.world.next_keyframe_id
+        else:
+            self._tries_left -= 1
+        if found.done or not self._tries_left:
+            self.end()
+        return found

@@ -1,0 +1,77 @@
+"""Stored observations as a camera with another readout time and another depth delay gives them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, make_features, points_before, random_descriptors
+
+from bmask_slam.back_end.reinterpretation import KeyframeMotion, reinterpret
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.tracking.rolling_shutter import share_of_rows
+from bmask_slam.world.world_map import Keyframe
+
+TWIST = np.array([0.5, -0.6, 0.4, 0.3, 0.2, -0.3])
+READOUT_S = 0.025
+ROLLING = replace(CAMERA, rolling_shutter_s=READOUT_S)
+
+
+def exposed_keyframe() -> tuple[Keyframe, Array]:
+    """A keyframe whose rows were exposed one by one, and its points at their mean row's time."""
+    points_world = points_before(np.eye(4), 200, np.random.default_rng(1))
+    later_s = np.zeros(len(points_world))
+    for _ in range(5):
+        T = se3_exp(later_s[:, None] * TWIST)
+        points = transform(inverse(T), points_world[:, None])[:, 0]
+        later_s = READOUT_S * share_of_rows(CAMERA.project(points)[:, 1], CAMERA)
+    features = make_features(
+        np.eye(4), points, random_descriptors(len(points), np.random.default_rng(0))
+    )
+    features = replace(features, image_pixels=CAMERA.distort(features.pixels))
+    T_mean = se3_exp(later_s.mean() * TWIST)
+    ids = np.full(len(points), -1, np.int64)
+    return Keyframe(0, 0, 0.0, 0, np.eye(4), features, ids), transform(
+        inverse(T_mean), points_world
+    )
+
+
+def error_px(keyframe: Keyframe, points: Array) -> float:
+    seen = keyframe.features
+    np.testing.assert_allclose(seen.disparity_px * seen.depth_m, CAMERA.stereo_bf_px_m)
+    u_right = seen.pixels[:, 0] - seen.disparity_px
+    truth = CAMERA.project_stereo(points)
+    return float(np.abs(np.column_stack([seen.pixels, u_right]) - truth).max())
+
+
+def test_a_readout_time_that_is_found_later_corrects_keyframes() -> None:
+    keyframe, points = exposed_keyframe()
+    assert error_px(keyframe, points) > 3
+    reinterpret(keyframe, KeyframeMotion(TWIST), CAMERA, ROLLING)
+    assert error_px(keyframe, points) < 0.05
+    twice = replace(CAMERA, rolling_shutter_s=2 * READOUT_S)
+    reinterpret(keyframe, KeyframeMotion(TWIST), ROLLING, twice)
+    assert error_px(keyframe, points) > 3
+
+
+def test_the_correction_of_the_old_camera_is_undone() -> None:
+    keyframe, _ = exposed_keyframe()
+    before = keyframe.features
+    reinterpret(keyframe, KeyframeMotion(TWIST), CAMERA, ROLLING)
+    assert np.abs(keyframe.features.depth_m - before.depth_m).max() > 1e-3
+    reinterpret(keyframe, KeyframeMotion(TWIST), ROLLING, CAMERA)
+    np.testing.assert_allclose(keyframe.features.pixels, before.pixels, atol=1e-6)
+    np.testing.assert_allclose(keyframe.features.depth_m, before.depth_m, atol=2e-4)
+
+
+def test_inverse_depth_changes_by_what_the_delay_did_and_no_more_than_is_possible() -> None:
+    keyframe, _ = exposed_keyframe()
+    before_m = keyframe.features.depth_m.copy()
+    change = np.array([0.01, -0.02, 10.0, np.nan]) / before_m[:4]
+    reinterpret(keyframe, KeyframeMotion(TWIST, np.arange(4), change), CAMERA, CAMERA)
+    after_m = keyframe.features.depth_m
+    np.testing.assert_allclose(1 / after_m[:2], 1 / before_m[:2] + change[:2])
+    np.testing.assert_array_equal(after_m[2:], before_m[2:])
+    assert before_m[0] == pytest.approx(after_m[0] * 1.01)
