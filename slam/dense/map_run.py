@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -211,5 +212,8 @@ def format_summary(summary: MapSummary) -> str:
     shares = sorted(products.label_shares.items(), key=lambda item: -item[1])
     if len(shares) > 1:
         lines.append("labels      " + ", ".join(f"{n} {100 * s:.1f} %" for n, s in shares[:8]))
-    lines.append(f"products    {', '.join(p.name for p in products.files)}")
+    folders = Counter(path.parent for path in products.files)
+    names = [path.name for path in products.files if path.parent == summary.folder]
+    names += [f"{p.name}/ ({n} files)" for p, n in folders.items() if p != summary.folder]
+    lines.append(f"products    {', '.join(names)}")
     return "\n".join([*lines, f"Folder      {summary.folder}"])
