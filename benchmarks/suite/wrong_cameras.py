@@ -3,13 +3,14 @@
     python -m benchmarks.suite.wrong_cameras [--into DIR] [--only NAME ...] [--faults NAME ...]
 
 Faulty copies of the recordings under ../shared/data and a rendered office are made in ``--into``;
-images that stay as they are are linked. Nothing of them belongs into the repository.
+images that stay as they are are linked. Nothing of them belongs into the repository. Faults of
+camera.yaml are run; faults of depth images and stamps are compared with the run without the fault.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,11 +22,13 @@ from numpy.typing import NDArray
 
 from benchmarks.pages import table
 from benchmarks.paths import SHARED
+from bmask_slam.calibration.camera_check import check_camera
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
-from bmask_slam.sequences import read_camera, write_camera
+from bmask_slam.run_folder.map_file import read_run
+from bmask_slam.sequences import open_sequence, read_camera, write_camera
 from bmask_slam.system_config import SystemConfig
 
 NAMES = ("tum_fr1_rpy", "bonn_crowd", "redkitchen", "office")
@@ -103,6 +106,7 @@ FAULTS: dict[str, Fault] = {
     "depth stamps -30 ms": _stamps(-0.03),
     "depth scale +2 %": _depth_scale(0.02),
 }
+OF_CAMERA = ("none", "focal length +3 %", "focal length -3 %", "depth scale +2 %")
 
 
 def faulty(source: Path, fault: Fault, folder: Path) -> Path:
@@ -115,14 +119,36 @@ def faulty(source: Path, fault: Fault, folder: Path) -> Path:
     return folder
 
 
-def said(folder: Path, out: Path) -> str:
+def _in_short(warnings: Sequence[str]) -> str:
+    """Warnings without their cures."""
+    return "; ".join(warning.partition(";")[0] for warning in warnings) or "-"
+
+
+def said_by_run(folder: Path, out: Path) -> str:
     """The warnings of a run in short, and its ATE."""
-    # The camera's readout time, which its name gives, is that of the recording without the fault.
     options = RunOptions(folder, CONFIG, out=out, max_frames=MAX_FRAMES, quiet=True)
     done = run(options)
     rows = {row["name"]: row["value"] for row in done.rows}
-    warnings = [warning.partition(";")[0] for warning in done.warnings] or ["-"]
-    return f"{'; '.join(warnings)} (ATE {1e3 * rows['ate_rmse']:.1f} mm)"
+    return f"{_in_short(done.warnings)} (ATE {1e3 * rows['ate_rmse']:.1f} mm)"
+
+
+def said_of_images(folder: Path, right: Path) -> str:
+    """The warnings about a faulty copy's images, with the poses of the run without the fault."""
+    saved = read_run(right)
+    return _in_short(check_camera(saved, open_sequence(folder, camera=saved.camera)).warnings)
+
+
+def rows_of(source: Path, faults: Sequence[str], into: Path) -> Iterator[tuple[str, str, str]]:
+    """Fault, sequence and what was said; faults of the camera file are run, others are not."""
+    right = into / "right" / source.name
+    if not right.is_dir():
+        run(RunOptions(source, CONFIG, out=right, max_frames=MAX_FRAMES, quiet=True))
+    for name in faults:
+        place = into / f"fault {list(FAULTS).index(name)}"
+        folder = faulty(source, FAULTS[name], place / source.name)
+        of_camera = name in OF_CAMERA
+        text = said_by_run(folder, place / "run") if of_camera else said_of_images(folder, right)
+        yield name, source.name, text
 
 
 def main() -> None:
@@ -131,22 +157,19 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=list(FAULTS))
     arguments = parser.parse_args()
+    lines = []
     with TemporaryDirectory() as temporary:
-        into = arguments.into or Path(temporary)
-        sources = {name: SHARED / name for name in arguments.only}
-        if "office" in sources:
-            sources["office"] = into / "source" / "office"
-            if not sources["office"].is_dir():
-                render_sequence(RenderConfig("office", MAX_FRAMES), sources["office"])
-        lines = []
-        for number, name in enumerate(arguments.faults):
-            for source in sources.values():
-                folder = faulty(source, FAULTS[name], into / str(number) / source.name)
-                lines.append(
-                    (name, source.name, said(folder, into / "runs" / f"{number}-{source.name}"))
-                )
-                print(" | ".join(lines[-1]), flush=True)
-        print(table(("fault", "sequence", "said"), lines))
+        for name in arguments.only:
+            into = (arguments.into or Path(temporary)) / name
+            source = SHARED / name
+            if name == "office":
+                source = into / "source" / name
+                if not source.is_dir():
+                    render_sequence(RenderConfig(name, MAX_FRAMES), source)
+            for line in rows_of(source, arguments.faults, into):
+                lines.append(line)
+                print(" | ".join(line), flush=True)
+    print(table(("fault", "sequence", "said"), lines))
 
 
 if __name__ == "__main__":
