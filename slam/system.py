@@ -30,8 +30,8 @@ from bmask_slam.world.world_map import Keyframe
 logger = logging.getLogger(__name__)
 OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
 """Arrays in older files that are read by nothing today."""
-NEWER_ARRAYS = ("mapper.events.now", "mapper.events.counted", "mapper.events.counts")
-"""Arrays that older files lack; an empty system's are used then."""
+NEWER_ARRAYS = ("mapper.events.", "localiser.images.")
+"""Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 
 
 class SlamSystem(SystemResults):
@@ -66,7 +66,11 @@ class SlamSystem(SystemResults):
         self.map = back_end or Mapper(camera, tracker, back_end_config(config))
         self.events = self.map.events
         self.camera_tracker = CameraTracker(
-            tracker, self.map, config.relocalisation, config.mapping.local_map
+            tracker,
+            self.map,
+            config.relocalisation,
+            config.mapping.local_map,
+            self.extractor,
         )
         self.moving_objects = MovingObjectFilter(
             camera, config.moving_objects, config.features, self.map, self.camera_tracker
@@ -88,6 +92,7 @@ class SlamSystem(SystemResults):
         """
         frame = self._begin(frame)
         features = self._extract(frame, features)
+        self._look(frame, features)
         static = self._without_moving(frame, features)
         tracked = self._track(static)
         restored = self._learn_motion(frame, tracked, static)
@@ -157,7 +162,7 @@ class SlamSystem(SystemResults):
         """Become the system of a state that was read from a file. Raises InputError."""
         own = self.state()
         state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
-        state = {name: own[name] for name in NEWER_ARRAYS} | state
+        state = {name: a for name, a in own.items() if name.startswith(NEWER_ARRAYS)} | state
         check_like(state, own, path)
         self.mapper.restore(part(state, "mapper"), path)
         self.camera_tracker.restore(part(state, "localiser"))
@@ -191,6 +196,10 @@ class SlamSystem(SystemResults):
     @stage("features")
     def _extract(self, frame: Frame, features: Features | None) -> Features:
         return features if features is not None else self.prepare(frame)
+
+    @stage("tracking")
+    def _look(self, frame: Frame, features: Features) -> None:
+        self.camera_tracker.look(frame, features)
 
     @stage("moving")
     def _without_moving(self, frame: Frame, features: Features) -> StaticFeatures:
@@ -263,9 +272,11 @@ class SlamSystem(SystemResults):
         if tracked.status is TrackingStatus.LOST or reference is None:
             return None
         T_world_camera, ids = tracked.T_world_camera, tracked.landmark_ids
+        landmark_of = tracked.landmark_of
         if keyframe:
-            T_world_camera = keyframe.T_world_camera
+            T_world_camera, landmark_of = keyframe.T_world_camera, keyframe.landmark_ids
             _, ids = self.map.world.observed(keyframe)
+        self.camera_tracker.remember(tracked.features, landmark_of, T_world_camera)
         self.camera_tracker.update_motion(tracked.T_world_camera, T_world_camera, ids)
         self.map.history.append(
             frame.timestamp_s, reference.id, reference.T_world_camera, T_world_camera

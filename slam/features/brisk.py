@@ -122,6 +122,14 @@ class BriskExtractor:
             frame, gray, (raw, np.ones(len(raw)), np.zeros(len(raw))), descriptors
         )
 
+    def at(self, frame: Frame, gray: Image, pixels: Array) -> tuple[Ints, Features]:
+        """Keypoints where none were detected: those of the pixels (N, 2) inside, and their rows."""
+        reach, size = self._describer.reach_px, np.array(gray.shape[::-1])
+        rows = np.flatnonzero(((pixels > reach) & (pixels < size - 1 - reach)).all(axis=1))
+        pixels, ones = pixels[rows], np.ones(len(rows))
+        bits, angles_rad = self._describer.describe(gray, pixels.astype(np.float32))
+        return rows, self._assemble(frame, gray, (pixels, ones, angles_rad), bits)
+
     def described(self, features: Features) -> Features:
         """Keypoints of a ``reserve`` with their descriptors and orientations."""
         found = self._describer.describe(features.gray, features.image_pixels.astype(np.float32))

@@ -35,7 +35,7 @@ class MapLocalisation(SlamSystem):
         """Locate a frame in the map."""
         frame = self._begin(frame)
         features = self._extract(frame, features)
-        tracked = self._find(features)
+        tracked = self._find(frame, features)
         T_world_camera = self._follow(frame, tracked)
         return FrameResult(
             index=frame.index,
@@ -63,7 +63,8 @@ class MapLocalisation(SlamSystem):
         return {}
 
     @stage("tracking")
-    def _find(self, features: Features) -> Tracked:
+    def _find(self, frame: Frame, features: Features) -> Tracked:
+        self.camera_tracker.look(frame, features)
         return self._reported(self.camera_tracker.track_in_map(features))
 
     @stage("tracking")
@@ -71,6 +72,7 @@ class MapLocalisation(SlamSystem):
         if tracked.status is TrackingStatus.LOST:
             return None
         T, ids, world = tracked.T_world_camera, tracked.landmark_ids, self.map.world
+        self.camera_tracker.remember(tracked.features, tracked.landmark_of, T)
         self.camera_tracker.update_motion(T, T, ids)
         self._located.append((frame.timestamp_s, T))
         self._frames_since_refresh += 1

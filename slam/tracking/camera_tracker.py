@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from bmask_slam.features.brisk import Features
+from bmask_slam.features.brisk import BriskExtractor, Features
 from bmask_slam.graph.arrays import Array, Arrays, Ints
+from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import carried_along, inverse, orthonormalised, se3_exp, se3_log
+from bmask_slam.sequences.frame import Frame
+from bmask_slam.tracking.guided_landmarks import GuidedLandmarks
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
-from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, untracked
+from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
@@ -38,6 +41,7 @@ class CameraTracker:
         map_reader: MapReader,
         relocalisation: RelocalisationConfig,
         local_map: LocalMapConfig,
+        extractor: BriskExtractor,
     ):
         self.tracker = tracker
         self.lost_frames = 0
@@ -51,6 +55,7 @@ class CameraTracker:
         self._interval_s = np.nan  # during which T_last_next happened
         self._recent_ids: Ints = np.zeros(0, np.int64)
         self._local_ids: Ints = np.zeros(0, np.int64)
+        self._images = GuidedLandmarks(extractor, tracker.config.image_motion)
 
     def state(self) -> Arrays:
         """The motion, and the landmarks that the next frame will be tracked against."""
@@ -61,6 +66,7 @@ class CameraTracker:
             "stamps_s": np.array([self._last_s, self._now_s, self._interval_s]),
             "recent_ids": self._recent_ids,
             "local_ids": self._local_ids,
+            **nested(images=self._images.state()),
         }
 
     def restore(self, state: Arrays) -> None:
@@ -69,6 +75,7 @@ class CameraTracker:
         self._T_world_last, self._T_last_next = state["T_world_last"], state["T_last_next"]
         self._last_s, self._now_s, self._interval_s = state["stamps_s"].tolist()
         self._recent_ids, self._local_ids = state["recent_ids"], state["local_ids"]
+        self._images.restore(part(state, "images"))
 
     @property
     def timestamp_s(self) -> float:
@@ -95,6 +102,7 @@ class CameraTracker:
         """Lost for so many frames, with no knowledge of where the camera is."""
         self.lost_frames = lost_frames
         self._recent_ids = self._local_ids = np.zeros(0, np.int64)
+        self._images.forget()
         self.restart(np.eye(4))
 
     def restart(self, T_world_camera: Array) -> None:
@@ -107,10 +115,23 @@ class CameraTracker:
         Without it the interval is taken to be the same as the last one.
         """
         self._now_s = timestamp_s
+        self._images.end_frame()
+
+    def look(self, frame: Frame, features: Features) -> None:
+        """Predict the frame's pose by its image, if the last one was surprising or found weakly.
+
+        Without it the pose is predicted by constant velocity alone.
+        """
+        if self.reference is None:
+            return
+        self._images.frame = frame
+        if self.lost_frames or self._images.needed:
+            self._follow(features)
 
     def prediction(self) -> Array | None:
         """T_world_camera (4, 4) of the next frame by constant velocity; None without a pose."""
-        return None if self.lost_frames or self.reference is None else self._predicted()
+        unknown = self.lost_frames and self._images.followed is None
+        return None if unknown or self.reference is None else self._predicted()
 
     def preview(self, features: Features) -> Array | None:
         """The pose that ``track`` would find, None if it would find none; no state is changed."""
@@ -153,11 +174,12 @@ class CameraTracker:
             raise ValueError("no map has been begun")
         world = self._map.world
         self._local_ids = world.landmarks.remaining(self._local_ids)
-        tracked = self._tracked(features, self._local_ids)
+        tracked = self._tracked_in_image(features)
         if tracked.status is TrackingStatus.LOST:
             tracked = self.recognise(features, world.in_segment(self.reference.segment)) or tracked
         if tracked.status is TrackingStatus.LOST:
             self.lost_frames += 1
+            self._images.end_frame()
             self._T_last_next = np.eye(4)
             return tracked
         world.landmarks.visible[tracked.visible_ids] += 1
@@ -192,6 +214,15 @@ class CameraTracker:
         self._recent_ids = landmark_ids
         self.lost_frames = 0
 
+    def remember(self, features: Features, landmark_ids: Ints, T_world_camera: Array) -> None:
+        """Keep what the frame saw from a pose (4, 4), to follow it into the next image.
+
+        ``landmark_ids`` (N,) are those that its features observe, -1 for none. To be called before
+        ``update_motion``.
+        """
+        poses = (self._predicted_by_velocity(), T_world_camera)
+        self._images.remember(features, landmark_ids, poses, self._map.world.landmarks)
+
     def follow_map(self, T_old: Array, T_new: Array) -> None:
         """The map was moved by its owner, as a keyframe from T_old to T_new (4, 4).
 
@@ -202,6 +233,7 @@ class CameraTracker:
         self._T_world_last = carried_along(self._T_world_last, T_old, T_new)
         known = self._recent_ids[self._recent_ids < len(landmarks)]
         self._recent_ids = landmarks.remaining(landmarks.current(known))
+        self._images.follow_map(landmarks)
 
     def refer_to(self, keyframe: Keyframe) -> None:
         """Make a keyframe the reference, and track against its surroundings from now on."""
@@ -220,7 +252,39 @@ class CameraTracker:
             self._previous(),
         )
 
+    def _follow(self, features: Features) -> None:
+        """Follow the last frame's corners into this one."""
+        T_last_next = inverse(self._T_world_last) @ self._predicted_by_velocity()
+        self._images.follow(features, T_last_next, self._now_s - self._last_s)
+
+    def _tracked_in_image(self, features: Features) -> Tracked:
+        """The pose by the local map, with the help of the image's motion where there is need."""
+        if self._images.followed is not None:
+            guided = self._guided(features)
+            if guided.status is TrackingStatus.OK:
+                return guided
+            return more(guided, self._tracked(features, self._local_ids))
+        tracked = self._tracked(features, self._local_ids)
+        if tracked.firm < self._images.config.few_inliers:
+            self._follow(features)
+        return tracked if self._images.followed is None else more(tracked, self._guided(features))
+
+    def _guided(self, features: Features) -> Tracked:
+        """The pose by the local map, of which landmarks were followed from the last image."""
+        world, local_ids = self._map.world, self._local_ids
+        guided = self._images.guided(features, local_ids, world.landmarks)
+        return self.tracker.refine(
+            features, self._predicted(), local_ids, world, self._previous(), guided
+        )
+
     def _predicted(self) -> Array:
+        """T_world_camera (4, 4), by the image's motion if that is known, else by velocity."""
+        followed = self._images.followed
+        if followed is None:
+            return self._predicted_by_velocity()
+        return orthonormalised(self._T_world_last @ followed.estimate.T_world_camera)
+
+    def _predicted_by_velocity(self) -> Array:
         """The last motion, extrapolated over the time from the last frame to this one."""
         known = self._interval_s > 0  # False for NaN
         steps = (self._now_s - self._last_s) / self._interval_s if known else 1.0

@@ -30,6 +30,7 @@ class Tracked:
         features: the frame's, with the registered pixels of the matches, and pixel sigmas that
             agree with the frame's residuals.
         keypoints, landmark_ids: (M,) inlier matches.
+        firm: how many of them do not rest on the flow of the image alone; by them a frame is WEAK.
         matches: number of matches before the robust estimate.
         visible_ids: landmarks of the local map that project into the frame.
         information: (6, 6) of the pose.
@@ -43,6 +44,14 @@ class Tracked:
     matches: int
     visible_ids: Ints
     information: Array
+    firm: int
+
+    @property
+    def landmark_of(self) -> Ints:
+        """(N,) the landmark that each of the features observes, -1 for none."""
+        column = np.full(len(self.features), -1, np.int64)
+        column[self.keypoints] = self.landmark_ids
+        return column
 
 
 def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked:
@@ -51,11 +60,23 @@ def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked
     return replace(begun, status=TrackingStatus.LOST, matches=matches)
 
 
+def more(first: Tracked, second: Tracked) -> Tracked:
+    """That of two results with a better status, then with more landmarks; else the first.
+
+    Landmarks that rest on the flow alone count at most as many as the others.
+    """
+    found = [
+        (r.status is TrackingStatus.OK, min(len(r.landmark_ids), 2 * r.firm), len(r.landmark_ids))
+        for r in (first, second)
+    ]
+    return second if found[1] > found[0] else first
+
+
 def untracked(T_world_camera: Array, features: Features) -> Tracked:
     """A frame that begins a map at a given pose (4, 4)."""
     none = np.zeros(0, np.int64)
     information = np.zeros((6, 6))
-    return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information)
+    return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information, 0)
 
 
 @dataclass(frozen=True)

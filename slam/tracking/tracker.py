@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bmask_slam.features.brisk import Features, select
+from bmask_slam.features.brisk import Features, joined, select
 from bmask_slam.features.matching import (
     MatchConfig,
     Matches,
@@ -18,6 +18,8 @@ from bmask_slam.features.patch_alignment import SubpixelConfig, register_patches
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.tracking.guided_landmarks import Guided, weighted, with_guided, without_unused
+from bmask_slam.tracking.image_motion import ImageMotionConfig
 from bmask_slam.tracking.pose_optimisation import (
     PoseEstimate,
     PoseOptimisationConfig,
@@ -56,6 +58,7 @@ class TrackingConfig:
     match: MatchConfig = field(default_factory=MatchConfig)
     pose: PoseOptimisationConfig = field(default_factory=PoseOptimisationConfig)
     subpixel: SubpixelConfig = field(default_factory=SubpixelConfig)
+    image_motion: ImageMotionConfig = field(default_factory=ImageMotionConfig)
 
 
 class Tracker:
@@ -100,26 +103,47 @@ class Tracker:
         local_ids: Ints,
         world: WorldMap,
         previous: PreviousPose | None = None,
+        guided: Guided | None = None,
     ) -> Tracked:
-        """The pose from all landmarks of the local map, given a good initial one (4, 4)."""
-        radius, landmarks = self.config.local_radius_px, world.landmarks
+        """The pose from all landmarks of the local map, given a good initial one (4, 4).
+
+        Guided landmarks that match no keypoint are measured where they were followed to.
+        """
+        landmarks, detected, radius_px = world.landmarks, features, self.config.local_radius_px
+        if guided is not None:
+            features = joined(features, guided.features)
         motion = motion_since(previous, T_world_camera, self.camera)
         still = at_one_moment(features, self.camera, motion)
         visible, matches = self.search(
-            still, WindowIndex(still.pixels), T_world_camera, local_ids, radius, landmarks
+            still, WindowIndex(still.pixels), T_world_camera, local_ids, radius_px, landmarks
         )
+        if guided is not None:
+            visible, matches = with_guided(visible, matches, guided)
         if self.config.subpixel.enabled:
             features = self._registered(
                 features, matches.train, visible[matches.query], T_world_camera[:3, 3], world
             )
+        features, loose = weighted(features, matches, guided, self.config.image_motion)
         features, estimate = self._refined(
             features, matches, visible, T_world_camera, landmarks, motion
         )
-        inliers = int(estimate.inliers.sum())
-        if not estimate.ok or inliers < self.config.weak_inliers:
-            return lost(T_world_camera, features, len(matches))
-        status = TrackingStatus.OK if inliers >= self.config.min_inliers else TrackingStatus.WEAK
+        if not estimate.ok or estimate.inliers.sum() < self.config.weak_inliers:
+            return lost(T_world_camera, detected, len(matches))
+        firm = int((estimate.inliers & ~loose).sum())
+        tracked = self._result(features, matches, visible, estimate, firm)
+        return tracked if guided is None else without_unused(tracked, guided)
+
+    def _result(
+        self,
+        features: Features,
+        matches: Matches,
+        visible: Ints,
+        estimate: PoseEstimate,
+        firm: int,
+    ) -> Tracked:
+        """The frame with its pose, of which some landmarks in view and their matches agree."""
         kept = matches[estimate.inliers]
+        status = TrackingStatus.OK if firm >= self.config.min_inliers else TrackingStatus.WEAK
         noise = np.array([estimate.noise_scale, estimate.noise_scale, 1.0])
         features = replace(features, sigmas_px=features.sigmas_px * noise)
         return Tracked(
@@ -131,6 +155,7 @@ class Tracker:
             matches=len(matches),
             visible_ids=visible,
             information=estimate.information,
+            firm=firm,
         )
 
     def _refined(
@@ -179,7 +204,9 @@ class Tracker:
         sigmas = features.sigmas_px.copy()
         image_pixels[rows] = refined[good]
         pixels[rows] = self.camera.undistort(refined[good])
-        sigmas[rows, :2] = config.sigma_px
+        usual, followed = config.sigma_px, self.config.image_motion
+        guided = sigmas[rows, 0] >= followed.sigma_px
+        sigmas[rows, :2] = np.where(guided, followed.patch_sigma_px, usual)[:, None]
         return replace(features, image_pixels=image_pixels, pixels=pixels, sigmas_px=sigmas)
 
     def search(

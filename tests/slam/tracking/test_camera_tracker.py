@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_view import T_NEW_OLD, add_keyframe, make_features, points_before
+from synthetic_view import CAMERA, T_NEW_OLD, add_keyframe, make_features, points_before
 
-from bmask_slam.features.brisk import Features
+from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp, se3_log
@@ -17,6 +17,7 @@ from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
+from bmask_slam.tracking.tracker import TrackingConfig
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.local_map import LocalMapConfig
 from bmask_slam.world.world_map import WorldMap
@@ -27,6 +28,9 @@ NO_IDS = np.zeros(0, np.int64)
 
 class RecordingTracker:
     """A fake tracker: records the prediction, and tracks there or is lost."""
+
+    camera = CAMERA
+    config = TrackingConfig()
 
     def __init__(self) -> None:
         self.predictions: list[Array] = []
@@ -58,6 +62,7 @@ def scene(map_reader: StillMap | None = None) -> tuple[CameraTracker, RecordingT
         map_reader,
         RelocalisationConfig(),
         LocalMapConfig(),
+        BriskExtractor(CAMERA, FeatureConfig()),
     )
     camera_tracker.refer_to(add_keyframe(map_reader.world, np.eye(4), features))
     return camera_tracker, tracker, features
