@@ -15,6 +15,8 @@ from repository import ROOT
 from benchmarks.pages import table, written_sections
 from benchmarks.paths import RESULTS
 from benchmarks.section_report import REPORTS
+from benchmarks.suite import never_lost
+from bmask_slam.graph.errors import InputError
 
 SCRIPTS = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -89,3 +91,14 @@ def test_a_table_has_one_cell_under_each_heading() -> None:
     assert table(("a", "b"), [("1", "2")]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
     with pytest.raises(ValueError, match="1 cells under 2"):
         table(("a", "b"), [("1",)])
+
+
+def test_a_recording_that_is_missing_is_no_rendered_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(never_lost, "SHARED", tmp_path)
+    for entry in never_lost.INPUTS.values():
+        if entry.source not in never_lost.RENDERED:
+            with pytest.raises(InputError, match=entry.source):
+                never_lost.sequence_of(entry, tmp_path / "into")
+    assert not list(tmp_path.iterdir())

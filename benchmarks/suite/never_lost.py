@@ -7,13 +7,14 @@ Inputs are made from those under ../shared/data and from a rendered office, in t
 the median of runs that differ by the grid on which keypoints are spread (see
 benchmarks/moving/no_harm.py): frames with a pose, frames of which the pose is WEAK, the longest
 loss in frames, errors against the truth (the red kitchen's is of the depth camera: by hand-eye),
-and the time of features and tracking.
+and the time of features and tracking. An input without its recording is skipped.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import sys
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -53,6 +54,10 @@ class Input:
     hand_eye: bool = False
 
 
+RENDERED = {
+    "office-300": RenderConfig("office", frames=300),
+}
+"""Rendered sources; all others are recordings."""
 INPUTS = {
     "rpy": Input("tum_fr1_rpy", timing=KINECT_V1),
     "rpy-x2": Input("tum_fr1_rpy", stride=2, timing=KINECT_V1),
@@ -81,12 +86,19 @@ class Outcome:
 
 
 def sequence_of(entry: Input, into: Path) -> Path:
-    """The folder of an input, made if it does not exist."""
-    source = SHARED / entry.source
-    if not source.is_dir():
+    """The folder of an input, made if it does not exist.
+
+    Raises:
+        InputError: its recording is not there.
+    """
+    if entry.source in RENDERED:
         source = into / entry.source
         if not source.is_dir():
-            render_sequence(RenderConfig("office", frames=300), source)
+            render_sequence(RENDERED[entry.source], source)
+    else:
+        source = SHARED / entry.source
+        if not source.is_dir():
+            raise InputError(f"{source}: no such recording")
     if entry.hardship is None:
         return source
     done = entry.hardship
@@ -97,9 +109,8 @@ def sequence_of(entry: Input, into: Path) -> Path:
     return make_hard(source, done, into / name)
 
 
-def outcome(entry: Input, into: Path, settings: list[str]) -> Outcome:
-    """Run an input."""
-    sequence = sequence_of(entry, into)
+def outcome(entry: Input, sequence: Path, settings: list[str]) -> Outcome:
+    """Run an input, of which the sequence was made."""
     config = resolve(SystemConfig, None, settings)
     with TemporaryDirectory() as folder:
         out, camera = Path(folder) / "run", None
@@ -167,8 +178,13 @@ def main() -> None:
         if given.masks and (given.masks / entry.source).is_dir():
             file = given.masks / entry.source / "annotations.json"
             kind = ["semantics.segmenter.name=precomputed", f"semantics.segmenter.masks={file}"]
+        try:
+            sequence = sequence_of(entry, given.into)
+        except InputError as error:
+            print(f"{name}: skipped, {error}", file=sys.stderr, flush=True)
+            continue
         outcomes = [
-            outcome(entry, given.into, [*kind, *settings, other_keypoints(k)])
+            outcome(entry, sequence, [*kind, *settings, other_keypoints(k)])
             for k in range(given.repeats)
         ]
         lines = table(HEADER, [row(name, outcomes)]).splitlines()
