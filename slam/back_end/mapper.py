@@ -21,7 +21,7 @@ from bmask_slam.back_end.landmark_management import (
 )
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.back_end.pruning import MapPruner
-from bmask_slam.back_end.segment_joining import join_segment
+from bmask_slam.back_end.segment_joining import anchors, join_segment
 from bmask_slam.back_end.triangulation import triangulate_landmarks
 from bmask_slam.events import EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
@@ -184,7 +184,8 @@ class Mapper:
         loops = self.smoother.relative_poses("loop")
         self.smoother = Smoother(self.camera, self._graph_config)
         update = self._factor_selector.whole_update(self.world)
-        self._apply(self.smoother.update(replace(update, relative_poses=loops)))
+        held = anchors(self.world, self._graph_config)
+        self._apply(self.smoother.update(replace(update, relative_poses=loops + held)))
         return joined
 
     def pruner(self) -> MapPruner:

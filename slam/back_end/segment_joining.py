@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.factors.graph_update import ANCHOR, RelativePose
+from bmask_slam.graph.factors.observability import diagonal_covariance
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.world_map import WorldMap
@@ -48,3 +52,23 @@ def move_segment(world: WorldMap, segment: int, T_other_segment: Array, target: 
     for keyframe in moving:
         keyframe.T_world_camera = T_other_segment @ keyframe.T_world_camera
         keyframe.segment = target
+
+
+def anchors(world: WorldMap, config: SmootherConfig) -> tuple[RelativePose, ...]:
+    """Weak poses between each keyframe and the next of its segment, for a graph that is built anew.
+
+    Where segments have few landmarks in common, or a keyframe was anchored before, landmarks alone
+    would not connect all keyframes, and the graph would refuse some. The smoother releases the
+    anchors that it does not need.
+    """
+    keyframes = world.keyframes.values()
+    covariance = diagonal_covariance(
+        config.anchor_sigma_rotation_rad, config.anchor_sigma_translation_m
+    )
+    return tuple(
+        RelativePose(
+            a.id, b.id, inverse(a.T_world_camera) @ b.T_world_camera, covariance, kind=ANCHOR
+        )
+        for segment in sorted({keyframe.segment for keyframe in keyframes})
+        for a, b in pairwise(world.in_segment(segment))
+    )

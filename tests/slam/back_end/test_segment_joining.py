@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
-from synthetic_view import T_NEW_OLD, add_keyframe, make_features, points_before, random_descriptors
+from synthetic_view import (
+    CAMERA,
+    T_NEW_OLD,
+    add_keyframe,
+    make_features,
+    points_before,
+    random_descriptors,
+)
 
+from bmask_slam.back_end.landmark_management import MappingConfig
+from bmask_slam.back_end.mapper import BackEndConfig, Mapper
 from bmask_slam.back_end.segment_joining import join_segment
 from bmask_slam.features.brisk import Features
+from bmask_slam.graph.factors.graph_update import ANCHOR
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.tracking.results import Tracked, TrackingStatus
+from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.world_map import WorldMap
 
 T_WORLD_FIRST = se3_exp(np.array([0.1, 0.2, -0.1, 0.3, 0.0, 0.2]))
@@ -72,3 +83,48 @@ def test_landmarks_at_one_keypoint_are_fused() -> None:
     by_keypoint = dict(zip(joined.keypoints.tolist(), joined.landmark_ids.tolist(), strict=True))
     assert [by_keypoint[k] for k in (5, 15, 35)] == [5, 15, 55]
     assert np.allclose(joined.T_world_camera @ inverse(T_WORLD_SECOND), np.eye(4))
+
+
+def segments_with_few_points_in_common(common: int) -> tuple[Mapper, Tracked, Tracked]:
+    """Two segments of three keyframes each, and a frame that both hold, of ``common`` points."""
+    rules = BackEndConfig(MappingConfig(redundant_share=2.0))
+    mapper = Mapper(CAMERA, Tracker(CAMERA, TrackingConfig()), rules)
+    rng, world = np.random.default_rng(4), mapper.world
+    looks = random_descriptors(40 + common, rng)
+    both = points_before(T_WORLD_FIRST, common, rng)
+    seen = []
+    for segment, T_move in enumerate((np.eye(4), T_SEGMENT_WORLD)):
+        points = np.concatenate([both, points_before(T_WORLD_FIRST, 40, rng)])
+        ids = None
+        for k in range(3):
+            T = T_WORLD_FIRST @ se3_exp(np.array([0, 0.01 * k, 0, 0.05 * k, 0, 0]))
+            keyframe = add_keyframe(world, T_move @ T, make_features(T, points, looks), segment)
+            if ids is None:
+                ids = world.make_landmarks(
+                    keyframe, np.arange(len(points)), transform(T_move, points)
+                )
+            else:
+                world.attach(keyframe, np.arange(len(points)), ids)
+            mapper.optimise(keyframe)
+        keypoints = np.arange(len(ids)) if segment else np.r_[:common, 40 + common : 80 + common]
+        seen.append(tracked(keyframe.T_world_camera, keyframe.features, keypoints, ids))
+    return mapper, seen[1], seen[0]
+
+
+def test_a_joined_segment_stays_in_the_graph_with_few_points_in_common() -> None:
+    mapper, in_segment, recognised = segments_with_few_points_in_common(3)
+    mapper.join(1, in_segment, recognised)
+    estimate = mapper.smoother.estimate()
+    assert estimate.keyframe_ids.tolist() == [0, 1, 2, 3, 4, 5]
+    poses = np.array([k.T_world_camera for k in mapper.world.keyframes.values()])
+    np.testing.assert_allclose(poses[3:], poses[:3], atol=1e-3)
+    held = [(k.keyframe_a, k.keyframe_b) for k in mapper.smoother.relative_poses(ANCHOR)]
+    assert (2, 3) in held
+    assert set(held) <= {(2, 3), (3, 4), (4, 5)}  # what needs none has none
+
+
+def test_anchors_that_a_joined_map_does_not_need_are_released() -> None:
+    mapper, in_segment, recognised = segments_with_few_points_in_common(20)
+    mapper.join(1, in_segment, recognised)
+    assert len(mapper.smoother.estimate().keyframe_ids) == 6
+    assert mapper.smoother.relative_poses(ANCHOR) == ()
