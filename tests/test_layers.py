@@ -45,7 +45,6 @@ ROOMS = {
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS = 12, 300, 40, 6
 MIN_LINES = 60  # below, a module that only one other imports lives with it ...
 SEAMS: dict[str, str] = {  # ... unless it is one of these
-    "slam/back_end/segment_joining.py": "where map segments are joined is found in one guess",
     "mapping/inverse_depth/search_range.py": "Step 1 of Algorithm 1",
     "slam/__main__.py": "python -m bmask_slam",
     "slam/commands/": "a module for one command or a few",
