@@ -6,12 +6,14 @@ import fcntl
 import hashlib
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 if TYPE_CHECKING:
+    from bmask_slam.graph.camera import Camera
     from bmask_slam.rendering.sequence import RenderConfig
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
@@ -59,3 +61,26 @@ def office(rendered: Callable[[RenderConfig], Path]) -> Path:
     from bmask_slam.rendering.sequence import RenderConfig
 
     return rendered(RenderConfig("office", frames=15, width=160, height=120, true_depth=True))
+
+
+SWEEP_DELAY_S = 0.016
+
+
+@pytest.fixture(scope="session")
+def late_sweep(rendered: Callable[[RenderConfig], Path]) -> Path:
+    """Ten seconds of the office by a sweeping camera; depth is late, which camera.yaml omits."""
+    from bmask_slam.rendering.sequence import RenderConfig
+
+    late_ms = 1e3 * SWEEP_DELAY_S
+    config = RenderConfig(
+        "office", 150, fps=15.0, width=320, height=240, sweeping=True, depth_delay_ms=late_ms
+    )
+    return rendered(config)
+
+
+@pytest.fixture(scope="session")
+def sweep_camera(late_sweep: Path) -> Camera:
+    """The right camera of ``late_sweep``."""
+    from bmask_slam.sequences import read_camera
+
+    return replace(read_camera(late_sweep / "camera.yaml"), depth_time_offset_s=SWEEP_DELAY_S)

@@ -14,9 +14,8 @@ from bmask_slam.calibration.edge_scores import correlation, edges_of
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, RunSummary, run
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.run_folder.map_file import read_run
-from bmask_slam.sequences import open_sequence, read_camera, write_camera
+from bmask_slam.sequences import open_sequence, write_camera
 from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
@@ -24,25 +23,25 @@ FRAMES, FPS = 100, 15.0
 
 
 @pytest.fixture(scope="module")
-def office(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("check") / "office"
-    config = RenderConfig("office", FRAMES, fps=FPS, width=320, height=240, sweeping=True)
-    return render_sequence(config, folder)
+def right(
+    late_sweep: Path, sweep_camera: Camera, tmp_path_factory: pytest.TempPathFactory
+) -> RunSummary:
+    return _run_with(sweep_camera, late_sweep, tmp_path_factory.mktemp("check"))
 
 
-@pytest.fixture(scope="module")
-def right(office: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    out = tmp_path_factory.mktemp("check") / "run"
-    return run(RunOptions(office, CONFIG, out=out, quiet=True, calibrate="off"))
+def _run_with(camera: Camera, sequence: Path, folder: Path) -> RunSummary:
+    write_camera(folder / "camera.yaml", camera)
+    options = RunOptions(sequence, CONFIG, camera=folder / "camera.yaml", max_frames=FRAMES)
+    return run(dataclasses.replace(options, out=folder / "run", quiet=True, calibrate="off"))
 
 
-def _with_depth(office: Path, folder: Path, shift: tuple[int, int] = (0, 0), scale: float = 1.0):
+def _with_depth(sequence: Path, folder: Path, shift: tuple[int, int] = (0, 0), scale: float = 1.0):
     """A copy whose depth images are moved by (u, v) pixels, and larger by a scale."""
     folder.mkdir()
     for name in ("rgb", "rgb.txt", "depth.txt", "camera.yaml"):
-        (folder / name).symlink_to(office / name)
+        (folder / name).symlink_to(sequence / name)
     (folder / "depth").mkdir()
-    for path in (office / "depth").iterdir():
+    for path in (sequence / "depth").iterdir():
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         height, width = depth.shape
         about = (1 - scale) * np.array([width - 1, height - 1]) / 2
@@ -72,21 +71,20 @@ def test_a_right_camera_gets_no_warning_and_figures_in_the_metrics(right: RunSum
 
 
 @pytest.mark.parametrize("share", [0.04, -0.04])
-def test_a_wrong_focal_length_is_named(office: Path, tmp_path: Path, share: float) -> None:
-    camera = read_camera(office / "camera.yaml")
-    wrong = dataclasses.replace(camera, fx=camera.fx * (1 + share), fy=camera.fy * (1 + share))
-    write_camera(tmp_path / "camera.yaml", wrong)
-    options = RunOptions(office, CONFIG, camera=tmp_path / "camera.yaml", calibrate="off")
-    done = run(dataclasses.replace(options, out=tmp_path / "run", quiet=True))
-    (warning,) = done.warnings
+def test_a_wrong_focal_length_is_named(
+    late_sweep: Path, sweep_camera: Camera, tmp_path: Path, share: float
+) -> None:
+    fx, fy = sweep_camera.fx * (1 + share), sweep_camera.fy * (1 + share)
+    wrong = dataclasses.replace(sweep_camera, fx=fx, fy=fy)
+    (warning,) = _run_with(wrong, late_sweep, tmp_path).warnings
     assert warning.startswith("focal length") and "bmask-slam calibrate" in warning
     assert (" % less than" if share > 0 else " % more than") in warning
 
 
 def test_shifted_depth_is_named_with_the_shift_that_cures(
-    office: Path, right: RunSummary, tmp_path: Path
+    late_sweep: Path, right: RunSummary, tmp_path: Path
 ) -> None:
-    found = _checked(right, _with_depth(office, tmp_path / "shifted", shift=(8, -3)))
+    found = _checked(right, _with_depth(late_sweep, tmp_path / "shifted", shift=(8, -3)))
     (warning,) = (w for w in found.warnings if w.startswith("registration"))
     rows = {row["name"]: row["value"] for row in found.rows}
     assert rows["camera_depth_shift_u"] == pytest.approx(-8, abs=1)
@@ -95,23 +93,23 @@ def test_shifted_depth_is_named_with_the_shift_that_cures(
 
 
 def test_depth_of_another_focal_length_is_named(
-    office: Path, right: RunSummary, tmp_path: Path
+    late_sweep: Path, right: RunSummary, tmp_path: Path
 ) -> None:
-    found = _checked(right, _with_depth(office, tmp_path / "larger", scale=1.12))
+    found = _checked(right, _with_depth(late_sweep, tmp_path / "larger", scale=1.12))
     assert any("scaled by 0.8" in w or "scaled by 0.9" in w for w in found.warnings), found
 
 
 @pytest.mark.parametrize("frames", [1, -1])
 def test_stamps_of_depth_that_are_wrong_are_named(
-    office: Path, right: RunSummary, tmp_path: Path, frames: int
+    late_sweep: Path, right: RunSummary, tmp_path: Path, frames: int
 ) -> None:
     lines = []
-    for line in (office / "depth.txt").read_text().splitlines():
+    for line in (late_sweep / "depth.txt").read_text().splitlines():
         if not line.startswith("#"):
             stamp, name = line.split(maxsplit=1)
             lines.append(f"{float(stamp) + frames / FPS:.6f} {name}")
     for name in ("rgb", "depth", "rgb.txt", "camera.yaml"):
-        (tmp_path / name).symlink_to(office / name)
+        (tmp_path / name).symlink_to(late_sweep / name)
     (tmp_path / "depth.txt").write_text("\n".join(lines) + "\n")
     (warning,) = (w for w in _checked(right, tmp_path).warnings if w.startswith("stamps"))
     assert ("ms earlier" if frames > 0 else "ms later") in warning

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,18 +16,15 @@ from bmask_slam.live.live_slam import LiveSlam
 from bmask_slam.live.play import PlayOptions, play
 from bmask_slam.live.sources.source import RecordedSource
 from bmask_slam.live.start import LiveOptions
-from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.run_folder.map_file import read_map, read_run
-from bmask_slam.sequences import open_sequence, read_camera
+from bmask_slam.sequences import Sequence, open_sequence, read_camera
 from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
-DELAY_S = 0.016
-SEQUENCE = RenderConfig("office", 150, fps=15.0, width=320, height=240, sweeping=True)
 
 
-def played(folder: Path, out: Path, calibrate: str) -> LiveSlam:
-    source = RecordedSource(open_sequence(folder), realtime=False)
+def played(sequence: Sequence, out: Path, calibrate: str) -> LiveSlam:
+    source = RecordedSource(sequence, realtime=False)
     options = LiveOptions(out, calibrate=calibrate, interpolates=True)
     with LiveSlam(source.camera, CONFIG, options) as slam:
         assert play(slam, source, PlayOptions(realtime=False, quiet=True)) is None
@@ -44,11 +40,11 @@ def short_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(system, "CALIBRATION_S", 120.0)  # a busy machine
 
 
-def test_a_delay_is_found_and_used(rendered, short_stretch, tmp_path) -> None:
-    late = rendered(replace(SEQUENCE, depth_delay_ms=1e3 * DELAY_S))
+def test_a_delay_is_found_and_used(late_sweep, sweep_camera, short_stretch, tmp_path) -> None:
+    late, delay_s = open_sequence(late_sweep), sweep_camera.depth_time_offset_s
     slam = played(late, tmp_path / "run", "auto")
     assert slam.calibration.endswith("found and applied")
-    assert slam.camera.depth_time_offset_s == pytest.approx(DELAY_S, abs=0.004)
+    assert slam.camera.depth_time_offset_s == pytest.approx(delay_s, abs=0.004)
     assert slam.camera.rolling_shutter_s == pytest.approx(0.0, abs=0.002)
     run = tmp_path / "run"
     assert read_camera(run / "camera.yaml") == slam.camera
@@ -58,23 +54,23 @@ def test_a_delay_is_found_and_used(rendered, short_stretch, tmp_path) -> None:
     assert told.camera.depth_time_offset_s == 0 and not (tmp_path / "told/camera.yaml").exists()
 
 
-def test_a_right_camera_stays(rendered, short_stretch, tmp_path) -> None:
-    slam = played(rendered(SEQUENCE), tmp_path / "run", "auto")
-    assert slam.camera.depth_time_offset_s == slam.camera.rolling_shutter_s == 0
+def test_a_right_camera_stays(late_sweep, sweep_camera, short_stretch, tmp_path) -> None:
+    slam = played(open_sequence(late_sweep, camera=sweep_camera), tmp_path / "run", "auto")
+    assert slam.camera == sweep_camera
     assert slam.calibration and not (tmp_path / "run" / "camera.yaml").exists()
 
 
-def test_a_recording_goes_on_with_the_camera_that_is_found(rendered) -> None:
-    late = open_sequence(rendered(replace(SEQUENCE, depth_delay_ms=1e3 * DELAY_S)))
+def test_a_recording_goes_on_with_the_camera_that_is_found(late_sweep, sweep_camera) -> None:
+    late = open_sequence(late_sweep)
     source, frames = RecordedSource(late, realtime=False), []
     for frame in source.frames():
         frames.append(frame)
         if len(frames) == 10:
-            source.use(replace(late.camera, depth_time_offset_s=DELAY_S))
+            source.use(sweep_camera)
     stamps_s = np.array([frame.timestamp_s for frame in frames])
     assert len(frames) >= 148 and (np.diff(stamps_s) > 0).all()
     assert {f.depth_lag_s for f in frames[:10]} == {0.0}
-    assert np.allclose([f.depth_lag_s for f in frames[11:-1]], -DELAY_S)
+    assert np.allclose([f.depth_lag_s for f in frames[11:-1]], -sweep_camera.depth_time_offset_s)
 
 
 def test_an_unknown_choice_is_refused() -> None:
