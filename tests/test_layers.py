@@ -30,7 +30,7 @@ ROOMS = {
     "graph": "[...]  files  factors  marginals  smoother  batch  pose_graph  g2o  calibration",
     "semantics": """[...]  instances  network  weights  segmenters  beliefs  objects  tracks
                     training""",
-    "semantics/network": "config  backbone  [...]",
+    "semantics/network": "config  backbone  [...]  yolox",
     "mapping": "[...]  inverse_depth  products",
     "slam": """events  evaluation  config  sequences  features  world  rendering  datasets
                tracking  loops  moving  runtime  back_end  labelling  system_config

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox
 from bmask_slam.semantics.training.dataset import (
     AugmentConfig,
     Dataset,
@@ -25,6 +26,7 @@ from bmask_slam.semantics.training.dataset import (
 )
 from bmask_slam.semantics.training.losses import Losses, MaskRois, Only, network_losses
 from bmask_slam.semantics.training.targets import Target
+from bmask_slam.semantics.training.yolox_losses import yolox_losses
 from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, save_network
 
 STATE = "training.pt"
@@ -196,7 +198,10 @@ def _step_losses(
     images, targets = zip(*_batch(data, rng, config, device), strict=True)
     kind = torch.float16 if device == "cuda" else torch.bfloat16
     with torch.autocast(device, kind, enabled=config.precision == "mixed"):
-        losses = network_losses(model, images, targets, generator, config.rois, config.only)
+        if isinstance(model, MaskScoringYolox):
+            losses = yolox_losses(model, images, targets, generator)
+        else:
+            losses = network_losses(model, images, targets, generator, config.rois, config.only)
     return {k: v.float() for k, v in losses.items() if k == MASKIOU or config.only != MASKIOU}
 
 

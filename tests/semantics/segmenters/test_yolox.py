@@ -1,4 +1,4 @@
-"""YOLOX boxes: decoding against the definition, and the real network on real photographs."""
+"""YOLOX boxes from an ONNX file, on real photographs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,8 @@ from bmask_slam.semantics.instances.coco_files import read_coco
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.labels import label_set, read_label_set
 from bmask_slam.semantics.network.boxes import iou
-from bmask_slam.semantics.segmenters.yolox import (
-    STRIDES,
-    YoloxConfig,
-    YoloxDetector,
-    decode,
-    letterbox,
-    voted,
-)
+from bmask_slam.semantics.network.yolox.selection import SelectionConfig
+from bmask_slam.semantics.segmenters.yolox import YoloxConfig, YoloxDetector, letterbox
 
 ONNX = SHARED / "weights" / "yolox_nano.onnx"
 
@@ -36,20 +30,6 @@ def small() -> YoloxDetector:
 def both() -> YoloxDetector:
     """At 416 and at 640 pixels."""
     return YoloxDetector(ONNX, YoloxConfig(mirror=False, sizes_px=(416, 640)))
-
-
-def test_decoding_equals_a_loop_over_cells() -> None:
-    rng = np.random.default_rng(0)
-    side = 64
-    cells = [(s, r, c) for s in STRIDES for r in range(side // s) for c in range(side // s)]
-    output = rng.uniform(0, 1, (len(cells), 7)).astype(np.float32)
-    boxes, probabilities = decode(output, side)
-    for k, (stride, row, column) in enumerate(cells):
-        x, y, w, h, objectness = output[k, :5]
-        u, v = (x + column) * stride, (y + row) * stride
-        half = np.array([np.exp(w), np.exp(h)]) * stride / 2
-        assert boxes[k] == pytest.approx([u - half[0], v - half[1], u + half[0], v + half[1]])
-        assert probabilities[k] == pytest.approx(objectness * output[k, 5:])
 
 
 def test_the_letterbox_keeps_proportions() -> None:
@@ -79,21 +59,8 @@ def test_the_real_network_finds_large_objects_in_real_photographs(small: YoloxDe
     assert hits / total > 0.6
 
 
-def test_a_kept_box_is_the_mean_of_overlapping_boxes_of_its_class() -> None:
-    boxes = torch.tensor([
-        [0.0, 0.0, 100.0, 100.0],
-        [0.0, 0.0, 110.0, 100.0],  # IoU 0.91 with the first
-        [0.0, 0.0, 100.0, 98.0],  # of another class
-        [0.0, 0.0, 100.0, 60.0],  # 0.6
-    ])  # fmt: skip
-    labels, scores = torch.tensor([1, 1, 2, 1]), torch.tensor([0.6, 0.2, 0.9, 0.5])
-    found = voted(boxes, scores, labels, torch.tensor([2, 0]), 0.8)
-    mean = 0.75 * boxes[0] + 0.25 * boxes[1]
-    torch.testing.assert_close(found, torch.stack([boxes[2], mean]))
-
-
 def test_with_the_mirror_image_a_mirrored_scene_has_the_mirrored_boxes() -> None:
-    detector = YoloxDetector(ONNX, YoloxConfig(min_score=0.2))
+    detector = YoloxDetector(ONNX, YoloxConfig(SelectionConfig(min_score=0.2)))
     labels = read_label_set("coco")
     image = read_colour(sorted((SHARED / "coco_excerpt" / "images").iterdir())[0])
     one = detector.detect(image, labels)
