@@ -10,13 +10,13 @@ from torch import Tensor
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.instances.instances import Instance
-from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.network.model import Detections
-from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox, around
+from bmask_slam.semantics.network.yolox.mask_scoring import around
 from bmask_slam.semantics.network.yolox.network import decode
 from bmask_slam.semantics.network.yolox.selection import SelectionConfig, select
 from bmask_slam.semantics.segmenters.network_segmenter import as_instances
 from bmask_slam.semantics.segmenters.segmenter import check_image
+from bmask_slam.semantics.weights.light_weights import LightNetwork
 
 
 class LightSegmenter:
@@ -26,22 +26,20 @@ class LightSegmenter:
     times slower, since threads of OpenMP wait for each other without giving up their processor.
 
     Args:
-        model: the network with its weights.
-        labels: set that its classes are looked up in by name.
+        network: weights and the label set.
         min_score: class score below which a detection is dropped.
         device: "cpu", "cuda", or None for CUDA if available.
     """
 
     def __init__(
         self,
-        model: MaskScoringYolox,
-        labels: LabelSet,
+        network: LightNetwork,
         min_score: float = 0.5,
         device: str | None = None,
     ) -> None:
-        self.labels = labels
+        self.labels = network.labels
         self._device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        self._model = model.to(self._device)
+        self._model = network.model.to(self._device)
         self._selection = SelectionConfig(max(min_score, SelectionConfig.min_score))
 
     def segment(self, image: Image, name: str) -> list[Instance]:

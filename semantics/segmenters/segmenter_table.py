@@ -102,18 +102,18 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     """A network segmenter; torch is imported here since that takes a second."""
     if options.weights is None and options.name != "light":
         raise InputError(f"segmenter {options.name!r}: give --weights, a file or torchvision:NAME")
-    from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox  # noqa: PLC0415
     from bmask_slam.semantics.network.yolox.selection import SelectionConfig  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.network_segmenter import NetworkSegmenter  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.yolox import YoloxConfig, YoloxDetector  # noqa: PLC0415
     from bmask_slam.semantics.weights.checkpoints import load_network  # noqa: PLC0415
+    from bmask_slam.semantics.weights.light_weights import is_light, load_light  # noqa: PLC0415
 
     labels = read_label_set(options.labels) if options.labels else None
     path = find_weights(options.weights) if options.weights else data_path(*LIGHT_WEIGHTS)
+    if is_light(path):
+        return LightSegmenter(load_light(path, labels), options.min_score)
     network = load_network(path, labels)
-    if isinstance(network.model, MaskScoringYolox):
-        return LightSegmenter(network.model, network.labels, options.min_score)
     light = network.model.config.backbone == "mobilenet_v2"
     if light != (options.name == "light"):
         kind = network.model.config.backbone

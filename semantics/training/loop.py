@@ -28,6 +28,7 @@ from bmask_slam.semantics.training.losses import Losses, MaskRois, Only, network
 from bmask_slam.semantics.training.targets import Target
 from bmask_slam.semantics.training.yolox_losses import yolox_losses
 from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, save_network
+from bmask_slam.semantics.weights.light_weights import LightNetwork, save_light
 
 STATE = "training.pt"
 CURVES = "losses.csv"
@@ -84,7 +85,7 @@ class TrainingConfig:
 
 
 def train(
-    network: TrainedNetwork,
+    network: TrainedNetwork | LightNetwork,
     data: Dataset | JoinedDatasets,
     out: Path,
     config: TrainingConfig,
@@ -120,7 +121,11 @@ def train(
                 file.flush()
                 _save(out, model, optimiser, step + 1, config)
             progress(step + 1, config.steps)
-    save_network(TrainedNetwork(model.eval(), network.labels), out / WEIGHTS)
+    model.eval()
+    if isinstance(network, LightNetwork):
+        save_light(network, out / WEIGHTS)
+    else:
+        save_network(network, out / WEIGHTS)
     return out / WEIGHTS
 
 

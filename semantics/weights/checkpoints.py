@@ -28,7 +28,6 @@ from bmask_slam.semantics.network.config import (
     ProposalConfig,
 )
 from bmask_slam.semantics.network.model import MaskRCNN
-from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox
 from bmask_slam.semantics.weights.checkpoint_names import State, current_names, is_mask_scoring
 
 NO_EPS = "maskrcnn_resnet50_fpn_coco-"
@@ -38,8 +37,6 @@ CAFFE_IMAGES = ImageConfig(
 )
 """The original Mask Scoring R-CNN subtracts the mean from 0..255 and does not divide."""
 CLASSES_KEY = "roi_heads.box_predictor.cls_score.weight"
-YOLOX = {"backbone": "yolox_nano"}
-"""The configuration in files of the light network, which has one form."""
 SHOWN = 4
 
 
@@ -47,7 +44,7 @@ SHOWN = 4
 class TrainedNetwork:
     """A network with its weights and the label set of its classes."""
 
-    model: MaskRCNN | MaskScoringYolox
+    model: MaskRCNN
     labels: LabelSet
 
 
@@ -62,8 +59,6 @@ def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
             what differs.
     """
     state, metadata = read_state(path)
-    if metadata.get("network") == json.dumps(YOLOX):
-        return _light_network(path, state, labels)
     own: LabelSet | None
     if "network" in metadata:
         config, own = _described(path, metadata)
@@ -79,22 +74,11 @@ def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
         )
     with torch.device("meta"):
         model = MaskRCNN(config)
-    config = model.config
-    _check(path, state, model, f"a Mask R-CNN with {config.backbone} and {config.classes} classes")
+    check_state(path, state, model, _name(config))
     floats = {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
     model.load_state_dict(floats, assign=True)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return TrainedNetwork(model.eval(), labels)
-
-
-def _light_network(path: Path, state: State, labels: LabelSet | None) -> TrainedNetwork:
-    """The light network; its classes are looked up in any label set by name."""
-    with torch.device("meta"):
-        model = MaskScoringYolox()
-    _check(path, state, model, "the light network")
-    model.load_state_dict(state, assign=True)
-    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return TrainedNetwork(model.eval(), labels or read_label_set("coco"))
 
 
 def load_mobilenet(model: MaskRCNN, path: Path) -> None:
@@ -117,18 +101,13 @@ def load_mobilenet(model: MaskRCNN, path: Path) -> None:
 
 
 def save_network(network: TrainedNetwork, path: Path, half: bool = True) -> None:
-    """Write weights, configuration and class names; by default in half precision.
-
-    The light network, which is small, keeps its detector's weights as they were published.
-    """
-    is_yolox = isinstance(network.model, MaskScoringYolox)
+    """Write weights, configuration and class names; by default in half precision."""
     state = {}
     for name, value in network.model.state_dict().items():
-        small = value.half() if half and not is_yolox and value.is_floating_point() else value
+        small = value.half() if half and value.is_floating_point() else value
         state[name] = small.detach().cpu().contiguous()
-    config = YOLOX if is_yolox else asdict(network.model.config)
     metadata = {
-        "network": json.dumps(config, sort_keys=True),
+        "network": json.dumps(asdict(network.model.config), sort_keys=True),
         "labels": json.dumps(network.labels.names),
     }
     with whole_file(path) as temporary:
@@ -195,7 +174,11 @@ def _names(config: NetworkConfig) -> set[str]:
         return set(MaskRCNN(config).state_dict())
 
 
-def _check(path: Path, state: State, model: nn.Module, name: str) -> None:
+def _name(config: NetworkConfig) -> str:
+    return f"a Mask R-CNN with {config.backbone} and {config.classes} classes"
+
+
+def check_state(path: Path, state: State, model: nn.Module, name: str) -> None:
     """Raise InputError with the differences unless the weights are exactly the model's."""
     expected = model.state_dict()
     missing, extra = sorted(expected.keys() - state.keys()), sorted(state.keys() - expected.keys())

@@ -95,15 +95,13 @@ def _tensor(message: int | memoryview) -> dict[str, Tensor]:
     values = {f.number: f.value for f in fields}
     if values[TENSOR_TYPE] != FLOAT or TENSOR_BYTES not in values:
         return {}
-    shape = [f.value for f in fields if f.number == TENSOR_SIZE]
-    array = np.frombuffer(values[TENSOR_BYTES], "<f4").reshape(shape)
+    shape = [f.value for f in fields if f.number == TENSOR_SIZE and isinstance(f.value, int)]
+    array = np.frombuffer(_bytes(values[TENSOR_BYTES]), "<f4").reshape(shape)
     return {_text(values[TENSOR_NAME]): torch.from_numpy(array.astype(np.float32))}
 
 
-def _fields(message: int | memoryview) -> Iterator[_Field]:
-    if isinstance(message, int):
-        raise ValueError("a number where a message is expected")
-    at = 0
+def _fields(content: int | memoryview) -> Iterator[_Field]:
+    message, at = _bytes(content), 0
     while at < len(message):
         key, at = _varint(message, at)
         kind = key & 7
@@ -135,6 +133,10 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
 
 
 def _text(value: int | memoryview) -> str:
+    return bytes(_bytes(value)).decode()
+
+
+def _bytes(value: int | memoryview) -> memoryview:
     if isinstance(value, int):
-        raise ValueError("a number where a text is expected")
-    return bytes(value).decode()
+        raise ValueError("a number where a text or a message is expected")
+    return value

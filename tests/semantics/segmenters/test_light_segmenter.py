@@ -1,0 +1,109 @@
+"""The light segmenter, with random heads on the published detector."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from repository import SHARED
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.image_files import read_colour
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.network.boxes import iou
+from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.semantics.weights.light_weights import (
+    LightNetwork,
+    is_light,
+    load_light,
+    new_light,
+    save_light,
+)
+from bmask_slam.semantics.weights.yolox_onnx import load_onnx
+
+PHOTOGRAPHS = SHARED / "coco_excerpt" / "images"
+
+
+@pytest.fixture(scope="module")
+def network() -> LightNetwork:
+    torch.manual_seed(0)
+    made = new_light(load_onnx(SHARED / "weights" / "yolox_nano.onnx"))
+    torch.nn.init.constant_(made.model.mask.logits.bias, 1.0)  # so that masks are not empty
+    made.model.eval()
+    return made
+
+
+@pytest.fixture(scope="module")
+def photograph() -> np.ndarray:
+    return read_colour(sorted(PHOTOGRAPHS.iterdir())[0])
+
+
+def test_instances_lie_in_the_image_best_first(
+    network: LightNetwork, photograph: np.ndarray
+) -> None:
+    found = LightSegmenter(network, 0.3).segment(photograph, "a.jpg")
+    assert len(found) > 1
+    assert all(i.mask.shape == photograph.shape[:2] and i.mask.any() for i in found)
+    scores = [i.mask_score for i in found]
+    assert scores == sorted(scores, reverse=True)
+    assert all(0.3 <= i.class_score <= 1 and i.mask_score <= i.class_score for i in found)
+    assert all(i.distribution.sum() == pytest.approx(1) for i in found)
+
+
+def test_a_larger_image_has_the_same_boxes_at_its_scale(
+    network: LightNetwork, photograph: np.ndarray
+) -> None:
+    segmenter = LightSegmenter(network, 0.4)
+    large = photograph.repeat(2, axis=0).repeat(2, axis=1)
+    once, twice = (
+        torch.from_numpy(np.stack([i.box for i in segmenter.segment(image, "a.jpg")]))
+        for image in (photograph, large)
+    )
+    assert len(twice) > 1
+    assert (iou(once, twice / 2).amax(dim=0) > 0.9).all()
+
+
+def test_it_leaves_the_number_of_threads_as_it_was(
+    network: LightNetwork, photograph: np.ndarray
+) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        LightSegmenter(network).segment(photograph, "a.jpg")
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_a_saved_network_is_found_by_its_file(
+    network: LightNetwork, photograph: np.ndarray, tmp_path: Path
+) -> None:
+    path = tmp_path / "heads.safetensors"
+    save_light(network, path)
+    assert is_light(path)
+    labels = tmp_path / "mine.txt"
+    labels.write_text("drone\nchair\ndining table\nbowl\n")
+    options = SegmenterOptions("light", str(path), labels=str(labels), min_score=0.3)
+    segmenter = make_segmenter(options, tmp_path)
+    assert segmenter.labels.names[1:] == ("drone", "chair", "dining table", "bowl")
+    expected = LightSegmenter(LightNetwork(network.model, segmenter.labels), 0.3)
+    pairs = zip(
+        segmenter.segment(photograph, "a.jpg"), expected.segment(photograph, "a.jpg"), strict=True
+    )
+    for one, other in pairs:
+        assert one.label == other.label
+        np.testing.assert_array_equal(one.mask, other.mask)
+
+
+def test_other_files_are_not_of_this_network(tmp_path: Path, network: LightNetwork) -> None:
+    assert not is_light(tmp_path / "none.safetensors")
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(b"no weights")
+    assert not is_light(broken)
+    other = LightNetwork(torch.nn.Linear(2, 2), label_set(("cup",)))  # type: ignore[arg-type]
+    save_light(other, tmp_path / "other.safetensors")
+    with pytest.raises(InputError, match="not the weights of the light network"):
+        load_light(tmp_path / "other.safetensors")
