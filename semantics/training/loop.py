@@ -121,12 +121,16 @@ def train(
                 file.flush()
                 _save(out, model, optimiser, step + 1, config)
             progress(step + 1, config.steps)
-    model.eval()
+    return _save_weights(network, out / WEIGHTS)
+
+
+def _save_weights(network: TrainedNetwork | LightNetwork, path: Path) -> Path:
+    network.model.eval()
     if isinstance(network, LightNetwork):
-        save_light(network, out / WEIGHTS)
+        save_light(network, path)
     else:
-        save_network(network, out / WEIGHTS)
-    return out / WEIGHTS
+        save_network(network, path)
+    return path
 
 
 def _descend(
