@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.errors import MAX_NUMBER
 
 UNDISTORTION_STEPS = 5
+MAX_SIDE_PX = 65_535
 KINECT_DISPARITY_SIGMA_PX = 0.08
 
 
@@ -80,6 +82,18 @@ class Camera:
     depth_time_offset_s: float = 0.0
     rolling_shutter_s: float = 0.0
     depth_noise: DepthNoise | None = None
+
+    def fault(self) -> str:
+        """What no camera can be, in words; "" for a possible camera."""
+        numbers = [getattr(self, f.name) for f in fields(self) if f.name != "depth_noise"]
+        flat: Array = np.concatenate([np.ravel(number) for number in numbers]).astype(float)
+        if not (np.abs(flat) <= MAX_NUMBER).all():
+            return "a number that is not finite"
+        if not (1 <= self.width <= MAX_SIDE_PX and 1 <= self.height <= MAX_SIDE_PX):
+            return f"an image of {self.width} x {self.height} pixels"
+        if min(self.fx, self.fy, self.depth_scale, self.fps, self.stereo_bf_px_m) <= 0:
+            return "a focal length, depth scale, rate or stereo_bf that is not positive"
+        return ""
 
     def noise_of_depth(self, disparity_sigma_px: float | None = None) -> DepthNoise:
         """The noise by a constant error of the disparity, if given; else the sensor's own.

@@ -11,14 +11,33 @@ class InputError(Exception):
     """
 
 
+MAX_NUMBER = 1e100
+"""Largest number in a text file: its square is a number too."""
+MAX_WHOLE = 2**63 - 1
+
+
 def finite_number(text: str, where: str) -> float:
     """The finite number in a word; ``where`` is its file and line, for the message."""
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not math.isfinite(number):
+    if not abs(number) <= MAX_NUMBER:
         raise InputError(
             f"{where}: {text[:40]!r} is not a finite number; correct or remove the line"
         )
     return number
+
+
+def is_whole(text: str) -> bool:
+    """Whether a word is a whole number from 0 to 2^63 - 1."""
+    return text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= MAX_WHOLE
+
+
+def whole_number(text: str, where: str) -> int:
+    """The whole number, from 0 on, in a word; ``where`` is its file and line, for the message."""
+    if not is_whole(text):
+        raise InputError(
+            f"{where}: {text[:40]!r} is not a whole number from 0 on; correct or remove the line"
+        )
+    return int(text)

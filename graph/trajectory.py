@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 from bmask_slam.graph.whole_file import whole_file
 
@@ -153,12 +154,8 @@ def read_tum(path: Path) -> Trajectory:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such trajectory file; give a file in TUM format")
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    rows = [
-        _tum_row(line, f"{path}:{number}")
-        for number, line in enumerate(map(str.strip, text.splitlines()), start=1)
-        if line and not line.startswith("#")
-    ]
+    cure = "give a file in TUM format"
+    rows = [_tum_row(line, f"{path}:{number}") for number, line in read_lines(path, cure)]
     if not rows:
         raise InputError(f"{path}: no pose in the file; expected lines of {TUM_HEADER[2:]}")
     values = np.array(rows)
@@ -180,9 +177,15 @@ def _tum_row(content: str, where: str) -> list[float]:
             f"timestamp tx ty tz qx qy qz qw{hint}"
         )
     row = [finite_number(column, where) for column in columns]
-    if sum(q * q for q in row[4:]) < 1e-12:
-        raise InputError(f"{where}: zero quaternion {columns[4:]}; no rotation, remove the line")
+    check_quaternion(row[4:], where)
     return row
+
+
+def check_quaternion(words: list[float], where: str) -> None:
+    """Refuse four numbers that are no rotation: all about zero, or far beyond one."""
+    if not 1e-12 <= sum(q * q for q in words) <= 1e12:
+        kind = "zero" if abs(max(words, key=abs)) < 1 else "very long"
+        raise InputError(f"{where}: a {kind} quaternion is no rotation; correct or remove the line")
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

@@ -12,9 +12,10 @@ from typing import Literal
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.errors import InputError, finite_number, is_whole
+from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
-from bmask_slam.graph.trajectory import Trajectory, read_tum
+from bmask_slam.graph.trajectory import Trajectory, check_quaternion, read_tum
 from bmask_slam.graph.whole_file import whole_file
 
 EUROC_HEADER = (
@@ -67,7 +68,7 @@ def recognise(path: Path) -> TrajectoryFormat:
     if not lines or not all("," in line for line in (lines[0], lines[-1])):
         return "tum"
     ends = [lines[k].split(",")[0].strip() for k in (0, -1)]
-    if not all(end.isdigit() for end in ends):
+    if not all(map(is_whole, ends)):
         return "tum"
     step = (int(ends[-1]) - int(ends[0])) / max(len(lines) - 1, 1)
     return "euroc" if step > MIN_STEP_NS or (len(lines) == 1 and int(ends[0]) > 1e12) else "tum"
@@ -117,7 +118,7 @@ def read_kitti(path: Path) -> Array:
     top = np.array(rows).reshape(-1, 3, 4)
     R = top[:, :, :3]
     skewness = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    bad = (skewness > MAX_SKEWNESS) | (np.linalg.det(R) < 0)
+    bad = ~(skewness <= MAX_SKEWNESS) | (np.linalg.det(R) < 0)
     if bad.any():
         k = int(np.argmax(bad))
         raise InputError(f"{path}: pose {k + 1} holds no rotation; correct or remove it")
@@ -148,11 +149,10 @@ def read_euroc(path: Path) -> Trajectory:
     stamps_s, rows = [], []
     for where, line in _lines(path):
         words = [word.strip() for word in line.split(",")]
-        if not words[0].isdigit():
+        if not is_whole(words[0]):
             raise InputError(f"{where}: {words[0][:40]!r} is no stamp in whole nanoseconds")
         row = _numbers(words, where, EUROC_COLUMNS)[1:8]
-        if sum(q * q for q in row[3:]) < 1e-12:
-            raise InputError(f"{where}: a zero quaternion is no rotation; remove the line")
+        check_quaternion(row[3:], where)
         stamps_s.append(int(words[0]) / 10**9)
         rows.append(row)
     if not rows:
@@ -168,9 +168,7 @@ def _lines(path: Path) -> list[tuple[str, str]]:
     """Place (file and line number) and text of every line that is neither empty nor a comment."""
     if not Path(path).is_file():
         raise InputError(f"{path}: no such trajectory file")
-    text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
-    numbered = enumerate(map(str.strip, text.splitlines()), start=1)
-    return [(f"{path}:{k}", line) for k, line in numbered if line and not line.startswith("#")]
+    return [(f"{path}:{k}", line) for k, line in read_lines(Path(path), "give a trajectory")]
 
 
 def _numbers(words: list[str], where: str, counts: tuple[int, ...]) -> list[float]:

@@ -6,12 +6,16 @@ that a link that lies in the folder is never followed; it is renamed to the targ
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO, Any
+
+from bmask_slam.graph.errors import InputError
 
 PREFIX = ".part-"
 
@@ -43,6 +47,27 @@ def whole_folder(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def open_plain(path: Path, mode: str) -> IO[Any]:
+    """Open a file in place to write to it, one that grows or is locked; never through a link.
+
+    Text is UTF-8 with the line breaks that are written.
+
+    Raises:
+        InputError: the file is a link, or OSError: it cannot be written.
+    """
+    encoding, newline = (None, None) if "b" in mode else ("utf-8", "")
+    try:
+        return open(path, mode, encoding=encoding, newline=newline, opener=_not_through_links)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise InputError(f"{path}: is a link; nothing is written through it, remove it") from error
+
+
+def _not_through_links(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def remove(path: Path) -> None:

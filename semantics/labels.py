@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import read_lines
 
 BACKGROUND = "background"
 UNKNOWN = "unknown"
 """Name of label 0 for landmarks and objects: of no class of the set."""
+MAX_CLASSES, MAX_NAME = 10_000, 200
 UNUSED = "N/A"
 """Name of a number that stands for no class."""
 
@@ -46,15 +49,16 @@ def read_label_set(name: str) -> LabelSet:
         InputError: no such file, no class in it, or a class on two lines.
     """
     path = data_path("labels", f"{name}.txt") if re.fullmatch(r"[\w-]+", name) else Path(name)
-    try:
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text; give one class name a line") from error
-    classes = [line for line in lines if line and not line.startswith("#")]
-    if not classes:
-        raise InputError(f"{path}: there is no class in it; give one class name a line")
-    named = [c for c in classes if c != UNUSED]
-    repeated = next((c for c in named if named.count(c) > 1), None)
+    cure = "give one class name a line"
+    classes = [line for _, line in read_lines(path, cure)]
+    if not 0 < len(classes) <= MAX_CLASSES:
+        many = f"more than {MAX_CLASSES} classes" if classes else "there is no class"
+        raise InputError(f"{path}: {many} in it; {cure}")
+    long = next((c for c in classes if len(c) > MAX_NAME), None)
+    if long is not None:
+        raise InputError(f"{path}: {long[:40]!r}... is too long for a name; {cure}")
+    counts = Counter(c for c in classes if c != UNUSED)
+    repeated = next((c for c, count in counts.items() if count > 1), None)
     if repeated is not None:
         raise InputError(f"{path}: the class {repeated!r} stands on two lines; remove one")
     return label_set(classes)

@@ -17,7 +17,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
-from bmask_slam.graph.files.growing_table import read_table
+from bmask_slam.graph.files.reading import read_table
 
 logger = logging.getLogger(__name__)
 
@@ -204,7 +204,7 @@ def read_events(run: Path) -> tuple[Event, ...]:
     path = run / EVENTS
     if not path.is_file():
         return ()
-    columns = read_table(path, EVENT_COLUMNS)
+    columns = read_table(path, EVENT_COLUMNS, "run again", growing=True)
     try:
         return tuple(
             Event(int(index), float(stamp), EventKind(kind), text)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from bmask_slam.cli import main
 from bmask_slam.comparison.jobs.job import Job, figures_file
+from bmask_slam.graph.whole_file import whole_file
 
 
 def end_with_parent() -> None:
@@ -39,7 +40,8 @@ def run(job: Job) -> int:
         from bmask_slam.comparison.jobs.truth_figures import truth_figures  # noqa: PLC0415 - as above
 
         figures = truth_figures(Path(job.run), Path(job.sequence))
-        figures_file(job).write_text(json.dumps(figures), encoding="utf-8")
+        with whole_file(figures_file(job)) as temporary:
+            temporary.write_text(json.dumps(figures), encoding="utf-8")
     return code
 
 

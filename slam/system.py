@@ -12,7 +12,7 @@ from bmask_slam.back_end.mapper import BackEndConfig, Mapper
 from bmask_slam.features.brisk import BriskExtractor, Features
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import check_like, nested, part
+from bmask_slam.graph.files.array_file import check_like, fitting, nested, part
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.moving.static_features import StaticFeatures
@@ -164,10 +164,11 @@ class SlamSystem(SystemResults):
         state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
         state = {name: a for name, a in own.items() if name.startswith(NEWER_ARRAYS)} | state
         check_like(state, own, path)
-        self.mapper.restore(part(state, "mapper"), path)
-        self.camera_tracker.restore(part(state, "localiser"))
-        self.semantics.restore(part(state, "semantics"), path)
-        self.moving_objects.restore(part(state, "dynamics"))
+        with fitting(path):
+            self.mapper.restore(part(state, "mapper"), path)
+            self.camera_tracker.restore(part(state, "localiser"))
+            self.semantics.restore(part(state, "semantics"), path)
+            self.moving_objects.restore(part(state, "dynamics"))
         self.camera_tracker.segment = int(state["segment"])
         self.camera_tracker.reference = self.map.world.keyframes.get(int(state["reference"]))
         self.keyframes.frames_since = int(state["frames_since_keyframe"])

@@ -27,7 +27,8 @@ from source_tree import (
 # or a module that stands alone); [...] are the other modules of the folder, which make one room.
 ROOMS = {
     "the layers": "graph  semantics  mapping  slam",
-    "graph": "[...]  files  factors  marginals  smoother  batch  pose_graph  g2o  calibration",
+    "graph": """arrays  errors  whole_file  files  [...]  factors  marginals  smoother  batch
+                pose_graph  g2o  calibration""",
     "semantics": """[...]  instances  network  weights  segmenters  beliefs  objects  tracks
                     training""",
     "semantics/network": "config  backbone  [...]  yolox",

@@ -8,27 +8,41 @@ file or the new one; the zip's checksums detect damage, and nothing in it is exe
 from __future__ import annotations
 
 import json
+import lzma
+import math
 import os
 import struct
+import tokenize
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import check_unpacked
 from bmask_slam.graph.whole_file import whole_file
 
 Header = dict[str, Any]
 _HEADER = "header"
+_HEADERS = TypeAdapter(Header)
+_KINDS = "biufU"
+SPARE_ROWS = 1000
+"""A table may have so many times as many rows as ids, and as 1000."""
 _UNREADABLE = (  # RuntimeError: a damaged byte may ask for encryption or another compression
-    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError),
-    *(ValueError, KeyError, TypeError, RuntimeError, OverflowError),
+    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, lzma.LZMAError),
+    *(ValueError, LookupError, TypeError, RuntimeError, OverflowError, SyntaxError),
+    tokenize.TokenError,
 )
+_UNFITTING = (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, AssertionError)
 
 
 @dataclass(frozen=True)
@@ -72,9 +86,8 @@ def read_arrays(path: Path, kind: FileKind) -> tuple[Header, Arrays]:
     if not path.is_file():
         raise InputError(f"{path}: there is no saved {kind.noun} here; give a run that has one")
     try:
-        with zipfile.ZipFile(path), np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(str(arrays.pop(_HEADER)))
+        arrays = _read_zip(path)
+        header: Header = _HEADERS.validate_json(str(arrays.pop(_HEADER)))
         found = header["format"], header["version"]
         if found == (kind.format, kind.version) and header["arrays"] != list(arrays):
             raise ValueError("an array is missing")
@@ -88,6 +101,63 @@ def read_arrays(path: Path, kind: FileKind) -> tuple[Header, Arrays]:
             f"{kind.version}; save it again with this version of bmask-slam"
         )
     return header, arrays
+
+
+def _read_zip(path: Path) -> Arrays:
+    """The arrays of a zip of .npy files. Raises one of _UNREADABLE."""
+    with zipfile.ZipFile(path) as zipped:
+        infos = zipped.infolist()
+        check_unpacked(sum(info.file_size for info in infos), path.stat().st_size)
+        names = [info.filename.removesuffix(".npy") for info in infos]
+        if len(set(names)) < len(names):
+            raise ValueError("an array is there twice")
+        return {name: _read_array(zipped, i) for name, i in zip(names, infos, strict=True)}
+
+
+def _read_array(zipped: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array, whose header must promise as many bytes as there are. Raises _UNREADABLE."""
+    with zipped.open(info) as file:
+        read_header = npy.read_array_header_1_0
+        if npy.read_magic(file) != (1, 0):
+            read_header = npy.read_array_header_2_0
+        shape, _, dtype = read_header(file)
+        size = dtype.itemsize * math.prod(shape)
+        if dtype.kind not in _KINDS or dtype.itemsize == 0 or min(shape, default=0) < 0:
+            raise ValueError(f"{info.filename} holds {str(dtype)[:40]} of shape {str(shape)[:40]}")
+        if size != info.file_size - file.tell():
+            raise ValueError(f"{info.filename} promises {size} bytes")
+    with zipped.open(info) as file:
+        return npy.read_array(file, allow_pickle=False)
+
+
+def check_ids(ids: Ints, size: int) -> None:
+    """Refuse ids (N,) that are not each once in [0, size), and a size far beyond their number.
+
+    ``size`` is that of a table with a row for every id, also of those that were removed. Raises
+    ValueError.
+    """
+    if size > SPARE_ROWS * (1000 + len(ids)):
+        raise ValueError(f"a table of {size} rows for {len(ids)} ids")
+    if len(ids) and not 0 <= ids.min() <= ids.max() < size:
+        raise ValueError(f"an id that is not below {size}")
+    if len(np.unique(ids)) < len(ids):
+        raise ValueError("an id that is there twice")
+
+
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Refuse a file by what the use of its arrays raises where they do not fit together.
+
+    Raises:
+        InputError: for what numpy and Python raise for wrong lengths, indices, names and numbers.
+    """
+    try:
+        yield
+    except _UNFITTING as error:
+        reason = " ".join(f"{type(error).__name__} {error}".split())[:200]
+        raise InputError(
+            f"{path}: its arrays do not fit together ({reason}); save it again"
+        ) from error
 
 
 def nested(**parts: Arrays) -> Arrays:
@@ -105,8 +175,10 @@ def split_rows(array: NDArray[Any], counts: Ints) -> list[NDArray[Any]]:
     """The consecutive parts (counts[i], ...) of an array (sum of counts, ...), one for each count.
 
     How columns of unequal length are read back that were saved one after the other. Unlike
-    ``np.split`` it gives no part for no counts.
+    ``np.split`` it gives no part for no counts. Raises ValueError for another sum.
     """
+    if counts.min(initial=0) < 0 or counts.sum() != len(array):
+        raise ValueError(f"{len(array)} rows where {counts.sum()} are counted")
     ends = np.cumsum(counts, dtype=np.int64)
     return [array[end - count : end] for end, count in zip(ends, counts, strict=True)]
 
@@ -114,7 +186,8 @@ def split_rows(array: NDArray[Any], counts: Ints) -> list[NDArray[Any]]:
 def check_like(arrays: Arrays, example: Arrays, path: Path) -> None:
     """Refuse arrays read from a file that differ from the example's in names, types or shapes.
 
-    The first dimension may be of any length. Raises InputError.
+    The first dimension may be of any length, as may others that are 0 in the example. Raises
+    InputError.
     """
     for name in sorted(arrays.keys() ^ example.keys()):
         raise InputError(
@@ -122,12 +195,15 @@ def check_like(arrays: Arrays, example: Arrays, path: Path) -> None:
             "again with this version of bmask-slam"
         )
     for name, array in arrays.items():
-        found, expected = _layout(array), _layout(example[name])
+        expected = _layout(example[name], example[name])
+        found = _layout(array, example[name])
         if found != expected:
             raise InputError(f"{path}: array {name!r} holds {found}, not {expected}; save it again")
 
 
-def _layout(array: NDArray[Any]) -> str:
-    """Type and shape in words, but for what may differ: texts' lengths, the first dimension."""
+def _layout(array: NDArray[Any], example: NDArray[Any]) -> str:
+    """Type and shape in words, but for what may differ: texts' lengths, some dimensions."""
     kind = "texts" if array.dtype.kind == "U" else str(array.dtype)
-    return f"{kind} of shape {('N', *array.shape[1:])[: array.ndim]}"
+    same = example.shape if example.ndim == array.ndim else array.shape
+    shape = [n if k and same[k] else "N" for k, n in enumerate(array.shape)]
+    return f"{kind} of shape {tuple(shape)}"

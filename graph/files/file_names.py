@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path, PurePosixPath
 
 from bmask_slam.graph.errors import InputError
@@ -42,6 +43,19 @@ def _fault(name: str) -> str:
     if max(map(len, parts)) > MAX_NAME_BYTES or sum(map(len, parts)) > MAX_PATH_BYTES:
         return "is too long for a file name"
     return ""
+
+
+def file_stem(name: str) -> str:
+    """A class name or the like as a part of a file's name: letters, digits and ``_ . -``."""
+    return re.sub(r"[^\w.-]+", "_", name)[:80]
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a path that stands in a file leads to a folder; not if no file can have that name."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
 
 
 def refuse_link(path: Path, cure: str = "remove it") -> None:

@@ -59,22 +59,3 @@ def check_grown(path: Path, columns: tuple[str, ...], size: int) -> None:
             f"{path}: not the file of the checkpoint, which has at least {size} bytes and the "
             f"columns {header}; start the run again with --overwrite"
         )
-
-
-def read_table(path: Path, needed: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
-    """The columns of a table, as texts by name; a last line that was cut off is ignored.
-
-    Raises:
-        InputError: no such file, a needed column that is missing, or a line of another length.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the folder as the run left it")
-    text = path.read_text(encoding="utf-8", errors="replace")
-    whole = text[: text.rfind("\n") + 1]
-    header, *rows = list(csv.reader(whole.splitlines())) or [[]]
-    missing = [name for name in needed if name not in header]
-    if missing or any(len(row) != len(header) for row in rows):
-        what = f"no column {missing[0]}" if missing else "a line with too few or too many values"
-        raise InputError(f"{path}: {what}; run again")
-    columns = zip(*rows, strict=True) if rows else [()] * len(header)
-    return dict(zip(header, columns, strict=True))

@@ -9,8 +9,8 @@ from typing import Annotated, Any, TypeVar, cast
 from pydantic import ConfigDict, StringConstraints, TypeAdapter, ValidationError
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import read_bytes
 
-MAX_BYTES = 1 << 30
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200)]
 """A name of a class or the like."""
 STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="ignore", frozen=True)
@@ -25,17 +25,23 @@ def read_json(path: Path, schema: type[Content], cure: str) -> Content:
         InputError: a missing or very large file, no JSON, or not what the schema asks for; the line
             names the file, the field, the value and the ``cure``.
     """
-    try:
-        size = path.stat().st_size
-        data = path.read_bytes() if size <= MAX_BYTES else b""
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {cure}") from error
-    if size > MAX_BYTES:
-        raise InputError(f"{path}: {size / 1e9:.1f} GB, more than {MAX_BYTES >> 30} GiB; {cure}")
+    return parse_json(read_bytes(path, cure), schema, str(path), cure)
+
+
+def parse_json(data: bytes | str, schema: type[Content], where: str, cure: str) -> Content:
+    """JSON that stands in a file, checked as by ``read_json``; ``where`` names it. InputError."""
     try:
         return _adapter(cast("Any", schema)).validate_json(data, strict=True)
     except ValidationError as error:
-        raise InputError(f"{path}: {first_problem(error)}; {cure}") from error
+        raise InputError(f"{where}: {first_problem(error)}; {cure}") from error
+
+
+def check_json(value: Any, schema: type[Content], where: str, cure: str) -> Content:
+    """A value of JSON that was parsed already, checked against ``schema``. Raises InputError."""
+    try:
+        return _adapter(cast("Any", schema)).validate_python(value)
+    except ValidationError as error:
+        raise InputError(f"{where}: {first_problem(error)}; {cure}") from error
 
 
 def first_problem(error: ValidationError) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import read_bytes
 from bmask_slam.graph.whole_file import whole_file
 
 _TYPES = {
@@ -24,6 +25,7 @@ _TYPES = {
     "uint": "<u4",
 }
 _NAMES = {np.dtype(code): name for name, code in _TYPES.items()}
+MAX_BYTES = 1 << 34
 _FORMAT = "format binary_little_endian 1.0"
 
 
@@ -59,7 +61,9 @@ def read_ply(path: Path) -> Arrays:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a binary PLY file")
-    head, separator, body = path.read_bytes().partition(b"end_header\n")
+    head, separator, body = read_bytes(path, "give a binary PLY file", MAX_BYTES).partition(
+        b"end_header\n"
+    )
     lines = head.decode("ascii", errors="replace").splitlines()
     if not separator or lines[:1] != ["ply"] or _FORMAT not in lines:
         raise InputError(f"{path}: not a PLY file of '{_FORMAT}'; convert it")

@@ -37,6 +37,7 @@ from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
+from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.g2o.lines import (
     Tag,
     information_columns,
@@ -73,8 +74,7 @@ def has_landmarks(path: Path) -> bool:
     """Whether a g2o file holds observations of landmarks."""
     if not path.is_file():
         return False
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        return any(line.split(maxsplit=1)[:1] == [VIEW] for line in file)
+    return any(line.split(maxsplit=1)[0] == VIEW for _, line in read_lines(path, "give a graph"))
 
 
 def write_landmark_graph(path: Path, tables: FactorTables, camera: Camera) -> None:

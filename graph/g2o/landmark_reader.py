@@ -10,7 +10,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, finite_number, whole_number
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.observability import component_labels
@@ -53,21 +53,15 @@ class _Notes:
 
     def read(self, path: Path, line: str, number: int) -> None:
         """Read a comment line; those of other programs are ignored."""
-        words = line.removeprefix(MARK).split()
+        words, where = line.removeprefix(MARK).split(), f"{path}:{number}"
         if not line.startswith(MARK + " ") or len(words) < 2:
             return
-        try:
-            if words[0] == "camera":
-                self.camera = [float(word) for word in words[1:]]
-            elif words[0] == "landmarks":
-                self.landmark_offset = int(words[1])
-            elif words[0] == "edge":
-                self.edges[number + 1] = words[1], None if words[2] == "none" else words[2]
-        except (ValueError, IndexError) as error:
-            raise InputError(
-                f"{path}:{number}: a comment of bmask-slam that cannot be read ({error}); "
-                "export the graph again"
-            ) from error
+        if words[0] == "camera":
+            self.camera = [finite_number(word, where) for word in words[1:]]
+        elif words[0] == "landmarks":
+            self.landmark_offset = whole_number(words[1], where)
+        elif words[0] == "edge" and len(words) == 3:
+            self.edges[number + 1] = words[1], None if words[2] == "none" else words[2]
 
 
 def read_landmark_graph(
@@ -143,12 +137,14 @@ def _camera(rows: dict[str, Rows], notes: _Notes, path: Path) -> Camera:
             )
     fx, fy, cx, cy = intrinsics[0].tolist()
     bf = {"stereo_bf_px_m": fx * rows[STEREO].numbers[0][11]} if len(rows[STEREO]) else {}
-    if len(notes.camera) != 10:
-        return Camera(round(2 * cx + 1), round(2 * cy + 1), fx, fy, cx, cy, **bf)
-    width, height, bf_px_m, depth_scale, fps, *distortion = notes.camera
-    k1, k2, p1, p2, k3 = distortion
-    rest = (k1, k2, p1, p2, k3), depth_scale, fps, bf_px_m
-    return Camera(round(width), round(height), fx, fy, cx, cy, *rest)
+    camera = Camera(round(2 * cx + 1), round(2 * cy + 1), fx, fy, cx, cy, **bf)
+    if len(notes.camera) == 10:
+        width, height, bf_px_m, depth_scale, fps, k1, k2, p1, p2, k3 = notes.camera
+        rest = (k1, k2, p1, p2, k3), depth_scale, fps, bf_px_m
+        camera = Camera(round(width), round(height), fx, fy, cx, cy, *rest)
+    if fault := camera.fault():
+        raise InputError(f"{path}: its camera has {fault}; correct {CAMERA} and {MARK} camera")
+    return camera
 
 
 def _check_parameters(edge: str, parameter: str, rows: dict[str, Rows], path: Path) -> None:

@@ -18,14 +18,15 @@ from typing import NamedTuple
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.errors import InputError, finite_number, is_whole
+from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
 from bmask_slam.graph.pose_graph.pose_graph import planar_coordinates, planar_poses
+from bmask_slam.graph.trajectory import check_quaternion
 from bmask_slam.graph.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
-MAX_ID = 2**63 - 1
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])  # its own inverse
 
 
@@ -66,12 +67,9 @@ def read_rows(
     rows = {tag: Rows() for tag in tags}
     fixed: dict[int, int] = {}
     unknown: Counter[str] = Counter()
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
-        if not words:
-            continue
-        tag, where = words[0], f"{path}:{number}"
+    for number, line in read_lines(path, "give a graph in g2o format", comments=True):
+        words, where = line.split(), f"{path}:{number}"
+        tag = words[0]
         if tag.startswith("#"):
             on_comment(line, number)
         elif tag in tags:
@@ -99,14 +97,14 @@ def _row(words: list[str], tag: Tag, where: str) -> tuple[list[int], list[float]
     names = [_id(word, where) for word in words[1 : 1 + tag.ids]]
     numbers = [finite_number(word, where) for word in words[1 + tag.ids :]]
     first = tag.quaternion
-    if first is not None and sum(q * q for q in numbers[first : first + 4]) < 1e-12:
-        raise InputError(f"{where}: a zero quaternion is no rotation; correct or remove the line")
+    if first is not None:
+        check_quaternion(numbers[first : first + 4], where)
     return names, numbers
 
 
 def _id(word: str, where: str) -> int:
     """The vertex id in a word."""
-    if not (word.isascii() and word.isdigit() and int(word) <= MAX_ID):
+    if not is_whole(word):
         raise InputError(f"{where}: {word[:40]!r} is no vertex id; ids are whole numbers from 0 on")
     return int(word)
 

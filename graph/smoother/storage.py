@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Arrays
-from bmask_slam.graph.camera import Camera, DepthNoise
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
-from bmask_slam.graph.files.array_file import FileKind, Header, read_arrays, write_arrays
+from bmask_slam.graph.files.array_file import FileKind, Header, fitting, read_arrays, write_arrays
+from bmask_slam.graph.files.json_file import check_json
 from bmask_slam.graph.smoother.marginalised_storage import (
     SHAPES,
     marginalised_arrays,
@@ -119,6 +120,12 @@ def factor_tables_of(arrays: Arrays, path: Path) -> FactorTables:
         InputError: the arrays do not fit together.
     """
     _check(arrays, path)
+    with fitting(path):
+        return _tables(arrays)
+
+
+def _tables(arrays: Arrays) -> FactorTables:
+    """The factor tables of arrays that were checked."""
     tables = FactorTables()
     tables.keyframes.insert(arrays["keyframe_ids"], arrays["poses_world_camera"])
     tables.landmarks.insert(arrays["landmark_ids"], arrays["points_world"])
@@ -148,11 +155,7 @@ def factor_tables_of(arrays: Arrays, path: Path) -> FactorTables:
 
 def read_camera(header: Header, path: Path) -> Camera:
     """The camera of a file's header. Raises InputError if it is none."""
-    try:
-        fields = dict(header["camera"])
-        fields["distortion"] = tuple(fields["distortion"])
-        if noise := fields.get("depth_noise"):
-            fields["depth_noise"] = DepthNoise(**noise)
-        return Camera(**fields)
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path}: its camera cannot be read ({error}); save it again") from error
+    camera = check_json(header.get("camera"), Camera, f"{path}: its camera", "save it again")
+    if fault := camera.fault():
+        raise InputError(f"{path}: its camera has {fault}; save it again")
+    return camera

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from bmask_slam.graph.arrays import Floats, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
 from bmask_slam.mapping.inverse_depth.pixelwise import nan_where_negative, squared_gradient
 
 DEPTH_FILE = FileKind("fused depth", 1)
@@ -109,6 +110,10 @@ def write_depth_map(path: Path, given: InverseDepthMap) -> None:
 def read_depth_map(path: Path) -> InverseDepthMap:
     """Read a map. Raises InputError for a missing, foreign or broken file."""
     arrays = read_arrays(path, DEPTH_FILE)[1]
+    none = np.zeros((0, 0), np.uint16)
+    check_like(arrays, {"rho": none, "sigma": none}, path)
+    if arrays["rho"].shape != arrays["sigma"].shape:
+        raise InputError(f"{path}: rho and sigma differ in size; make it again")
     known = arrays["rho"] > 0
     rho, sigma = (
         np.where(known, arrays[name] * np.float32(step), np.float32(np.nan))

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Arrays, Bytes, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
+from bmask_slam.graph.files.json_file import check_json
 from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
 from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 
@@ -118,7 +120,10 @@ def read_submap(path: Path) -> Submap:
     """Read a submap. Raises InputError for a missing, foreign or broken file."""
     header, arrays = read_arrays(path, SUBMAP_FILE)
     check_like(arrays, _arrays(_empty()), path)
-    return Submap(int(header["anchor"]), **arrays)
+    anchor = check_json(header.get("anchor"), int, f"{path}: its anchor", "make it again")
+    if len({len(array) for array in arrays.values()}) > 1:
+        raise InputError(f"{path}: its arrays have different lengths; make it again")
+    return Submap(anchor, **arrays)
 
 
 def _arrays(submap: Submap) -> Arrays:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import betaln
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
+from bmask_slam.graph.files.array_file import check_ids
 
 _MIN_CAPACITY = 1024
 
@@ -168,6 +169,7 @@ class LabelStore:
     def restore(self, state: Arrays) -> None:
         """Replace the content by a state; further arrays, as older files hold, are ignored."""
         ids = state["ids"]
+        check_ids(ids, int(ids.max(initial=-1)) + 1)
         self._clear()
         self._reserve(int(ids.max(initial=-1)) + 1)
         self._log_p[ids] = state["log_p"].reshape(len(ids), self.classes)

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from ruamel.yaml import YAML, YAMLError
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import check_ids
+from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.semantics.labels import UNKNOWN, LabelSet
 
 _FIRST_CAPACITY = 1024
@@ -118,6 +119,7 @@ class MovabilityFilter:
 
     def restore(self, state: Arrays) -> None:
         """Replace the content by a state."""
+        check_ids(state["ids"], int(state["size"]))
         self._clear()
         self._reserve(state["size"].reshape(1) - 1)
         self._prior[state["ids"]] = state["prior"]
@@ -156,10 +158,7 @@ def read_priors(name: str) -> MovabilityPriors:
         InputError: no such file, not a table of names and numbers, or a number outside (0, 1).
     """
     path = data_path("labels", f"{name}.yaml") if re.fullmatch(r"[\w-]+", name) else Path(name)
-    try:
-        content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, YAMLError) as error:
-        raise InputError(f"{path}: cannot be read as YAML; write a line 'class: prior'") from error
+    content = read_yaml(path)
     if not isinstance(content, dict) or not {UNKNOWN, "other"} <= content.keys():
         raise InputError(f"{path}: needs lines 'class: prior', '{UNKNOWN}' and 'other' among them")
     for key, value in content.items():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import read_bytes
 
 MAX_MEGAPIXELS = 100
 LIMIT = "BMASK_SLAM_MAX_MEGAPIXELS"
@@ -42,12 +43,10 @@ def read_colour(path: Path) -> Image:
 
 def decode_image(path: Path, flags: int) -> NDArray:
     """The decoded image. A truncated file is refused; OpenCV would fill the rest with grey."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        reason = "no such image" if not path.exists() else f"cannot be read ({error.strerror})"
-        raise InputError(f"{path}: {reason}; restore it or correct the list") from error
-    return decode_bytes(data, flags, str(path))
+    cure = "restore it or correct the list"
+    if not path.exists():
+        raise InputError(f"{path}: no such image; {cure}")
+    return decode_bytes(read_bytes(path, cure), flags, str(path))
 
 
 def decode_bytes(data: bytes, flags: int, where: str) -> NDArray:

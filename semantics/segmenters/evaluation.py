@@ -19,6 +19,7 @@ from pycocotools.cocoeval import COCOeval
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.instances.coco_files import CocoFile, CocoImage
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.instances.instances import Instance, as_annotation
@@ -190,13 +191,17 @@ def draw_precision_recall(result: SegmentationResult, picture: Path) -> None:
     axes.set(xlabel="recall", ylabel="precision at IoU 0.5", xlim=(0, 1), ylim=(0, 1))
     axes.legend()
     axes.grid(alpha=0.3)
-    figure.savefig(picture, dpi=120)
+    with whole_file(picture) as temporary:
+        figure.savefig(temporary, dpi=120)
 
 
 def write_curves(result: SegmentationResult, path: Path) -> None:
     """Write the curves as a table of kind, ranked_by, recall and precision at IoU 0.5."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as file:
+    with (
+        whole_file(path) as temporary,
+        temporary.open("w", encoding="utf-8", newline="") as file,
+    ):
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("kind", "ranked_by", "recall", "precision"))
         for curve in result.curves:

@@ -86,7 +86,7 @@ def cache_masks(
     entries: list[dict[str, Any]] = []
     reused = broken = 0
     for k, (name, path) in enumerate(files):
-        cached = target_below(options.out / "images", name).with_suffix(".json")
+        cached = target_below(options.out, f"images/{name}").with_suffix(".json")
         if cached.is_file():
             entries.append(read_json(cached, _Entry, "remove it").model_dump())
             reused += 1
@@ -131,7 +131,7 @@ def _segmented(
     instances = segmenter.segment(image, name)
     if options.overlays:
         picture = draw(image, instances, segmenter.labels)
-        target = target_below(options.out / "overlays", name).with_suffix(".jpg")
+        target = target_below(options.out, f"overlays/{name}").with_suffix(".jpg")
         with whole_file(target) as temporary:
             cv2.imwrite(str(temporary), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     height, width = image.shape[:2]

@@ -34,6 +34,7 @@ def connect(address: str, local_cpus: int | None = None) -> Any:
     try:
         ray.init(
             address,
+            job_config=_isolated(ray),
             num_cpus=local_cpus if here else None,
             include_dashboard=False if here else None,
             log_to_driver=False,
@@ -43,6 +44,26 @@ def connect(address: str, local_cpus: int | None = None) -> Any:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"--ray {address}: no cluster answers there ({reason})") from error
     return ray
+
+
+def _isolated(ray: Any) -> Any:
+    """A job whose workers do not import from this process's current folder, as Ray has it.
+
+    That folder may hold foreign files, such as a downloaded recording with a ``json.py``.
+    """
+
+    class Isolated(ray.job_config.JobConfig):
+        """Ray adds the current folder to this list when it connects."""
+
+        @property
+        def _py_driver_sys_path(self) -> list[str]:
+            return []
+
+        @_py_driver_sys_path.setter
+        def _py_driver_sys_path(self, folders: list[str]) -> None:
+            pass
+
+    return Isolated()
 
 
 def _check_address(address: str) -> None:

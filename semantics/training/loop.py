@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.errors import InputError, whole_number
+from bmask_slam.graph.files.reading import read_lines
+from bmask_slam.graph.whole_file import open_plain, whole_file
 from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox
 from bmask_slam.semantics.training.dataset import (
     AugmentConfig,
@@ -31,7 +32,7 @@ from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, save_networ
 from bmask_slam.semantics.weights.light_weights import LightNetwork, save_light
 
 STATE = "training.pt"
-CURVES = "losses.csv"
+CURVES, CURVES_HEAD = "losses.csv", "step,loss,value"
 WEIGHTS = "weights.safetensors"
 MASKIOU = "maskiou"
 BODY = "backbone.body."
@@ -107,7 +108,7 @@ def train(
     scaler = torch.amp.GradScaler(device, enabled=halves)
     out.mkdir(parents=True, exist_ok=True)
     first = _resume(out, model, optimiser, config)
-    with (out / CURVES).open("a", newline="") as file:
+    with open_plain(out / CURVES, "a") as file:
         writer = csv.writer(file)
         for step in range(first, config.steps):
             _set_rate(optimiser, step, config)
@@ -258,7 +259,7 @@ def _resume(
 ) -> int:
     """Load the checkpoint, if any, and cut the curves at it; the next step."""
     if not (out / STATE).is_file():
-        (out / CURVES).write_text("step,loss,value\n")
+        _write(out / CURVES, [CURVES_HEAD])
         return 0
     content = torch.load(out / STATE, map_location="cpu", weights_only=True)
     if content["config"] != _comparable(config):
@@ -271,10 +272,16 @@ def _resume(
     model.load_state_dict(content["model"])
     optimiser.load_state_dict(content["optimiser"])
     step = int(content["step"])
-    lines = (out / CURVES).read_text().splitlines()
-    kept = [line for line in lines[1:] if int(line.split(",")[0]) < step]
-    (out / CURVES).write_text("\n".join([lines[0], *kept]) + "\n")
+    cure = "choose another --out or delete it"
+    lines = list(read_lines(out / CURVES, cure))[1:]
+    rows = [(line, whole_number(line.split(",")[0], f"{out / CURVES}:{k}")) for k, line in lines]
+    _write(out / CURVES, [CURVES_HEAD, *(line for line, of in rows if of < step)])
     return step
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _comparable(config: TrainingConfig) -> dict[str, str]:

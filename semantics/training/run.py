@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,6 +13,8 @@ import numpy as np
 import torch
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import read_table
+from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.instances.coco_files import read_coco
 from bmask_slam.semantics.labels import LabelSet, read_label_set
 from bmask_slam.semantics.network.config import LIGHT
@@ -117,9 +118,9 @@ def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork:
 def draw_losses(curves: Path, picture: Path) -> None:
     """Each loss against the step, smoothed (the paper's Fig. 8)."""
     values: dict[str, list[tuple[int, float]]] = defaultdict(list)
-    with curves.open(newline="") as file:
-        for row in csv.DictReader(file):
-            values[row["loss"]].append((int(row["step"]), float(row["value"])))
+    columns = read_table(curves, ("step", "loss", "value"), "train again", growing=True)
+    for step, loss, value in zip(*(columns[n] for n in ("step", "loss", "value")), strict=True):
+        values[loss].append((int(step), float(value)))
     figure = matplotlib.figure.Figure(figsize=(7, 4), layout="constrained")
     axes = figure.add_subplot()
     for name, points in values.items():
@@ -130,4 +131,5 @@ def draw_losses(curves: Path, picture: Path) -> None:
     axes.set(xlabel="step", ylabel="loss", yscale="log")
     axes.legend()
     axes.grid(alpha=0.3)
-    figure.savefig(picture, dpi=120)
+    with whole_file(picture) as temporary:
+        figure.savefig(temporary, dpi=120)

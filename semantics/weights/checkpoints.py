@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Mapping
+import struct
+import zipfile
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,17 +17,16 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.json_file import Name, parse_json
+from bmask_slam.graph.files.reading import check_unpacked
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.labels import LabelSet, label_set, read_label_set
 from bmask_slam.semantics.network.config import (
     RESNET50,
     RESNET50_V2,
     RESNET101,
-    AnchorConfig,
-    DetectionConfig,
     ImageConfig,
     NetworkConfig,
-    ProposalConfig,
 )
 from bmask_slam.semantics.network.model import MaskRCNN
 from bmask_slam.semantics.weights.checkpoint_names import State, current_names, is_mask_scoring
@@ -38,6 +39,14 @@ CAFFE_IMAGES = ImageConfig(
 """The original Mask Scoring R-CNN subtracts the mean from 0..255 and does not divide."""
 CLASSES_KEY = "roi_heads.box_predictor.cls_score.weight"
 SHOWN = 4
+MAX_ANCHORS, MAX_LAYERS, MAX_WIDTH = 64, 64, 16_384
+
+
+_UNREADABLE = (
+    *(RuntimeError, EOFError, OSError, ValueError, LookupError, TypeError, AttributeError),
+    *(AssertionError, ArithmeticError, struct.error, zipfile.BadZipFile),
+)
+"""What torch raises for files that are not what they seem."""
 
 
 @dataclass(frozen=True)
@@ -130,13 +139,17 @@ def read_state(path: Path) -> tuple[State, dict[str, str]]:
         except (safetensors.SafetensorError, OSError) as error:
             raise InputError(f"{path}: not a whole safetensors file ({error})") from error
     try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as zipped:
+                unpacked = sum(info.file_size for info in zipped.infolist())
+            check_unpacked(unpacked, path.stat().st_size)
         content: Any = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise InputError(
             f"{path}: holds more than tensors, which is not loaded since it could run code; "
             "save the state_dict alone"
         ) from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+    except _UNREADABLE as error:
         raise InputError(
             f"{path}: truncated or no PyTorch file ({path.stat().st_size} bytes); get it again"
         ) from error
@@ -201,22 +214,26 @@ def check_state(path: Path, state: State, model: nn.Module, name: str) -> None:
 
 def _described(path: Path, metadata: Mapping[str, str]) -> tuple[NetworkConfig, LabelSet]:
     """Configuration and label set from the metadata of a file of this project."""
-    parts = {
-        "image": ImageConfig,
-        "anchors": AnchorConfig,
-        "proposals": ProposalConfig,
-        "detections": DetectionConfig,
-    }
-    try:
-        values = json.loads(metadata["network"])
-        for name, cls in parts.items():
-            given = values.get(name, {})
-            inner = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
-            values[name] = cls(**inner)
-        names = tuple(json.loads(metadata["labels"]))
-        return NetworkConfig(**values), label_set(names[1:])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: made by another version of this program ({error})") from error
+    cure = "give weights that this version of the program made"
+    config = parse_json(metadata["network"], NetworkConfig, f"{path}: its network", cure)
+    names = parse_json(metadata.get("labels", ""), list[Name], f"{path}: its labels", cure)
+    fault = next((f for f in _faults(asdict(config)) if f), "")
+    if fault or not names:
+        raise InputError(f"{path}: its network has {fault or 'no labels'}; {cure}")
+    return config, label_set(names[1:])
+
+
+def _faults(values: Mapping[str, Any]) -> Iterator[str]:
+    """What no network can have, in words: values that would take all memory or never end."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _faults(value)
+        elif isinstance(value, tuple):
+            yield from _faults({f"{name}.{k}": item for k, item in enumerate(value)})
+            yield f"{len(value)} {name}" if len(value) > MAX_ANCHORS else ""
+        elif not isinstance(value, str):
+            limit = MAX_LAYERS if name.endswith("_convs") else MAX_WIDTH
+            yield "" if 0 <= value <= limit else f"{name} = {value}"
 
 
 def _published_labels(classes: int) -> LabelSet | None:

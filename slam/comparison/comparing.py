@@ -33,6 +33,7 @@ from bmask_slam.comparison.jobs.plan import Plan, make_plan
 from bmask_slam.comparison.jobs.pool import LocalPool, Pool, RayPool
 from bmask_slam.comparison.report import write_report
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import open_plain
 
 logger = logging.getLogger(__name__)
 
@@ -197,7 +198,7 @@ def _locked(folder: Path) -> Iterator[Path]:
     """Make the folder if needed and lock it for this process. Raises InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / ".lock").open("w")
+        file = open_plain(folder / ".lock", "w")
     except OSError as error:
         raise InputError(
             f"{folder}: cannot be written ({error.strerror}); choose another --out"

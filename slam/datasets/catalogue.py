@@ -5,17 +5,42 @@ from __future__ import annotations
 import difflib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
-from bmask_slam.config.yaml import read_yaml
+from pydantic import BaseModel, ConfigDict, PositiveInt, StringConstraints
+
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import check_name
+from bmask_slam.graph.files.json_file import check_json
+from bmask_slam.graph.files.yaml_file import read_yaml
 
 CATALOGUE = "sequences.yaml"
 SHOWN = 5
 Layout = Literal["tum", "icl-nuim"]
-SET_KEYS = {"title", "page", "licence", "archive", "layout", "camera", "sequences"}
-RECORDING_KEYS = {"archive", "size", "sha256"}
+STRICT = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+class _Entry(BaseModel):
+    """What a catalogue says of one recording."""
+
+    model_config = STRICT
+    archive: str = ""
+    size: PositiveInt | None = None
+    sha256: Annotated[str, StringConstraints(pattern=r"^([0-9a-fA-F]{64})?$")] = ""
+
+
+class _Set(BaseModel):
+    """What it says of a set of them."""
+
+    model_config = STRICT
+    sequences: dict[str, _Entry | None]
+    archive: str = ""
+    layout: Layout = "tum"
+    camera: dict[str, Any] = {}
+    title: str = ""
+    page: str = ""
+    licence: str = ""
 
 
 @dataclass(frozen=True)
@@ -41,6 +66,11 @@ class Recording:
     page: str = ""
     licence: str = ""
 
+    @property
+    def archive(self) -> str:
+        """Where its archive is kept, below the same folder as itself."""
+        return f"{self.name.rpartition('/')[0]}/{self.url.rsplit('/', 1)[-1]}"
+
 
 def read_catalogue(file: Path | None = None) -> dict[str, Recording]:
     """Recordings by name, from the shipped catalogue or another one in its format.
@@ -50,12 +80,10 @@ def read_catalogue(file: Path | None = None) -> dict[str, Recording]:
     """
     file = file or data_path(CATALOGUE)
     sets = read_yaml(file)
-    if not isinstance(sets, dict):
-        raise InputError(f"{file}: not a catalogue; expected sets of recordings by name")
-    found = [
-        _recording(file, name, sets[name], key) for name in sets for key in _keys(file, sets, name)
-    ]
-    return {recording.name: recording for recording in found}
+    cure = "expected sets of recordings by name"
+    found = check_json(sets, dict[str, _Set], f"{file}: not a catalogue", cure)
+    recordings = [_recording(file, n, s, k) for n, s in found.items() for k in s.sequences]
+    return {recording.name: recording for recording in recordings}
 
 
 def find(catalogue: dict[str, Recording], name: str) -> Recording:
@@ -80,27 +108,12 @@ def format_catalogue(catalogue: dict[str, Recording]) -> str:
     return "\n".join(rows)
 
 
-def _keys(file: Path, sets: dict[str, Any], name: str) -> list[str]:
-    given = sets[name]
-    if not isinstance(given, dict) or not isinstance(given.get("sequences"), dict):
-        raise InputError(f"{file}: {name}: expected a set with an archive and sequences")
-    if unknown := set(given) - SET_KEYS:
-        raise InputError(f"{file}: {name}: unknown key {sorted(unknown)[0]!r}")
-    if given.get("layout", "tum") not in get_args(Layout):
-        raise InputError(f"{file}: {name}.layout: {given['layout']!r}; use {get_args(Layout)}")
-    return list(given["sequences"])
-
-
-def _recording(file: Path, name: str, given: dict[str, Any], key: str) -> Recording:
-    own = given["sequences"][key] or {}
-    if unknown := set(own) - RECORDING_KEYS:
-        raise InputError(f"{file}: {name}.{key}: unknown key {sorted(unknown)[0]!r}")
-    url = str(own.get("archive", given.get("archive", "")))
-    url = url.format(name=key, first=key.partition("_")[0])
-    if not url.startswith(("https://", "http://")):
-        raise InputError(f"{file}: {name}.{key}.archive: {url!r} is no web address")
-    return Recording(
-        f"{name}/{key}", url, own.get("size"), str(own.get("sha256", "")),
-        given.get("layout", "tum"), dict(given.get("camera", {})),
-        *(str(given.get(text, "")) for text in ("title", "page", "licence")),
-    )  # fmt: skip
+def _recording(file: Path, name: str, given: _Set, key: str) -> Recording:
+    where, own = f"{file}: {name}.{key}", given.sequences[key] or _Entry()
+    url = own.archive or given.archive
+    url = url.replace("{name}", key).replace("{first}", key.partition("_")[0])
+    if not url.startswith(("https://", "http://")) or not url.isprintable() or url.endswith("/"):
+        raise InputError(f"{where}.archive: {url[:100]!r} is no web address of a file")
+    check_name(f"{name}/{key}", where)
+    about = given.layout, given.camera, given.title, given.page, given.licence
+    return Recording(f"{name}/{key}", url, own.size, own.sha256.lower(), *about)

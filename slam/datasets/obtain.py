@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections.abc import Callable
@@ -9,14 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.config.yaml import format_yaml
 from bmask_slam.datasets.catalogue import Recording
 from bmask_slam.datasets.unpack import unpack
 from bmask_slam.datasets.web_file import WebFile, download
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import target_below
+from bmask_slam.graph.files.reading import read_lines
+from bmask_slam.graph.files.yaml_file import format_yaml
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.sequences.lists import read_associations
+
+logger = logging.getLogger(__name__)
 
 SUMS = "SHA256SUMS"
 LISTS = ("rgb.txt", "associations.txt")
@@ -45,19 +50,10 @@ def obtain(
             archive, or one without image lists.
     """
     report = progress or (lambda what, done, total: None)
-    place = folder / recording.name
+    place = target_below(folder, recording.name)
     if place.is_dir():
         return place
-    place.parent.mkdir(parents=True, exist_ok=True)
-    archive = place.parent / recording.url.rsplit("/", 1)[-1]
-    known = read_sums(folder / SUMS)
-    expected = recording.sha256 or known.get(recording.url.rsplit("/", 1)[-1], "")
-    found = download(
-        WebFile(recording.url, expected, recording.size),
-        archive,
-        lambda done, total: report("download", done, total),
-    )
-    write_sums(folder / SUMS, known | {archive.name: found})
+    archive = _received(recording, folder, report)
     unpacked = place.with_name(f".{place.name}.unpacking")
     shutil.rmtree(unpacked, ignore_errors=True)
     try:
@@ -70,11 +66,33 @@ def obtain(
     return place
 
 
+def _received(recording: Recording, folder: Path, report: Progress) -> Path:
+    """The archive, downloaded and checked as far as its SHA-256 is known."""
+    archive = target_below(folder, recording.archive)
+    known = read_sums(folder / SUMS)
+    expected = recording.sha256 or known.get(archive.name, "")
+    found = download(
+        WebFile(recording.url, expected, recording.size),
+        archive,
+        lambda done, total: report("download", done, total),
+    )
+    if not expected:
+        logger.warning(
+            "%s: no SHA-256 is known to check it by; received %d bytes with %s, kept in %s",
+            *(recording.name, archive.stat().st_size, found, folder / SUMS),
+        )
+    write_sums(folder / SUMS, known | {archive.name: found})
+    return archive
+
+
 def read_sums(path: Path) -> dict[str, str]:
     """SHA-256 by file name, from a file in the format of ``sha256sum``; empty if missing."""
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    pairs = (line.split(maxsplit=1) for line in lines if line.strip())
-    return {name.strip(): digest for digest, name in pairs}
+    cure = "remove it; the sums of further downloads are written to a new one"
+    lines = read_lines(path, cure) if path.is_file() else ()
+    pairs = [line.split(maxsplit=1) for _, line in lines]
+    if any(len(pair) < 2 for pair in pairs):
+        raise InputError(f"{path}: a line that is not 'SHA-256  NAME'; {cure}")
+    return {name: digest for digest, name in pairs}
 
 
 def write_sums(path: Path, sums: dict[str, str]) -> None:

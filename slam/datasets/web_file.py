@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import open_plain, whole_file
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_S = 30.0
@@ -169,7 +170,7 @@ def _receive(file: WebFile, part: Path, progress: Progress) -> None:
         total = begin + int(length) if length and length.isdigit() else file.size or 0
         _check_room(file, part, total)
         _write_mark(response.headers, mark)
-        with part.open("r+b" if begin else "wb") as out:
+        with open_plain(part, "r+b" if begin else "wb") as out:
             out.seek(begin)
             done = _copy(response, out, begin, total, progress)
     if done < total:
@@ -210,7 +211,8 @@ def _write_mark(headers: http.client.HTTPMessage, mark: Path) -> None:
     strong = headers.get("ETag", "")
     known = strong if strong and not strong.startswith("W/") else headers.get("Last-Modified", "")
     if known:
-        mark.write_text(known, encoding="utf-8")
+        with whole_file(mark) as temporary:
+            temporary.write_text(known, encoding="utf-8")
     else:
         mark.unlink(missing_ok=True)
 

@@ -33,9 +33,10 @@ from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.graph.arrays import Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
+from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.json_file import read_json
+from bmask_slam.graph.files.reading import MAX_LINE
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.inverse_depth.depth_map import (
     InverseDepthMap,
@@ -50,6 +51,9 @@ from bmask_slam.semantics.labels import LabelSet
 logger = logging.getLogger(__name__)
 
 LABEL_FILE = FileKind("keyframe labels", 2)
+_NO_EVIDENCE = InstanceEvidence(
+    np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.uint16)
+)
 PARTS = ("depth", "labels", "moving", "submaps")
 METHOD = 3
 """Version of the method; to be raised when the same settings give other submaps than before."""
@@ -89,7 +93,7 @@ def _first_log_line(run: Path) -> str:
     if not path.is_file():
         return ""
     with path.open(encoding="utf-8", errors="replace") as file:
-        return file.readline().strip()
+        return file.readline(MAX_LINE).strip()
 
 
 class DenseFolder:
@@ -187,12 +191,16 @@ class DenseFolder:
 
     def evidence(self, keyframe_id: int) -> InstanceEvidence:
         """The evidence of a finished keyframe about the classes of its instances."""
-        arrays = read_arrays(self._file("labels", keyframe_id), LABEL_FILE)[1]
-        return InstanceEvidence(
-            np.asarray(arrays["log_likelihoods"], np.float32),
-            np.asarray(arrays["landmark_ids"], np.int64),
-            np.asarray(arrays["landmark_instances"], np.uint16),
-        )
+        path = self._file("labels", keyframe_id)
+        arrays = read_arrays(path, LABEL_FILE)[1]
+        types = {name: array.dtype for name, array in vars(_NO_EVIDENCE).items()}
+        arrays = {
+            name: array.astype(types.get(name, array.dtype)) for name, array in arrays.items()
+        }
+        check_like(arrays, vars(_NO_EVIDENCE), path)
+        if len(arrays["landmark_ids"]) != len(arrays["landmark_instances"]):
+            raise InputError(f"{path}: its arrays have different lengths; remove it and map again")
+        return InstanceEvidence(**arrays)
 
     def fused(self, keyframe_id: int) -> InverseDepthMap:
         """The fused inverse depth of a finished keyframe."""

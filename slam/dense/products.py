@@ -16,6 +16,7 @@ from bmask_slam.dense.options import MapOptions
 from bmask_slam.dense.saved_map import MappedRun, SavedMap
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.file_names import file_stem
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.mapping.products.cloud import Cloud, PlacedSubmap, merge_blocks, sort_into_blocks
 from bmask_slam.mapping.products.cloud_files import CloudWriter
@@ -165,7 +166,7 @@ def _regions(fused: FusedMap) -> list[ObjectRegion]:
         return []
     number = fused.labels.number
     return [
-        ObjectRegion(f"{o.id:04d}-{o.label.replace(' ', '_')}", number(o.label), o.box)
+        ObjectRegion(f"{o.id:04d}-{file_stem(o.label)}", number(o.label), o.box)
         for o in read_objects(fused.run.path)[1]
         if number(o.label)
     ]

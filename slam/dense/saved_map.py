@@ -10,9 +10,9 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import part
+from bmask_slam.graph.files.array_file import fitting, part
 from bmask_slam.mapping.inverse_depth.dense_mapper import DepthSource
-from bmask_slam.run_folder.map_file import RunLabels, read_map, saved_labels
+from bmask_slam.run_folder.map_file import MAP, RunLabels, read_map, saved_labels
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.sequences import Sequence, open_sequence
@@ -98,6 +98,8 @@ def with_right_images(run: MappedRun, source: DepthSource) -> MappedRun:
 def read_saved_map(path: Path) -> SavedMap:
     """The map of a run folder, without its images. Raises InputError if there is none."""
     state, camera = read_map(path)
-    world = world_of(part(state, "mapper.world"))
-    keyframes = world.in_segment(world.largest_segment())
-    return SavedMap(path, world, keyframes, camera, saved_labels(part(state, "semantics"), path))
+    with fitting(path / MAP):
+        world = world_of(part(state, "mapper.world"))
+        keyframes = world.in_segment(world.largest_segment())
+        labels = saved_labels(part(state, "semantics"), path)
+    return SavedMap(path, world, keyframes, camera, labels)

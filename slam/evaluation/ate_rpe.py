@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 from dataclasses import dataclass
@@ -13,7 +12,8 @@ import numpy as np
 
 from bmask_slam.events import read_events
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.geometry import so3_log
 from bmask_slam.graph.hand_eye import body_trajectory, hand_eye
 from bmask_slam.graph.metrics import (
@@ -171,8 +171,8 @@ def frame_stamps(trajectory_file: Path) -> Array | None:
     path = trajectory_file.parent / "frames.csv"
     if trajectory_file.name != "trajectory.txt" or not path.is_file():
         return None
-    with path.open(encoding="utf-8", newline="") as file:
-        return np.array([float(row["timestamp"]) for row in csv.DictReader(file)])
+    stamps = read_table(path, ("timestamp",), "run again", growing=True)["timestamp"]
+    return np.array([finite_number(stamp, str(path)) for stamp in stamps])
 
 
 def _reference_file(path: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -119,6 +120,8 @@ class DepthViewBuffer:
         size = len(ids), *(state["shape"].tolist() or [0, 0])
         stamps_s, steps = state["timestamps_s"].tolist(), state["step"].tolist()
         poses = state["T_keyframe_camera"].reshape(len(ids), 4, 4).copy()
+        if not 0 <= math.prod(size) <= 8 * state["speak"].size:
+            raise ValueError(f"fewer bits than {size}")
         known_pixels = np.unpackbits(state["speak"], count=np.prod(size)).reshape(size).astype(bool)
         depths = (state[name].reshape(size) for name in ("nearest_m", "farthest_m"))
         self.views = []

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.errors import InputError, finite_number, is_whole
+from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -81,9 +82,7 @@ def read_covariances(path: Path) -> KeyframeCovariances:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; run with --covariances to get it")
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    numbered = enumerate(map(str.strip, text.splitlines()), start=1)
-    rows = [_row(s, f"{path}:{n}") for n, s in numbered if s and not s.startswith("#")]
+    rows = [_row(s, f"{path}:{n}") for n, s in read_lines(path, "run with --covariances again")]
     if not rows:
         raise InputError(f"{path}: no covariance in the file; run with --covariances again")
     table = np.array(rows)
@@ -103,6 +102,6 @@ def _row(line: str, where: str) -> list[float]:
     words = line.split()
     if len(words) != _COLUMNS:
         raise InputError(f"{where}: {len(words)} columns, expected {_COLUMNS}; correct the line")
-    if not words[0].isdigit():
+    if not is_whole(words[0]):
         raise InputError(f"{where}: {words[0][:40]!r} is not a keyframe id; correct the line")
     return [finite_number(word, where) for word in words]

@@ -11,7 +11,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.growing_table import read_table
+from bmask_slam.graph.files.reading import read_table
 from bmask_slam.tracking.results import FrameResult
 
 FRAMES = "frames.csv"
@@ -81,11 +81,11 @@ def read_frames(path: Path) -> FrameTable:
     Raises:
         InputError: no such file, a column that is missing, or a value that is no number.
     """
-    columns = read_table(path, _NEEDED)
+    columns = read_table(path, _NEEDED, "run again", growing=True)
     absent = ("",) * len(columns["index"])  # a column that older versions did not write
     try:
         return _table({name: columns.get(name, absent) for name in COLUMNS})
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: {error}; run again") from error
 
 

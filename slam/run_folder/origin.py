@@ -8,6 +8,8 @@ from pathlib import Path
 
 from bmask_slam import __version__
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import is_folder
+from bmask_slam.graph.files.reading import read_text
 
 CONFIG = "config.yaml"
 _SEQUENCE = re.compile(r"^# .*?, sequence (?P<path>.+), stride (?P<stride>\d+)$")
@@ -35,10 +37,8 @@ def read_origin(run: Path) -> Origin:
     folder exists.
     """
     config = run / CONFIG
-    try:
-        first = config.read_text(encoding="utf-8").partition("\n")[0] if config.is_file() else ""
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{config}: cannot be read ({error}); give --sequence") from error
+    text = read_text(config, "give --sequence") if config.is_file() else ""
+    first = text.partition("\n")[0]
     found = _SEQUENCE.match(first)
     if found is None:
         return Origin(None)
@@ -51,7 +51,7 @@ def read_origin(run: Path) -> Origin:
 
 def _may_be_sequence(folder: Path) -> bool:
     """Whether it is a folder and no run: runs/office is named after its sequence, office."""
-    return folder.is_dir() and not (folder / CONFIG).exists()
+    return is_folder(folder) and not (folder / CONFIG).exists()
 
 
 def find_sequence(run: Path) -> Path:
@@ -61,7 +61,7 @@ def find_sequence(run: Path) -> Path:
         InputError: config.yaml names none, or one that is not there.
     """
     sequence = read_origin(run).sequence
-    if sequence is None or not sequence.is_dir():
+    if sequence is None or not is_folder(sequence):
         named = f"names {str(sequence)!r}, which is not there" if sequence else "names no sequence"
         cure = "give the folder of the run's images as --sequence"
         raise InputError(f"{run / CONFIG}: {named}; {cure}")

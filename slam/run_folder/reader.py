@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from pydantic import BaseModel
 
 from bmask_slam.events import Event, read_events
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.json_file import STRICT, read_json
+from bmask_slam.graph.files.reading import read_text
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices, read_tum
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
 from bmask_slam.run_folder.folder import CHECKPOINT, FILES, trajectory_files
@@ -44,6 +46,15 @@ class Metric(NamedTuple):
     """A number of metrics.json; unit "1" is a share."""
 
     value: float
+    unit: str
+
+
+class _Row(BaseModel):
+    """A row of metrics.json."""
+
+    model_config = STRICT
+    name: str
+    value: int | float
     unit: str
 
 
@@ -152,10 +163,12 @@ class Run:
     @cached_property
     def label_distributions(self) -> Array:
         """Probabilities (N, C) of ``label_names`` for the N ``landmarks``."""
-        from bmask_slam.graph.files.array_file import part  # noqa: PLC0415
-        from bmask_slam.run_folder.map_file import read_map, saved_labels  # noqa: PLC0415
+        from bmask_slam.graph.files.array_file import fitting, part  # noqa: PLC0415
+        from bmask_slam.run_folder.map_file import MAP, read_map, saved_labels  # noqa: PLC0415
 
-        found = saved_labels(part(read_map(self._file("map"))[0], "semantics"), self.path)
+        path = self._file(MAP)
+        with fitting(path):
+            found = saved_labels(part(read_map(path)[0], "semantics"), self.path)
         if found is None:
             raise InputError(
                 f"{self.path / 'map'}: has no labels; {self._again('--segmenter light')}"
@@ -202,11 +215,8 @@ class Run:
     def metrics(self) -> dict[str, Metric]:
         """Value and unit of every number in metrics.json by its name."""
         path = self._file("metrics.json")
-        try:
-            rows = json.loads(path.read_text(encoding="utf-8"))
-            return {row["name"]: Metric(row["value"], str(row["unit"])) for row in rows}
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: cannot be read ({error}); {self._again()}") from error
+        rows = read_json(path, list[_Row], self._again())
+        return {row.name: Metric(row.value, row.unit) for row in rows}
 
     @cached_property
     def camera(self) -> Camera:
@@ -231,8 +241,7 @@ class Run:
     @cached_property
     def log(self) -> tuple[str, ...]:
         """The lines of log.txt."""
-        text = self._file("log.txt").read_text(encoding="utf-8", errors="replace")
-        return tuple(text.splitlines())
+        return tuple(read_text(self._file("log.txt"), self._again()).splitlines())
 
     @cached_property
     def _label_names_and_objects(self) -> tuple[tuple[str, ...], list[SavedObject]]:
@@ -243,7 +252,7 @@ class Run:
     def _dense_names(self) -> tuple[str, ...]:
         """Class names of the labels of the dense clouds."""
         path = self._file(f"{_DENSE}/legend.json")
-        return tuple(json.loads(path.read_text(encoding="utf-8")))
+        return tuple(read_json(path, dict[str, Any], f"bmask-slam map {self.path} makes it again"))
 
     def _marginals(self, landmark_ids: Ints) -> tuple[tuple[Ints, Array], tuple[Ints, Array]]:
         """Ids and covariances of the graph's keyframes, and of those landmarks that it has."""

@@ -8,12 +8,15 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.errors import InputError, finite_number
+from bmask_slam.graph.errors import MAX_WHOLE, InputError, finite_number, whole_number
+from bmask_slam.graph.files.json_file import STRICT, Name, read_json
+from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.semantics.instances.overlay import class_colour
@@ -88,17 +91,51 @@ def read_labels(run: Path) -> LabelTable:
     path = run / LABELS
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a run that had a segmenter")
-    with path.open(encoding="utf-8", newline="") as file:
-        header, *rows = list(csv.reader(file)) or [[]]
-    if tuple(header) != _COLUMNS or any(len(row) != len(_COLUMNS) for row in rows):
-        raise InputError(f"{path}: needs the columns {', '.join(_COLUMNS)}; run again")
-    numbers = [
-        [finite_number(row[k], f"{path}: line {n}") for k in (0, 2, 3, 4)]
-        for n, row in enumerate(rows, 2)
-    ]
-    ids, probability, entropy, views = np.array(numbers, float).reshape(-1, 4).T
-    names = tuple(row[1] for row in rows)
-    return LabelTable(ids.astype(np.int64), names, probability, entropy, views.astype(np.int64))
+    columns = read_table(path, _COLUMNS, "run again")
+
+    def numbers(name: str, parse: Callable[[str, str], float]) -> list[float]:
+        return [parse(text, f"{path}: line {n}") for n, text in enumerate(columns[name], 2)]
+
+    return LabelTable(
+        np.array(numbers("id", whole_number), np.int64),
+        columns["label"],
+        np.array(numbers("probability", finite_number), float),
+        np.array(numbers("entropy", finite_number), float),
+        np.array(numbers("views", whole_number), np.int64),
+    )
+
+
+Metres = Annotated[float, Field(ge=-1e9, le=1e9)]
+Point = tuple[Metres, Metres, Metres]
+Id = Annotated[int, Field(ge=0, le=MAX_WHOLE)]
+
+
+class _Box(BaseModel):
+    model_config = STRICT
+    centre_world_m: Point
+    axes_world: tuple[Point, Point, Point]
+    size_m: Point
+
+
+class _Object(BaseModel):
+    model_config = STRICT
+    id: Id
+    label: Name
+    probability: float
+    centroid_world_m: Point
+    box: _Box
+    keyframes: list[Id]
+    landmarks: list[Id]
+    first_seen_s: float
+    last_seen_s: float
+
+
+class _ObjectFile(BaseModel):
+    """What `write_objects` writes, as far as it is read."""
+
+    model_config = STRICT
+    labels: list[Name]
+    objects: list[_Object]
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,27 +209,24 @@ def read_objects(run: Path) -> tuple[tuple[str, ...], list[SavedObject]]:
     path = run / OBJECTS
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a run that had a segmenter")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return tuple(map(str, content["labels"])), [_from_json(o) for o in content["objects"]]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read ({error!r}); run again") from error
+    content = read_json(path, _ObjectFile, "run again")
+    return tuple(content.labels), [_saved(o) for o in content.objects]
 
 
-def _from_json(o: dict[str, Any]) -> SavedObject:
+def _saved(o: _Object) -> SavedObject:
     T = np.eye(4)
-    T[:3, :3] = np.array(o["box"]["axes_world"], float).reshape(3, 3).T
-    T[:3, 3] = np.array(o["box"]["centre_world_m"], float).reshape(3)
+    T[:3, :3] = np.array(o.box.axes_world).T
+    T[:3, 3] = o.box.centre_world_m
     return SavedObject(
-        int(o["id"]),
-        str(o["label"]),
-        float(o["probability"]),
-        np.array(o["centroid_world_m"], float).reshape(3),
-        OrientedBox(T, np.array(o["box"]["size_m"], float).reshape(3)),
-        np.array(o["keyframes"], np.int64),
-        np.array(o["landmarks"], np.int64),
-        float(o["first_seen_s"]),
-        float(o["last_seen_s"]),
+        o.id,
+        o.label,
+        o.probability,
+        np.array(o.centroid_world_m),
+        OrientedBox(T, np.array(o.box.size_m)),
+        np.array(o.keyframes, np.int64),
+        np.array(o.landmarks, np.int64),
+        o.first_seen_s,
+        o.last_seen_s,
     )
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.config.yaml import format_yaml, parse_yaml
-from bmask_slam.graph.camera import Camera, DepthNoise
+from bmask_slam.graph.camera import MAX_SIDE_PX, Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.sequences.camera_presets import (
     PRESETS,
@@ -144,15 +144,14 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
 
 def _values(path: Path) -> dict[str, object]:
     """The values of a camera.yaml by key, none unknown and none missing. Raises InputError."""
-    try:
-        values = parse_yaml(path.read_text(encoding="utf-8"), path.name)
-    except OSError as error:
+    if not path.is_file():
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give a camera.yaml, or one of "
-            f"{', '.join(PRESETS)}"
-        ) from error
-    except (InputError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not YAML ({error}); write e.g. {CAMERA_EXAMPLE}") from error
+            f"{path}: no such file; give a camera.yaml, or one of {', '.join(PRESETS)}"
+        )
+    try:
+        values = read_yaml(path)
+    except InputError as error:
+        raise InputError(f"{error}; write e.g. {CAMERA_EXAMPLE}") from error
     if not isinstance(values, dict):
         raise InputError(f"{path}: {values!r} is no mapping; write e.g. {CAMERA_EXAMPLE}")
     for key in values:
@@ -202,6 +201,8 @@ def _check_range(path: Path, numbers: dict[str, float]) -> None:
                 "depth_offset is in metres, depth_time_offset and rolling_shutter in seconds"
             )
     for key in ("width", "height"):
+        if numbers[key] > MAX_SIDE_PX:
+            raise InputError(f"{path}: {key} is {numbers[key]:g}, more than {MAX_SIDE_PX} pixels")
         if numbers[key] != int(numbers[key]):
             raise InputError(f"{path}: {key} is {numbers[key]:g}; it must be a whole number")
     for key, size in (("cx", "width"), ("cy", "height")):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -11,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.files.file_names import check_name
+from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.trajectory import associate_stamps, check_seconds
 
 logger = logging.getLogger(__name__)
@@ -144,7 +144,7 @@ def read_list(path: Path) -> ImageList:
             or not in seconds.
     """
     rows = [
-        (number, _stamp(columns[0], f"{path}:{number}"), columns[1])
+        (number, finite_number(columns[0], f"{path}:{number}"), columns[1])
         for number, columns in _lines(path, 2, "timestamp file")
     ]
     return _image_list(path, rows)
@@ -157,8 +157,8 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
     recognised by their folder names. Raises InputError as ``read_list`` does.
     """
     lines = _lines(path, 4, "timestamp rgb timestamp depth")
-    first = [(n, _stamp(c[0], f"{path}:{n}"), c[1]) for n, c in lines]
-    second = [(n, _stamp(c[2], f"{path}:{n}"), c[3]) for n, c in lines]
+    first = [(n, finite_number(c[0], f"{path}:{n}"), c[1]) for n, c in lines]
+    second = [(n, finite_number(c[2], f"{path}:{n}"), c[3]) for n, c in lines]
     if first[0][2].startswith("depth") and second[0][2].startswith("rgb"):
         logger.info("%s: depth comes first in the lines", path)
         first, second = second, first
@@ -168,10 +168,7 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
 def _lines(path: Path, count: int, form: str) -> list[tuple[int, list[str]]]:
     """Line number and columns of each line that is neither empty nor a comment."""
     lines = []
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    for number, line in enumerate(map(str.strip, text.splitlines()), start=1):
-        if not line or line.startswith("#"):
-            continue
+    for number, line in read_lines(path, f"expected lines of '{form}'"):
         columns = line.split(maxsplit=1) if count == 2 else line.split()
         if len(columns) != count:
             raise InputError(f"{path}:{number}: {line[:60]!r} is not of the form '{form}'")
@@ -179,17 +176,6 @@ def _lines(path: Path, count: int, form: str) -> list[tuple[int, list[str]]]:
     if not lines:
         raise InputError(f"{path}: the list is empty; expected lines of '{form}'")
     return lines
-
-
-def _stamp(text: str, where: str) -> float:
-    """A finite stamp in seconds."""
-    try:
-        stamp_s = float(text)
-    except ValueError:
-        stamp_s = math.nan
-    if not math.isfinite(stamp_s):
-        raise InputError(f"{where}: timestamp {text!r} is not a finite number; correct the line")
-    return stamp_s
 
 
 def _image_list(path: Path, rows: list[tuple[int, float, str]]) -> ImageList:

@@ -6,10 +6,10 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bmask_slam.config.yaml import read_yaml
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.trajectory import associate_stamps
 from bmask_slam.sequences import Sequence, read_camera
 from bmask_slam.sequences.images import read_rgb

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from graphlib import TopologicalSorter
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -98,7 +100,7 @@ class FrameHistory:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Become the history of a state."""
+        """Become the history of a state. Raises ValueError for keyframes in a circle."""
         self._size = len(state["timestamps_s"])
         self._store = np.zeros(max(self._size, 1024), ENTRY)
         columns = ("timestamps_s", "keyframe_ids", "T_keyframe_camera")
@@ -106,6 +108,7 @@ class FrameHistory:
             self._store[name][: self._size] = state[column]
         parents = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)
         self._parent = dict(zip(state["culled_ids"].tolist(), parents, strict=True))
+        TopologicalSorter({k: (parent,) for k, (parent, _) in self._parent.items()}).prepare()
 
     def _resolve(self, keyframe_id: int, T: Array) -> tuple[int, Array]:
         """The keyframe that replaces one, and poses T (..., 4, 4) relative to it."""

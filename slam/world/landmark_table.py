@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from bmask_slam.features.patch_alignment import PATCH_PX
 from bmask_slam.graph.arrays import Array, Arrays, Bytes, Image, Ints, Mask
+from bmask_slam.graph.files.array_file import check_ids
 from bmask_slam.graph.geometry import inverse, transform
 
 PATCHES = 4  # of a landmark: views from one walk past it, of which each patch serves a range
-
 
 _Columns = dict[str, tuple[tuple[int, ...], type, float]]
 
@@ -254,7 +254,10 @@ class LandmarkTable:
         return {"size": np.array(self._size), "ids": ids, **columns}
 
     def restore(self, state: Arrays) -> None:
-        """Become the table of a state; this table must be new."""
+        """Become the table of a state; this table must be new. Raises ValueError."""
+        check_ids(state["ids"], int(state["size"]))
+        if (state["replaced_by"] >= 0).any():
+            raise ValueError("a landmark of the map that was fused into another")
         self.extend_to(int(state["size"]))
         self._assign_rows(state["ids"])
         for name in _COLUMNS:

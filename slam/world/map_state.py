@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Arrays
-from bmask_slam.graph.files.array_file import nested, part, split_rows
+from bmask_slam.graph.files.array_file import check_ids, nested, part, split_rows
 from bmask_slam.world.landmark_table import LandmarkTable
 from bmask_slam.world.world_map import CulledKeyframe, Keyframe, WorldMap
 
@@ -79,8 +79,11 @@ def world_of(state: Arrays) -> WorldMap:
         )
         keyframe.sent_ids, keyframe.masked = own["sent_ids"], own["masked"]
         keyframes[keyframe_id] = keyframe
+    check_ids(rows["id"], int(state["next_keyframe_id"]))
     landmarks = LandmarkTable()
     landmarks.restore(part(state, "landmarks"))
+    if keypoints["landmark_ids"].max(initial=-1) >= len(landmarks.host):
+        raise ValueError("a keypoint on a landmark that is not there")
     culled = _culled_of(part(state, "culled"))
     return WorldMap(keyframes, landmarks, int(state["next_keyframe_id"]), culled)
 

@@ -18,9 +18,9 @@ from bmask_slam.comparison.experiment.experiment import (
 )
 from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.config.configuration import find_config, from_tree, resolve
-from bmask_slam.config.yaml import read_yaml
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S
 from bmask_slam.rendering.sequence import SCENES, RenderConfig
 from bmask_slam.system_config import SystemConfig

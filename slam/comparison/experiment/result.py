@@ -8,9 +8,12 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BeforeValidator
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.json_file import check_json, read_json
 from bmask_slam.graph.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -34,6 +37,10 @@ class CellStatus(Enum):
     DONE = "done"
     FAILED = "failed"
     PENDING = "pending"
+
+
+Figure = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number that JSON has as null where it is not finite."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,7 @@ class Cell:
     method: str
     seed: int | None
     status: CellStatus
-    metrics: dict[str, float] = field(default_factory=dict)
+    metrics: dict[str, Figure] = field(default_factory=dict)
     folder: str = ""
     trajectory: str = ""
     reference: str = ""
@@ -151,23 +158,11 @@ def read_results(path: Path) -> Comparison:
         InputError: it is missing, not JSON, or of another format.
     """
     path = path / RESULTS if path.is_dir() else path
-    try:
-        plain = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; make it by bmask-slam compare") from error
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: not JSON ({error}); run bmask-slam compare again") from error
-    if not isinstance(plain, dict) or plain.pop("format", None) != FORMAT_VERSION:
+    cure = "make it by bmask-slam compare"
+    plain = read_json(path, dict[str, Any], cure)
+    if plain.pop("format", None) != FORMAT_VERSION:
         raise InputError(f"{path}: not a comparison of format {FORMAT_VERSION}; compare again")
-    methods = tuple(Method(**m | {"kind": Kind(m["kind"])}) for m in plain.pop("methods"))
-    cells = tuple(_cell(cell) for cell in plain.pop("cells"))
-    names = {key: tuple(plain.get(key, ())) for key in ("sequences", "drawn")}
-    return Comparison(**plain | names, methods=methods, cells=cells)
-
-
-def _cell(plain: dict[str, Any]) -> Cell:
-    metrics = {name: math.nan if v is None else v for name, v in plain["metrics"].items()}
-    return Cell(**plain | {"status": CellStatus(plain["status"]), "metrics": metrics})
+    return check_json({"sequences": (), "drawn": ()} | plain, Comparison, str(path), cure)
 
 
 def _finite(value: object) -> object:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 from bmask_slam.comparison.experiment.metric_table import BY_NAME
 from bmask_slam.evaluation import evaluate_trajectory, read_reference
 from bmask_slam.graph.trajectory_formats import read_trajectory
+from bmask_slam.run_folder.reader import Run
 
 COMPARISON_NAMES = {"estimate_share": "evaluated_share"}
 """Names of evaluation rows that have another name in a comparison."""
@@ -42,6 +42,8 @@ def trajectory_errors(
 
 def run_figures(run: Path) -> dict[str, float]:
     """The measurements of a run without errors: times, memory, shares."""
-    rows = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    kept = (row for row in rows if not row["name"].startswith(("ate_", "rpe_")))
-    return {row["name"]: float(row["value"]) for row in kept if row["name"] in BY_NAME}
+    return {
+        name: float(metric.value)
+        for name, metric in Run(run).metrics.items()
+        if name in BY_NAME and not name.startswith(("ate_", "rpe_"))
+    }

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from bmask_slam.comparison.experiment.result import CellStatus
-from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.json_file import read_json
+from bmask_slam.graph.files.reading import read_text
+from bmask_slam.graph.whole_file import open_plain, remove, whole_file
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PROCESS = "bmask_slam.job_process"
@@ -92,9 +93,9 @@ def run_job(job: Job, threads: int = 1, started: Start = lambda process: None) -
     log.parent.mkdir(parents=True, exist_ok=True)
     record.unlink(missing_ok=True)
     if job.clear:
-        shutil.rmtree(job.clear, ignore_errors=True)
+        remove(Path(job.clear))
     begin_s = time.monotonic()
-    with log.open("wb") as output:
+    with open_plain(log, "wb") as output:
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", PROCESS, json.dumps(asdict(job))],
             stdin=subprocess.PIPE,
@@ -124,9 +125,8 @@ def figures_file(job: Job) -> Path:
 def read_record(path: Path) -> Outcome | None:
     """The outcome in a file; None where there is none that can be read."""
     try:
-        plain: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return Outcome(**plain | {"status": CellStatus(plain["status"])})
-    except (OSError, ValueError, TypeError, KeyError):
+        return read_json(path, Outcome, "run it again")
+    except InputError:
         return None
 
 
@@ -140,7 +140,7 @@ def write_record(path: Path, outcome: Outcome) -> None:
 def _outcome(job: Job, code: int, wall_s: float) -> Outcome:
     if code == 0 and Path(job.product).exists():
         file = figures_file(job)
-        figures = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        figures = read_json(file, dict[str, float], "compare again") if file.is_file() else {}
         return Outcome(CellStatus.DONE, "", wall_s, figures, job.depends)
     error = _last_error(Path(job.log)) or f"ended with status {code} without a message"
     if code < 0:
@@ -150,7 +150,7 @@ def _outcome(job: Job, code: int, wall_s: float) -> Outcome:
 
 def _last_error(log: Path) -> str:
     """The last error message in a log, else its last line."""
-    text = log.read_text(encoding="utf-8", errors="replace").replace("\r", "\n")
+    text = read_text(log, "compare again").replace("\r", "\n")
     lines = [line.strip() for line in text.splitlines() if line.strip()][-LAST_LINES:]
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
     return (errors or lines or [""])[-1][:LINE_LIMIT]

@@ -2,30 +2,54 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.json_file import STRICT, Name, read_json
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.trajectory import associate, nearest_indices, read_tum
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.run_folder.semantic_files import LABELS, read_labels
+from bmask_slam.semantics.instances.image_files import decode_image
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.system_config import SystemConfig
 
+MAX_INSTANCE = 65_535
 MIN_DEPTH_M, OUTLIER_M = 0.1, 0.05
 NEAR_M = (0.02, 0.01)  # a + b z^2
+
+
+class _Category(BaseModel):
+    model_config = STRICT
+    id: int
+    name: Name
+
+
+class _Annotation(BaseModel):
+    model_config = STRICT
+    instance_id: Annotated[int, Field(ge=0, le=MAX_INSTANCE)]
+    category_id: int
+
+
+class _Truth(BaseModel):
+    """What is read of a rendered sequence's annotations."""
+
+    model_config = STRICT
+    categories: list[_Category]
+    annotations: list[_Annotation]
 
 
 def truth_figures(run: Path, folder: Path) -> dict[str, float]:
@@ -106,11 +130,11 @@ def truth_from_world(poses_world_camera: Array, poses_truth_camera: Array) -> Ar
 
 def true_classes(folder: Path, names: LabelSet) -> Ints:
     """The label of each instance number, 0 for background and classes that the set lacks."""
-    content = json.loads((folder / "annotations.json").read_text(encoding="utf-8"))
-    by_id = {c["id"]: c["name"] for c in content["categories"]}
-    classes = np.zeros(np.iinfo(np.uint16).max + 1, np.int64)
-    for annotation in content["annotations"]:
-        classes[annotation["instance_id"]] = names.number(by_id[annotation["category_id"]])
+    content = read_json(folder / "annotations.json", _Truth, "render the sequence again")
+    by_id = {c.id: c.name for c in content.categories}
+    classes = np.zeros(MAX_INSTANCE + 1, np.int64)
+    for annotation in content.annotations:
+        classes[annotation.instance_id] = names.number(by_id.get(annotation.category_id, ""))
     return classes
 
 
@@ -135,4 +159,4 @@ def true_depth(sequence: Sequence, index: int) -> Array:
 def truth_image(sequence: Sequence, kind: str, index: int) -> NDArray[np.uint16]:
     """The image of a frame in the folder ``kind`` of a rendered sequence."""
     name = sequence.pairs.rgb_files[index].name
-    return np.asarray(cv2.imread(str(sequence.folder / kind / name), cv2.IMREAD_UNCHANGED))
+    return decode_image(sequence.folder / kind / name, cv2.IMREAD_UNCHANGED)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,8 @@ from bmask_slam.comparison.experiment.result import Comparison
 from bmask_slam.comparison.report.drawing import COLOURS, DASHES, as_picture, figure
 from bmask_slam.comparison.report.section import Picture
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.errors import InputError, finite_number, whole_number
+from bmask_slam.graph.files.reading import read_table
 
 LOSSES, CURVES = "losses.csv", "precision_recall.csv"
 TOTAL, MASKS = "total", "segm, by class score x MaskIoU"
@@ -63,9 +64,8 @@ def curve_picture(title: str, caption: str, curves: Curves, names: tuple[str, st
 def read_losses(path: Path) -> Curves:
     """Each loss of a losses.csv, and their sum as "total", against the step, smoothed."""
     parts: dict[str, dict[int, float]] = defaultdict(dict)
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            parts[row["loss"]][int(row["step"])] = float(row["value"])
+    for step, loss, value in _rows(path, ("step", "loss", "value")):
+        parts[loss][whole_number(step, str(path))] = finite_number(value, str(path))
     shared = set.intersection(*(set(part) for part in parts.values())) if parts else set()
     if len(parts) > 1 and shared:
         parts[TOTAL] = {step: sum(p[step] for p in parts.values()) for step in sorted(shared)}
@@ -75,12 +75,16 @@ def read_losses(path: Path) -> Curves:
 def read_precision(path: Path) -> Curves:
     """Each curve of a precision_recall.csv, named by kind and ranking score."""
     points = defaultdict(list)
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            points[f"{row['kind']}, by {row['ranked_by']}"].append(
-                (float(row["recall"]), float(row["precision"]))
-            )
+    for kind, ranked_by, *numbers in _rows(path, ("kind", "ranked_by", "recall", "precision")):
+        point = [finite_number(number, str(path)) for number in numbers]
+        points[f"{kind}, by {ranked_by}"].append(point)
     return {name: np.array(values) for name, values in points.items()}
+
+
+def _rows(path: Path, names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """The values of these columns, line by line."""
+    columns = read_table(path, names, "train again", growing=True)
+    return zip(*(columns[name] for name in names), strict=True)
 
 
 def _read_all(
@@ -89,12 +93,12 @@ def _read_all(
     """All curves of a single network, or the preferred curve of each of several."""
     found: dict[str, Curves] = {}
     for name, folder in folders.items():
+        if not (folder / file).exists():
+            continue
         try:
             found[name] = read(folder / file)
-        except FileNotFoundError:
-            continue
-        except (KeyError, ValueError, OSError) as error:
-            logger.warning("%s: no curves in it (%s); skipped", folder / file, error)
+        except InputError as error:
+            logger.warning("%s; skipped", error)
     if len(found) == 1:
         return next(iter(found.values()))
     first = {name: next(iter(curves.values()), None) for name, curves in found.items()}

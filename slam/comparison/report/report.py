@@ -13,6 +13,7 @@ from bmask_slam.comparison.report.sections import make_sections, summary
 from bmask_slam.comparison.report.table import metric_tables
 from bmask_slam.comparison.report.text_tables import csv_text, latex_text, markdown_text
 from bmask_slam.comparison.report.verdict_tables import ablation_table, verdict_tables
+from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.whole_file import whole_file
 
 PAGE = "report.html"
@@ -43,6 +44,7 @@ def write_report(comparison: Comparison, folder: Path) -> list[Path]:
 
 def _write_figures(folder: Path, sections: list[Section]) -> list[Path]:
     """Write every drawing as a PDF for a paper, and remove earlier ones."""
+    refuse_link(folder)
     folder.mkdir(exist_ok=True)
     drawn = [p for section in sections for p in section.pictures if p.pdf is not None]
     files = {}

@@ -13,7 +13,9 @@ from bmask_slam.comparison.experiment.result import Cell, CellStatus, Comparison
 from bmask_slam.comparison.report.section import Picture, slug
 from bmask_slam.comparison.report.table import EMPTY, Entry, Table, TableRow
 from bmask_slam.events import EventKind, read_events
+from bmask_slam.graph.errors import InputError
 from bmask_slam.run_folder.frame_file import FRAMES, STAGES, read_frames
+from bmask_slam.semantics.instances.image_files import decode_image
 
 KEYFRAME_STAGES = ("keyframe", "graph", "loops", "semantics")
 PICTURE_WIDTH_PX = 900
@@ -104,9 +106,10 @@ def _map_picture(path: Path, cell: Cell, shows: str) -> Picture | None:
     """A picture file, reduced in size; None if it cannot be read."""
     if not path.is_file():
         return None
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        logger.warning("%s: not a picture; skipped in the report", path)
+    try:
+        image = decode_image(path, cv2.IMREAD_COLOR)
+    except InputError as error:
+        logger.warning("%s; skipped in the report", error)
         return None
     height, width = image.shape[:2]
     if width > PICTURE_WIDTH_PX:

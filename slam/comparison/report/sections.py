@@ -26,7 +26,9 @@ from bmask_slam.comparison.report.verdict_tables import (
     verdict_sentences,
     verdict_tables,
 )
-from bmask_slam.config.yaml import format_yaml
+from bmask_slam.graph.files.file_names import is_inside
+from bmask_slam.graph.files.reading import read_text
+from bmask_slam.graph.files.yaml_file import format_yaml
 
 LOG_LINES = 15
 LINE_CHARACTERS = 400
@@ -74,9 +76,9 @@ def summary(comparison: Comparison) -> list[str]:
 def log_tail(cell: Cell, folder: Path) -> str:
     """The last lines of a cell's log, or a sentence if there are none."""
     path = folder / cell.log
-    if not cell.log or not path.is_file():
+    if not is_inside(cell.log) or not path.is_file():
         return "(no log)"
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
+    lines = read_text(path, "compare again").splitlines()[-LOG_LINES:]
     return "\n".join(line[:LINE_CHARACTERS] for line in lines) or "(the log is empty)"
 
 

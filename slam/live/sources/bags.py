@@ -39,19 +39,17 @@ class Bag:
     Attributes:
         path: of the bag.
         topics: all of them, sorted by name.
+        duration_s: time from the first message to the last, by the time of recording.
     """
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path = path
+        self.duration_s = max(float(reader.duration), 0.0) * 1e-9
         self._reader = reader
         self.topics = sorted(
-            Topic(name, str(topic.msgtype), topic.msgcount) for name, topic in reader.topics.items()
+            Topic(str(name), str(topic.msgtype), int(topic.msgcount))
+            for name, topic in reader.topics.items()
         )
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first message to the last, by the time of recording."""
-        return max(float(self._reader.duration), 0.0) * 1e-9
 
     def messages(self, *names: str) -> Iterator[tuple[str, Any]]:
         """The messages of these topics, each with its topic's name, in the order of recording.
@@ -90,9 +88,12 @@ def open_bag(path: Path) -> Iterator[Bag]:
         reader = highlevel.AnyReader([path], default_typestore=types)
         reader.open()
     try:
-        yield Bag(path, reader)
+        with _translated(path):
+            bag = Bag(path, reader)
+        yield bag
     finally:
-        reader.close()
+        with _translated(path):
+            reader.close()
 
 
 def format_topics(bag: Bag) -> str:
@@ -113,8 +114,9 @@ def _translated(path: Path) -> Iterator[None]:
     known = (highlevel.AnyReaderError, one.ReaderError, two.ReaderError)
     inside = (reader.zstd.ZstdError, sqlite.apsw.Error, struct.error, EOFError, OSError)
     damaged = (ArithmeticError, AssertionError, LookupError, MemoryError, RuntimeError)
+    untyped = (TypeError, ValueError, AttributeError)
     try:
         yield
-    except (*known, *inside, *damaged, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+    except (*known, *inside, *damaged, *untyped) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"{path}: cannot be read ({reason}); {_CURE}") from error

@@ -217,7 +217,7 @@ BAD = {
     "edge": (WHOLE + EDGE.replace("0 5 0 6", "0 5 9 6"), ":10: an information matrix that is not"),
     "self": (WHOLE + EDGE.replace("0 1", "1 1", 1), ":10: an edge from vertex 1 to itself"),
     "fix": (WHOLE + "FIX 2\n", ":10: FIX 2, a vertex that is not there"),
-    "comment": ("# bmask-slam landmarks many\n" + WHOLE, ":1: a comment of bmask-slam"),
+    "comment": ("# bmask-slam landmarks many\n" + WHOLE, ":1: 'many' is not a whole number"),
     "nothing seen": (CALIBRATION + POSES + POINTS, "no EDGE_PROJECT_DISPARITY line"),
 }
 

@@ -87,7 +87,7 @@ def test_shipped_priors_rank_people_chairs_and_walls() -> None:
         ("unknown: 0.2\nother: 0.1\nperson: high\n", "person: 'high' is no prior"),
         ("unknown: 0.2\nother: true\n", "other: True is no prior"),
         ("person: 0.9\n", "needs lines"),
-        ("a: [", "cannot be read as YAML"),
+        ("a: [", "line 1: expected the node content"),
     ],
 )
 def test_bad_priors_are_refused(tmp_path: Path, text: str, message: str) -> None:

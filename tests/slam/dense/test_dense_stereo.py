@@ -14,7 +14,6 @@ import pytest
 from true_run import make_run
 
 from bmask_slam.cli import main
-from bmask_slam.config.yaml import format_yaml, read_yaml
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.map_run import RunFusion
 from bmask_slam.dense.options import MapOptions
@@ -22,6 +21,7 @@ from bmask_slam.dense.saved_map import open_run
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.rendering.engine.builder import SceneBuilder
 from bmask_slam.rendering.engine.path import camera_poses

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from repository import ROOT
 
-from bmask_slam.config.yaml import read_yaml
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.geometry import inverse, rotation_from_quaternion, so3_exp, so3_log, transform
 from bmask_slam.rendering.annotations import CATEGORY_IDS, run_lengths
 from bmask_slam.rendering.engine.atlas import build_atlas

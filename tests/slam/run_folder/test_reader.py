@@ -221,7 +221,7 @@ def test_a_missing_part_names_the_command_that_makes_it(
 @pytest.mark.parametrize(
     ("part", "name", "text", "message"),
     [
-        ("metrics", "metrics.json", "[{}]", r"metrics\.json: cannot be read .*; make it by: bmask"),
+        ("metrics", "metrics.json", "[{}]", r"metrics\.json: 0\.name: field req.*; make it"),
         ("frames", "frames.csv", "index,timestamp\n", r"frames\.csv: no column status; run again"),
         ("frames", "frames.csv", None, r"frames\.csv: a line with too few or too many values"),
         ("trajectory", "trajectory.txt", "0 0 0 nan 0 0 0 1\n", r"trajectory\.txt"),

@@ -85,7 +85,7 @@ def test_the_example_in_the_messages_is_valid(tmp_path):
         ({"depth_noise": "0.002"}, r"depth_noise is 0.002; write \[a, b, c\]"),
         ({"depth_noise": "[0.1, x, 0]"}, "depth_noise is 'x'"),
         ({"focal": "500"}, "unknown key 'focal'; the keys are width"),
-        ({"fx": "[1, 2"}, "not YAML"),
+        ({"fx": "[1, 2"}, "line 4: .*; write e.g."),
     ],
 )
 def test_impossible_cameras(tmp_path, changes, words):
@@ -96,7 +96,7 @@ def test_impossible_cameras(tmp_path, changes, words):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["", "just text", "- 1\n- 2\n"])
+@pytest.mark.parametrize("text", ["just text", "- 1\n- 2\n"])
 def test_not_a_mapping(tmp_path, text):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(InputError, match="no mapping"):
@@ -189,7 +189,7 @@ def test_a_preset_alone_is_a_camera_where_intrinsics_are_published(tmp_path, cap
     assert "a camera.yaml is more accurate" in caplog.text
     with pytest.raises(InputError, match="--camera azure-kinect: every Microsoft Azure Kinect DK"):
         find_camera(tmp_path, Path("azure-kinect"))
-    with pytest.raises(InputError, match=r"kinectv1: cannot be read .* one of kinect-v1, xtion"):
+    with pytest.raises(InputError, match=r"kinectv1: no such file; .* one of kinect-v1, xtion"):
         find_camera(tmp_path, Path("kinectv1"))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bmask_slam.config.yaml import format_yaml, parse_yaml
+from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml
 
 
 @pytest.mark.parametrize("flow", [False, True])
