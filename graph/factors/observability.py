@@ -56,7 +56,7 @@ def loose_keyframes(
     """Those of the sorted ids (K,) that are not firmly connected to a prior.
 
     Grown from the priors: a keyframe is firm by a relative pose to a firm one, or by
-    ``min_shared_observations`` landmarks that firm ones observe. A landmark counts if the firm
+    ``min_left_observations`` landmarks that firm ones observe. A landmark counts if the firm
     ones constrain it, or if the keyframe itself measures its depth: one that is monocular in all
     views would leave the scale open. Poses (M, 4, 4) and points (M, 3) are those of each
     observation.
@@ -79,7 +79,7 @@ def loose_keyframes(
         known[np.searchsorted(names, by_rays)] = True
         counts = known[landmark] | (stereo & observed[landmark])
         shared = np.bincount(keyframe[counts], minlength=len(ids))
-        now = firm | (shared >= config.min_shared_observations)
+        now = firm | (shared >= config.min_left_observations)
         now[pairs[now[pairs].any(axis=1)].ravel()] = True
         if (now == firm).all():
             return ids[~firm]

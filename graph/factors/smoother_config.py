@@ -27,8 +27,10 @@ class SmootherConfig:
         min_depth_m, max_range_m: allowed z-depth of an observed landmark.
         min_parallax_deg: angle between two viewing rays that a landmark without any stereo
             observation needs.
-        min_shared_observations: landmarks of the graph that a keyframe without a prior or
+        min_shared_observations: landmarks of the graph that a new keyframe without a prior or
             relative pose must observe.
+        min_left_observations: the same after a removal. Larger, since what is left may lie in
+            one part of the image, about which the camera can turn with little error.
         prior_sigma_rotation_rad, prior_sigma_translation_m: of the prior on the first pose.
         anchor_sigma_rotation_rad, anchor_sigma_translation_m: of the weak between factor that
             holds a keyframe which a removal left underconstrained.
@@ -52,6 +54,7 @@ class SmootherConfig:
     max_range_m: float = 60.0
     min_parallax_deg: float = 1.0
     min_shared_observations: int = 6
+    min_left_observations: int = 15
     prior_sigma_rotation_rad: float = 1e-4
     prior_sigma_translation_m: float = 1e-4
     anchor_sigma_rotation_rad: float = 0.05

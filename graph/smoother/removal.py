@@ -157,7 +157,7 @@ def _still_linked(
         near,
         table.select(np.setdiff1d(table.rows_of_keyframes(near.tolist()), rows)),
         [factors[number].keyframes for number in sorted(edges)],
-        config.min_shared_observations,
+        config.min_left_observations,
     )[np.searchsorted(near, touched)]
     return len(np.unique(group)) == len(np.unique(np.stack([group, part]), axis=1).T)
 

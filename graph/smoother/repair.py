@@ -7,7 +7,7 @@ searched first, and the named variable is removed only if there is none.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,6 +54,7 @@ def repair(
     config: SmootherConfig,
 ) -> Repair:
     """Remove what makes the system singular; ``new_keyframes`` are removed, not anchored."""
+    config = replace(config, min_left_observations=config.min_shared_observations)
     constrained = keyframes_anchored_by(anchor_components(tables, config), tables)
     pairs = _broken_observations(tables, camera)
     broken = remove(GraphUpdate(remove_observations=pairs), tables, config)

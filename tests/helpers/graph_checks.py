@@ -8,12 +8,13 @@ from synthetic_room import CAMERA, Room
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import GraphUpdate, PosePrior, RelativePose
 from bmask_slam.graph.factors.keys import keyframe_keys, landmark_keys
+from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.geometry import inverse, se3_log
 from bmask_slam.graph.smoother.smoother import Smoother
 
 
-def filled(room: Room) -> Smoother:
-    smoother = Smoother(CAMERA)
+def filled(room: Room, config: SmootherConfig | None = None) -> Smoother:
+    smoother = Smoother(CAMERA, config)
     for update in room.updates():
         smoother.update(update)
     return smoother

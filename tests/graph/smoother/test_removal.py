@@ -186,9 +186,25 @@ def test_a_keyframe_without_landmarks_is_anchored_at_its_pose() -> None:
     assert (sigma_m > 0.01).any()  # and it says how badly it is known
 
 
+def test_a_keyframe_left_with_landmarks_in_one_spot_is_anchored() -> None:
+    """Ten are more than the unknowns, but it could turn about them."""
+    smoother, observed = filled(ROOM), ROOM.observations
+    before = smoother.estimate()
+    own = observed.select(observed.keyframe_ids == 7)
+    apart = np.linalg.norm(own.measurements[:, :2] - own.measurements[0, :2], axis=1)
+    leaving = own.select(np.argsort(apart)[10:])
+    after = smoother.update(GraphUpdate(remove_observations=leaving.pairs))
+    assert after.anchored_keyframes.tolist() == [7]
+    np.testing.assert_allclose(after.poses_world_camera[7], before.poses_world_camera[7], atol=0.05)
+    again = smoother.update(GraphUpdate(observations=leaving))
+    assert again.factors == before.factors
+    assert_isam_matches_tables(smoother)
+
+
 def test_a_disconnected_pair_of_keyframes_is_anchored() -> None:
     """Each has enough common landmarks with the other, but both can rotate against the rest."""
-    smoother, observed = filled(ROOM), ROOM.observations
+    room = make_room(keyframes=8, points=240, noise_px=0.3)
+    smoother, observed = filled(room), room.observations
     last_two = np.isin(observed.keyframe_ids, [6, 7])
     inside = np.isin(observed.landmark_ids, observed.landmark_ids[~last_two])
     both = np.intersect1d(*(observed.landmark_ids[observed.keyframe_ids == k] for k in (6, 7)))
