@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -68,6 +69,13 @@ def test_the_remote_segmenter_equals_the_local_one(segmenter, options, folder) -
     found = segmenter.segment(IMAGE, "a.png")
     assert len(found) == 2
     assert equal(found, here.segment(IMAGE, "a.png"))
+
+
+def test_workers_do_not_import_from_the_current_folder(segmenter) -> None:
+    folders = ray.get(
+        ray.remote(num_cpus=0)(lambda: [os.path.realpath(p) for p in sys.path]).remote()
+    )
+    assert os.path.realpath(os.curdir) not in folders
 
 
 def test_a_remote_input_error_is_raised_locally(segmenter) -> None:
