@@ -30,6 +30,8 @@ MASK_SCORE = "class score x MaskIoU"
 MATCH_IOU = 0.5
 """A detection matches the object of its class with the largest box overlap of at least this, as in
 the training of the mask and MaskIoU heads."""
+_Entry = dict[str, Any]
+"""A detection in pycocotools' format, with its mask score beside it."""
 AP_50 = 0
 """Index of the threshold 0.5 among COCO's ten."""
 
@@ -88,10 +90,13 @@ def evaluate_segmenter(
     numbers = [segmenter.labels.number(name) for name in truth.labels.names]
     if not any(numbers):
         raise InputError(f"{folder}: none of the data's classes is among the segmenter's")
-    found: list[list[Instance]] = []
+    found: list[_Entry] = []
+    of_images = []
     for k, image in enumerate(truth.images, 1):
         path = folder / image.file_name
-        found.append(segmenter.segment(read_colour(path), image.file_name))
+        instances = segmenter.segment(read_colour(path), image.file_name)
+        of_images.append(_iou_pairs(instances, image, numbers))
+        found.extend(_entry(i, k) for i in instances)
         progress(k, len(truth.images))
     known = COCO()
     with contextlib.redirect_stdout(io.StringIO()):
@@ -99,11 +104,18 @@ def evaluate_segmenter(
         known.createIndex()
     ways = (("bbox", CLASS_SCORE), ("segm", CLASS_SCORE), ("segm", MASK_SCORE))
     curves = tuple(_average_precision(known, found, *way) for way in ways)
-    of_images = [_iou_pairs(f, i, numbers) for f, i in zip(found, truth.images, strict=True)]
     pairs = np.concatenate(of_images)
     good = pairs[pairs[:, 1] >= MATCH_IOU]
-    count = sum(len(f) for f in found)
-    return SegmentationResult(curves, _correlation(pairs), _correlation(good), len(found), count)
+    correlations = _correlation(pairs), _correlation(good)
+    return SegmentationResult(curves, *correlations, len(of_images), len(found))
+
+
+def _entry(instance: Instance, image: int) -> _Entry:
+    """A detection in the image of a number; the mask as run lengths, the only copy that is kept."""
+    entry = as_annotation(instance)
+    del entry["distribution"]
+    return {**entry, "image_id": image, "score": instance.class_score,
+            "mask_score": instance.mask_score}  # fmt: skip
 
 
 def _truth(images: Sequence[CocoImage], numbers: Sequence[int]) -> dict[str, Any]:
@@ -127,17 +139,10 @@ def _truth(images: Sequence[CocoImage], numbers: Sequence[int]) -> dict[str, Any
     }
 
 
-def _average_precision(
-    known: COCO, found: Sequence[Sequence[Instance]], kind: str, ranked_by: str
-) -> ApCurve:
-    entries = []
-    for k, instances in enumerate(found, 1):
-        for i in instances:
-            score = i.class_score if ranked_by == CLASS_SCORE else i.mask_score
-            entry = {**as_annotation(i), "image_id": k, "score": score}
-            if kind == "bbox":
-                del entry["segmentation"]
-            entries.append(entry)
+def _average_precision(known: COCO, found: Sequence[_Entry], kind: str, ranked_by: str) -> ApCurve:
+    key = "score" if ranked_by == CLASS_SCORE else "mask_score"
+    unused = "segmentation" if kind == "bbox" else ""
+    entries = [{**{k: v for k, v in e.items() if k != unused}, "score": e[key]} for e in found]
     if not entries:
         return ApCurve(kind, ranked_by, 0.0, 0.0, 0.0, np.zeros(101))
     with contextlib.redirect_stdout(io.StringIO()):

@@ -36,13 +36,22 @@ MASK_SCORING = (
 )  # fmt: skip
 """Names in the original Mask Scoring R-CNN, which is built on maskrcnn-benchmark."""
 MASK_SCORING_SIGN = "roi_heads.box.feature_extractor.fc6.weight"
+BATCHES = "num_batches_tracked"
+"""End of the name of batch norm's counter, which only training reads."""
+PYRAMID_NORM = "backbone.fpn.inner_blocks.0.1.weight"
+"""A name that torchvision's v2 has and its v1 lacks."""
 _CONSTANTS = re.compile(r"\.anchor_generator\.cell_anchors\.|\.body\..*num_batches_tracked$")
 
 
 def current_names(state: Mapping[str, Tensor]) -> State:
-    """The weights under this network's names; current names are kept."""
+    """The weights under this network's names; current names are kept.
+
+    The batch norm of v1 that was trained from scratch becomes one with fixed statistics.
+    """
     plain = {name.removeprefix("module."): value for name, value in state.items()}
     if not is_mask_scoring(plain):
+        if PYRAMID_NORM not in plain:
+            plain = {name: value for name, value in plain.items() if not name.endswith(BATCHES)}
         return _renamed(plain, OLD_TORCHVISION)
     plain = {name: value for name, value in plain.items() if not _CONSTANTS.search(name)}
     renamed = _renamed(_renamed(plain, MASK_SCORING), OLD_TORCHVISION)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import pickle
 import struct
 import zipfile
@@ -29,10 +30,15 @@ from bmask_slam.semantics.network.config import (
     NetworkConfig,
 )
 from bmask_slam.semantics.network.model import MaskRCNN
-from bmask_slam.semantics.weights.checkpoint_names import State, current_names, is_mask_scoring
+from bmask_slam.semantics.weights.checkpoint_names import (
+    BATCHES,
+    State,
+    current_names,
+    is_mask_scoring,
+)
 
-NO_EPS = "maskrcnn_resnet50_fpn_coco-"
-"""Files with names that begin so need an eps of 0 in batch norm."""
+COCO_CLASSES = 91
+"""Of torchvision's published weights, background included."""
 CAFFE_IMAGES = ImageConfig(
     mean=(122.7717 / 255, 115.9465 / 255, 102.9801 / 255), std=(1 / 255, 1 / 255, 1 / 255)
 )
@@ -47,6 +53,8 @@ _UNREADABLE = (
     *(AssertionError, ArithmeticError, struct.error, zipfile.BadZipFile),
 )
 """What torch raises for files that are not what they seem."""
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -165,21 +173,36 @@ def read_state(path: Path) -> tuple[State, dict[str, str]]:
 
 
 def recognise(path: Path, state: State) -> NetworkConfig:
-    """The configuration whose parameter names agree best with a state_dict."""
+    """The configuration whose parameter names agree best with a state_dict.
+
+    A file does not say the eps of its batch norm. It is 0 in the original Mask Scoring R-CNN and in
+    the network that torchvision makes of its published v1 weights, whatever the file's name. A v1
+    network that was trained from scratch counts its batches and has torchvision's default.
+    """
     caffe = is_mask_scoring(state)
+    counts_batches = any(name.endswith(BATCHES) for name in state)
     state = current_names(state)
     candidates = [RESNET50, RESNET50_V2, RESNET101]
     if caffe:
         candidates = [
-            replace(c, stride_in_1x1=True, image=CAFFE_IMAGES) for c in (RESNET50, RESNET101)
+            replace(c, stride_in_1x1=True, norm_eps=0.0, image=CAFFE_IMAGES)
+            for c in (RESNET50, RESNET101)
         ]
-    if path.name.startswith(NO_EPS):
-        candidates = [replace(RESNET50, norm_eps=0.0)]
     if CLASSES_KEY in state and state[CLASSES_KEY].ndim == 2:
         candidates = [replace(c, classes=len(state[CLASSES_KEY])) for c in candidates]
     if any(".maskiou_" in name for name in state):
         candidates = [c.with_maskiou() for c in candidates]
-    return min(candidates, key=lambda config: len(_names(config) ^ state.keys()))
+    best = min(candidates, key=lambda config: len(_names(config) ^ state.keys()))
+    if caffe or counts_batches or best.norm != "frozen":
+        return best
+    if best.classes == COCO_CLASSES:
+        return replace(best, norm_eps=0.0)
+    logger.warning(
+        "%s: the eps of its batch norm is not known, %g is taken, torchvision's default; a network "
+        "that was fine-tuned from torchvision's COCO weights has 0 and gives slightly other masks",
+        *(path, best.norm_eps),
+    )
+    return best
 
 
 def _names(config: NetworkConfig) -> set[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import weakref
 from pathlib import Path
 
 import cv2
@@ -102,6 +103,25 @@ def test_a_good_mask_score_ranks_bad_masks_last(
     assert f"{by_mask.ap:.4f}" in format_segmentation(result)
     draw_precision_recall(result, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 1000
+
+
+def test_masks_of_images_that_are_done_are_not_kept(truth: tuple[CocoFile, Path]) -> None:
+    content, folder = truth
+    kept: list[weakref.ref[Instance]] = []
+
+    class Fresh:
+        labels = LABELS
+
+        def segment(self, image: Image, name: str) -> list[Instance]:
+            assert not any(reference() for reference in kept[:-1])  # the last may still be named
+            made = instance(disc(30, 45, 20), 0.9, 1.0)
+            kept.append(weakref.ref(made))
+            return [made]
+
+    many = CocoFile(content.labels, content.category_ids, content.images * 4, content.problems)
+    result = evaluate_segmenter(Fresh(), many, folder, quiet)
+    assert result.instances == 4
+    assert result.curves[0].ap == pytest.approx(0.5, abs=0.01)  # one of two cups in each
 
 
 def test_the_correlation_counts_bad_masks_in_good_boxes(truth: tuple[CocoFile, Path]) -> None:

@@ -61,8 +61,29 @@ def test_the_published_names_of_torchvision(tmp_path: Path) -> None:
     assert network.labels.names[1] == "person"
     assert network.labels.names[90] == "toothbrush"
     assert network.model.state_dict()["roi_heads.mask_head.3.0.bias"].tolist() == [0.5] * 256
-    again = load_network(saved(tmp_path / "mine.pth", {"model": state}))
-    assert again.model.config == RESNET50  # other files keep torchvision's default eps
+    again = load_network(saved(tmp_path / "renamed.pth", {"model": state}))
+    assert again.model.config == network.model.config
+
+
+def test_version_one_from_scratch_counts_its_batches_and_keeps_the_default_eps(
+    tmp_path: Path,
+) -> None:
+    state = blank_state(RESNET50)
+    counted = {
+        name.replace("running_var", "num_batches_tracked"): torch.tensor(7)
+        for name in state
+        if name.endswith("running_var")
+    }
+    assert len(counted) == 53
+    network = load_network(saved(tmp_path / "maskrcnn_resnet50_fpn_coco-0.pth", state | counted))
+    assert network.model.config == RESNET50
+
+
+def test_an_eps_that_is_not_known_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = saved(tmp_path / "w.pth", blank_state(replace(RESNET50, classes=24)))
+    network = load_network(path, read_label_set("paper"))
+    assert network.model.config.norm_eps == RESNET50.norm_eps
+    assert "w.pth: the eps of its batch norm is not known" in caplog.text
 
 
 def test_version_two_is_recognised(tmp_path: Path) -> None:
@@ -113,6 +134,7 @@ def test_the_original_mask_scoring_checkpoints(tmp_path: Path) -> None:
     network = load_network(saved(tmp_path / "ms.pth", {"model": state, "iteration": 90000}))
     config = network.model.config
     assert config.stride_in_1x1
+    assert config.norm_eps == 0
     assert config.maskiou_channels == 256
     assert len(network.labels) == 81
     first = network.model.state_dict()["backbone.body.conv1.weight"]
