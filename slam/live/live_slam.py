@@ -26,7 +26,13 @@ from bmask_slam.live.recorder import Recorder, rescued
 from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.live.start import LiveOptions, start_system
 from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
-from bmask_slam.run_folder.metrics import RunCounters, measure, row, save
+from bmask_slam.run_folder.metrics import (
+    RunCounters,
+    measure,
+    row,
+    save,
+    save_poses_and_points,
+)
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -209,7 +215,10 @@ class LiveSlam:
         """Process ids by name."""
         system = self._system
         owners = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
-        return {name: owner.worker.pid for name, owner in owners.items() if owner is not None}
+        found = {name: owner.worker.pid for name, owner in owners.items() if owner is not None}
+        return (
+            found if system.calibration is None else found | {"calibration": system.calibration.pid}
+        )
 
     def health(self) -> Health:
         """The state of the live loop."""
@@ -221,7 +230,7 @@ class LiveSlam:
         """End the processes and save everything; a second call does nothing.
 
         Raises:
-            InputError: the disk is full; the text says where the trajectory is.
+            InputError: the disk is full, or the map is lost; the text says where the poses are.
         """
         if self._closed:
             return
@@ -237,7 +246,7 @@ class LiveSlam:
                 raise InputError(f"{self.options.out}: {error.strerror}; {where}") from error
 
     def _save(self, health: Health) -> None:
-        """Save what an offline run saves; only the trajectory if the map is lost."""
+        """Save what an offline run saves; poses and points only if the map is lost."""
         if self._recorder is None:
             return
         folder = self._recorder.folder
@@ -250,10 +259,14 @@ class LiveSlam:
             self._system.finish()
             self._follow_camera()
         except InputError as error:
-            logger.error("the map is lost, the trajectory is saved: %s", error)
-            return
+            save_poses_and_points(self._system, folder)
+            raise InputError(
+                f"{error}: the map is lost; all poses, and the landmarks as they were known last, "
+                f"are in {folder.path}"
+            ) from error
         finally:
             folder.write_events(self._system.events.take())
+            self._save_frames_apart(folder)
         rows = measure(self._system, self.options.reference, self._counters, 1)
         median_ms, p95_ms = self._meter.percentiles_ms()
         rows += [row("latency_ms_median", median_ms, "ms"), row("latency_ms_p95", p95_ms, "ms")]
@@ -263,6 +276,12 @@ class LiveSlam:
         folder.complete()
         if self._system.dense is not None:
             self._finish_dense(self._system.dense, folder, health)
+
+    def _save_frames_apart(self, folder: RunFolder) -> None:
+        """Write the frames of keyframes that no map has, as segments of their own."""
+        first = max(self._system.segments(), default=-1) + 1
+        for number, frames in enumerate(self._system.map.history.without_map(), first):
+            folder.write_trajectory(frames, f"trajectory_segment_{number}.txt")
 
     def _finish_dense(self, dense: RemoteDenseMapper, folder: RunFolder, health: Health) -> None:
         """Let the dense map's process finish, and log which keyframes are missing."""

@@ -155,12 +155,12 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
     """Make a copy of the map equal to its owner's.
 
     Keyframes that the owner has not received yet stay, and keep their pose relative to the newest
-    keyframe that both have.
+    keyframe that both have. An owner that was restarted from an older state may have fewer
+    landmarks, which then stay here as ones that are not in the map, and keyframes that had been
+    culled.
     """
     _apply_landmarks(delta, world)
     pending = [k for k in world.keyframes.values() if k.id >= delta.next_keyframe_id]
-    for keyframe in pending:  # a restarted owner may have fewer landmarks
-        keyframe.landmark_ids[keyframe.landmark_ids >= delta.size] = -1
     shared = [i for i in delta.keyframe_ids.tolist() if i in world.keyframes]
     poses = dict(zip(delta.keyframe_ids.tolist(), delta.poses, strict=True))
     if pending and shared:
@@ -175,19 +175,23 @@ def apply_delta(delta: WorldDelta, world: WorldMap, history: FrameHistory) -> No
         keyframe.segment = segments[keyframe.id]
     world.keyframes = kept | {k.id: k for k in pending}
     world.next_keyframe_id = max(world.next_keyframe_id, delta.next_keyframe_id)
+    history.take_back(kept)
     for keyframe_id, (parent, T_parent_culled) in delta.parents.items():
         history.hand_over(keyframe_id, parent, T_parent_culled)
 
 
 def _apply_landmarks(delta: WorldDelta, world: WorldMap) -> None:
     table = world.landmarks
-    table.extend_to(delta.size)
-    table.set_in_map(np.unpackbits(delta.in_map, count=delta.size).view(bool))
+    table.extend_to(max(delta.size, len(table)))
+    in_map = np.zeros(len(table), bool)
+    in_map[: delta.size] = np.unpackbits(delta.in_map, count=delta.size)
+    table.set_in_map(in_map)
     table.points_world[table.in_map] = delta.points_world
     for name, rows in delta.columns.items():
         getattr(table, name)[delta.ids] = rows
     if delta.replaced_by is not None:
-        table.replaced_by[:] = delta.replaced_by
+        table.replaced_by[: delta.size] = delta.replaced_by
+        table.replaced_by[delta.size :] = -1
 
 
 def _keyframe(keyframe_id: int, delta: WorldDelta, world: WorldMap) -> Keyframe:

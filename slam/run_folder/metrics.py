@@ -102,10 +102,11 @@ def _percentiles(name: str, values_ms: list[float]) -> list[Row]:
     return [row(f"{name}_median", float(median), "ms"), row(f"{name}_p95", float(high), "ms")]
 
 
-def save(
-    system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
-) -> None:
-    """Write the result files."""
+def save_poses_and_points(system: System, folder: RunFolder) -> None:
+    """Write all poses, and the landmarks: what there is even where the graph was lost.
+
+    Every map segment that is not joined to the largest has a file of its own.
+    """
     trajectory = system.trajectory()
     folder.write_trajectory(trajectory)
     folder.write_trajectory(system.keyframe_trajectory(), "keyframes.txt")
@@ -113,6 +114,14 @@ def save(
         if segment.timestamps_s[0] not in trajectory.timestamps_s:
             folder.write_trajectory(segment, f"trajectory_segment_{number}.txt")
     write_landmarks(folder.path / "landmarks.ply", system.landmarks())
+
+
+def save(
+    system: System, folder: RunFolder, rows: list[Row], reference: Trajectory | None, title: str
+) -> None:
+    """Write the result files."""
+    trajectory = system.trajectory()
+    save_poses_and_points(system, folder)
     files = system.files()
     for name, write in files.items():
         with whole_file(folder.path / name) as temporary:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from graphlib import TopologicalSorter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Arrays
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.files.array_file import split_rows
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory
@@ -60,14 +61,16 @@ class FrameHistory:
         """A keyframe leaves the map: its frames follow the parent from now on."""
         self._parent[keyframe_id] = (parent_id, T_parent_keyframe)
 
+    def take_back(self, keyframe_ids: Iterable[int]) -> None:
+        """These keyframes are in the map, also if they had left it."""
+        for keyframe_id in keyframe_ids:
+            self._parent.pop(keyframe_id, None)
+
     def trajectories(self, world: WorldMap) -> dict[int, Trajectory]:
         """Every tracked frame whose keyframe was not lost, by map segment, from current poses."""
         entries = self._store[: self._size]
-        ids, which = np.unique(entries["keyframe_id"], return_inverse=True)
-        order = np.argsort(which, kind="stable")
-        groups = split_rows(order, np.bincount(which, minlength=len(ids)))
         poses, segments = np.empty((len(entries), 4, 4)), np.full(len(entries), NO_KEYFRAME)
-        for keyframe_id, rows in zip(ids.tolist(), groups, strict=True):
+        for keyframe_id, rows in self._by_keyframe():
             owner, T = self._resolve(keyframe_id, entries["T_keyframe_camera"][rows])
             if owner == NO_KEYFRAME:
                 continue
@@ -79,6 +82,22 @@ class FrameHistory:
             )
             for segment in np.unique(segments[segments != NO_KEYFRAME]).tolist()
         }
+
+    def without_map(self) -> list[Trajectory]:
+        """The frames of each keyframe whose pose was lost, in that keyframe's frame."""
+        entries = self._store[: self._size]
+        return [
+            Trajectory(entries["timestamp_s"][rows], entries["T_keyframe_camera"][rows])
+            for keyframe_id, rows in self._by_keyframe()
+            if self._resolve(keyframe_id, np.eye(4))[0] == NO_KEYFRAME
+        ]
+
+    def _by_keyframe(self) -> Iterator[tuple[int, Ints]]:
+        """Each keyframe that has entries, and their rows in order."""
+        ids, which = np.unique(self._store["keyframe_id"][: self._size], return_inverse=True)
+        order = np.argsort(which, kind="stable")
+        groups = split_rows(order, np.bincount(which, minlength=len(ids)))
+        return zip(ids.tolist(), groups, strict=True)
 
     def parent(self, keyframe_id: int) -> tuple[int, Array]:
         """The keyframe of the map that replaces one, or NO_KEYFRAME, and T_parent_keyframe (4, 4).

@@ -71,8 +71,12 @@ def serve_map(
     config: SystemConfig,
     names: tuple[str, ...],
     state: Path | None,
+    resent: int,
 ) -> None:
-    """Handle messages until the channel ends, from a saved state on if there is one."""
+    """Handle messages until the channel ends, from a saved state on if there is one.
+
+    Messages up to the number ``resent`` had been sent to a process that died.
+    """
     os.nice(NICENESS)
     segmenter = LabelsOnly(names)
     saved = None
@@ -90,7 +94,7 @@ def serve_map(
     system.events.on_event = channel.send
     if state is not None and saved is not None:
         system.restore(saved, state)
-    server = MapServer(system, channel.send)
+    server = MapServer(system, channel.send, resent)
     channel.send(Ready())
     if saved is not None:
         server.send_changes(-1, done=False)
@@ -101,9 +105,10 @@ def serve_map(
 class MapServer:
     """Handles the messages of tracking and the segmenter; answers go to ``send``."""
 
-    def __init__(self, system: SlamSystem, send: Callable[[Any], None]) -> None:
+    def __init__(self, system: SlamSystem, send: Callable[[Any], None], resent: int = 0) -> None:
         self.system = system
         self._send = send
+        self._resent = resent
         self._deltas = DeltaMaker()
 
     def handle(self, number: int, message: Any) -> None:
@@ -111,6 +116,8 @@ class MapServer:
         self._send(Started(number))
         match message:
             case NewKeyframe():
+                if number > self._resent:  # else tracking may have been told to remove it
+                    self._deltas.has_features(message.id)
                 self.add_keyframe(message)
             case LostKeyframe():
                 self.skip_keyframe(message)
@@ -179,7 +186,6 @@ class MapServer:
         frame = Frame(
             message.frame_index, message.timestamp_s, np.zeros((0, 0, 3), np.uint8), nothing
         )
-        self._deltas.has_features(message.id)
         system.camera_tracker.segment = segment
         system.events.begin_frame(frame.index, frame.timestamp_s)
         _, keyframe = system.insert(frame, tracked, message.local_ids)

@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 TARGET = "bmask_slam.live.processes.map_process:serve_map"
 MAX_CRASHES = 3
-"""Number of crashes without a saved state in between after which it is not restarted."""
+"""Number of crashes after which it is not restarted, if it never got as far as before between."""
 
 
 class MapWorker:
@@ -49,7 +49,7 @@ class MapWorker:
         self._number = 0
         self._crashes_in_a_row = 0
         self._is_ready = False
-        self._started = self._crashed_at = 0  # numbers of messages
+        self._started = self._crashed_at = self._resent = 0  # numbers of messages
         self._worker = self._start()
 
     @property
@@ -115,11 +115,24 @@ class MapWorker:
                 "the map's process died %d times in a row; it is not restarted", MAX_CRASHES
             )
             return
-        count = len(self._journal)
-        logger.warning("the map's process died; restarted, %d messages are sent again", count)
-        if self._crashed_at == self._started > 0:
-            self._skip(self._started)
-        self._crashed_at = self._started
+        if not self._worker.was_killed:  # a message may be the cause
+            if self._crashed_at == self._started > 0:
+                self._skip(self._started)
+            self._crashed_at = self._started
+        logger.warning(
+            "the map's process died; restarted, %d messages are sent again", len(self._journal)
+        )
+        self._send_again()
+
+    def try_again(self) -> None:
+        """Restart it although it died too often: at the end of a run there is time for that."""
+        logger.warning("the map's process is started a last time")
+        self._crashes_in_a_row = 0
+        self._send_again()
+
+    def _send_again(self) -> None:
+        """Start a process and send it what no saved state contains."""
+        self._resent = self._number
         self._worker = self._start()
         for number, message in sorted(self._journal.items()):
             self._worker.send((number, message))
@@ -133,7 +146,7 @@ class MapWorker:
         self._worker.kill()
 
     def _start(self) -> Worker:
-        return Worker("map", TARGET, *self._arguments, self.state)
+        return Worker("map", TARGET, *self._arguments, self.state, self._resent)
 
     def _without_own(self, messages: list[Any]) -> list[Any]:
         """Handle the messages about the process itself; returns the others."""
@@ -142,6 +155,8 @@ class MapWorker:
             match message:
                 case Started():
                     self._started = message.number
+                    if message.number > self._resent:
+                        self._crashes_in_a_row = 0
                 case StateSaved():
                     self._journal = {n: m for n, m in self._journal.items() if n > message.number}
                     self.state, self._crashes_in_a_row = message.path, 0

@@ -204,13 +204,16 @@ class RemoteMapper:
             InputError: it did not finish within the timeout.
         """
         path = self._folder / ".live-final"
+        if self.given_up:
+            self.worker.try_again()
         self.send(Finish(path, self._unsent_history()))
         deadline_s = time.monotonic() + timeout_s
         while self.worker.busy and not self.given_up and time.monotonic() < deadline_s:
             self.catch_up(0.1)
         self.worker.stop()
         if self.worker.busy:
-            raise InputError(f"{self._folder}: the map's process did not finish")
+            died = self.given_up
+            raise InputError(f"the map's process {'died too often' if died else 'did not finish'}")
         return path
 
     def close(self) -> None:

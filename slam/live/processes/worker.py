@@ -18,6 +18,7 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -31,6 +32,10 @@ logger = logging.getLogger(__name__)
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 """Each worker uses one core at most: more threads of libraries would slow tracking down."""
+
+
+OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
+"""Exit codes of a process that another one has ended."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,11 @@ class Worker:
         """Whether the process runs and its connection is open."""
         return self._channel.open and self._process.poll() is None
 
+    @property
+    def was_killed(self) -> bool:
+        """Whether a signal from outside ended it, rather than its own fault."""
+        return self._process.poll() in OUTSIDE
+
     def send(self, message: Any) -> None:
         """Queue a message; does nothing once the process has ended."""
         self._channel.send(message)
@@ -100,6 +110,9 @@ class Worker:
 
     def kill(self) -> None:
         """Kill it. The messages that it sent before can still be received."""
+        if not self._channel.open:  # it is ending by itself
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(1.0)
         self._process.kill()
         self._process.wait()
         self._channel.drain()

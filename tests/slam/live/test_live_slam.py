@@ -25,6 +25,7 @@ from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.live.messages import NewKeyframe
+from bmask_slam.live.processes.map_worker import MAX_CRASHES, MapWorker
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
@@ -103,18 +104,39 @@ def test_a_killed_map_process_is_restarted_without_losing_frames(tmp_path) -> No
     assert (tmp_path / "run" / "map").stat().st_size > 10_000
 
 
-def test_repeated_map_failures_keep_the_trajectory(tmp_path) -> None:
+def kill_until_it_is_given_up(slam: LiveSlam) -> None:
+    for _ in range(MAX_CRASHES):
+        os.kill(slam.processes()["map"], signal.SIGKILL)
+        crashes, deadline_s = slam.health().map_deaths, time.monotonic() + 60
+        while slam.health().map_deaths == crashes and time.monotonic() < deadline_s:
+            slam.catch_up()
+
+
+def test_a_map_process_that_is_killed_again_and_again_is_tried_once_more(tmp_path) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         track_frames(slam, FRAMES[:8])
-        for _ in range(3):
-            os.kill(slam.processes()["map"], signal.SIGKILL)
-            crashes, deadline_s = slam.health().map_deaths, time.monotonic() + 10
-            while slam.health().map_deaths == crashes and time.monotonic() < deadline_s:
-                slam.catch_up()
+        kill_until_it_is_given_up(slam)
         for frame in FRAMES[8:12]:
             assert slam.track(frame.timestamp_s, frame.rgb, frame.depth_m).keyframe_id is None
     assert len(read_tum(tmp_path / "run" / "trajectory.txt")) == 12
-    assert "the trajectory is saved" in (tmp_path / "run" / "log.txt").read_text()
+    assert len(read_tum(tmp_path / "run" / "keyframes.txt")) > 1
+    assert (tmp_path / "run" / "map").is_file()
+
+
+def test_every_pose_is_saved_if_the_map_is_lost(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(MapWorker, "try_again", lambda worker: None)
+    run = tmp_path / "run"
+    with (
+        pytest.raises(InputError, match="the map is lost; all poses, and"),
+        LiveSlam(CAMERA, CONFIG, LiveOptions(run)) as slam,
+    ):
+        track_frames(slam, FRAMES[:8])
+        wait_for_the_map(slam)
+        kill_until_it_is_given_up(slam)
+        track_frames(slam, FRAMES[8:12])
+    assert len(read_tum(run / "trajectory.txt")) == 12
+    assert len(read_tum(run / "keyframes.txt")) > 1
+    assert (run / "landmarks.ply").stat().st_size > 1000
 
 
 def poison_next_keyframe(slam: LiveSlam, monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -151,7 +173,9 @@ def test_a_keyframe_that_crashes_the_map_process_is_skipped(tmp_path, monkeypatc
     assert error_m(trajectory.poses_world_camera) < 0.02
 
 
-def test_a_first_keyframe_that_crashes_the_map_loses_its_frame(tmp_path, monkeypatch) -> None:
+def test_the_frame_of_a_first_keyframe_that_crashes_the_map_is_saved_apart(
+    tmp_path, monkeypatch
+) -> None:
     with LiveSlam(CAMERA, CONFIG, LiveOptions(tmp_path / "run")) as slam:
         poison_next_keyframe(slam, monkeypatch)
         track_frames(slam, FRAMES[:1])
@@ -162,6 +186,8 @@ def test_a_first_keyframe_that_crashes_the_map_loses_its_frame(tmp_path, monkeyp
     trajectory = read_tum(tmp_path / "run" / "trajectory.txt")
     assert len(trajectory) == len(FRAMES) - 1
     assert error_m(trajectory.poses_world_camera, first=1) < 0.02
+    (apart,) = (tmp_path / "run").glob("trajectory_segment_*.txt")
+    assert read_tum(apart).timestamps_s.tolist() == [FRAMES[0].timestamp_s]
 
 
 def test_frames_that_cannot_be_used_are_refused_and_the_next_is_tracked() -> None:

@@ -101,3 +101,26 @@ def test_keyframes_unknown_to_the_owner_move_with_the_others(followed) -> None:
     expected = world.keyframes[newest.id].T_world_camera @ ahead
     np.testing.assert_allclose(copy.keyframes[pending.id].T_world_camera, expected, atol=1e-12)
     assert copy.next_keyframe_id == pending.id + 1
+
+
+def test_an_owner_restarted_from_an_older_state_is_followed() -> None:
+    """It has fewer landmarks, and keyframes that had been culled; tracking's ids stay valid."""
+    system = SlamSystem(CAMERA, resolve(SystemConfig, None, SETTINGS))
+    world, frames = system.mapper.world, system.mapper.history
+    before, after = DeltaMaker(), DeltaMaker()
+    copy, history, older = WorldMap(), FrameHistory(), b""
+    for index, shift in enumerate(np.concatenate([np.arange(8), np.arange(8)[::-1]]) * 0.03):
+        system.process(render_plane(se3_exp(np.array([0, 0, 0, shift, 0, 0])), index))
+        apply_delta(before.delta(world, frames), copy, history)
+        if index == 6:
+            older, known = pickle.dumps(after.delta(world, frames)), set(world.keyframes)
+    size, culled = len(copy.landmarks), known - copy.keyframes.keys()
+    assert culled and len(pickle.loads(older).in_map) * 8 < size
+    apply_delta(pickle.loads(older), copy, history)
+    assert len(copy.landmarks) == size
+    assert not copy.landmarks.in_map[pickle.loads(older).size :].any()
+    assert culled < copy.keyframes.keys()
+    assert all(history.parent(keyframe_id)[0] == keyframe_id for keyframe_id in culled)
+    apply_delta(after.delta(world, frames), copy, history)
+    equal(copy, world)
+    assert all(history.parent(k)[0] == frames.parent(k)[0] for k in culled)

@@ -1,0 +1,65 @@
+"""Children of a live run are killed at random moments: every tracked pose is on the disk.
+
+``BMASK_SLAM_FAULT_SEEDS=20 pytest tests/faults`` tries more than the usual two seeds.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.live.live_slam import LiveOptions, LiveSlam
+from bmask_slam.rendering.sequence import RenderConfig
+from bmask_slam.sequences import open_sequence
+from bmask_slam.system_config import SystemConfig
+
+FRAMES = 60
+SEEDS = range(int(os.environ.get("BMASK_SLAM_FAULT_SEEDS", "2")))
+CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=truth",))
+
+
+@pytest.fixture(scope="module")
+def recording(rendered) -> Path:
+    return rendered(RenderConfig("office", FRAMES, fps=8.0, width=320, height=240))
+
+
+def kills(seed: int) -> Iterator[tuple[int, str]]:
+    """Frames before which a child is killed, and its name."""
+    draw = random.Random(seed)
+    for _ in range(draw.randint(1, 5)):
+        yield draw.randrange(2, FRAMES), draw.choice(["map", "map", "segmenter", "calibration"])
+
+
+def children() -> set[int]:
+    tasks = Path("/proc/self/task").glob("*/children")
+    return {int(pid) for task in tasks for pid in task.read_text().split()}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_every_tracked_pose_is_saved(recording: Path, tmp_path: Path, seed: int) -> None:
+    plan, before, memory = sorted(kills(seed)), children(), set(os.listdir("/dev/shm"))
+    sequence, tracked = open_sequence(recording), []
+    options = LiveOptions(tmp_path / "run", images=recording, calibrate="report", interpolates=True)
+    with LiveSlam(sequence.camera, CONFIG, options) as slam:
+        for frame in sequence.frames():
+            for name in (name for at, name in plan if at == frame.index):
+                with suppress(ProcessLookupError):  # it has died and is not started again yet
+                    os.kill(slam.processes()[name], signal.SIGKILL)
+            arrived = slam.track(frame.timestamp_s, frame.rgb, frame.depth_m, name=frame.name)
+            if arrived.T_world_camera is not None:
+                tracked.append(frame.timestamp_s)
+    files = (tmp_path / "run").glob("trajectory*.txt")
+    saved = [stamp_s for path in files for stamp_s in read_tum(path).timestamps_s.tolist()]
+    assert sorted(saved) == pytest.approx(tracked, abs=1e-6), plan
+    assert len(tracked) > FRAMES / 2, plan
+    assert (tmp_path / "run" / "map").is_file(), plan
+    assert children() <= before, plan
+    assert set(os.listdir("/dev/shm")) <= memory, plan
