@@ -46,16 +46,13 @@ class Recording:
 RPY = "TUM freiburg1_rpy, 360 frames (Kinect v1)"
 RECORDINGS = {
     "rpy": Recording(RPY),
-    "rpy-unknown": Recording(
-        RPY, ("--calibrate", "auto"), note="folder of another name: the camera's model is not known"
-    ),
+    "rpy-unknown": Recording(RPY, note="folder of another name: the camera's model is not known"),
     "rpy-none": Recording(RPY, ("--segmenter", "none")),
     "bonn": Recording("Bonn crowd, 280 frames (Xtion)"),
     "kitchen": Recording("red kitchen, 600 frames (Kinect v1)", hand_eye=True),
     "office": Recording("rendered office, 300 frames, exact camera"),
     "office-rolling": Recording(
-        f"rendered office, rows over {1e3 * READOUT_S:g} ms, depth {DELAY_MS} ms late",
-        ("--calibrate", "auto"),
+        f"rendered office, rows over {1e3 * READOUT_S:g} ms, depth {DELAY_MS} ms late"
     ),
 }
 

@@ -74,15 +74,21 @@ class CalibrationResult:
 
 
 def calibrate(
-    problem: CalibrationProblem, config: CalibrationConfig | None = None
+    problem: CalibrationProblem,
+    config: CalibrationConfig | None = None,
+    noise_scales: Array | None = None,
 ) -> CalibrationResult:
-    """The most probable poses, points and calibration, and the covariance of the last."""
+    """The most probable poses, points and calibration, and the covariance of the last.
+
+    With ``noise_scales`` (2,) the noise is held, which makes costs comparable.
+    """
     config = config or CalibrationConfig()
     state = CalibrationState(problem.poses_world_camera, problem.points_world, problem.calibration)
-    scales = np.ones(2)
+    scales = np.ones(2) if noise_scales is None else noise_scales
     for _ in range(config.rounds):
         before = state
-        scales = _noise_scales(problem, state, scales)
+        if noise_scales is None:
+            scales = _noise_scales(problem, state, scales)
         state = _descend(problem, state, scales, config)
         change = (state.calibration - before.calibration) / np.maximum(problem.prior_sigmas, 1e-12)
         converged = bool(np.abs(change).max() < 1e-3)

@@ -23,8 +23,7 @@ from bmask_slam.graph.calibration.model import CalibrationViews, linearise
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState
 
 MIN_KEYFRAMES = 5
-ESTIMATE = CalibrationConfig(rounds=4, steps=8)
-JUDGE = CalibrationConfig(rounds=2, steps=8)
+QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
 
 
 @dataclass(frozen=True)
@@ -53,11 +52,8 @@ def cross_validate(problem: CalibrationProblem) -> CrossValidation | None:
     first, second = halves_of(problem)
     if first is None or second is None:
         return None
-    found = [calibrate(half, ESTIMATE) for half in (first, second)]
-    gains = [
-        _gains(judge, result.calibration)
-        for judge, result in zip((second, first), found, strict=True)
-    ]
+    found = [calibrate(half, QUICK) for half in (first, second)]
+    gains = [_gains(judge, result) for judge, result in zip((second, first), found, strict=True)]
     return CrossValidation(
         np.array([result.calibration for result in found]),
         np.array([np.sqrt(np.diag(result.covariance)) for result in found]),
@@ -100,20 +96,19 @@ def _select(
     return CalibrationViews(**{**columns, "keyframes": keyframes, "landmarks": landmarks})
 
 
-def _gains(problem: CalibrationProblem, calibration: Array) -> Array:
-    """Of each keyframe (K,), the drop of its cost from the problem's calibration to another."""
-    before = _fitted(problem, problem.calibration)
-    after = _fitted(problem, calibration)
-    costs = [_costs(problem, result, before.noise_scales) for result in (before, after)]
+def _gains(problem: CalibrationProblem, result: CalibrationResult) -> Array:
+    """Of each keyframe (K,), the drop of its cost from the problem's calibration to another's.
+
+    Poses and points are fitted with each. Both times the noise is that of the other result, so that
+    both are the smallest costs of the same kind.
+    """
+    scales, costs = result.noise_scales, []
+    for calibration in (problem.calibration, result.calibration):
+        fixed = dataclasses.replace(problem, calibration=calibration, prior_sigmas=np.zeros(13))
+        costs.append(_costs(fixed, calibrate(fixed, QUICK, scales), scales))
     drop = np.zeros(len(problem.poses_world_camera))
     np.add.at(drop, problem.views.keyframes, costs[0] - costs[1])
     return drop
-
-
-def _fitted(problem: CalibrationProblem, calibration: Array) -> CalibrationResult:
-    """Poses and points with a calibration that is held fixed."""
-    fixed = dataclasses.replace(problem, calibration=calibration, prior_sigmas=np.zeros(13))
-    return calibrate(fixed, JUDGE)
 
 
 def _costs(problem: CalibrationProblem, result: CalibrationResult, scales: Array) -> Array:

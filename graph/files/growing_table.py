@@ -24,7 +24,9 @@ class GrowingTable:
 
     def begin(self, size: int) -> None:
         """Cut the file to its first bytes; one that is empty then gets its header."""
+        self.file.flush()
         self.file.truncate(size)
+        self.file.seek(0, os.SEEK_END)
         if not size:
             self._rows.writeheader()
             self.file.flush()

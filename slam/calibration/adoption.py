@@ -1,10 +1,13 @@
 """Whether a run should use what was found of its camera's times: by one estimate and the next.
 
-What was found is adopted if it is observable, differs from what the camera has, fits observations
-that it was not estimated from better (`graph.calibration.cross_validation`), and is found in both
-halves of the observations. A run with a wrong camera has matched what fits that camera, which draws
-the estimate towards it, so it is estimated in rounds, each from frames tracked with what the round
-before found, until that changes no more.
+What was found is adopted if it is observable, differs from what the camera has, is found in both
+halves of the observations, and fits the half that it was not estimated from better by two standard
+errors (`graph.calibration.cross_validation`).
+
+A run with a wrong camera has matched what fits that camera, which draws the estimate towards it. An
+offline run therefore searches its landmarks again (`calibration.rematching`); where that cannot be
+done, estimates are made in rounds, each from frames tracked with what the round before found, until
+that changes no more.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import numpy as np
 
 from bmask_slam.calibration.calibrate import camera_from, with_rate_error
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.calibration.calibration import calibrate
+from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
 from bmask_slam.graph.calibration.cross_validation import CrossValidation, cross_validate
 from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, TIME, parameters_of
 from bmask_slam.graph.calibration.problem import CalibrationProblem
@@ -40,12 +43,14 @@ class SelfCalibrationConfig:
     """How much is tracked, and when something is adopted.
 
     Attributes:
-        frames: of a stretch.
-        min_frames: of a sequence; a shorter one is not calibrated.
-        stretches: how many are tried until one shows the parameters.
-        rounds: how often a stretch is tracked at most.
+        frames: after which an offline run is looked at first; then after twice and four times as
+            many, as long as the motion does not show the parameters.
+        min_frames: fewer are not looked at, at the end of a sequence.
+        stretches: how often it is looked at in vain at most.
+        rounds: how often the first frames are tracked at most.
         max_sigma_s: largest standard deviation of a parameter that counts as observable.
-        min_change_sigmas: what is adopted differs by so many standard deviations.
+        min_change_sigmas: what is adopted differs by so many standard deviations,
+        min_change_s: and by so much.
         min_gain_sigmas: so many standard errors is the gain on observations kept out of the fit.
         max_s: a larger time is no readout within a frame's interval, but an error.
     """
@@ -56,6 +61,7 @@ class SelfCalibrationConfig:
     rounds: int = 4
     max_sigma_s: float = 0.004
     min_change_sigmas: float = 3.0
+    min_change_s: float = 0.002
     min_gain_sigmas: float = 2.0
     max_s: float = 0.035
 
@@ -68,11 +74,15 @@ class SelfCalibration:
         given: the camera before.
         camera: to run with, that one if nothing is adopted.
         text: one line for the summary and the log; "" if nothing could be said.
+        looks: how often an offline run was looked at in vain.
+        settled: whether it needs no other look.
     """
 
     given: Camera
     camera: Camera
     text: str = ""
+    looks: int = 0
+    settled: bool = False
 
     @property
     def adopted(self) -> bool:
@@ -94,13 +104,13 @@ class Estimate:
         change_s = abs(self.found[i] - self.before[i])
         return bool(
             self.sigmas[i] < config.max_sigma_s
-            and change_s > config.min_change_sigmas * self.sigmas[i]
+            and change_s > max(config.min_change_sigmas * self.sigmas[i], config.min_change_s)
             and abs(self.found[i]) < config.max_s
         )
 
     def settled(self, chosen: list[int]) -> bool:
         """Whether the run found what its camera had, within 95 % bounds of two rounds."""
-        bounds = 1.96 * np.sqrt(2) * self.sigmas[chosen]
+        bounds = np.maximum(1.96 * np.sqrt(2) * self.sigmas[chosen], MIN_STEP_S)
         return bool((np.abs(self.found - self.before)[chosen] <= bounds).all())
 
     def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
@@ -111,8 +121,12 @@ class Estimate:
 
 def estimate_times(problem: CalibrationProblem) -> Estimate:
     """What the observations of a problem say of a camera's times."""
-    result = with_rate_error(calibrate(problem))
-    sigmas = np.sqrt(np.diag(result.covariance))
+    return estimate_of(problem, calibrate(problem))
+
+
+def estimate_of(problem: CalibrationProblem, result: CalibrationResult) -> Estimate:
+    """The estimate of a problem that was solved."""
+    sigmas = np.sqrt(np.diag(with_rate_error(result).covariance))
     return Estimate(problem.calibration, result.calibration, sigmas, problem)
 
 
@@ -140,13 +154,14 @@ class CalibrationRounds:
 
     def add(self, estimate: Estimate) -> Camera | None:
         """Add the estimate of a round; the camera to track the next one with, None at the end."""
-        more = self._newly_sure(estimate, self._sure)
+        tried = [i for i in self._free if i not in self._sure]
+        more = newly_sure(estimate, tried, self._config)
         settled = bool(self._rounds) and not more and estimate.settled(self._sure)
         self._rounds.append(estimate)
         self._sure += more
         if not self._sure or settled or len(self._rounds) == self._config.rounds:
             return None
-        return _with(self._given, next_start(self._rounds), self._sure)
+        return camera_with(self._given, next_start(self._rounds), self._sure)
 
     def result(self) -> SelfCalibration:
         """What the rounds together say of the given camera."""
@@ -156,7 +171,7 @@ class CalibrationRounds:
         kept = [i for i in self._sure if final.differs(i, config)]
         if not kept:
             return SelfCalibration(given, given, format_times(final, FREE, self._refused(final)))
-        camera = _with(given, final.found, kept)
+        camera = camera_with(given, final.found, kept)
         return SelfCalibration(given, camera, format_times(final, kept, "found and applied"))
 
     def _refused(self, estimate: Estimate) -> str:
@@ -164,19 +179,22 @@ class CalibrationRounds:
         differs = any(estimate.differs(i, self._config) for i in FREE)
         return "not sure enough to be applied" if differs else "the camera keeps its values"
 
-    def _newly_sure(self, estimate: Estimate, known: Iterable[int]) -> list[int]:
-        """The parameters that are to be adopted beside those that already are."""
-        sure = [i for i in self._free if i not in known and estimate.differs(i, self._config)]
-        halves = cross_validate(estimate.problem) if sure else None
-        if halves is None:
-            return []
-        logger.info(
-            "calibration: better on observations kept out of the fit by %.1f standard errors",
-            halves.gain_sigmas,
-        )
-        if halves.gain_sigmas < self._config.min_gain_sigmas:
-            return []
-        return [i for i in sure if estimate.agrees(i, halves, self._config)]
+
+def newly_sure(
+    estimate: Estimate, tried: Iterable[int], config: SelfCalibrationConfig
+) -> list[int]:
+    """Those of the parameters tried that are to be adopted."""
+    sure = [i for i in tried if estimate.differs(i, config)]
+    halves = cross_validate(estimate.problem) if sure else None
+    if halves is None:
+        return []
+    logger.info(
+        "calibration: better on observations kept out of the fit by %.1f standard errors",
+        halves.gain_sigmas,
+    )
+    if halves.gain_sigmas < config.min_gain_sigmas:
+        return []
+    return [i for i in sure if estimate.agrees(i, halves, config)]
 
 
 def next_start(rounds: list[Estimate]) -> Array:
@@ -193,15 +211,15 @@ def next_start(rounds: list[Estimate]) -> Array:
     return last.before + (last.found - last.before) / (1 - np.clip(share, 0.0, MAX_SHARE))
 
 
-def _with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
-    """The camera with some of the parameters of a vector (13,)."""
+def camera_with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
+    """The camera with some of the parameters of a vector (13,), rounded as in camera.yaml."""
     calibration = parameters_of(camera, camera.depth_scale)
     calibration[chosen] = values[chosen]
     found = camera_from(camera, calibration)
     return dataclasses.replace(
         camera,
-        rolling_shutter_s=found.rolling_shutter_s,
-        depth_time_offset_s=found.depth_time_offset_s,
+        rolling_shutter_s=round(found.rolling_shutter_s, 6),
+        depth_time_offset_s=round(found.depth_time_offset_s, 6),
     )
 
 

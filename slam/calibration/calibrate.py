@@ -185,7 +185,7 @@ def make_problem(
 ) -> tuple[CalibrationProblem, Ints]:
     """The problem for the solver, and the ids (K,) of its keyframes."""
     stamps_s = dict(zip(run.tables.keyframes.ids.tolist(), run.keyframe_stamps_s, strict=True))
-    frames = _frames_of(stamps_s, sequence)
+    frames = frames_of(stamps_s, sequence)
     observations = connected_views(run.tables, np.array(sorted(frames), np.int64), MAX_KEYFRAMES)
     count = len(np.unique(observations.keyframe_ids))
     if count < MIN_KEYFRAMES:
@@ -219,7 +219,7 @@ def make_problem(
     return problem, keyframe_ids
 
 
-def _frames_of(stamps_s: dict[int, float], sequence: Sequence) -> dict[int, int]:
+def frames_of(stamps_s: dict[int, float], sequence: Sequence) -> dict[int, int]:
     """Index in the sequence of every keyframe whose stamp the sequence has."""
     known = {k: s for k, s in stamps_s.items() if np.isfinite(s)}
     at = nearest_indices(sequence.timestamps_s, np.array(list(known.values())))

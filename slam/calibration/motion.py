@@ -14,7 +14,7 @@ from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.tracking.rolling_shutter import exposed_after_s, velocities
 
-MAX_LATE_S, MAX_STEP_S = 1e-3, 0.2
+MAX_LATE_S, MAX_GAP_S = 1e-3, 0.11
 MIN_DEPTH_M = 0.1
 
 
@@ -34,15 +34,18 @@ class LandmarkMotion:
 def twists_at(path: Trajectory, stamps_s: Array) -> Array:
     """Velocities (N, 6) [rad/s, m/s] of a camera in its own frame, from the poses before and after.
 
-    Zero where the path has no pose at a stamp (N,), or no pose near before or after it.
+    At an end of the path, or beside a gap, the pose itself takes the place of the one that is
+    missing. Zero where the path has no pose at a stamp (N,), or none near before and after it.
     """
-    at = nearest_indices(path.timestamps_s, stamps_s)
+    T, times_s = path.poses_world_camera, path.timestamps_s
+    at = nearest_indices(times_s, stamps_s)
     before, after = np.maximum(at - 1, 0), np.minimum(at + 1, len(path) - 1)
-    T, step_s = path.poses_world_camera, path.timestamps_s[after] - path.timestamps_s[before]
-    known = (np.abs(path.timestamps_s[at] - stamps_s) < MAX_LATE_S) & (step_s < MAX_STEP_S)
-    known &= after - before == 2
+    before = np.where(times_s[at] - times_s[before] < MAX_GAP_S, before, at)
+    after = np.where(times_s[after] - times_s[at] < MAX_GAP_S, after, at)
+    known = (np.abs(times_s[at] - stamps_s) < MAX_LATE_S) & (after > before)
+    step_s = np.where(known, times_s[after] - times_s[before], 1.0)
     motions = se3_log(inverse(T[before]) @ T[after])
-    return np.where(known[:, None], motions / np.where(known, step_s, 1.0)[:, None], 0.0)
+    return np.where(known[:, None], motions / step_s[:, None], 0.0)
 
 
 def landmark_motion(observations: Observations, run: SavedRun) -> LandmarkMotion:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from bmask_slam.calibration.motion import LandmarkMotion, as_exposed
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
@@ -22,6 +22,8 @@ from bmask_slam.tracking.rolling_shutter import share_of_rows
 MIN_VIEWS = 2
 MIN_KEYFRAME_VIEWS = 12
 VALUE_RADIUS_PX, RATE_RADIUS_PX = 6, 14
+RATE_STEP_PX = 2
+"""Every second pixel of the wide windows is used: depth errors of neighbours are correlated."""
 MIN_WINDOW_SHARE = 0.6
 MAX_STEP_SIGMAS = 4.0
 """A window shows one smooth surface if all pixels are within so many sensor sigmas of its plane."""
@@ -43,15 +45,15 @@ def connected_views(tables: FactorTables, keyframe_ids: Ints, most: int) -> Obse
         richest = ids[np.argsort(-count, kind="stable")[:most]]
         found = found.select(np.isin(found.keyframe_ids, richest))
     while True:
-        views = _group_sizes(found.landmark_ids)
-        keep = (views >= MIN_VIEWS) & (_group_sizes(found.keyframe_ids) >= MIN_KEYFRAME_VIEWS)
+        views = group_sizes(found.landmark_ids)
+        keep = (views >= MIN_VIEWS) & (group_sizes(found.keyframe_ids) >= MIN_KEYFRAME_VIEWS)
         if keep.all():
             break
         found = found.select(keep)
     return found.select(np.isin(found.keyframe_ids, _largest_part(found)))
 
 
-def _group_sizes(ids: Ints) -> Ints:
+def group_sizes(ids: Ints) -> Ints:
     """How often each of the ids (M,) occurs among them (M,)."""
     _, rows, count = np.unique(ids, return_inverse=True, return_counts=True)
     return np.asarray(count[rows])
@@ -96,7 +98,7 @@ def make_views(
     landmark_ids, landmarks = np.unique(observations.landmark_ids, return_inverse=True)
     pixels = camera.distort(as_exposed(observations.measurements[:, :2], motion, camera))
     nominal = sensor_sigmas(observations, camera)
-    depths = _Depths.missing(len(observations))
+    depths = Depths.missing(len(observations))
     for k, keyframe in enumerate(keyframe_ids.tolist()):
         rows, index = np.flatnonzero(keyframes == k), frames[keyframe]
         depths.measure(rows, pixels[rows], sequence, index, MAX_STEP_SIGMAS * nominal[rows])
@@ -114,21 +116,26 @@ def make_views(
     return views, keyframe_ids, landmark_ids
 
 
-def sensor_sigmas(observations: Observations, camera: Camera) -> Array:
-    """Sigmas (M,) of inverse depth in 1/m by the depth sensor alone; the median's without depth.
+def sensor_sigmas(
+    observations: Observations, camera: Camera, inverse_depth: Array | None = None
+) -> Array:
+    """Sigmas of inverse depths in 1/m by the depth sensor alone; the median's without depth.
 
-    The graph's include the roughness of the surface, which is fitted here: the camera's noise model
-    is scaled to the smallest of them.
+    Those of the M observations, or of ``inverse_depth`` (N,).
+
+    Those of the graph's observations include the roughness of the surface, which is fitted here:
+    the camera's noise model is scaled to the smallest of them.
     """
     left, _, right = observations.measurements.T
-    sensor = camera.noise_of_depth().inverse_depth_sigma((left - right) / camera.stereo_bf_px_m)
+    noise, seen = camera.noise_of_depth(), (left - right) / camera.stereo_bf_px_m
     graph = observations.sigmas_px[:, 2] / camera.stereo_bf_px_m
-    sigmas = float(np.nanmin(graph / sensor)) * sensor
+    scale = float(np.nanmin(graph / noise.inverse_depth_sigma(seen)))
+    sigmas = scale * noise.inverse_depth_sigma(seen if inverse_depth is None else inverse_depth)
     return np.where(np.isfinite(sigmas), sigmas, np.nanmedian(sigmas))
 
 
 @dataclass(frozen=True, eq=False)
-class _Depths:
+class Depths:
     """Measurements of the depth images at M pixels.
 
     Attributes:
@@ -144,10 +151,19 @@ class _Depths:
     lag_s: Array
 
     @classmethod
-    def missing(cls, count: int) -> _Depths:
+    def missing(cls, count: int) -> Depths:
         """No measurements yet."""
         inverse_depth, rms, rate = np.full((3, count), np.nan)
         return cls(inverse_depth, rms, rate, np.zeros(count))
+
+    def select(self, rows: Ints, known: Mask) -> Depths:
+        """Those of some rows (m,), missing where they are not known (m,)."""
+        return Depths(
+            np.where(known, self.inverse_depth[rows], np.nan),
+            np.where(known, self.rms[rows], np.nan),
+            np.where(known, self.rate[rows], np.nan),
+            np.where(known, self.lag_s[rows], 0.0),
+        )
 
     def measure(
         self, rows: Ints, pixels: Array, sequence: Sequence, index: int, max_step: Array
@@ -199,18 +215,18 @@ def mean_on_plane(
     change: Array, image: Array, pixels: Array, planes: Array, max_step: Array
 ) -> Array:
     """The change (M,) at pixels, fitted over wide windows where the image is on these planes."""
-    values, offsets = _windows(change, pixels, RATE_RADIUS_PX)
-    around = _windows(image, pixels, RATE_RADIUS_PX)[0]
+    values, offsets = _windows(change, pixels, RATE_RADIUS_PX, RATE_STEP_PX)
+    around = _windows(image, pixels, RATE_RADIUS_PX, RATE_STEP_PX)[0]
     expected = planes[:, :1] + (offsets @ planes[:, 1:, None])[..., 0]
     values[~(np.abs(around - expected) < max_step[:, None])] = np.nan
     return _fit_planes(values, offsets)[0][:, 0]
 
 
-def _windows(image: Array, pixels: Array, radius: int) -> tuple[Array, Array]:
+def _windows(image: Array, pixels: Array, radius: int, step: int = 1) -> tuple[Array, Array]:
     """Values (M, n) in square windows around pixels (M, 2), and their offsets (M, n, 2)."""
     border = cv2.BORDER_CONSTANT
     padded = cv2.copyMakeBorder(image, radius, radius, radius, radius, border, value=float("nan"))
-    dv, du = (d.ravel() for d in np.indices((2 * radius + 1, 2 * radius + 1)))
+    dv, du = (d.ravel() for d in np.mgrid[: 2 * radius + 1 : step, : 2 * radius + 1 : step])
     nearest = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape[::-1]) - 1)
     values = padded[nearest[:, 1:] + dv, nearest[:, :1] + du]
     offsets = np.stack([du - radius, dv - radius], axis=1) + (nearest - pixels)[:, None]

@@ -26,6 +26,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, nested, part, read_arrays, write_arrays
 from bmask_slam.graph.smoother.storage import read_camera
 from bmask_slam.offline.options import RunOptions
+from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
 from bmask_slam.run_folder.frame_file import FRAMES
 from bmask_slam.run_folder.metrics import RunCounters
@@ -88,12 +89,12 @@ class Checkpoints:
         folder: RunFolder,
         options: RunOptions,
         sequence: Sequence,
-        calibration: SelfCalibration,
+        calibrator: SelfCalibrator,
     ) -> None:
         self._folder = folder
         self._options = options
         self._sequence = sequence
-        self._calibration = calibration
+        self._calibrator = calibrator
         self._every = options.checkpoint_every
         self._frames = -1  # number of frames at the last checkpoint
 
@@ -116,10 +117,10 @@ class Checkpoints:
         checkpoint = Checkpoint(
             self._options,
             self._sequence.camera,
-            self._calibration,
+            self._calibrator.state,
             digest(self._sequence),
             skipped,
-            self._folder.synced_bytes(),
+            self._folder.synced_bytes() if counters.frames else self._folder.empty_bytes,
             counters,
             system.state(),
         )

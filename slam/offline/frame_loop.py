@@ -11,18 +11,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bmask_slam.calibration.adoption import SelfCalibration
 from bmask_slam.calibration.camera_check import CameraCheck, check_camera
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.graph.whole_file import remove
 from bmask_slam.offline.checkpoint import Checkpoints
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.run_folder.folder import RunFolder
+from bmask_slam.offline.self_calibration import SelfCalibrator
+from bmask_slam.run_folder.folder import CAMERA, DENSE, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, measure, save
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
-from bmask_slam.sequences import Sequence
+from bmask_slam.sequences import Sequence, write_camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
@@ -45,7 +46,7 @@ class ActiveRun:
         system: what processes the frames.
         folder: where results are written.
         stop: says when a signal asked to end the run.
-        calibration: what was found of the camera; ``sequence`` has the camera that is used.
+        calibrator: finds what the camera file does not say; ``sequence`` has the camera in use.
         counters: of the frames processed so far.
     """
 
@@ -55,7 +56,7 @@ class ActiveRun:
     system: System
     folder: RunFolder
     stop: StopRequest
-    calibration: SelfCalibration
+    calibrator: SelfCalibrator
     counters: RunCounters = field(default_factory=RunCounters)
 
     @property
@@ -103,35 +104,44 @@ class RunSummary:
     warnings: tuple[str, ...] = ()
 
 
-def report_calibration(run: ActiveRun) -> None:
-    """The first event: what was found of the camera before the run, if anything was tried."""
-    events, first = run.system.events, run.indices[:1]
-    if run.calibration.text and first:
+def _begin(run: ActiveRun, checkpoints: Checkpoints) -> None:
+    """Before the first frame: the checkpoint, the camera that was found, and that as an event.
+
+    Files that hold frames of an earlier beginning are cut after the checkpoint, which states their
+    sizes, was written: a kill at any moment leaves files that fit the checkpoint.
+    """
+    found, events, first = run.calibrator.state, run.system.events, run.indices[:1]
+    if found.adopted:
+        write_camera(run.folder.path / CAMERA, found.camera, found.text)
+    checkpoints.write(run.system, run.counters)
+    run.folder.begin_anew()
+    if found.adopted and not run.options.map:
+        remove(run.folder.path / DENSE)
+    if found.text and first:
         events.begin_frame(first[0], float(run.sequence.timestamps_s[first[0]]))
-        events.calibration(run.calibration.text)
+        events.calibration(found.text)
         run.folder.write_events(events.take())
 
 
-def process_frames(run: ActiveRun) -> None:
-    """Process the remaining frames until the last or a stop request, and record each."""
+def process_frames(run: ActiveRun) -> bool:
+    """Process the remaining frames; whether the run is to begin anew, with the camera found."""
     system, counters, remaining = run.system, run.counters, run.remaining
     frames = run.sequence.frames(
         remaining.start, remaining.stop, remaining.step, prepare=_timed(system.prepare)
     )
-    checkpoints = Checkpoints(run.folder, run.options, run.sequence, run.calibration)
+    checkpoints = Checkpoints(run.folder, run.options, run.sequence, run.calibrator)
+    if not counters.frames:
+        _begin(run, checkpoints)
     fuse = _dense_follower(run) if run.options.dense else None
-    start_s = time.perf_counter() - counters.wall_s
-    done = len(run.indices) - len(remaining)
+    start_s, done = time.perf_counter() - counters.wall_s, len(run.indices) - len(remaining)
     with (
         closing(frames),
         Progress(len(run.indices), run.options.quiet, done) as bar,
         _snapshots(run) as snapshot,
     ):
-        if not counters.frames:
-            checkpoints.write(system, counters)
-        for frame, (features, features_ms) in frames:
+        for frame, (features, ms) in frames:
             result = system.process(frame, features)
-            result = replace(result, stage_ms={**result.stage_ms, "features": features_ms})
+            result = replace(result, stage_ms={**result.stage_ms, "features": ms})
             run.folder.write_frame(result)
             counters.count(result)
             if fuse is not None:
@@ -141,11 +151,27 @@ def process_frames(run: ActiveRun) -> None:
             snapshot()
             if run.stop.signal is not None:
                 break
+            if _is_to_begin_anew(run, last=False):
+                return True
             checkpoints.after_frame(system, counters)
         else:
+            if _is_to_begin_anew(run, last=True):
+                return True
             counters.next_index = run.indices.stop
             checkpoints.write(system, counters)
     logger.info("%d frames in %.1f s", counters.frames, counters.wall_s)
+    return False
+
+
+def _is_to_begin_anew(run: ActiveRun, last: bool) -> bool:
+    """Let the calibrator look at the run if it is time; whether the run has to begin anew."""
+    if not run.calibrator.is_due(run.counters.frames, last):
+        return False
+    anew = run.calibrator.look(run.system, run.sequence)
+    run.folder.write_events(run.system.events.take())
+    if anew:
+        logger.info("calibration: tracking begins anew with the camera that was found")
+    return anew
 
 
 def finish_run(run: ActiveRun) -> RunSummary:
@@ -167,7 +193,7 @@ def finish_run(run: ActiveRun) -> RunSummary:
         run.folder.complete()
     skipped = sum(index < counters.next_index for index, _ in run.sequence.skipped)
     resumable = stopped_by is not None and options.checkpoint_every is not None
-    text = run.calibration.text
+    text = run.calibrator.state.text
     return RunSummary(
         run.folder.path,
         rows,

@@ -39,7 +39,7 @@ class RunOptions:
         map: map file, or run folder with one, that the run continues.
         localise: map file, or run folder with one, in which the frames are located; it is not
             changed.
-        calibrate: whether the camera's readout time and delay are found from the first frames:
+        calibrate: whether the camera's readout time and delay are found from its motion:
             "auto", and used where that is sure; "report", and only said; "off".
         dense: also make a dense map, fusing keyframes while the run goes on.
         quiet: no progress bar.
@@ -57,7 +57,7 @@ class RunOptions:
     checkpoint_every: int | None = None
     map: Path | None = None
     localise: Path | None = None
-    calibrate: str = "off"
+    calibrate: str = "auto"
     dense: bool = False
     quiet: bool = False
 

@@ -26,19 +26,18 @@ from bmask_slam.offline.frame_loop import (
     RunSummary,
     finish_run,
     process_frames,
-    report_calibration,
-    run_indices,
 )
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.offline.self_calibration import SelfCalibrator
-from bmask_slam.run_folder.folder import CAMERA, CHECKPOINT, RunFolder, free_run_path
+from bmask_slam.offline.self_calibration import RememberingSegmenter, SelfCalibrator
+from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder, free_run_path
 from bmask_slam.run_folder.map_file import read_map
+from bmask_slam.run_folder.metrics import RunCounters
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
-from bmask_slam.sequences import Sequence, open_sequence, write_camera
+from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.system_interface import System
@@ -71,15 +70,12 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
     ):
         describe_run(folder, options, sequence)
         make = make_system or _with_segmenter(options, sequence)
-        calibration = find_calibration(options, sequence, make, stop)
-        if calibration.adopted:
-            sequence = open_sequence(options.sequence, camera=calibration.camera)
-            write_camera(folder.path / CAMERA, calibration.camera, calibration.text)
+        calibrator = _calibrator(options, inherited_calibration(options, sequence), make)
+        if calibrator.state.adopted:
+            sequence = open_sequence(options.sequence, camera=calibrator.state.camera)
         system = start_system(options, sequence, make)
-        active = ActiveRun(options, sequence, reference, system, folder, stop, calibration)
-        report_calibration(active)
-        process_frames(active)
-        return finish_run(active)
+        active = ActiveRun(options, sequence, reference, system, folder, stop, calibrator)
+        return _finished(active, make)
 
 
 def resume(
@@ -98,7 +94,7 @@ def resume(
         return None
     checkpoint = read_checkpoint(path)
     options = checkpoint.options.with_given(given or {})
-    sequence, calibration = _reopened(options, checkpoint), checkpoint.calibration
+    sequence = _reopened(options, checkpoint)
     checkpoint.check_sequence(sequence)
     reference = find_reference(options.reference, sequence)
     make = make_system or _with_segmenter(options, sequence)
@@ -110,11 +106,32 @@ def resume(
             logger.warning("%s: no checkpoint was reached; starting from the beginning", path)
         for index, reason in checkpoint.skipped:
             sequence.skip(index, reason)
-        active = ActiveRun(
-            options, sequence, reference, system, folder, stop, calibration, counters
+        calibrator = _calibrator(options, checkpoint.calibration, make)
+        active = ActiveRun(options, sequence, reference, system, folder, stop, calibrator, counters)
+        return _finished(active, make)
+
+
+def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
+    """A run after its last frame, begun anew as often as another camera was found for it."""
+    while process_frames(active):
+        options, camera = active.options, active.calibrator.state.camera
+        active = replace(
+            active,
+            sequence=open_sequence(options.sequence, camera=camera),
+            system=make_system(camera, options.config),
+            counters=RunCounters(wall_s=active.counters.wall_s),
         )
-        process_frames(active)
-        return finish_run(active)
+    return finish_run(active)
+
+
+def _calibrator(
+    options: RunOptions, state: SelfCalibration, make_system: MakeSystem
+) -> SelfCalibrator:
+    """What looks for the camera's times; nothing in a run that uses a map."""
+    mode = "off" if options.map or options.localise else options.calibrate
+    masks = getattr(make_system, "keywords", {}).get("segmenter")
+    kept = masks if isinstance(masks, RememberingSegmenter) else None
+    return SelfCalibrator(state, mode, kept)
 
 
 def _reopened(options: RunOptions, checkpoint: Checkpoint) -> Sequence:
@@ -126,26 +143,12 @@ def _reopened(options: RunOptions, checkpoint: Checkpoint) -> Sequence:
     return sequence
 
 
-def find_calibration(
-    options: RunOptions, sequence: Sequence, make_system: MakeSystem, stop: StopRequest
-) -> SelfCalibration:
-    """The camera to run with: what the first frames say of it, or that of the map to go on with."""
+def inherited_calibration(options: RunOptions, sequence: Sequence) -> SelfCalibration:
+    """The camera to begin with: the sequence's own, or what the run of the map has found of it."""
     given, source = sequence.camera, options.map or options.localise
-    if options.calibrate == "off":
+    if options.calibrate == "off" or source is None:
         return SelfCalibration(given, given)
-    if source is not None:
-        return _calibration_of_map(options, source, given)
-    calibrator = SelfCalibrator(
-        sequence,
-        lambda camera: open_sequence(options.sequence, camera=camera),
-        run_indices(sequence, options),
-        lambda camera: make_system(camera, options.config),
-    )
-    found = calibrator.calibrate(stop, options.quiet)
-    if options.calibrate == "report":
-        text = found.text.replace("found and applied", "found, not applied")
-        return SelfCalibration(given, given, text)
-    return found
+    return _calibration_of_map(options, source, given)
 
 
 def _calibration_of_map(options: RunOptions, source: Path, given: Camera) -> SelfCalibration:
@@ -198,6 +201,8 @@ def _with_segmenter(options: RunOptions, sequence: Sequence) -> MakeSystem:
     segmenter = (
         NoSegmenter() if options.localise else make_segmenter(chosen, sequence.folder, find_weights)
     )
+    if options.calibrate == "auto" and options.map is None and options.localise is None:
+        segmenter = RememberingSegmenter(segmenter)
     return partial(SlamSystem, segmenter=segmenter)
 
 

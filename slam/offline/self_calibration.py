@@ -1,148 +1,155 @@
-"""Self-calibration at the start of a run: what the motion shows of the camera, found and adopted.
+"""Self-calibration in a run: what its first frames show of the camera, found and adopted.
 
-A first stretch of the sequence is tracked, and the readout time of the rolling shutter and the
-delay of the depth images are estimated from it, with the intrinsics held fixed: those of a
-published calibration are better than what a short stretch shows, and an error of the depth scale,
-which images and depths alone do not show, would be taken for one of the focal length. Whether it is
-adopted is decided in `calibration.adoption`; for each round the stretch is tracked again.
+The run itself is the first stretch. After some frames the readout time of the rolling shutter and
+the delay of the depth images are estimated from its map (`calibration.rematching`), with the
+intrinsics held fixed: those of a published calibration are better than what a short stretch shows,
+and an error of the depth scale, which images and depths alone do not show, would be taken for one
+of the focal length. Whether a time is adopted is decided in `calibration.adoption`. If none is, the
+run goes on; else it begins anew, once, with the camera that was found.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from pathlib import Path
+from dataclasses import replace
 
 from bmask_slam.calibration.adoption import (
-    FIXED,
     FREE,
-    CalibrationRounds,
     Estimate,
     SelfCalibration,
     SelfCalibrationConfig,
-    estimate_times,
+    camera_with,
     format_times,
+    newly_sure,
 )
-from bmask_slam.calibration.calibrate import CalibrateOptions, make_problem
-from bmask_slam.graph.camera import Camera
+from bmask_slam.calibration.rematching import estimate_again
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
-from bmask_slam.run_folder.map_file import SavedRun
-from bmask_slam.runtime.progress import Progress
-from bmask_slam.runtime.stop_request import StopRequest
+from bmask_slam.semantics.instances.instances import Instance, PackedMask
+from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.sequences import Sequence
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
-from bmask_slam.tracking.results import TrackingStatus
 
 logger = logging.getLogger(__name__)
 
-MakeSystem = Callable[[Camera], System]
+UNOBSERVABLE = "readout and delay not observable in the motion"
+
+
+class RememberingSegmenter:
+    """A segmenter that keeps what it found, one bit a pixel, for frames that are tracked again."""
+
+    def __init__(self, segmenter: Segmenter) -> None:
+        self.labels = segmenter.labels
+        self._segmenter = segmenter
+        self._found: dict[str, list[tuple[Instance, PackedMask]]] | None = {}
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """The instances in an image, as the segmenter found them the first time."""
+        if self._found is None:
+            return self._segmenter.segment(image, name)
+        if name in self._found:
+            return [replace(i, mask=mask.unpacked()) for i, mask in self._found[name]]
+        instances = self._segmenter.segment(image, name)
+        packed = [PackedMask.of(i.mask) for i in instances]
+        self._found[name] = [
+            (replace(i, mask=i.mask[:0]), mask) for i, mask in zip(instances, packed, strict=True)
+        ]
+        return instances
+
+    def forget(self) -> None:
+        """Keep nothing any more: no frame is tracked again."""
+        self._found = None
 
 
 class SelfCalibrator:
-    """Calibrates the camera of one sequence.
+    """Looks at a run now and then until its camera is settled.
+
+    Attributes:
+        state: what was found so far; all that a checkpoint has to keep.
 
     Args:
-        sequence: its frames; ``reopen`` opens it with another camera.
-        indices: of the frames that the run will process.
-        make_system: an empty system for a camera.
+        mode: "auto": what is sure is adopted; "report": it is only said; "off".
+        masks: kept while the run may begin anew.
     """
 
     def __init__(
         self,
-        sequence: Sequence,
-        reopen: Callable[[Camera], Sequence],
-        indices: range,
-        make_system: MakeSystem,
+        state: SelfCalibration,
+        mode: str,
+        masks: RememberingSegmenter | None = None,
         config: SelfCalibrationConfig | None = None,
     ) -> None:
-        self._sequence, self._reopen = sequence, reopen
-        self._indices, self._make_system = indices, make_system
+        self.state = state
+        self._mode, self._masks = mode, masks
         self._config = config or SelfCalibrationConfig()
+        self._forget_masks()
 
-    def calibrate(self, stop: StopRequest, quiet: bool) -> SelfCalibration:
-        """What the first stretch that shows enough motion says of the camera.
+    @property
+    def finished(self) -> bool:
+        """Whether it does not look at the run any more."""
+        looked = self.state.looks >= self._config.stretches
+        return self._mode == "off" or self.state.settled or looked
 
-        A stop request ends it with nothing adopted.
-        """
-        camera, config = self._sequence.camera, self._config
-        for number in range(config.stretches):
-            start = number * config.frames
-            stretch = self._indices[start : start + config.frames]
-            if len(stretch) < config.min_frames:
-                break
-            estimate = self._estimate(camera, stretch, stop, quiet)
-            if estimate is None:
-                return SelfCalibration(camera, camera)
-            rounds = CalibrationRounds(camera, config)
-            if rounds.shows(estimate):
-                return self._in_rounds(rounds, estimate, stretch, stop, quiet)
-        return SelfCalibration(camera, camera, "readout and delay not observable in the motion")
+    def is_due(self, frames: int, last: bool) -> bool:
+        """Whether it looks after a number of frames: n, 2n, 4n, or the last of them."""
+        if self.finished:
+            return False
+        looks, n = self.state.looks, self._config.frames
+        before = n * 2 ** (looks - 1) if looks else 0
+        return frames == n * 2**looks or (last and frames - before >= self._config.min_frames)
 
-    def _in_rounds(
-        self,
-        rounds: CalibrationRounds,
-        estimate: Estimate,
-        stretch: range,
-        stop: StopRequest,
-        quiet: bool,
-    ) -> SelfCalibration:
-        """Track a stretch again with what was found, until that changes no more."""
-        given = self._sequence.camera
-        while (camera := rounds.add(estimate)) is not None:
-            again = self._estimate(camera, stretch, stop, quiet)
-            if again is None:
-                return SelfCalibration(given, given)
-            estimate = again
-        return rounds.result()
+    def look(self, system: System, sequence: Sequence) -> bool:
+        """Take what the run shows by now into account; whether it is to begin anew."""
+        before = self.state
+        estimate = self._estimate(system, sequence)
+        if estimate is None:
+            self.state = replace(before, looks=before.looks + 1)
+        else:
+            self.state = self._judged(estimate)
+        text = self.state.text
+        if text != before.text:
+            logger.info("calibration: %s", text)
+        if self.state.camera == before.camera and text != before.text:
+            system.events.calibration(text)
+        self._forget_masks()
+        return self.state.camera != before.camera
 
-    def _estimate(
-        self, camera: Camera, stretch: range, stop: StopRequest, quiet: bool
-    ) -> Estimate | None:
-        """What a stretch tracked with a camera says; None if that is too little, or stopped."""
-        sequence = self._reopen(camera)
-        with _quiet_log():
-            run = self._track(sequence, stretch, stop, quiet)
-        if run is None:
+    def _forget_masks(self) -> None:
+        if self._masks is not None and (self.finished or self._mode == "report"):
+            self._masks.forget()
+
+    def _estimate(self, system: System, sequence: Sequence) -> Estimate | None:
+        """What the run shows of its camera; None if that is too little."""
+        if not isinstance(system, SlamSystem):
             return None
+        world, worth_s = system.mapper.world, self._config.min_change_s
         try:
-            problem, _ = make_problem(CalibrateOptions(Path(), fixed=FIXED), run, sequence)
+            estimate = estimate_again(world, system.as_run(), sequence, worth_s)
         except InputError as error:
             logger.info("calibration: %s", error)
             return None
-        estimate = estimate_times(problem)
-        text = format_times(estimate, FREE, "estimated")
-        logger.info("calibration: frames %d to %d: %s", stretch[0], stretch[-1], text)
-        return None if stop.signal is not None else estimate
+        if estimate is not None:
+            logger.info("calibration: %s", format_times(estimate, FREE, "estimated"))
+        return estimate
 
-    def _track(
-        self, sequence: Sequence, stretch: range, stop: StopRequest, quiet: bool
-    ) -> SavedRun | None:
-        """A stretch of frames through a new system."""
-        system = self._make_system(sequence.camera)
-        if not isinstance(system, SlamSystem):
-            return None
-        frames = sequence.frames(stretch.start, stretch.stop, stretch.step, prepare=system.prepare)
-        keyframes = lost = 0
-        with closing(frames), Progress(len(stretch), quiet) as bar:
-            for frame, features in frames:
-                result = system.process(frame, features)
-                keyframes += result.keyframe_id is not None
-                lost += result.status is TrackingStatus.LOST
-                bar.update(result.status, keyframes, lost)
-                if stop.signal is not None:
-                    return None
-        return system.as_run()
+    def _judged(self, estimate: Estimate) -> SelfCalibration:
+        """The state after an estimate. What was adopted is not estimated again.
 
-
-@contextmanager
-def _quiet_log() -> Iterator[None]:
-    """Only errors are logged: what is tracked here is tracked again."""
-    root = logging.getLogger("bmask_slam")
-    level = root.level
-    root.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        root.setLevel(level)
+        A parameter that does not show yet is looked for again later, unless one was adopted.
+        """
+        state, config = self.state, self._config
+        sure = newly_sure(estimate, FREE, config)
+        if sure:
+            verdict = "found and applied" if self._mode == "auto" else "found, not applied"
+            text = format_times(estimate, sure, verdict)
+            if self._mode != "auto":
+                return replace(state, text=text, settled=True)
+            camera = camera_with(state.given, estimate.found, sure)
+            return replace(state, camera=camera, text=text, settled=True)
+        seen = [i for i in FREE if estimate.sigmas[i] < config.max_sigma_s]
+        differs = any(estimate.differs(i, config) for i in FREE)
+        verdict = "not sure enough to be applied" if differs else "the camera keeps it"
+        text = format_times(estimate, seen, verdict) if seen else UNOBSERVABLE
+        settled = len(seen) == len(FREE) and not differs
+        return replace(state, text=text, looks=state.looks + 1, settled=settled)

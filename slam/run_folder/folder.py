@@ -71,6 +71,7 @@ CAMERA = "camera.yaml"
 CHECKPOINT = "checkpoint"
 SEQUENCE_FILES = ("rgb.txt", "depth.txt", "associations.txt")
 """What is only in a folder that nothing may be removed from."""
+DENSE = "dense"
 HEALTH = "health.json"
 SOMETIMES = (CHECKPOINT, CAMERA, COVARIANCES, HEALTH, *SEMANTIC_FILES)
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
@@ -195,6 +196,16 @@ class RunFolder:
     def synced_bytes(self) -> dict[str, int]:
         """Write the files that grow to disk; their sizes in bytes by name."""
         return {name: table.synced_bytes() for name, table in self._tables.items()}
+
+    @property
+    def empty_bytes(self) -> dict[str, int]:
+        """Sizes in bytes by name of the files that grow, with nothing in them but the header."""
+        return {name: len(",".join(columns).encode()) + 1 for name, columns in GROWING.items()}
+
+    def begin_anew(self) -> None:
+        """Take back all frames and events: the run begins with its first frame again."""
+        for name, size in self.empty_bytes.items():
+            self._tables[name].begin(size)
 
     def complete(self) -> None:
         """Mark the run as finished by removing its checkpoint."""

@@ -19,7 +19,7 @@ from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.files.reading import read_text
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices, read_tum
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
-from bmask_slam.run_folder.folder import CHECKPOINT, FILES, trajectory_files
+from bmask_slam.run_folder.folder import CHECKPOINT, DENSE, FILES, trajectory_files
 from bmask_slam.run_folder.frame_file import (
     FRAMES,
     MAX_STAMP_ERROR_S,
@@ -38,8 +38,6 @@ from bmask_slam.run_folder.semantic_files import OBJECTS, SavedObject, read_obje
 
 if TYPE_CHECKING:
     from bmask_slam.system_config import SystemConfig
-
-_DENSE = "dense"
 
 
 class Metric(NamedTuple):
@@ -202,13 +200,13 @@ class Run:
     @cached_property
     def dense_cloud(self) -> DenseCloud:
         """The dense cloud, after ``map_run``."""
-        return read_dense_cloud(self._file(f"{_DENSE}/cloud.ply"), self._dense_names)
+        return read_dense_cloud(self._file(f"{DENSE}/cloud.ply"), self._dense_names)
 
     @cached_property
     def object_clouds(self) -> dict[int, DenseCloud]:
         """The dense cloud of each object by its id, after ``map_run``."""
         names = self._dense_names
-        files = sorted((self.path / _DENSE / "objects").glob("*-*.ply"))
+        files = sorted((self.path / DENSE / "objects").glob("*-*.ply"))
         return {int(f.name.partition("-")[0]): read_dense_cloud(f, names) for f in files}
 
     @cached_property
@@ -251,7 +249,7 @@ class Run:
     @cached_property
     def _dense_names(self) -> tuple[str, ...]:
         """Class names of the labels of the dense clouds."""
-        path = self._file(f"{_DENSE}/legend.json")
+        path = self._file(f"{DENSE}/legend.json")
         return tuple(read_json(path, dict[str, Any], f"bmask-slam map {self.path} makes it again"))
 
     def _marginals(self, landmark_ids: Ints) -> tuple[tuple[Ints, Array], tuple[Ints, Array]]:
@@ -270,7 +268,7 @@ class Run:
         path = self.path / name
         if path.exists():
             return path
-        if name.startswith(_DENSE):
+        if name.startswith(DENSE):
             raise InputError(f"{path}: no such file; make it by: bmask-slam map {self.path}")
         if (self.path / CHECKPOINT).exists():
             cure = f"finish the run by: bmask-slam run --resume {self.path}"

@@ -36,5 +36,16 @@ def test_a_correct_camera_is_not_improved() -> None:
     assert np.abs(found.calibrations - ROLLING)[:, SHUTTER].max() < 0.001
 
 
+def test_a_delay_is_confirmed_although_it_hides_in_the_noise_of_depth() -> None:
+    """With the wrong delay the noise that depths seem to have is larger."""
+    on_time = np.where(np.arange(13) == TIME, TRUTH[TIME] - 0.004, TRUTH)
+    found = cross_validate(_problem(TRUTH, on_time))
+    assert found is not None
+    error = np.abs(found.calibrations - TRUTH)[:, TIME]
+    assert (error < 4 * found.sigmas[:, TIME]).all()
+    z = 0.004 / found.sigmas[:, TIME]
+    assert found.gains.sum() > 0.35 * (z**2).sum()  # each half's cost drops by z^2 / 2
+
+
 def test_too_few_keyframes_give_no_result() -> None:
     assert cross_validate(make_problem(keyframes=8)[0]) is None

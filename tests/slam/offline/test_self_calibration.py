@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +17,19 @@ from bmask_slam.calibration.adoption import (
 )
 from bmask_slam.calibration.report import parameter_named
 from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.offline import runner
-from bmask_slam.offline.runner import RunOptions, resume, run
-from bmask_slam.offline.self_calibration import SelfCalibrator
+from bmask_slam.offline import checkpoint, runner
+from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
+from bmask_slam.offline.self_calibration import RememberingSegmenter, SelfCalibrator
 from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.run_folder.map_file import read_run
+from bmask_slam.run_folder.reader import Run
+from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.labels import label_set
+from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.sequences import read_camera
 from bmask_slam.system_config import SystemConfig
 
@@ -41,33 +47,66 @@ def late_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return render_sequence(config, folder)
 
 
-def test_a_delay_is_found_adopted_and_kept_by_resume(late_depth: Path, tmp_path: Path) -> None:
-    options = RunOptions(late_depth, CONFIG, quiet=True, checkpoint_every=60, calibrate="auto")
-    whole = run(dataclasses.replace(options, out=tmp_path / "whole"))
-    assert "colour-depth delay" in whole.calibration
-    assert whole.calibration.endswith("found and applied")
-    found = read_camera(tmp_path / "whole" / "camera.yaml")
-    assert found.depth_time_offset_s == pytest.approx(DELAY_S, abs=0.0015)
-    assert found.rolling_shutter_s == pytest.approx(0.0, abs=0.001)
-    assert read_run(tmp_path / "whole").camera == found
+@pytest.fixture(scope="module")
+def found(late_depth: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+    """A run with checkpoints that finds the delay."""
+    return run(late_options(late_depth, tmp_path_factory.mktemp("found") / "run"))
+
+
+def late_options(sequence: Path, out: Path) -> RunOptions:
+    return RunOptions(sequence, CONFIG, quiet=True, checkpoint_every=40, out=out)
+
+
+def test_a_delay_is_found_and_adopted(found: RunSummary, late_depth: Path, tmp_path: Path) -> None:
+    assert found.calibration.startswith("colour-depth delay")
+    assert found.calibration.endswith("found and applied")
+    camera = read_camera(found.folder / "camera.yaml")
+    assert camera.depth_time_offset_s == pytest.approx(DELAY_S, abs=0.0015)
+    assert camera.rolling_shutter_s == 0.0
+    saved = read_run(found.folder)
+    assert saved.camera == camera
+    assert len(Run(found.folder).frames.timestamps_s) == 100  # those tracked first are taken back
+    out, known = tmp_path / "known", found.folder / "camera.yaml"
+    run(replace(late_options(late_depth, out), camera=known, calibrate="off"))
+    for name in ("trajectory.txt", "map", "graph"):  # as a run that has known the camera
+        assert (out / name).read_bytes() == (found.folder / name).read_bytes(), name
+
+
+def test_the_map_of_such_a_run_is_continued_with_its_camera(
+    found: RunSummary, late_depth: Path, tmp_path: Path
+) -> None:
+    gone_on = RunOptions(late_depth, CONFIG, out=tmp_path / "on", map=found.folder, quiet=True)
+    with pytest.raises(InputError, match="can only be continued with its own camera"):
+        run(dataclasses.replace(gone_on, calibrate="off"))
+    later = runner.inherited_calibration(gone_on, runner.open_sequence(late_depth))
+    assert later.camera == read_camera(found.folder / "camera.yaml")
+
+
+@pytest.mark.parametrize("number", [4, 5, 6, 7])
+def test_killed_before_and_after_the_adoption_and_resumed(
+    number: int, found: RunSummary, late_depth: Path, tmp_path: Path
+) -> None:
+    """Killed after and before the checkpoints of 40 and 80 frames, and of the new beginning."""
+    options, written = late_options(late_depth, tmp_path / "run"), 0
+    write = checkpoint.write_checkpoint
+
+    def killed(path: Path, content: checkpoint.Checkpoint) -> None:
+        nonlocal written
+        written += 1
+        if written == number // 2 + 1 and number % 2:
+            raise KeyboardInterrupt
+        write(path, content)
+        if written == number // 2 and not number % 2:
+            raise KeyboardInterrupt
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "bmask_slam.offline.frame_loop.RunFolder.complete", lambda folder: None
-        )  # its last checkpoint stays
-        run(dataclasses.replace(options, out=tmp_path / "again"))
-    (tmp_path / "again" / "metrics.json").unlink()
-    resumed = resume(tmp_path / "again", {"quiet": True})
-    assert resumed is not None and resumed.calibration == whole.calibration
-    for name in ("trajectory.txt", "camera.yaml"):
-        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    continued = dataclasses.replace(options, out=tmp_path / "on", map=tmp_path / "whole")
-    with pytest.raises(InputError) as caught:  # the same stamps again
-        run(dataclasses.replace(continued, calibrate="off"))
-    assert "can only be continued with its own camera" in str(caught.value)
-    later = runner.find_calibration(
-        continued, runner.open_sequence(late_depth), runner.SlamSystem, runner.StopRequest()
-    )
-    assert later.camera == found
+        patch.setattr("bmask_slam.offline.checkpoint.write_checkpoint", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run(options)
+    resumed = resume(tmp_path / "run", {"quiet": True})
+    assert resumed is not None and resumed.calibration == found.calibration
+    for name in ("trajectory.txt", "camera.yaml", "map", "graph", "events.csv"):
+        assert (tmp_path / "run" / name).read_bytes() == (found.folder / name).read_bytes(), name
 
 
 def test_report_and_off_change_nothing(late_depth: Path, tmp_path: Path) -> None:
@@ -101,11 +140,42 @@ def test_only_observable_parameters_are_changed(
     assert not estimate.differs(SHUTTER, config)
 
 
-def test_a_short_sequence_is_not_calibrated(late_depth: Path) -> None:
-    sequence = runner.open_sequence(late_depth)
-    calibrator = SelfCalibrator(sequence, lambda _: sequence, range(40), runner.SlamSystem)
-    found = calibrator.calibrate(runner.StopRequest(), quiet=True)
-    assert found.camera == sequence.camera and not found.adopted
+@pytest.mark.parametrize(
+    ("looks", "frames", "last", "due"),
+    [
+        (0, 210, False, True), (0, 209, False, False), (0, 100, True, True), (0, 89, True, False),
+        (1, 420, False, True), (1, 210, True, False), (1, 310, True, True), (2, 840, False, True),
+        (3, 1680, False, False), (3, 1200, True, False),
+    ],
+)  # fmt: skip
+def test_when_it_looks(looks: int, frames: int, last: bool, due: bool) -> None:
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    state = SelfCalibration(camera, camera, looks=looks)
+    assert SelfCalibrator(state, "auto").is_due(frames, last) is due
+    assert not SelfCalibrator(state, "off").is_due(frames, last)
+    assert not SelfCalibrator(replace(state, settled=True), "auto").is_due(frames, last)
+
+
+def test_masks_are_kept_while_the_run_may_begin_anew() -> None:
+    class Counting(NoSegmenter):
+        labels, calls = label_set(("cup",)), 0
+
+        def segment(self, image: Image, name: str) -> list[Instance]:
+            self.calls += 1
+            mask = np.zeros(image.shape[:2], bool)
+            mask[3, 4:9] = True
+            return [Instance(mask, mask_box(mask), 1, certain(1, 2), 1.0, 0.5)]
+
+    inner, image = Counting(), np.zeros((11, 13, 3), np.uint8)
+    masks = RememberingSegmenter(inner)
+    first, again = masks.segment(image, "a.png"), masks.segment(image, "a.png")
+    assert inner.calls == 1
+    np.testing.assert_array_equal(first[0].mask, again[0].mask)
+    assert again[0].mask_score == 0.5 and again[0].label == 1
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    SelfCalibrator(SelfCalibration(camera, camera, settled=True), "auto", masks)
+    masks.segment(image, "a.png")
+    assert inner.calls == 2
 
 
 @pytest.mark.parametrize(
