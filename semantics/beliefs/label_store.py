@@ -28,12 +28,15 @@ class LabelStoreConfig:
     such views there are: what a network missed in one view it misses in the next. The network's
     recall of a thing is a Beta variable with the parameters ``recall_found`` a and
     ``recall_missed`` b, so that m misses of a thing of a known class have the probability
-    B(a, b + m) / B(a, b).
+    B(a, b + m) / B(a, b). Like what masks say, misses are bounded: m is their sum over about the
+    last ``recall_views`` views, so that it tells how often a thing is missed and not how often it
+    was seen.
     """
 
     prior_unknown: float = 0.5
     recall_found: float = 2.0
     recall_missed: float = 0.4
+    recall_views: float = 10.0
     power: float = 1.0
     max_log_odds: float = 9.0
 
@@ -44,6 +47,8 @@ class LabelStoreConfig:
             raise ValueError("prior_unknown must be between 0 and 1")
         if min(self.recall_found, self.recall_missed) <= 0:
             raise ValueError("recall_found and recall_missed must be positive")
+        if self.recall_views < 1:
+            raise ValueError("recall_views must be at least 1")
 
     def prior(self, classes: int) -> Array:
         """The prior (C,) over classes."""
@@ -108,11 +113,13 @@ class LabelStore:
         floor = np.float32(np.exp(-self.config.max_log_odds))
         gained = np.float32(self.config.power) * np.log(np.maximum(likelihood, floor))
         self._add(ids, gained, np.ones(len(ids), np.int32))
+        np.multiply.at(self._misses, ids, np.float32(1 - 1 / self.config.recall_views))
 
     def miss(self, ids: Ints, weights: Floats) -> None:
         """Count views of ids (N,), which may repeat, that no mask covers, with weights (N,)."""
         if len(ids):
             self._reserve(int(ids.max()) + 1)
+            np.multiply.at(self._misses, ids, 1 - weights / np.float32(self.config.recall_views))
             np.add.at(self._misses, ids, weights)
             np.add.at(self._views, ids, 1)
 
@@ -126,6 +133,7 @@ class LabelStore:
         self._reset(from_ids)
         self._add(to_ids, gained, views)
         np.add.at(self._misses, to_ids, misses)
+        self._limit_misses(to_ids)
         self._resize(len(self))
 
     def drop(self, ids: Ints) -> None:
@@ -167,7 +175,10 @@ class LabelStore:
         }
 
     def restore(self, state: Arrays) -> None:
-        """Replace the content by a state; further arrays, as older files hold, are ignored."""
+        """Replace the content by a state.
+
+        Further arrays, as older files hold, are ignored. Older files count all misses.
+        """
         ids = state["ids"]
         check_ids(ids, int(ids.max(initial=-1)) + 1)
         self._clear()
@@ -175,6 +186,7 @@ class LabelStore:
         self._log_p[ids] = state["log_p"].reshape(len(ids), self.classes)
         self._views[ids] = state["views"]
         self._misses[ids] = state["misses"]
+        self._limit_misses(ids)
         self._resize(len(self))
 
     def _add(self, ids: Ints, gained: Floats, views: NDArray[np.int32]) -> None:
@@ -187,6 +199,10 @@ class LabelStore:
         log_p = self._log_p[ids]
         log_p -= log_p.max(axis=1, keepdims=True)
         self._log_p[ids] = np.maximum(log_p, np.float32(-self.config.max_log_odds))
+
+    def _limit_misses(self, ids: Ints) -> None:
+        limit = np.float32(self.config.recall_views)
+        self._misses[ids] = np.minimum(self._misses[ids], limit)
 
     def _reset(self, ids: Ints) -> None:
         self._log_p[ids] = 0.0

@@ -11,7 +11,7 @@ from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfi
 
 C = 5
 PRIOR = np.array([0.5, *4 * [0.125]])
-NO_LIMIT = LabelStoreConfig(max_log_odds=60.0)
+NO_LIMIT = LabelStoreConfig(max_log_odds=60.0, recall_views=1e9)
 
 
 def views(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -83,7 +83,7 @@ def missed_by_integral(prior: np.ndarray, misses: float, a: float, b: float) -> 
 
 
 def test_misses_of_one_view_are_dependent() -> None:
-    config = LabelStoreConfig(recall_found=2.0, recall_missed=1.5, max_log_odds=60.0)
+    config = LabelStoreConfig(0.5, 2.0, 1.5, recall_views=1e9, max_log_odds=60.0)
     store, three = LabelStore(C, config), np.array([3])
     p, weights = views(1, np.random.default_rng(6))
     store.miss(np.array([3, 3]), np.array([1.0, 0.5], np.float32))
@@ -96,6 +96,54 @@ def test_misses_of_one_view_are_dependent() -> None:
     nine = store.probabilities(np.array([9]))[0]
     assert np.log(nine[1]) == pytest.approx(first, abs=1e-4)
     assert then - first > first - np.log(PRIOR[1])  # the second adds less than the first
+
+
+def labelled_after(views: int, recall: float, things: int = 500) -> tuple[float, float]:
+    """Share of things with a label, and with the right one, after views of all of them.
+
+    A mask is on a thing in a random part of the views. It has the score of a usual detection, and
+    one in five has another class.
+    """
+    rng = np.random.default_rng(7)
+    store, ids = LabelStore(81), np.arange(things)
+    p = np.zeros((2, 81), np.float32)
+    p[:, 0] = 0.35
+    p[0, 3], p[1, 8] = 0.65, 0.65
+    for _ in range(views):
+        seen = rng.random(things) < recall
+        other = (rng.random(seen.sum()) < 0.2).astype(int)
+        store.update(ids[seen], p[other], np.full(seen.sum(), 0.5, np.float32))
+        store.miss(ids[~seen], np.ones((~seen).sum(), np.float32))
+    labels = store.estimates(ids).labels
+    return float(np.mean(labels > 0)), float(np.mean(labels == 3))
+
+
+@pytest.mark.parametrize("count", [10, 50, 200])
+def test_what_is_seen_often_is_not_forgotten(count: int) -> None:
+    labelled, right = labelled_after(count, recall=0.7)
+    assert labelled >= 0.95
+    assert right >= 0.9
+
+
+def test_what_a_wrong_mask_covers_now_and_then_stays_unknown() -> None:
+    for count in (10, 50, 200):
+        assert labelled_after(count, recall=0.05)[0] < 0.05
+
+
+def test_a_label_is_withdrawn_after_many_misses_and_comes_back() -> None:
+    store, one = LabelStore(81), np.array([0])
+    certain = np.eye(81, dtype=np.float32)[[2]]
+    for _ in range(50):
+        store.update(one, certain, np.array([0.9], np.float32))
+    store.miss(one, np.ones(1, np.float32))
+    store.miss(one, np.ones(1, np.float32))
+    assert store.estimates(one).labels[0] == 2
+    for _ in range(1000):
+        store.miss(one, np.ones(1, np.float32))
+    assert store.estimates(one).labels[0] == 0
+    for _ in range(5):
+        store.update(one, certain, np.array([0.9], np.float32))
+    assert store.estimates(one).labels[0] == 2
 
 
 def test_a_fused_landmark_combines_both_distributions() -> None:
