@@ -24,15 +24,11 @@ from bmask_slam.live.processes.dense_messages import MapWritten
 from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.recorder import Recorder, rescued
 from bmask_slam.live.sources.source import SourceCounts
+from bmask_slam.live.sources.source_clock import SourceClock
 from bmask_slam.live.start import LiveOptions, start_system
+from bmask_slam.run_folder import metrics
 from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
-from bmask_slam.run_folder.metrics import (
-    RunCounters,
-    measure,
-    row,
-    save,
-    save_poses_and_points,
-)
+from bmask_slam.run_folder.metrics import RunCounters, row
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -94,6 +90,7 @@ class LiveSlam:
         self.dense: MapWritten | None = None
         self._counters, self._meter = RunCounters(), FrameMeter()
         self._begin_s = time.monotonic()
+        self._clock = SourceClock()
         self._closed = False
         with ExitStack() as stack:  # closed in the opposite order
             self._recorder = self._open_recorder(stack)
@@ -148,7 +145,8 @@ class LiveSlam:
         The time that it takes is bounded: it does not wait for the other processes.
 
         Args:
-            timestamp_s: of the frame; later than the one before.
+            timestamp_s: of the frame; later than the one before. Where the source's clock goes
+                back for good, an offset is added from then on, and a warning logged.
             rgb: (H, W, 3) uint8, red first.
             depth_m: (H, W) float z-depth in metres, NaN or 0 where missing, registered to rgb.
             prepared: from ``prepare``, if the features were extracted ahead.
@@ -156,23 +154,32 @@ class LiveSlam:
             depth_lag_s: stamp of the depth image less ``timestamp_s``, to find the depth's delay.
 
         Raises:
-            InputError: a frame that ``check_frame`` refuses. It is not used; the next one may be.
+            InputError: a frame that ``check_frame`` or ``SourceClock`` refuses. It is not used; the
+                next one may be.
         """
         arrived_s = time.monotonic() if prepared is None else prepared.arrived_s
         if not self._meter.frames:
             self._begin_s = arrived_s
         frame = Frame(self._meter.frames, timestamp_s, rgb, depth_m, name, depth_lag_s)
-        try:
-            result = self._system.process(frame, prepared.features if prepared else None)
-        except InputError:
-            self._meter.refused += 1
-            raise
-        if prepared is not None:
-            result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
+        result = self._process(frame, prepared)
         self._follow_camera()
         self._counters.count(result)
         self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
         self._show(result, rgb)
+        return result
+
+    def _process(self, frame: Frame, prepared: Prepared | None) -> FrameResult:
+        """Do a frame's step; one that is refused is counted."""
+        try:
+            stamp_s = self._clock.checked(frame.timestamp_s)
+            features = prepared.features if prepared else None
+            result = self._system.process(replace(frame, timestamp_s=stamp_s), features)
+        except InputError:
+            self._meter.refused += 1
+            raise
+        self._clock.used(stamp_s)
+        if prepared is not None:
+            result = replace(result, stage_ms={**result.stage_ms, "features": prepared.ms})
         return result
 
     def _show(self, result: FrameResult, rgb: Image) -> None:
@@ -259,29 +266,22 @@ class LiveSlam:
             self._system.finish()
             self._follow_camera()
         except InputError as error:
-            save_poses_and_points(self._system, folder)
-            raise InputError(
-                f"{error}: the map is lost; all poses, and the landmarks as they were known last, "
-                f"are in {folder.path}"
-            ) from error
+            metrics.save_poses_and_points(self._system, folder)
+            saved = f"all poses, and the landmarks as they were last, are in {folder.path}"
+            raise InputError(f"{error}: the map is lost; {saved}") from error
         finally:
             folder.write_events(self._system.events.take())
-            self._save_frames_apart(folder)
-        rows = measure(self._system, self.options.reference, self._counters, 1)
+            lost = self._system.map.history.without_map()
+            self._recorder.frames_apart(lost, max(self._system.segments(), default=-1) + 1)
+        rows = metrics.measure(self._system, self.options.reference, self._counters, 1)
         median_ms, p95_ms = self._meter.percentiles_ms()
         rows += [row("latency_ms_median", median_ms, "ms"), row("latency_ms_p95", p95_ms, "ms")]
         rows.append(row("frames_dropped", health.frames_dropped, "frames"))
         self.rows = rows
-        save(self._system, folder, rows, self.options.reference, self.options.title)
+        metrics.save(self._system, folder, rows, self.options.reference, self.options.title)
         folder.complete()
         if self._system.dense is not None:
             self._finish_dense(self._system.dense, folder, health)
-
-    def _save_frames_apart(self, folder: RunFolder) -> None:
-        """Write the frames of keyframes that no map has, as segments of their own."""
-        first = max(self._system.segments(), default=-1) + 1
-        for number, frames in enumerate(self._system.map.history.without_map(), first):
-            folder.write_trajectory(frames, f"trajectory_segment_{number}.txt")
 
     def _finish_dense(self, dense: RemoteDenseMapper, folder: RunFolder, health: Health) -> None:
         """Let the dense map's process finish, and log which keyframes are missing."""

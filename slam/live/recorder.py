@@ -46,6 +46,11 @@ class Recorder:
         """Write the camera that was found, with a comment that says how."""
         self._guarded(lambda: write_camera(self.folder.path / CAMERA, camera, text))
 
+    def frames_apart(self, lost: list[Trajectory], first: int) -> None:
+        """Write the frames of keyframes that no map has, as segments numbered from ``first``."""
+        for number, frames in enumerate(lost, first):
+            self.folder.write_trajectory(frames, f"trajectory_segment_{number}.txt")
+
     def frame(
         self,
         result: FrameResult,
