@@ -1,13 +1,15 @@
 # make demo    sets everything up in .venv, runs, maps, asks and compares on a rendered sequence, offline and live
 # make test    sets up and runs the tests; TESTS="tests/graph -x" passes other arguments to pytest
-# make check   lint, format, types and tests (with the layer rule)
+# make check   lint, format, types, security (bandit, pip-audit) and tests (with the layer rule)
 # make typing  makes build/typing, the tree that mypy (and an editor) reads the package from
+# make fuzz    gives every reader broken files for two minutes; FUZZ="--seconds 3600 --seed 7" for longer
 # make bench   measures and writes docs/results/benchmarks.md; BENCH="..." passes arguments
 # make clean   removes what these made, but for runs/
 
 PYTHON ?= python3
 VENV ?= .venv
 BENCH ?=
+FUZZ ?=
 TESTS ?= --numprocesses 2 --dist worksteal
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -17,7 +19,7 @@ TYPING := build/typing/bmask_slam
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
-.PHONY: demo test check typing bench setup clean
+.PHONY: demo test check typing fuzz bench setup clean
 .DELETE_ON_ERROR:
 
 demo: $(DEMO)
@@ -38,6 +40,8 @@ check: $(READY) typing
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
+	@$(BIN)/bandit --quiet --configfile pyproject.toml --recursive graph semantics mapping slam
+	@$(BIN)/python tests/audit.py
 	@$(BIN)/python -m pytest $(TESTS)
 
 # The four folders as the one package that they are installed as, for mypy and editors; made anew
@@ -49,6 +53,9 @@ typing:
 	  name=$$(basename $$path); \
 	  test $$name = __pycache__ || ln -s ../../../$${path%/} $(TYPING)/$$name; \
 	done
+
+fuzz: $(READY)
+	@$(BIN)/python tests/fuzz/run.py $(FUZZ)
 
 bench: $(READY)
 	@$(BIN)/python -m benchmarks.run $(BENCH)

@@ -2,13 +2,21 @@
 
 import math
 
+MAX_MESSAGE = 2000
+
 
 class InputError(Exception):
     """Broken input from outside: the message names the file, the value and the cure.
 
     The command line prints it as one line and exits with 1. Expected failures of the
     method (tracking lost, a factor refused) are results with a status, never exceptions.
+    What a file holds may be of any length: of a long message the middle is left out.
     """
+
+    def __init__(self, message: str = "") -> None:
+        if len(message) > MAX_MESSAGE:
+            message = f"{message[: MAX_MESSAGE // 2]} ... {message[-MAX_MESSAGE // 2 :]}"
+        super().__init__(message)
 
 
 MAX_NUMBER = 1e100

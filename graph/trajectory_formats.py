@@ -81,7 +81,8 @@ def read_times(path: Path) -> Array:
         InputError: no file, no line, a value that is no finite number, or stamps that do not
             increase.
     """
-    rows = [(where, line.replace(",", " ").split()[0]) for where, line in _lines(path)]
+    words = [(where, line.replace(",", " ").split()) for where, line in _lines(path)]
+    rows = [(where, of_line[0]) for where, of_line in words if of_line]
     stamps_s = np.array([finite_number(word, where) for where, word in rows])
     if not len(stamps_s):
         raise InputError(f"{path}: no stamp in the file; expected one in seconds a line")

@@ -28,7 +28,7 @@ from pydantic import TypeAdapter
 
 from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.reading import check_unpacked
+from bmask_slam.graph.files.reading import check_unpacked, in_short
 from bmask_slam.graph.whole_file import whole_file
 
 Header = dict[str, Any]
@@ -93,7 +93,7 @@ def read_arrays(path: Path, kind: FileKind) -> tuple[Header, Arrays]:
             raise ValueError("an array is missing")
     except _UNREADABLE as error:
         raise InputError(
-            f"{path}: not a saved {kind.noun}, or a damaged one ({error}); save it again"
+            f"{path}: not a saved {kind.noun}, or a damaged one ({in_short(error)}); save it again"
         ) from error
     if found != (kind.format, kind.version):
         raise InputError(
@@ -154,7 +154,7 @@ def fitting(path: Path) -> Iterator[None]:
     try:
         yield
     except _UNFITTING as error:
-        reason = " ".join(f"{type(error).__name__} {error}".split())[:200]
+        reason = f"{type(error).__name__}: {in_short(error)}"
         raise InputError(
             f"{path}: its arrays do not fit together ({reason}); save it again"
         ) from error

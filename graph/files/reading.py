@@ -22,6 +22,11 @@ SMALL_BYTES, MAX_RATIO = 1 << 28, 100
 """A file may unpack to so many bytes, or to so many times its own."""
 
 
+def in_short(error: BaseException) -> str:
+    """What an error says, on one short line; what a file holds may be in it at any length."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
 def check_unpacked(unpacked: int, packed: int) -> None:
     """Refuse what unpacks to far more bytes than it takes packed. Raises ValueError."""
     if unpacked > max(SMALL_BYTES, MAX_RATIO * packed):

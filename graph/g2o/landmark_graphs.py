@@ -108,6 +108,8 @@ def write_landmark_graph(path: Path, tables: FactorTables, camera: Camera) -> No
 
 
 def _lines(tag: str, names: Ints, numbers: Array) -> list[str]:
+    if not len(numbers):
+        return []
     rows = zip(names.reshape(len(numbers), -1).tolist(), numbers, strict=True)
     return [f"{tag} {' '.join(map(str, ids))} {numbers_text(row)}" for ids, row in rows]
 

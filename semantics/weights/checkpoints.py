@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import pickle
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.json_file import Name, parse_json
-from bmask_slam.graph.files.reading import check_unpacked
+from bmask_slam.graph.files.reading import check_unpacked, in_short, read_bytes
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.labels import LabelSet, label_set, read_label_set
 from bmask_slam.semantics.network.config import (
@@ -45,6 +46,7 @@ CAFFE_IMAGES = ImageConfig(
 """The original Mask Scoring R-CNN subtracts the mean from 0..255 and does not divide."""
 CLASSES_KEY = "roi_heads.box_predictor.cls_score.weight"
 SHOWN = 4
+MAX_WEIGHTS_BYTES = 1 << 32
 MAX_ANCHORS, MAX_LAYERS, MAX_WIDTH = 64, 64, 16_384
 
 
@@ -145,13 +147,14 @@ def read_state(path: Path) -> tuple[State, dict[str, str]]:
                 metadata = file.metadata() or {}
             return load_file(path), metadata
         except (safetensors.SafetensorError, OSError) as error:
-            raise InputError(f"{path}: not a whole safetensors file ({error})") from error
+            raise InputError(f"{path}: not a whole safetensors file ({in_short(error)})") from error
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as zipped:
                 unpacked = sum(info.file_size for info in zipped.infolist())
             check_unpacked(unpacked, path.stat().st_size)
-        content: Any = torch.load(path, map_location="cpu", weights_only=True)
+        data = io.BytesIO(read_bytes(path, "get it again", MAX_WEIGHTS_BYTES))
+        content: Any = torch.load(data, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise InputError(
             f"{path}: holds more than tensors, which is not loaded since it could run code; "

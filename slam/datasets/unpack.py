@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import lzma
 import stat
 import struct
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import is_inside
-from bmask_slam.graph.files.reading import check_unpacked
+from bmask_slam.graph.files.reading import check_unpacked, in_short
 
 MAX_HEADER_BYTES = 1 << 20
 Progress = Callable[[int, int], None]
@@ -94,7 +95,10 @@ def _archive_errors(archive: Path) -> Iterator[None]:
         yield
     except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
         raise InputError(f"{archive}: holds a file and a folder of one name: refused") from error
-    except (*broken, *wrong) as error:
+    except (*broken, *wrong, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+            raise  # of the disk
         raise InputError(
-            f"{archive}: not an archive, or a broken one ({error}); remove it and download again"
+            f"{archive}: not an archive, or a broken one ({in_short(error)}); remove it and "
+            "download again"
         ) from error

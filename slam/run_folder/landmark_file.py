@@ -65,7 +65,7 @@ def read_landmarks(path: Path, names: tuple[str, ...] | None) -> Landmarks:
     Raises:
         InputError: no such file, a column that is missing, or a label without a name.
     """
-    columns = _columns(path, ("id", "observations"))
+    columns = _columns(path, ("id", "observations"), ("label", "probability", "entropy"))
     found = Landmarks(
         columns["id"].astype(np.int64),
         columns["xyz"],
@@ -116,10 +116,16 @@ def read_dense_cloud(path: Path, names: tuple[str, ...]) -> DenseCloud:
     )
 
 
-def _columns(path: Path, needed: tuple[str, ...]) -> dict[str, NDArray]:
-    """Columns of a PLY file, and "xyz" (N, 3) and "rgb" (N, 3) of its points."""
+def _columns(
+    path: Path, needed: tuple[str, ...], together: tuple[str, ...] = ()
+) -> dict[str, NDArray]:
+    """Columns of a PLY file, and "xyz" (N, 3) and "rgb" (N, 3) of its points.
+
+    The columns ``together`` are needed if the first of them is there.
+    """
     columns = read_ply(path)
     position, colour = ("x", "y", "z"), ("red", "green", "blue")
+    needed = (*needed, *together) if columns.keys() & set(together[:1]) else needed
     missing = [name for name in (*position, *colour, *needed) if name not in columns]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]!r}; make it again")

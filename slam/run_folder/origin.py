@@ -12,7 +12,7 @@ from bmask_slam.graph.files.file_names import is_folder
 from bmask_slam.graph.files.reading import read_text
 
 CONFIG = "config.yaml"
-_SEQUENCE = re.compile(r"^# .*?, sequence (?P<path>.+), stride (?P<stride>\d+)$")
+_SEQUENCE = re.compile(r"^# .*?, sequence (?P<path>.+), stride (?P<stride>[0-9]{1,9})$")
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,11 @@ class WebViewer:
         """
         if host not in (LOCAL, "localhost"):
             logger.warning("%s: everyone who reaches this address sees the map and images", host)
-        near = LOCAL if host == "0.0.0.0" else host
+        near = LOCAL if host == "0.0.0.0" else host  # nosec B104 # given by --host, with a warning
         data_port = _free_port(host, port)
         program = Path(str(cli.__file__)).with_name("rerun")
         places = ["--bind", host, "--port", str(data_port), "--web-viewer-port", str(port)]
-        self._process = subprocess.Popen(
+        self._process = subprocess.Popen(  # nosec B603 # Rerun's own program, an address, ports
             [sys.executable, "-P", "-c", _START, str(program), "--serve-web", *places],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

@@ -96,7 +96,7 @@ def run_job(job: Job, threads: int = 1, started: Start = lambda process: None) -
         remove(Path(job.clear))
     begin_s = time.monotonic()
     with open_plain(log, "wb") as output:
-        process = subprocess.Popen(
+        process = subprocess.Popen(  # nosec B603 # this program with arguments of its own
             [sys.executable, "-P", "-m", PROCESS, json.dumps(asdict(job))],
             stdin=subprocess.PIPE,
             stdout=output,

@@ -59,7 +59,7 @@ class Worker:
         descriptors = [child_socket.fileno(), *files]
         code = f"from {__name__} import serve; serve(*{descriptors})"
         try:
-            self._process = subprocess.Popen(
+            self._process = subprocess.Popen(  # nosec B603 # this module, by number of descriptors
                 [sys.executable, "-P", "-c", code],
                 pass_fds=descriptors,
                 stdin=subprocess.DEVNULL,

@@ -1,0 +1,112 @@
+"""Some seconds of `make fuzz`: no reader raises anything but InputError for a broken file."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from engine import Count, Reader, fuzz, table
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from readers import all_readers
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml
+
+SECONDS, INPUTS = 12.0, 40
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@pytest.fixture
+def silent() -> Iterator[None]:
+    logging.disable()
+    yield
+    logging.disable(logging.NOTSET)
+
+
+def test_every_reader_refuses_broken_files(folder: Path, silent: None) -> None:
+    readers = all_readers(folder / "good")
+    each_s = SECONDS / len(readers)
+    counts = [fuzz(r, folder / f"{k}", INPUTS, each_s) for k, r in enumerate(readers)]
+    assert not any(count.faulty for count in counts), table(counts)
+    assert all(count.inputs for count in counts)
+
+
+def crash(path: Path) -> None:
+    import os
+
+    os.kill(os.getpid(), 11)
+
+
+def hang(path: Path) -> None:
+    import time
+
+    time.sleep(60)
+
+
+def large(path: Path) -> None:
+    bytes(3 << 30)
+
+
+def escape(path: Path) -> None:
+    raise KeyError("x")
+
+
+def refuse(path: Path) -> None:
+    raise InputError("no")
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [(crash, "SIGSEGV"), (large, "MemoryError"), (escape, "KeyError at"), (refuse, "")],
+)
+def test_the_engine_sees(
+    read: object, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FUZZ_OUT", str(tmp_path / "kept"))
+    count = fuzz(Reader("a", "a.txt", read, (b"abc",)), tmp_path, 3, 20.0)  # type: ignore[arg-type]
+    assert count.inputs == 3
+    assert (words in "".join(count.faults)) and bool(count.faults) == bool(words)
+    assert count.faulty == (3 if words else 0)
+    assert bool(words) == (tmp_path / "kept").is_dir()
+
+
+def test_the_same_seed_gives_the_same_inputs(tmp_path: Path) -> None:
+    def some(seed: int) -> Count:
+        reader = Reader("a", "a.txt", lambda path: sums.append(path.read_bytes()), (b"abc 1.5\n",))
+        from engine import inputs
+
+        source = inputs(reader, seed)
+        return [next(source) for _ in range(50)]  # type: ignore[return-value]
+
+    sums: list[bytes] = []
+    assert some(3) == some(3) != some(4)
+
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**20), 10**20) | st.text()
+    | st.floats(allow_nan=False),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(PLAIN)
+def test_documents_are_read_back(document: object) -> None:
+    assert parse_yaml(format_yaml(document), "here") == document
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.text(max_size=60))
+def test_any_text_is_a_document_or_one_error(text: str) -> None:
+    try:
+        parse_yaml(text, "here")
+    except InputError as error:
+        assert str(error).startswith("here")
