@@ -119,8 +119,8 @@ def factor_tables_of(arrays: Arrays, path: Path) -> FactorTables:
     Raises:
         InputError: the arrays do not fit together.
     """
-    _check(arrays, path)
     with fitting(path):
+        _check(arrays, path)
         return _tables(arrays)
 
 

@@ -22,6 +22,12 @@ LIMIT = "BMASK_SLAM_MAX_MEGAPIXELS"
 """The environment variable that sets another limit."""
 FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")
 _TAIL_BYTES = 4096
+_BYTES = {"I;16": 2, "I;16B": 2, "I": 4, "F": 4}
+"""Of a value, by Pillow's mode, where it is not 1. A pixel of over 4 bytes counts as several."""
+_PNG_BITS = 24
+"""Where a PNG says how many bits a value has."""
+_PNG_PIXELS_A_BYTE = 8 * 1032
+"""More cannot come from a byte: of one bit each, at the highest ratio of deflate."""
 warnings.filterwarnings("ignore", module=r"PIL\.")  # said here in one line
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -69,15 +75,21 @@ def decode_bytes(data: bytes, flags: int, where: str) -> NDArray:
 def _has_possible_size(data: bytes, where: str) -> bool:
     """Whether the file's header can be read. Raises InputError if the image would be too large."""
     try:
-        width, height = PIL.Image.open(io.BytesIO(data), formats=FORMATS).size
+        header = PIL.Image.open(io.BytesIO(data), formats=FORMATS)
+        (width, height), bytes_each = header.size, len(header.getbands())
+        bytes_each *= _BYTES.get(header.mode, 1)
     except PIL.Image.DecompressionBombError:
         width = height = 1 << 20
+        bytes_each = 1
     except (OSError, ValueError, SyntaxError, OverflowError, struct.error):
         return False
+    is_png = data.startswith(b"\x89PNG")
+    if is_png and data[_PNG_BITS] == 16:
+        bytes_each = 2 * len(header.getbands())
     limit = float(os.environ.get(LIMIT, MAX_MEGAPIXELS))
-    if width * height > limit * 1e6:
+    if width * height * max(1, bytes_each / 4) > limit * 1e6:
         raise InputError(
             f"{where}: {width} x {height} pixels, more than {limit:g} megapixels; scale it "
             f"down, or set {LIMIT}"
         )
-    return True
+    return not is_png or width * height <= _PNG_PIXELS_A_BYTE * len(data)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from bmask_slam.graph.errors import InputError, whole_number
-from bmask_slam.graph.files.reading import read_lines
+from bmask_slam.graph.files.reading import in_short, read_lines
 from bmask_slam.graph.whole_file import open_plain, whole_file
 from bmask_slam.semantics.network.yolox.mask_scoring import MaskScoringYolox
 from bmask_slam.semantics.training.dataset import (
@@ -28,9 +28,11 @@ from bmask_slam.semantics.training.dataset import (
 from bmask_slam.semantics.training.losses import Losses, MaskRois, Only, network_losses
 from bmask_slam.semantics.training.targets import Target
 from bmask_slam.semantics.training.yolox_losses import yolox_losses
-from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, save_network
+from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, read_pickle, save_network
 from bmask_slam.semantics.weights.light_weights import LightNetwork, save_light
 
+_FOREIGN = (LookupError, TypeError, ValueError, AttributeError, RuntimeError, StopIteration)
+"""What the use of a state raises that is not this training's."""
 STATE = "training.pt"
 CURVES, CURVES_HEAD = "losses.csv", "step,loss,value"
 WEIGHTS = "weights.safetensors"
@@ -261,18 +263,22 @@ def _resume(
     if not (out / STATE).is_file():
         _write(out / CURVES, [CURVES_HEAD])
         return 0
-    content = torch.load(out / STATE, map_location="cpu", weights_only=True)
-    if content["config"] != _comparable(config):
+    content, cure = read_pickle(out / STATE), "choose another --out or delete it"
+    try:
         before, now = content["config"], _comparable(config)
-        key = next(k for k in now if before.get(k) != now[k])
+        if before != now:
+            key = next(k for k in now if before.get(k) != now[k])
+            raise InputError(
+                f"{out}: holds a training with {key} {before.get(key)}, now it is {now[key]}; "
+                f"{cure}"
+            )
+        model.load_state_dict(content["model"])
+        optimiser.load_state_dict(content["optimiser"])
+        step = int(content["step"])
+    except _FOREIGN as error:
         raise InputError(
-            f"{out}: holds a training with {key} {before.get(key)}, now it is {now[key]}; "
-            "choose another --out or delete it"
-        )
-    model.load_state_dict(content["model"])
-    optimiser.load_state_dict(content["optimiser"])
-    step = int(content["step"])
-    cure = "choose another --out or delete it"
+            f"{out / STATE}: not the state of this training ({in_short(error)}); {cure}"
+        ) from error
     lines = list(read_lines(out / CURVES, cure))[1:]
     rows = [(line, whole_number(line.split(",")[0], f"{out / CURVES}:{k}")) for k, line in lines]
     _write(out / CURVES, [CURVES_HEAD, *(line for line, of in rows if of < step)])

@@ -91,8 +91,11 @@ def load_network(path: Path, labels: LabelSet | None = None) -> TrainedNetwork:
             f"{path}: has {config.classes} classes with the background, but {given}; "
             "give the label set that it was trained on"
         )
-    with torch.device("meta"):
-        model = MaskRCNN(config)
+    try:
+        with torch.device("meta"):
+            model = MaskRCNN(config)
+    except ValueError as error:
+        raise InputError(f"{path}: no such network ({error}); give other weights") from error
     check_state(path, state, model, _name(config))
     floats = {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
     model.load_state_dict(floats, assign=True)
@@ -148,22 +151,7 @@ def read_state(path: Path) -> tuple[State, dict[str, str]]:
             return load_file(path), metadata
         except (safetensors.SafetensorError, OSError) as error:
             raise InputError(f"{path}: not a whole safetensors file ({in_short(error)})") from error
-    try:
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as zipped:
-                unpacked = sum(info.file_size for info in zipped.infolist())
-            check_unpacked(unpacked, path.stat().st_size)
-        data = io.BytesIO(read_bytes(path, "get it again", MAX_WEIGHTS_BYTES))
-        content: Any = torch.load(data, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise InputError(
-            f"{path}: holds more than tensors, which is not loaded since it could run code; "
-            "save the state_dict alone"
-        ) from error
-    except _UNREADABLE as error:
-        raise InputError(
-            f"{path}: truncated or no PyTorch file ({path.stat().st_size} bytes); get it again"
-        ) from error
+    content = read_pickle(path)
     for key in ("model", "state_dict"):
         if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
             content = content[key]
@@ -173,6 +161,31 @@ def read_state(path: Path) -> tuple[State, dict[str, str]]:
     if other is not None:
         raise InputError(f"{path}: the entry {other!r} is no tensor; save the state_dict alone")
     return {str(name): value for name, value in content.items()}, {}
+
+
+def read_pickle(path: Path) -> Any:
+    """What PyTorch saved: tensors, numbers and texts in containers. No code in the file is run.
+
+    Raises:
+        InputError: no such file, a truncated one, one that unpacks to far more than its size, or a
+            pickle of anything else.
+    """
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as zipped:
+                unpacked = sum(info.file_size for info in zipped.infolist())
+            check_unpacked(unpacked, path.stat().st_size)
+        data = io.BytesIO(read_bytes(path, "get it again", MAX_WEIGHTS_BYTES))
+        return torch.load(data, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise InputError(
+            f"{path}: holds more than tensors, which is not loaded since it could run code; "
+            "save the state_dict alone"
+        ) from error
+    except _UNREADABLE as error:
+        raise InputError(
+            f"{path}: truncated or no PyTorch file ({path.stat().st_size} bytes); get it again"
+        ) from error
 
 
 def recognise(path: Path, state: State) -> NetworkConfig:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 from bmask_slam.viewer.web_viewer import LOCAL, WebViewer
@@ -84,6 +85,7 @@ class Scene:
         if options.record is not None:
             if not options.record.parent.is_dir():
                 raise InputError(f"{options.record.parent}: no such folder; make it first")
+            refuse_link(options.record)
             self._stream.save(str(options.record))
         elif options.serve:
             import rerun_cli  # noqa: PLC0415 - a part of Rerun

@@ -20,6 +20,7 @@ from bmask_slam.datasets.unpack import unpack
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.evaluation import frame_stamps
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files import reading
 from bmask_slam.graph.files.array_file import FileKind, read_arrays, write_arrays
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
@@ -203,8 +204,14 @@ def test_an_array_is_as_large_as_its_header_says(tmp_path: Path, array: bytes) -
         read_arrays(tmp_path / "map", KIND)
 
 
-def test_a_small_zip_does_not_unpack_to_gigabytes(tmp_path: Path) -> None:
-    size = 1 << 29
+@pytest.fixture
+def small_bombs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A megabyte stands for the 256 that a small file may unpack to."""
+    monkeypatch.setattr(reading, "SMALL_BYTES", 1 << 20)
+
+
+def test_a_small_zip_does_not_unpack_to_gigabytes(tmp_path: Path, small_bombs: None) -> None:
+    size = 1 << 24
     with (
         zipfile.ZipFile(tmp_path / "map", "w", zipfile.ZIP_DEFLATED) as zipped,
         zipped.open("a.npy", "w") as file,
@@ -277,8 +284,8 @@ def test_a_file_and_a_folder_of_one_name(tmp_path: Path, kind: str, folder_first
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar"])
-def test_an_archive_that_unpacks_to_far_more(tmp_path: Path, kind: str) -> None:
-    path, size = tmp_path / f"archive.{kind}", 1 << 29
+def test_an_archive_that_unpacks_to_far_more(tmp_path: Path, kind: str, small_bombs: None) -> None:
+    path, size = tmp_path / f"archive.{kind}", 1 << 24
     if kind == "zip":
         with (
             zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as zipped,

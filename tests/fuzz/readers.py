@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -39,6 +40,7 @@ from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.evaluation import frame_stamps
 from bmask_slam.events import read_events
 from bmask_slam.graph.arrays import Arrays
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, write_arrays
 from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.g2o.landmark_graphs import write_landmark_graph
@@ -53,8 +55,10 @@ from bmask_slam.graph.trajectory_formats import (
     write_euroc,
     write_kitti,
 )
+from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.bags import open_bag
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
+from bmask_slam.live.sources.ros_images import camera_of, colour_image, depth_image
 from bmask_slam.mapping.inverse_depth.depth_map import DEPTH_FILE, read_depth_map
 from bmask_slam.mapping.products.submaps import SUBMAP_FILE, read_submap
 from bmask_slam.offline.checkpoint import CHECKPOINT_FILE, read_checkpoint
@@ -201,6 +205,23 @@ def pickled(folder: Path) -> tuple[bytes, ...]:
     )
 
 
+def messages() -> tuple[bytes, ...]:
+    """A colour image, a depth image, a compressed one and a CameraInfo, as JSON."""
+    raw = {"height": 2, "width": 3, "is_bigendian": 0}
+    depth = cv2.imencode(".png", np.full((2, 3), 1500, np.uint16))[1].tobytes()
+    found = (
+        {**raw, "encoding": "rgb8", "step": 9, "data": bytes(18).hex()},
+        {**raw, "encoding": "16UC1", "step": 6, "data": bytes(12).hex()},
+        {**raw, "encoding": "32FC1", "step": 12, "data": bytes(24).hex()},
+        {"format": "16UC1; compressedDepth png", "data": (bytes(12) + depth).hex()},
+        {"format": "png", "data": depth.hex()},
+        {"height": 24, "width": 32, "distortion_model": "plumb_bob", "d": [0.0] * 5,
+         "k": [30.0, 0, 15, 0, 30, 12, 0, 0, 1], "p": [30.0, 0, 15, 0, 0, 30, 12, 0, 0, 0, 1, 0]},
+    )  # fmt: skip
+    return tuple(json.dumps(message).encode() for message in found)
+
+
+MESSAGES = messages()
 LIGHT: dict[str, Any] = {
     "classes": 3, "backbone": "mobilenet_v2", "norm": "none", "channels": 8, "box_hidden": 8,
     "mask_channels": 8, "image": {"short_px": 64}, "anchors": {"ratios": [0.5, 1.0]},
@@ -436,6 +457,56 @@ def both_pictures(path: Path) -> None:
     read_colour(path)
 
 
+ROS_TYPES: dict[tuple[bool, bool], dict[str, type]] = {
+    (True, False): {
+        **{"height": int, "width": int, "distortion_model": str},
+        **{"k": list, "d": list, "p": list},
+    },
+    (False, True): {"format": str, "data": str},
+    (False, False): {
+        **{"height": int, "width": int, "step": int, "is_bigendian": int},
+        **{"encoding": str, "data": str},
+    },
+}
+
+
+def is_float(value: object) -> bool:
+    """Whether it can be a float64 of a message."""
+    return isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**53)
+
+
+def read_message(path: Path) -> None:
+    """A ROS image or CameraInfo whose fields stand in a JSON file, data as hexadecimal digits."""
+    try:
+        fields = json.loads(path.read_text())
+        message = SimpleNamespace(**fields)
+        message.data = np.frombuffer(bytes.fromhex(fields.get("data", "")), np.uint8)
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError("no message") from error
+    kinds = ROS_TYPES.get(("k" in fields, "format" in fields), {"none": str})
+    wrong = [name for name, kind in kinds.items() if not isinstance(fields.get(name), kind)]
+    counts = [value for value in fields.values() if isinstance(value, int)]
+    if wrong or any(not 0 <= count < 2**32 for count in counts):
+        raise InputError("not of the message's type")  # which rosbags would not give either
+    for name, length in (("k", 9), ("p", 12), ("d", None)):
+        row = fields.get(name, [0.0] * 12)
+        sized = length in (None, len(row)) or name not in fields
+        if not sized or not all(map(is_float, row)):
+            raise InputError("not of the message's type")
+    if hasattr(message, "k"):
+        for rectified in (False, True):
+            camera_of(message, 1000.0, rectified, "here")
+        return
+    for read in (colour_image, depth_image):
+        with suppress(InputError):
+            read(message, "here")
+
+
+def follow_bag(path: Path) -> None:
+    for _ in BagSource(path).frames():
+        pass
+
+
 def unpacked(path: Path) -> None:
     unpack(path, path.parent / "out")
     inside = (path.parent / "out").resolve()
@@ -599,6 +670,8 @@ def binary_readers(folder: Path) -> list[Reader]:
         Reader("image", "1.png", both_pictures, images()),
         Reader("archive", "a.tgz", unpacked, packed, zip_maker),
         Reader("ROS 1 bag", "a.bag", read_bag, (recorded["a.bag"],)),
+        Reader("bag as a source", "a.bag", follow_bag, (recorded["a.bag"],)),
+        Reader("ROS message", "m.json", read_message, MESSAGES, json_maker(*MESSAGES)),
         Reader("mcap", "a.mcap", read_bag, (recorded["a.mcap"],)),
         Reader("ROS 2 database", "a.db3", read_bag, (recorded["a.db3"],)),
         Reader("ROS 2 metadata", "metadata.yaml", database, (recorded["metadata.yaml"],)),

@@ -15,7 +15,7 @@ from readers import all_readers
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml
 
-SECONDS, INPUTS = 12.0, 40
+SECONDS, INPUTS = 8.0, 30
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ PLAIN = st.recursive(
 )  # fmt: skip
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(PLAIN)
 def test_documents_are_read_back(document: object) -> None:
     assert parse_yaml(format_yaml(document), "here") == document

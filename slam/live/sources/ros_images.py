@@ -130,7 +130,7 @@ def camera_of(info: Any, depth_scale: float, rectified: bool, where: str) -> Cam
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise InputError(f"{where}: focal lengths of {K[0, 0]:g} and {K[1, 1]:g} px; {cure}")
     k1, k2, p1, p2, k3 = (float(value) for value in distortion)
-    return Camera(
+    camera = Camera(
         width=int(info.width),
         height=int(info.height),
         fx=float(K[0, 0]),
@@ -140,6 +140,9 @@ def camera_of(info: Any, depth_scale: float, rectified: bool, where: str) -> Cam
         distortion=(k1, k2, p1, p2, k3),
         depth_scale=depth_scale,
     )
+    if fault := camera.fault():
+        raise InputError(f"{where}: a camera with {fault}; {cure}")
+    return camera
 
 
 def _field(info: Any, name: str) -> Any:
