@@ -84,11 +84,7 @@ REPORTS = {
     }),
     "semantics": Report(RESULTS / "semantics.md", "Results: masks, labels, moving things", {
         "photographs": (
-            "Masks of photographs",
-            "semantics.segmentation photographs --weights {sequences}/light-{{}}",
-        ),
-        "rooms": (
-            "Masks of rendered rooms", "semantics.segmentation rooms --rooms {sequences}/rooms"
+            "Masks of photographs that no training saw", "semantics.segmentation photographs"
         ),
         "cost": ("Time and memory of the networks", "semantics.segmentation cost"),
         "beside": (
@@ -98,11 +94,6 @@ REPORTS = {
         "labels-truth": (
             "Labels and objects from true masks",
             "semantics.labels {sequences}/office-300 {sequences}/room-930 {sequences}/room-931",
-        ),
-        "labels": (
-            "Labels and objects from the network's masks",
-            "semantics.labels {sequences}/office-300 {sequences}/room-930 {sequences}/room-931 "
-            "--segmenter light",
         ),
         "store": ("Time of the label store", "semantics.label_store"),
         "dynamic": (

@@ -53,7 +53,7 @@ def files_of_the_tree() -> set[str]:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A wheel of a copy of the checkout, so that no build folders are made in it."""
     copy, folder = tmp_path_factory.mktemp("checkout"), tmp_path_factory.mktemp("wheel")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", *PROJECT["license-files"]):
         shutil.copy(ROOT / name, copy)
     for name in FOLDERS.values():
         ignored = shutil.ignore_patterns("__pycache__")
@@ -139,7 +139,9 @@ def test_the_licence_and_the_command_are_in_the_wheel(wheel: Path) -> None:
             if path.startswith("bmask_slam-")
         }
     assert "Redistribution" in texts["licenses/LICENSE"]
-    assert "License-Expression: BSD-3-Clause" in texts["METADATA"]
+    assert "Apache License" in texts["licenses/LICENSE.Apache-2.0"]
+    assert "YOLOX-Nano" in texts["licenses/NOTICE"]  # whose weights are in the wheel
+    assert "License-Expression: BSD-3-Clause AND Apache-2.0\n" in texts["METADATA"]
     points = configparser.ConfigParser()
     points.read_string(texts["entry_points.txt"])
     assert points["console_scripts"]["bmask-slam"] == "bmask_slam.cli:main"

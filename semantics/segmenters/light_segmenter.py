@@ -6,16 +6,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
-from torch import Tensor
 
 from bmask_slam.graph.arrays import Image
 from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.network.box_head import ClassifiedBoxes
 from bmask_slam.semantics.network.model import Detections
 from bmask_slam.semantics.network.yolox.mask_scoring import around
-from bmask_slam.semantics.network.yolox.network import decode
+from bmask_slam.semantics.network.yolox.network import Features, decode
 from bmask_slam.semantics.network.yolox.selection import SelectionConfig, select
 from bmask_slam.semantics.segmenters.network_segmenter import as_instances
 from bmask_slam.semantics.segmenters.segmenter import check_image
+from bmask_slam.semantics.segmenters.yolox import YoloxDetector
 from bmask_slam.semantics.weights.light_weights import LightNetwork
 
 
@@ -28,6 +29,7 @@ class LightSegmenter:
     Args:
         network: weights and the label set.
         min_score: class score below which a detection is dropped.
+        detector: finds the boxes in place of the network's own.
         device: "cpu", "cuda", or None for CUDA if available.
     """
 
@@ -35,33 +37,38 @@ class LightSegmenter:
         self,
         network: LightNetwork,
         min_score: float = 0.5,
+        detector: YoloxDetector | None = None,
         device: str | None = None,
     ) -> None:
         self.labels = network.labels
         self._device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self._model = network.model.to(self._device)
+        self._detector = detector
         self._selection = SelectionConfig(max(min_score, SelectionConfig.min_score))
 
     def segment(self, image: Image, name: str) -> list[Instance]:
         """Instances in an image (H, W, 3), best mask score first."""
         check_image(image, name)
+        size = (image.shape[0], image.shape[1])
         with torch.inference_mode(), one_thread():
             tensor = torch.from_numpy(image).to(self._device).permute(2, 0, 1)
-            found = self.detections(tensor)
-            size = (image.shape[0], image.shape[1])
-            return as_instances(found, size, self._selection.min_score)
+            padded, factor = self._model.detector.letterboxed(tensor)
+            features = self._model.detector.features(padded)
+            if self._detector is None:
+                found = self._detect(features, factor, size)
+            else:
+                found = self._detector.detect(image, self.labels).to(self._device)
+            logits, ious = self._model.masks(features, [found.boxes * factor])
+            masks = logits.sigmoid()
+            every = Detections(found, masks, around(found.boxes), ious.clamp(0, 1))
+            return as_instances(every, size, self._selection.min_score)
 
-    def detections(self, image: Tensor) -> Detections:
-        """Boxes, masks and their quality in an image (3, H, W) of 0..255."""
-        detector = self._model.detector
-        padded, factor = detector.letterboxed(image)
-        features = detector.features(padded)
-        size = (padded.shape[2], padded.shape[3])
-        boxes, probabilities = decode(detector.detections(features)[0], size)
-        height, width = image.shape[1:]
-        found = select(boxes / factor, probabilities, (height, width), self.labels, self._selection)
-        logits, ious = self._model.masks(features, [found.boxes * factor])
-        return Detections(found, logits.sigmoid(), around(found.boxes), ious.clamp(0, 1))
+    def _detect(self, features: Features, factor: float, size: tuple[int, int]) -> ClassifiedBoxes:
+        """Boxes in an image of (height, width), of which the input is ``factor`` times as large."""
+        output = self._model.detector.detections(features)[0]
+        cells = features.stem.shape[2:]
+        boxes, probabilities = decode(output, (2 * cells[0], 2 * cells[1]))
+        return select(boxes / factor, probabilities, size, self.labels, self._selection)
 
 
 @contextmanager

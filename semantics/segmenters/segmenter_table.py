@@ -18,14 +18,12 @@ from bmask_slam.semantics.segmenters.segmenter import (
 )
 
 NAMES = {
-    "light": "MobileNetV2-FPN of this project, with its own weights or --weights",
+    "light": "YOLOX-Nano with masks, with the weights of this project or --weights",
     "mask-scoring-rcnn": "ResNet-FPN, with --weights",
     "precomputed": "masks that any tool made: --masks FILE.json (COCO) or a folder of label PNGs",
     "truth": "the annotations of a rendered sequence",
     "none": "no instances",
 }
-LIGHT_WEIGHTS = ("weights", "light.safetensors")
-"""Those that come with the project, in its data folder."""
 TRUTH_FILE = "annotations.json"
 
 
@@ -107,22 +105,26 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     from bmask_slam.semantics.segmenters.network_segmenter import NetworkSegmenter  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.yolox import YoloxConfig, YoloxDetector  # noqa: PLC0415
     from bmask_slam.semantics.weights.checkpoints import load_network  # noqa: PLC0415
-    from bmask_slam.semantics.weights.light_weights import is_light, load_light  # noqa: PLC0415
+    from bmask_slam.semantics.weights.light_weights import SHIPPED, is_light, load_light  # noqa: PLC0415
 
     labels = read_label_set(options.labels) if options.labels else None
-    path = find_weights(options.weights) if options.weights else data_path(*LIGHT_WEIGHTS)
-    if is_light(path):
-        return LightSegmenter(load_light(path, labels), options.min_score)
-    network = load_network(path, labels)
-    light = network.model.config.backbone == "mobilenet_v2"
-    if light != (options.name == "light"):
-        kind = network.model.config.backbone
-        other = "light" if light else "mask-scoring-rcnn"
-        raise InputError(
-            f"{options.weights}: a {kind} network, which is not {options.name!r}; take {other!r}"
-        )
+    path = find_weights(options.weights) if options.weights else data_path(*SHIPPED)
     detector = None
     if options.proposals:
-        config = YoloxConfig(SelectionConfig(max(options.min_score, SelectionConfig.min_score)))
-        detector = YoloxDetector(options.proposals, config)
+        selection = SelectionConfig(max(options.min_score, SelectionConfig.min_score))
+        detector = YoloxDetector(options.proposals, YoloxConfig(selection))
+    if is_light(path):
+        _check_kind(options, "light", "YOLOX-Nano")
+        return LightSegmenter(load_light(path, labels), options.min_score, detector)
+    network = load_network(path, labels)
+    body = network.model.config.backbone
+    _check_kind(options, "light" if body == "mobilenet_v2" else "mask-scoring-rcnn", body)
     return NetworkSegmenter(network, options.min_score, detector)
+
+
+def _check_kind(options: SegmenterOptions, name: str, body: str) -> None:
+    """Raise InputError unless the network is of the kind that was asked for."""
+    if name != options.name:
+        raise InputError(
+            f"{options.weights}: a {body} network, which is not {options.name!r}; take {name!r}"
+        )

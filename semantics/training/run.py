@@ -27,8 +27,18 @@ from bmask_slam.semantics.weights.checkpoints import (
     load_mobilenet,
     load_network,
 )
+from bmask_slam.semantics.weights.light_weights import (
+    LightNetwork,
+    is_light,
+    load_light,
+    new_light,
+)
+from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 
 SMOOTHING_STEPS = 25
+ONNX = ".onnx"
+DETECTOR = "detector."
+"""Beginning of the names of the light network's parameters that are never trained."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +64,11 @@ class TrainingRun:
     Attributes:
         data: sources of images; one that is listed twice is drawn twice as often.
         out: folder of the results.
-        weights: to start from; None: a new light network with the body ``backbone``.
+        weights: to start from; None: the light network with new heads.
         light: whether ``weights`` get the light network's anchors and numbers of proposals and
             detections.
-        backbone: weights of an ImageNet MobileNetV2.
+        backbone: the published YOLOX-Nano in ONNX, in place of the one that comes with the project;
+            or weights of an ImageNet MobileNetV2, for a network on it.
         labels: label set, by name or file.
         freeze: beginnings of the names of parameters that are not trained.
         settings: other values of ``TrainingConfig``.
@@ -95,24 +106,31 @@ def run_training(run: TrainingRun, progress: Callable[[int, int], None]) -> Path
         for s, seed in zip(run.data, seeds, strict=True)
     ]
     network = _start(run, labels, config.seed)
+    if isinstance(network, LightNetwork):
+        config = replace(config, freeze=(*config.freeze, DETECTOR))
     weights = train(network, JoinedDatasets(parts), run.out, config, progress)
     draw_losses(run.out / CURVES, run.out / "losses.png")
     return weights
 
 
-def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork:
+def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork | LightNetwork:
     """The initial network."""
     torch.manual_seed(seed)
-    if run.weights is not None:
+    if run.weights is not None and not is_light(run.weights):
         like = LIGHT if run.light else None
         return transferred(load_network(run.weights), labels, like)
-    model = MaskRCNN(replace(LIGHT, classes=len(labels)))
-    if run.backbone is None:
+    if run.weights is None and run.backbone is not None and run.backbone.suffix != ONNX:
+        model = MaskRCNN(replace(LIGHT, classes=len(labels)))
+        load_mobilenet(model, run.backbone)
+        return TrainedNetwork(model, labels)
+    if labels != read_label_set("coco"):
         raise InputError(
-            "training: give --weights to start from, or --backbone for a light network"
+            f"--labels {run.labels}: the light network has COCO's classes; for others give "
+            "--weights of a Mask R-CNN, or --backbone of an ImageNet MobileNetV2"
         )
-    load_mobilenet(model, run.backbone)
-    return TrainedNetwork(model, labels)
+    if run.weights is not None:
+        return load_light(run.weights)
+    return new_light(load_onnx(run.backbone) if run.backbone else None)
 
 
 def draw_losses(curves: Path, picture: Path) -> None:

@@ -47,21 +47,12 @@ def add_segmenter_arguments(parser: argparse.ArgumentParser, default: str) -> No
 
 
 def segmenter_options(arguments: argparse.Namespace, base: SegmenterOptions) -> SegmenterOptions:
-    """The options with what was given on the command line; files by their absolute paths.
-
-    Where a run's segmenter is not configured and --proposals is given, weak detections do not vote
-    on labels: a detector of photographs is too often wrong there. In the red kitchen its weak books
-    became the table.
-    """
-    from bmask_slam.labelling.config import SemanticsConfig
-
+    """The options with what was given on the command line; files by their absolute paths."""
     given = {name: getattr(arguments, name) for name in ("weights", "labels", "ray")}
     given["name"] = arguments.segmenter
     for name in ("proposals", "masks"):
         path = getattr(arguments, name)
         given[name] = path.absolute() if path else None
-    if arguments.proposals and base == SemanticsConfig().segmenter:
-        given["min_score"] = SemanticsConfig.object_score
     if arguments.weights and Path(arguments.weights).is_file():
         given["weights"] = str(Path(arguments.weights).absolute())
     return replace(base, **{name: value for name, value in given.items() if value is not None})

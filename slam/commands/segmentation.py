@@ -18,7 +18,7 @@ Box and mask AP as COCO defines them, masks ranked by class score and by class s
 and how well the predicted mask IoU follows the true one."""
 TRAIN = "train the segmentation network on images with masks"
 TRAIN_MORE = """\
-Starts from --weights, or as a light network from --backbone. --out gets weights.safetensors,
+Starts from --weights, or as a light network with new heads. --out gets weights.safetensors,
 losses.csv, losses.png and a checkpoint, from which the same command goes on."""
 
 
@@ -116,7 +116,7 @@ def add_train(commands: Commands) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to make")
     parser.add_argument("--weights", metavar="F", help="weights to start from, or torchvision:NAME")
     parser.add_argument(
-        "--backbone", type=Path, metavar="F", help="ImageNet MobileNetV2 to start a light one from"
+        "--backbone", type=Path, metavar="F", help="ImageNet MobileNetV2 to start a network from"
     )
     parser.add_argument(
         "--labels", default="coco", metavar="F", help="classes to learn: file, or coco, paper"

@@ -10,21 +10,17 @@ from bmask_slam.semantics.objects.object_map import ObjectConfig
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
 DEFAULT_SEGMENTER = "light"
-VOTE_SCORE = 0.1
-"""Least class score of the instances of the default segmenter."""
 
 
 @dataclass(frozen=True)
 class SemanticsConfig:
     """Where masks come from, and how they are used.
 
-    Instances with a class score below ``object_score`` vote on labels only: they make no objects,
-    and are no evidence of motion.
+    Instances with a class score below ``object_score``, found where the segmenter's ``min_score``
+    is lower, vote on labels only: they make no objects, and are no evidence of motion.
     """
 
-    segmenter: SegmenterOptions = field(
-        default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER, min_score=VOTE_SCORE)
-    )
+    segmenter: SegmenterOptions = field(default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER))
     object_score: float = 0.5
     votes: VoteConfig = field(default_factory=VoteConfig)
     labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)

@@ -29,7 +29,7 @@ class SelectionConfig:
     """
 
     min_score: float = 0.001
-    nms_iou: float = 0.65
+    nms_iou: float = 0.5
     vote_iou: float = 0.8
     max_count: int = 100
 

@@ -11,11 +11,13 @@ import torch
 from repository import SHARED
 
 from bmask_slam.cli import main
+from bmask_slam.graph.data_files import data_path
 from bmask_slam.semantics.labels import label_set, read_label_set
 from bmask_slam.semantics.network.config import LIGHT, AnchorConfig
 from bmask_slam.semantics.network.model import MaskRCNN
 from bmask_slam.semantics.training.transfer import transferred
 from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, load_network
+from bmask_slam.semantics.weights.light_weights import SHIPPED, load_light
 
 
 @pytest.fixture
@@ -30,7 +32,21 @@ def few(tmp_path: Path) -> Path:
     return tmp_path / "few.json"
 
 
-def test_a_light_network_is_trained_and_resumed(
+def test_new_heads_of_the_light_network_are_trained(
+    few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = str(SHARED / "coco_excerpt" / "images")
+    command = ["train", "--data", str(few), "--images", images, "--quiet"]
+    command += ["--steps", "2", "--batch", "1", "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    weights = Path(capsys.readouterr().out.strip())
+    new, shipped = (load_light(path).model.state_dict() for path in (weights, data_path(*SHIPPED)))
+    same = {name for name, value in new.items() if torch.equal(value, shipped[name])}
+    assert same == {name for name in new if name.startswith("detector.")}
+    assert (tmp_path / "out" / "losses.png").stat().st_size > 1000
+
+
+def test_a_network_on_mobilenet_is_trained_and_resumed(
     few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     images = str(SHARED / "coco_excerpt" / "images")
@@ -66,7 +82,7 @@ def test_a_light_network_is_trained_and_resumed(
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        ([], "give --weights to start from, or --backbone"),
+        (["--labels", "paper"], "--labels paper: the light network has COCO's classes"),
         (["--held-out", "1.5"], "--held-out 1.5"),
         (["--steps", "0"], "steps and batch must be at least 1"),
         (["--weights", "none.pth"], "none.pth: no such file"),

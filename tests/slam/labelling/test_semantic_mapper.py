@@ -275,5 +275,5 @@ def test_files(at_once: SlamSystem, tmp_path: Path) -> None:
     at_once.files()["objects.png"](tmp_path / "objects.png")
     assert (tmp_path / "objects.png").stat().st_size > 10_000
     (tmp_path / "labels.csv").write_text("id,label\n")
-    with pytest.raises(InputError, match="columns"):
+    with pytest.raises(InputError, match="no column"):
         read_labels(tmp_path)
