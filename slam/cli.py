@@ -38,7 +38,18 @@ first steps:
   bmask-slam run office                                run on it; results go to runs/office
   bmask-slam evaluate runs/office --reference office   compare a trajectory with a reference
 """
-DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+SPACE, RIGHTS, DESCRIPTORS = (
+    "free some space",
+    "change its permissions, or choose another place",
+    "raise the limit of open files: ulimit -n 4096",
+)
+CURES = {
+    **{errno.ENOSPC: SPACE, errno.EDQUOT: SPACE, errno.EFBIG: SPACE},
+    **{errno.EACCES: RIGHTS, errno.EPERM: RIGHTS, errno.EROFS: RIGHTS},
+    **{errno.EMFILE: DESCRIPTORS, errno.ENFILE: DESCRIPTORS},
+    **{errno.ENAMETOOLONG: "choose a shorter name", errno.ELOOP: "remove the link"},
+}
+MEMORY = "out of memory; free some, raise its limit (ulimit -v), or take smaller input"
 MAX_LINE = 480
 """Characters of an error: what a file holds may be of any length."""
 
@@ -56,8 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `bmask-slam info ... | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
-    except OSError as error:
-        return _after_os_error(error)
+    except (OSError, MemoryError) as error:
+        return _after_refusal(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 128 + signal.SIGINT
@@ -67,13 +78,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 128 + ended.number
 
 
-def _after_os_error(error: OSError) -> int:
-    """The exit status after a full disk or a closed terminal; another error is raised again."""
+def _after_refusal(error: OSError | MemoryError) -> int:
+    """The exit status after what the machine refuses; another error is raised again."""
+    if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
+        return _fail(MEMORY)
     if error.errno == errno.EIO and error.filename is None:
         return 128 + signal.SIGHUP
-    if error.errno not in DISK_ERRORS:
+    if error.errno not in CURES:
         raise error
-    return _fail(f"{error.filename or 'output'}: {error.strerror}; free some space")
+    return _fail(f"{error.filename or 'output'}: {error.strerror}; {CURES[error.errno]}")
 
 
 class _Terminated(BaseException):

@@ -12,6 +12,7 @@ from bmask_slam.graph.files.file_names import is_folder
 from bmask_slam.graph.files.reading import read_text
 
 CONFIG = "config.yaml"
+_MAX_LINE = 5000
 _SEQUENCE = re.compile(r"^# .*?, sequence (?P<path>.+), stride (?P<stride>[0-9]{1,9})$")
 
 
@@ -38,7 +39,7 @@ def read_origin(run: Path) -> Origin:
     """
     config = run / CONFIG
     text = read_text(config, "give --sequence") if config.is_file() else ""
-    first = text.partition("\n")[0]
+    first = text[:_MAX_LINE].partition("\n")[0]
     found = _SEQUENCE.match(first)
     if found is None:
         return Origin(None)

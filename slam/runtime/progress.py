@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from tqdm import tqdm
 
 from bmask_slam.tracking.results import TrackingStatus
+
+tqdm.set_lock(threading.RLock())  # its own is for processes, and may start one
 
 TERMINAL_INTERVAL_S = 0.1
 FILE_INTERVAL_S = 10.0

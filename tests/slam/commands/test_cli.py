@@ -220,6 +220,11 @@ def test_render_options_reach_the_renderer(capsys, monkeypatch, tmp_path: Path) 
     [
         (InputError("a file:\nwrong"), 1, "error: a file: wrong\n"),
         (OSError(28, "No space left on device", "f"), 1, "error: f: No space left on device"),
+        (OSError(13, "Permission denied", "f"), 1, "error: f: Permission denied; change its perm"),
+        (OSError(24, "Too many open files"), 1, "error: output: Too many open files; raise the"),
+        (OSError(30, "Read-only file system", "f"), 1, "error: f: Read-only file system; change"),
+        (OSError(12, "Cannot allocate memory"), 1, "error: out of memory; free some"),
+        (MemoryError(), 1, "error: out of memory; free some"),
         (KeyboardInterrupt(), 130, "interrupted\n"),
     ],
 )
@@ -235,10 +240,10 @@ def test_expected_errors(capsys, monkeypatch, error, status: int, expected: str)
 
 def test_unknown_errors_keep_their_traceback(monkeypatch) -> None:
     def fail(arguments: object) -> int:
-        raise PermissionError(13, "Permission denied", "f")
+        raise ProcessLookupError(3, "No such process")
 
     monkeypatch.setattr(sequences, "_info", fail)
-    with pytest.raises(PermissionError):
+    with pytest.raises(ProcessLookupError):
         cli.main(["info", "x"])
 
 
