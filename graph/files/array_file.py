@@ -36,7 +36,7 @@ _HEADER = "header"
 _HEADERS = TypeAdapter(Header)
 _KINDS = "biufU"
 SPARE_ROWS = 1000
-"""A table may have so many times as many rows as ids, and as 1000."""
+"""A table may have so many times as many rows as ids and 4000 more: days of tracking."""
 _UNREADABLE = (  # RuntimeError: a damaged byte may ask for encryption or another compression
     *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, lzma.LZMAError),
     *(ValueError, LookupError, TypeError, RuntimeError, OverflowError, SyntaxError),
@@ -136,7 +136,7 @@ def check_ids(ids: Ints, size: int) -> None:
     ``size`` is that of a table with a row for every id, also of those that were removed. Raises
     ValueError.
     """
-    if size > SPARE_ROWS * (1000 + len(ids)):
+    if size > SPARE_ROWS * (4000 + len(ids)):
         raise ValueError(f"a table of {size} rows for {len(ids)} ids")
     if len(ids) and not 0 <= ids.min() <= ids.max() < size:
         raise ValueError(f"an id that is not below {size}")

@@ -304,7 +304,7 @@ def changed_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
         extremes: tuple[Any, ...] = (0, 1, 255)
         if other.dtype.kind == "f":
             extremes = (np.nan, np.inf, -1.0, 1e30)
-        elif other.dtype.itemsize == 8:
+        elif other.dtype == np.int64:
             extremes = (-7, 10**6, 10**12, 2**62)
         flat = other.reshape(-1)
         flat[rng.randrange(len(flat))] = rng.choice(extremes)
