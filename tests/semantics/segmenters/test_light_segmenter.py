@@ -13,6 +13,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.network.boxes import iou
+from bmask_slam.semantics.network.yolox.network import Features
 from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 from bmask_slam.semantics.weights.light_weights import (
@@ -66,13 +67,21 @@ def test_a_larger_image_has_the_same_boxes_at_its_scale(
     assert (iou(once, twice / 2).amax(dim=0) > 0.9).all()
 
 
-def test_it_leaves_the_number_of_threads_as_it_was(
-    network: LightNetwork, photograph: np.ndarray
+def test_it_runs_in_one_thread_and_leaves_their_number_as_it_was(
+    network: LightNetwork, photograph: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = torch.get_num_threads()
+    features, within = network.model.detector.features, []
+
+    def watched(images: torch.Tensor) -> Features:
+        within.append(torch.get_num_threads())
+        return features(images)
+
+    monkeypatch.setattr(network.model.detector, "features", watched)
     torch.set_num_threads(2)
     try:
         LightSegmenter(network).segment(photograph, "a.jpg")
+        assert within == [1]
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
