@@ -203,7 +203,8 @@ def measure_real_cameras(arguments: argparse.Namespace) -> None:
         return
     report, command = REPORTS["real-cameras"], ["-m", "benchmarks.cameras.real_sequences"]
     if not arguments.report_only:
-        replace_section(report, make_section(report, "table", arguments.work))
+        for section in ("table", "loops"):
+            replace_section(report, make_section(report, section, arguments.work))
     printed = ["--report-only", "--work", str(arguments.work), "--readme", str(ROOT / "README.md")]
     print(call([*command, *printed]).partition("\n\n")[0])
 

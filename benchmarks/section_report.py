@@ -151,7 +151,7 @@ REPORTS = {
         "table": ("Real sequences", "cameras.real_sequences --work {sequences}"),
         "reading": ("What the figures say", ""),
         "hard": ("Hard inputs: never lost", ""),
-        "loops": ("Loop closures", ""),
+        "loops": ("Loop closures", "loops.loop_edges --work {sequences}"),
         "wrong": ("Wrong cameras", ""),
     }, markdown=frozenset({"table", "hard", "loops", "wrong"})),
 }  # fmt: skip

@@ -30,7 +30,7 @@ from bmask_slam.world.world_map import Keyframe
 logger = logging.getLogger(__name__)
 OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
 """Arrays in older files that are read by nothing today."""
-NEWER_ARRAYS = ("mapper.events.", "localiser.images.")
+NEWER_ARRAYS = ("mapper.events.", "mapper.loops.noise.", "localiser.images.")
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 
 

@@ -201,16 +201,20 @@ def wrong_observations(
 
 
 def relative_pose_errors(
-    factors: Sequence[RelativePose], keyframes: ValueTable
+    factors: Sequence[RelativePose], keyframes: ValueTable, slack: Array | None = None
 ) -> RelativePoseErrors:
-    """Chi-square of relative poses between keyframes that the table holds."""
+    """Chi-square of relative poses between keyframes that the table holds.
+
+    ``slack`` (N, 6, 6) is added to their covariances: errors of the poses that no factor states.
+    """
     a = np.array([f.keyframe_a for f in factors], np.int64)
     b = np.array([f.keyframe_b for f in factors], np.int64)
     measured = np.array([f.T_a_b for f in factors]).reshape(-1, 4, 4)
     covariances = np.array([f.covariance for f in factors]).reshape(-1, 6, 6)
     r = se3_log(inverse(measured) @ inverse(keyframes.get(a)) @ keyframes.get(b))
     kinds = np.array([f.kind for f in factors], np.str_)
-    return RelativePoseErrors(a, b, kinds, mahalanobis(r, covariances))
+    S = covariances if slack is None else covariances + slack
+    return RelativePoseErrors(a, b, kinds, mahalanobis(r, S))
 
 
 def mahalanobis(r: Array, covariances: Array) -> Array:

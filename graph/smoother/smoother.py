@@ -147,9 +147,16 @@ class Smoother:
         """The relative poses of a kind, such as "loop", in the order in which they were added."""
         return self._tables.relative_poses(kind)
 
-    def relative_pose_errors(self, kind: str) -> RelativePoseErrors:
-        """Chi-square of every relative pose of a kind at the current estimate."""
-        return relative_pose_errors(self.relative_poses(kind), self._tables.keyframes)
+    def relative_pose_errors(
+        self, kind: str, slack: Callable[[Array], Array] | None = None
+    ) -> RelativePoseErrors:
+        """Chi-square of every relative pose of a kind at the current estimate.
+
+        ``slack`` gives covariances (N, 6, 6) to add, for measured T_a_b (N, 4, 4).
+        """
+        poses = self.relative_poses(kind)
+        added = slack(np.array([k.T_a_b for k in poses]).reshape(-1, 4, 4)) if slack else None
+        return relative_pose_errors(poses, self._tables.keyframes, added)
 
     def marginal_covariance(self, keyframe_id: int) -> Array:
         """Covariance (6, 6) of a pose's ``[rotation rad, translation m]`` on its right side.

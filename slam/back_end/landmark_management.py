@@ -11,6 +11,7 @@ from bmask_slam.features.matching import Matches, WindowIndex
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import transform
+from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
@@ -108,6 +109,29 @@ def cull_landmarks(world: WorldMap, candidates: Ints, config: MappingConfig) -> 
     culled = ids[rarely | few | (views == 0)]
     landmarks.remove(culled)
     return culled
+
+
+def fuse_loops(
+    world: WorldMap,
+    loops: list[LoopConstraint],
+    tracker: Tracker,
+    config: MappingConfig,
+    keyframes: int,
+) -> Ints:
+    """Fuse the landmarks of both sides of loops: their own pairs, then by projection.
+
+    ``keyframes`` of the newer side are searched. Returns the ids removed.
+    """
+    old_ids, new_side = loop_sides(
+        world, [loop.ends for loop in loops], keyframes, config.local_map
+    )
+    removed = []
+    for loop in loops:
+        pairs = np.sort(loop.landmark_pairs, axis=1)
+        pairs = pairs[world.landmarks.in_map[pairs].all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
+        removed.append(world.replace_landmarks(pairs[:, 1], pairs[:, 0]))
+    removed.append(fuse_into(world, new_side, old_ids, tracker, config.fuse_radius_px))
+    return np.concatenate(removed)
 
 
 def loop_sides(

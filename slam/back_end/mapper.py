@@ -16,14 +16,14 @@ from bmask_slam.back_end.landmark_management import (
     cull_landmarks,
     fuse_into,
     fuse_into_neighbours,
-    loop_sides,
+    fuse_loops,
     redundant_keyframe,
 )
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.back_end.pruning import MapPruner
 from bmask_slam.back_end.segment_joining import anchors, join_segment
 from bmask_slam.back_end.triangulation import triangulate_landmarks
-from bmask_slam.events import EventLog
+from bmask_slam.events import Ends, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
@@ -85,7 +85,7 @@ class Mapper:
 
     @property
     def idle(self) -> bool:
-        """Whether it waits for work: always, since every update ends before the next frame."""
+        """Whether it waits for work: always, since updates end before the next frame."""
         return True
 
     @property
@@ -153,8 +153,7 @@ class Mapper:
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
         """Look for known places from a keyframe; confirmed loops move the map and fuse landmarks.
 
-        Afterwards loops are tested in the graph: a new one that does not fit is removed and waits
-        for more support; an older one that no longer fits is removed with what it fused.
+        New loops that do not fit the graph then are removed, and wait for more support.
         """
         confirmed = self.loops.loops_of(keyframe, self.world)
         if not confirmed:
@@ -162,15 +161,16 @@ class Mapper:
         self._change_graph(relative_poses=self.loops.relative_poses(confirmed))
         believed = self.loops.is_strong(confirmed)
         self.loops.closed |= {loop.ends: believed for loop in confirmed}
-        errors = self.smoother.relative_pose_errors("loop")
-        refuted = self.loops.refuted(errors, self.world)
+        refuted = self._remove_wrong_loops({loop.ends for loop in confirmed})
         kept = [loop for loop in confirmed if loop.ends not in refuted]
         self.loops.waiting += [loop for loop in confirmed if loop.ends in refuted]
-        self._remove_loops(refuted, {loop.ends for loop in confirmed})
         for loop in kept:
             self.events.loop_closed(loop.ends, loop.inliers)
         if kept:
-            self._fuse(kept)
+            count, world = self.loops.config.fuse_keyframes, self.world
+            fused = fuse_loops(world, kept, self._tracker, self._mapping, count)
+            self._factor_selector.remove_landmarks(fused)
+            self._change_graph()
         return kept
 
     def join(self, segment: int, tracked: Tracked, recognised: Tracked) -> Tracked:
@@ -184,8 +184,8 @@ class Mapper:
         loops = self.smoother.relative_poses("loop")
         self.smoother = Smoother(self.camera, self._graph_config)
         update = self._factor_selector.whole_update(self.world)
-        held = anchors(self.world, self._graph_config)
-        self._apply(self.smoother.update(replace(update, relative_poses=loops + held)))
+        loops += anchors(self.world, self._graph_config)
+        self._apply(self.smoother.update(replace(update, relative_poses=loops)))
         return joined
 
     def pruner(self) -> MapPruner:
@@ -246,36 +246,30 @@ class Mapper:
         )
         self._apply(self.smoother.update(update))
 
-    def _remove_loops(self, refuted: set[tuple[int, int]], fresh: set[tuple[int, int]]) -> None:
-        """Remove loops from the graph; those that are not fresh with what they fused."""
-        if not refuted:
-            return
-        removed_loops = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
-        for a, b, _ in removed_loops:
-            self.events.loop_refused((a, b), "it does not fit the graph; waits until more agree")
-        self.events.count({"loops pruned: refuted": len(removed_loops)})
-        self._change_graph(remove_relative_poses=removed_loops)
-        for ends in sorted(refuted - fresh):
-            self.events.loop_removed(ends)
-            self.events.count(self.pruner().prune_loop(*ends).counts("refuted"))
-        for ends in refuted:
-            self.loops.closed.pop(ends, None)
+    def _remove_wrong_loops(self, fresh: set[Ends]) -> set[Ends]:
+        """Remove loops that do not fit the graph, older ones with what they fused; their ends.
 
-    def _fuse(self, loops: list[LoopConstraint]) -> None:
-        """Fuse the landmarks of both sides: first the loops' own pairs, then by projection."""
-        world, count = self.world, self.loops.config.fuse_keyframes
-        ends = [loop.ends for loop in loops]
-        old_ids, new_side = loop_sides(world, ends, count, self._mapping.local_map)
-        for loop in loops:
-            pairs = np.sort(loop.landmark_pairs, axis=1)
-            pairs = pairs[world.landmarks.in_map[pairs].all(axis=1) & (pairs[:, 0] != pairs[:, 1])]
-            self._factor_selector.remove_landmarks(
-                world.replace_landmarks(pairs[:, 1], pairs[:, 0])
-            )
-        self._factor_selector.remove_landmarks(
-            fuse_into(world, new_side, old_ids, self._tracker, self._mapping.fuse_radius_px)
-        )
-        self._change_graph()
+        Until all fit: a wrong one pulls at others.
+        """
+        removed: set[Ends] = set()
+        while True:
+            errors = self.smoother.relative_pose_errors("loop", self.loops.noise.bent)
+            refuted = self.loops.refuted(errors, self.world)
+            if not refuted:
+                return removed
+            removed |= refuted
+            new = tuple((a, b, "loop") for a, b in sorted(refuted & fresh))
+            for a, b, _ in new:
+                self.events.loop_refused(
+                    (a, b), "it does not fit the graph; waits until more agree"
+                )
+            self.events.count({"loops pruned: refuted": len(new)})
+            self._change_graph(remove_relative_poses=new)
+            for ends in sorted(refuted - fresh):
+                self.events.loop_removed(ends)
+                self.events.count(self.pruner().prune_loop(*ends).counts("refuted"))
+            for ends in refuted:
+                self.loops.closed.pop(ends, None)
 
     def _cull_keyframe(self, newest: Keyframe) -> None:
         """Remove the youngest redundant keyframe around the newest one.

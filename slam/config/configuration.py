@@ -41,6 +41,11 @@ RENAMED = {
     "mapping.local_keyframes": "local_map.keyframes",
     "mapping.local_min_shared": "local_map.min_shared",
     "factor_selection.retire_batch": "marginalise_batch",
+    **{
+        f"loops.{name}": f"noise.{name}"
+        for name in ("drift_rad_per_m", "drift_m_per_m", "model_sigma_rad", "model_sigma_m")
+    },
+    "loops.model_share": "noise.model_share",
     "graph.max_recoveries": "max_repairs",
     "graph.bridge_sigma_rotation_rad": "anchor_sigma_rotation_rad",
     "graph.bridge_sigma_translation_m": "anchor_sigma_translation_m",

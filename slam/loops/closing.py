@@ -13,14 +13,14 @@ import numpy as np
 
 from bmask_slam.events import EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex, IndexConfig
-from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors
 from bmask_slam.graph.factors.graph_update import RelativePose
 from bmask_slam.graph.files.array_file import nested, part, split_rows
 from bmask_slam.graph.geometry import inverse, se3_log
-from bmask_slam.graph.pose_graph.loop_consistency import cycle_chi2
+from bmask_slam.loops.noise import Cycles, LoopNoise, NoiseConfig
 from bmask_slam.loops.place_recognition import PlaceConfig, PlaceRecogniser
 from bmask_slam.loops.verification import LoopConfig, LoopConstraint, NoLoop, loop_view, verify_loop
 from bmask_slam.world.world_map import Keyframe, WorldMap
@@ -30,20 +30,16 @@ MEDIAN_CHI2_6DOF = 5.348
 
 @dataclass(frozen=True)
 class LoopClosingConfig:
-    """When a loop enters the graph, and how strongly.
+    """When a loop enters the graph.
 
     A candidate's ``neighbours`` most covisible keyframes are verified with it. ``min_support``
     loops from two keyframes must agree with each other at ``probability``; the last ``waiting``
-    ones are kept. The map is trusted within ``drift_rad_per_m`` and ``drift_m_per_m`` of a
-    path: a loop must not imply more drift, and only loops whose ends are within ``comparable_m``
-    of path are compared.
-
-    A loop's covariance is raised by ``model_sigma_rad``, ``model_sigma_m`` and ``model_share`` of
-    its own rotation and translation, for errors that its inliers share, such as calibration. It
-    stays while its chi-square in the graph is below that of ``probability``. A map with a
-    systematic error (a wrong focal length) is overconfident and would refute every loop; therefore
-    ``strong_support`` loops from three keyframes enter without a robust kernel and untested.
-    ``fuse_keyframes`` of the new side are searched for the old side's landmarks.
+    ones are kept. A loop must not imply more drift than ``noise`` allows, and only loops whose ends
+    are within ``comparable_m`` of path are compared. A loop stays while its chi-square in the graph
+    is below that of ``probability``. A map with a systematic error (a wrong focal length) is
+    overconfident and would refute every loop; therefore ``strong_support`` loops from three
+    keyframes enter without a robust kernel and untested. ``fuse_keyframes`` of the new side are
+    searched for the old side's landmarks.
     """
 
     enabled: bool = True
@@ -53,17 +49,13 @@ class LoopClosingConfig:
     waiting: int = 30
     probability: float = 0.999
     comparable_m: float = 10.0
-    drift_rad_per_m: float = 0.005
-    drift_m_per_m: float = 0.02
-    model_sigma_rad: float = 0.003
-    model_sigma_m: float = 0.005
-    model_share: float = 0.02
     robust: str = "cauchy"
     max_iterations: int = 10
     fuse_keyframes: int = 10
     index: IndexConfig = field(default_factory=IndexConfig)
     places: PlaceConfig = field(default_factory=PlaceConfig)
     verification: LoopConfig = field(default_factory=LoopConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
 
     @property
     def gate(self) -> float:
@@ -78,6 +70,7 @@ class LoopCloser:
         self.config = config
         self.index = DescriptorIndex(config.index)
         self.recogniser = PlaceRecogniser(self.index, config.places)
+        self.noise = LoopNoise(config.noise)
         self.waiting: list[LoopConstraint] = []
         self.closed: dict[tuple[int, int], bool] = {}
         """Ends of the closed loops, and whether each is trusted more than the graph."""
@@ -98,13 +91,14 @@ class LoopCloser:
                 [np.zeros((0, 2), np.int64), *(loop.landmark_pairs for loop in waiting)]
             ),
             "pairs": np.array([len(loop.landmark_pairs) for loop in waiting], np.int64),
-            **nested(recogniser=self.recogniser.state()),
+            **nested(recogniser=self.recogniser.state(), noise=self.noise.state()),
         }
 
     def restore(self, state: Arrays, world: WorldMap) -> None:
         """Restore a state, with the keyframes of a map."""
         self.index.restore({k.id: k.features.descriptors for k in world.keyframes.values()})
         self.recogniser.restore(part(state, "recogniser"))
+        self.noise.restore(part(state, "noise"))
         ends_closed = map(tuple, state["closed"].tolist())
         self.closed = dict(zip(ends_closed, state["believed"].tolist(), strict=True))
         columns = (
@@ -180,6 +174,7 @@ class LoopCloser:
         confirmed = [loops[k] for k in chosen] if supported else []
         if len({loop.keyframe_b for loop in confirmed}) < 2:
             confirmed = []
+        self.noise.learn(confirmed, world)
         entering = {loop.ends for loop in confirmed}
         self.waiting = [loop for loop in loops if loop.ends not in entering]
         for loop in found:
@@ -196,7 +191,7 @@ class LoopCloser:
         """The relative poses that a confirmed set adds to the graph."""
         robust = None if self.is_strong(loops) else self.config.robust
         return tuple(
-            RelativePose(*k.ends, k.T_a_b, self._loop_covariance(k), robust, "loop") for k in loops
+            RelativePose(*k.ends, k.T_a_b, self.noise.covariance(k), robust, "loop") for k in loops
         )
 
     def refuted(self, errors: RelativePoseErrors, world: WorldMap) -> set[tuple[int, int]]:
@@ -221,18 +216,12 @@ class LoopCloser:
             and not inside.get(pair, False)
         }
 
-    def _loop_covariance(self, loop: LoopConstraint) -> Array:
-        """Covariance (6, 6) of a loop, with the errors that its inliers share."""
-        rules, change = self.config, np.linalg.norm(se3_log(loop.T_a_b).reshape(2, 3), axis=1)
-        sigmas = np.array([rules.model_sigma_rad, rules.model_sigma_m]) + rules.model_share * change
-        return loop.covariance + np.diag(np.repeat(sigmas**2, 3))
-
     def _within_drift(self, loop: LoopConstraint, world: WorldMap) -> bool:
         """Whether the drift that a loop implies is possible."""
         a, b = (world.keyframes[k].T_world_camera for k in loop.ends)
-        ids, travelled_m = world.path_lengths_m()
-        row_a, row_b = np.searchsorted(ids, loop.ends)
-        S = loop.covariance + self._map_covariances(travelled_m[row_b] - travelled_m[row_a])
+        ids, travelled = world.travelled()
+        path = np.subtract(*travelled[np.searchsorted(ids, loop.ends[::-1])])
+        S = self.noise.covariance(loop) + self.noise.map_covariances(path)
         r = se3_log(inverse(loop.T_a_b) @ inverse(a) @ b)
         fits = bool(mahalanobis(r[None], S[None])[0] < self.config.gate)
         if not fits:
@@ -242,41 +231,12 @@ class LoopCloser:
 
     def _agreement(self, loops: list[LoopConstraint], world: WorldMap) -> Mask:
         """(N, N) whether loops agree; False where their paths are too long to compare."""
-        first, second = np.triu_indices(len(loops), 1)
-        a, b = (np.array([getattr(k, f"keyframe_{end}") for k in loops]) for end in "ab")
-        poses = np.array([k.T_world_camera for k in world.keyframes.values()])
-        ids, travelled_m = world.path_lengths_m()
-        row_a, row_b = np.searchsorted(ids, a), np.searchsorted(ids, b)
-        lengths = np.stack(
-            [np.abs(travelled_m[k[first]] - travelled_m[k[second]]) for k in (row_a, row_b)]
-        )
-        chi_square = cycle_chi2(
-            np.array([loop.T_a_b for loop in loops]),
-            np.array([loop.covariance for loop in loops]),
-            (poses[row_a], poses[row_b]),
-            (first, second),
-            self._map_covariances(lengths),
-        )
-        fine = (lengths < self.config.comparable_m).all(axis=0) & (chi_square < self.config.gate)
+        cycles = Cycles.of(loops, world)
+        chi2 = cycles.chi2(self.noise.ratio, self.noise.map_covariances(cycles.paths))
+        comparable = (cycles.paths[..., 1] < self.config.comparable_m).all(axis=0)
         agree = np.zeros((len(loops), len(loops)), bool)
-        agree[first, second] = agree[second, first] = fine
-        return agree
-
-    def _map_covariances(self, lengths_m: Array) -> Array:
-        """Covariances (..., 6, 6) of the map's relative pose over a path of these lengths.
-
-        A rotation error that grows along a path displaces its end by half of it times the length.
-        """
-        rules = self.config
-        sigmas = np.stack(
-            [
-                rules.model_sigma_rad + rules.drift_rad_per_m * lengths_m,
-                rules.model_sigma_m
-                + (rules.drift_m_per_m + rules.drift_rad_per_m * lengths_m / 2) * lengths_m,
-            ],
-            axis=-1,
-        )
-        return np.repeat(sigmas**2, 3, axis=-1)[..., None] * np.eye(6)
+        agree[cycles.first, cycles.second] = comparable & (chi2 < self.config.gate)
+        return agree | agree.T
 
 
 def _largest_clique(agree: Mask) -> Ints:

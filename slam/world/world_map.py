@@ -11,7 +11,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.features.patch_alignment import SubpixelConfig, cut_patches
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import transform
+from bmask_slam.graph.geometry import inverse, so3_log, transform
 from bmask_slam.world.landmark_table import LandmarkTable
 
 MAX_CULLED = 500
@@ -92,12 +92,17 @@ class WorldMap:
         segments = [self.keyframes[h].segment for h in hosts if h in self.keyframes]
         return int(np.bincount(segments).argmax())
 
-    def path_lengths_m(self) -> tuple[Ints, Array]:
-        """Ids (K,) of all keyframes, ascending, and the metres (K,) of path up to each."""
+    def travelled(self) -> tuple[Ints, Array]:
+        """Ids (K,) of all keyframes, ascending, and (K, 2) radians and metres of path up to each.
+
+        The path goes straight from keyframe to keyframe.
+        """
         ids = np.fromiter(self.keyframes, np.int64)
-        centres = np.array([k.T_world_camera[:3, 3] for k in self.keyframes.values()])
-        steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
-        return ids, np.cumsum(steps)
+        poses = np.array([k.T_world_camera for k in self.keyframes.values()])
+        turns = so3_log((inverse(poses[:-1]) @ poses[1:])[:, :3, :3])
+        moves = np.diff(poses[:, :3, 3], axis=0)
+        steps = np.stack([np.linalg.norm(turns, axis=1), np.linalg.norm(moves, axis=1)], axis=1)
+        return ids, np.cumsum(np.concatenate([np.zeros((1, 2)), steps]), axis=0)
 
     def observed(self, keyframe: Keyframe) -> tuple[Ints, Ints]:
         """Keypoint indices and ids of the landmarks in the map that a keyframe observes."""

@@ -250,7 +250,8 @@ def test_an_inconsistent_old_loop_is_removed_with_its_fusions(
     monkeypatch.setattr(closer, "loops_of", lambda *_: [extra])
     relative_pose_errors = smoother.relative_pose_errors
 
-    def old_ones_bad(kind: str) -> RelativePoseErrors:
+    def old_ones_bad(kind: str, slack: object) -> RelativePoseErrors:
+        assert slack == closer.noise.bent
         errors = relative_pose_errors(kind)
         return replace(errors, chi2=np.where(errors.keyframe_a < 20, 1e3, 0.0))
 

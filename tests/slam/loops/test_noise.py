@@ -1,0 +1,138 @@
+"""The real noise of loops is learned from cycles; what drift of the map is possible."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, T_NEW_OLD, add_keyframe, make_features
+
+from bmask_slam.events import EventLog
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.factors.checks import chi2_quantile
+from bmask_slam.graph.geometry import inverse, se3_exp, se3_log
+from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
+from bmask_slam.loops.noise import LoopNoise, NoiseConfig
+from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.world.world_map import WorldMap
+
+STATED = np.diag([2e-3, 1e-3, 1e-3, 2e-3, 4e-3, 6e-3]) ** 2
+REAL_RATIO = 9.0
+COUNT = 60
+
+
+def turning_world(step_m: float, T_move: Array | None = None) -> WorldMap:
+    """An exact map of 2 x 60 keyframes that turn, where keyframe 60 + k is near keyframe k."""
+    world, T_move = WorldMap(), np.eye(4) if T_move is None else T_move
+    nothing = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
+    for k in range(2 * COUNT):
+        add_keyframe(world, T_move @ se3_exp([0.1, 0.05 * k, 0.3, step_m * k, 0, 0.1]), nothing)
+    return world
+
+
+def noisy_loops(world: WorldMap, ratio: float, count: int = COUNT) -> list[LoopConstraint]:
+    """Loops k to 60 + k whose errors have ``ratio`` times the covariance that they state."""
+    rng = np.random.default_rng(2)
+    found = []
+    for k in range(count):
+        a, b = (world.keyframes[i].T_world_camera for i in (k, COUNT + k))
+        xi = np.linalg.cholesky(ratio * STATED) @ rng.normal(size=6)
+        T_a_b = inverse(a) @ b @ se3_exp(xi)
+        none = np.zeros((0, 2), np.int64)
+        found.append(LoopConstraint(k, COUNT + k, T_a_b, STATED, 50, 1.0, none))
+    return found
+
+
+@pytest.mark.parametrize("ratio", [1.0, REAL_RATIO])
+def test_the_real_covariance_is_learned(ratio: float) -> None:
+    world, noise = turning_world(0.01), LoopNoise(NoiseConfig())
+    assert noise.ratio == NoiseConfig().prior_ratio
+    loops = noisy_loops(world, ratio)
+    noise.learn(loops, world)
+    assert noise.ratio == pytest.approx(ratio, rel=0.2)
+    keyframes = world.keyframes
+    errors = np.array([
+        se3_log(inverse(k.T_a_b) @ inverse(keyframes[k.keyframe_a].T_world_camera)
+                @ keyframes[k.keyframe_b].T_world_camera)
+        for k in loops
+    ])  # fmt: skip
+    S = noise.covariance(loops[0])
+    nees = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(S), errors)
+    low, high = chi2_quantile(0.025, 6 * COUNT), chi2_quantile(0.975, 6 * COUNT)
+    assert low < nees.sum() < high
+
+
+def test_moving_the_world_changes_nothing() -> None:
+    plain, moved = (LoopNoise(NoiseConfig()) for _ in range(2))
+    loops = noisy_loops(turning_world(0.01), REAL_RATIO)
+    plain.learn(loops, turning_world(0.01))
+    moved.learn(loops, turning_world(0.01, T_NEW_OLD))
+    assert moved.ratio == pytest.approx(plain.ratio, rel=1e-6)
+
+
+def test_few_loops_change_little_and_many_count_together() -> None:
+    world, together, apart = turning_world(0.01), *(LoopNoise(NoiseConfig()) for _ in range(2))
+    loops = noisy_loops(world, REAL_RATIO)
+    together.learn(loops[:3], world)
+    assert NoiseConfig().prior_ratio < together.ratio < REAL_RATIO
+    for k in range(0, COUNT, 5):
+        apart.learn(loops[k : k + 5], world)
+    assert apart.ratio == pytest.approx(REAL_RATIO, rel=0.35)
+
+
+def test_long_cycles_and_loops_with_a_common_keyframe_teach_nothing() -> None:
+    """The first contain the map's own errors, the others lack those of the common keyframe."""
+    far, near = turning_world(1.5), turning_world(0.01)
+    loops = noisy_loops(near, REAL_RATIO)
+    shared = [replace(loop, keyframe_b=COUNT) for loop in loops]
+    for world, given in ((far, loops), (near, shared), (near, loops[:1]), (near, [])):
+        noise = LoopNoise(NoiseConfig())
+        noise.learn(given, world)
+        assert noise.ratio == NoiseConfig().prior_ratio
+
+
+def test_what_was_learned_is_state() -> None:
+    world, noise, other = turning_world(0.01), *(LoopNoise(NoiseConfig()) for _ in range(2))
+    noise.learn(noisy_loops(world, REAL_RATIO), world)
+    other.restore(noise.state())
+    assert other.ratio == noise.ratio
+
+
+def test_right_loops_are_not_refused_for_errors_that_their_inliers_share() -> None:
+    world = turning_world(0.01)
+    closer = LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
+    right = noisy_loops(world, NoiseConfig().prior_ratio)
+    assert all(closer._within_drift(loop, world) for loop in right)
+
+
+@pytest.mark.parametrize(("a", "b", "fits"), [(0, 60, True), (0, 3, False)])
+def test_a_map_may_be_bent_by_turns_not_without(a: int, b: int, fits: bool) -> None:
+    """50 mrad and 40 mm are much for a turn of 0.15 rad, and little for one of 3 rad."""
+    world = turning_world(0.01)
+    closer = LoopCloser(CAMERA, LoopClosingConfig(), EventLog())
+    T_a_b = inverse(world.keyframes[a].T_world_camera) @ world.keyframes[b].T_world_camera
+    T_bent = T_a_b @ se3_exp([0.03, 0.0, 0.04, -0.01, 0.04, 0.0])
+    loop = replace(noisy_loops(world, 1.0, 1)[0], keyframe_a=a, keyframe_b=b, T_a_b=T_bent)
+    assert closer._within_drift(loop, world) == fits
+    alias = replace(loop, T_a_b=T_a_b @ se3_exp([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
+    assert not closer._within_drift(alias, world)
+
+
+def test_the_path_is_in_radians_and_metres() -> None:
+    ids, travelled = turning_world(0.01).travelled()
+    assert ids.tolist() == list(range(2 * COUNT))
+    assert travelled[0].tolist() == [0, 0]
+    assert travelled[-1, 0] == pytest.approx(0.05 * (2 * COUNT - 1), rel=0.01)
+    steps = np.diff(travelled, axis=0)
+    assert (steps[:, 1] > 0).all()
+    assert steps[:, 1].max() < 0.02
+
+
+def test_what_a_bent_map_adds_grows_with_the_change_and_has_units() -> None:
+    """Sigmas of a turn of 1 rad: 23 mrad; of a move of 2 m: 45 mm."""
+    noise = LoopNoise(NoiseConfig())
+    poses = np.stack([se3_exp([0, 1.0, 0, 0, 0, 0]), se3_exp([0, 0, 0, 0, 2.0, 0])])
+    sigmas = np.sqrt(np.diagonal(noise.bent(poses), axis1=1, axis2=2))
+    np.testing.assert_allclose(sigmas[0], np.repeat([0.023, 0.005], 3))
+    np.testing.assert_allclose(sigmas[1], np.repeat([0.003, 0.045], 3))
