@@ -30,7 +30,12 @@ from bmask_slam.world.world_map import Keyframe
 logger = logging.getLogger(__name__)
 OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
 """Arrays in older files that are read by nothing today."""
-NEWER_ARRAYS = ("mapper.events.", "mapper.loops.noise.", "localiser.images.")
+NEWER_ARRAYS = (
+    "mapper.events.",
+    "mapper.history.information",
+    "mapper.loops.noise.",
+    "localiser.images.",
+)
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 
 
@@ -136,6 +141,8 @@ class SlamSystem(SystemResults):
         """The last optimisation; the map is then final."""
         if self.config.final_adjustment:
             self.mapper.finish()
+        if self.config.smooth_trajectory:
+            self.map.history.smooth(self.map.world)
         known = self.map.world.in_segment(largest(self.segments()))
         if self._first_keyframe and known and known[0].id >= self._first_keyframe:
             logger.warning(
@@ -279,9 +286,8 @@ class SlamSystem(SystemResults):
             _, ids = self.map.world.observed(keyframe)
         self.camera_tracker.remember(tracked.features, landmark_of, T_world_camera)
         self.camera_tracker.update_motion(tracked.T_world_camera, T_world_camera, ids)
-        self.map.history.append(
-            frame.timestamp_s, reference.id, reference.T_world_camera, T_world_camera
-        )
+        poses = reference.T_world_camera, T_world_camera
+        self.map.history.append(frame.timestamp_s, reference.id, *poses, tracked.information)
         return T_world_camera
 
 

@@ -20,7 +20,8 @@ from bmask_slam.tracking.tracker import TrackingConfig
 class SystemConfig:
     """All settings; YAML files hold only what differs from these defaults.
 
-    ``final_adjustment``: a full bundle adjustment ends the run. ``covariances``: those of all
+    ``final_adjustment``: a full bundle adjustment ends the run. ``smooth_trajectory``: then the
+    poses of all frames are smoothed by the camera's inertia. ``covariances``: those of all
     keyframes are written with its results.
     """
 
@@ -35,4 +36,5 @@ class SystemConfig:
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     moving_objects: MovingObjectConfig = field(default_factory=MovingObjectConfig)
     final_adjustment: bool = True
+    smooth_trajectory: bool = True
     covariances: bool = False

@@ -12,12 +12,22 @@ from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.files.array_file import split_rows
 from bmask_slam.graph.geometry import inverse
 from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.graph.trajectory_smoothing import smooth
 from bmask_slam.world.world_map import WorldMap
 
 ENTRY = np.dtype(
-    [("timestamp_s", float), ("keyframe_id", np.int64), ("T_keyframe_camera", float, (4, 4))]
+    [
+        ("timestamp_s", float),
+        ("keyframe_id", np.int64),
+        ("T_keyframe_camera", float, (4, 4)),
+        ("information", float, (6, 6)),
+    ]
 )
-"""A frame's stamp and its pose as seen from its reference keyframe."""
+"""A frame's stamp, its pose as seen from its reference keyframe, and the pose's information.
+
+The information is of ``[rad, m]`` on the right side, NaN where it is unknown.
+"""
+UNKNOWN = np.full((6, 6), np.nan)
 Entries = NDArray[np.void]
 NO_KEYFRAME = -1
 """Parent of a keyframe whose pose was lost: its frames have no pose."""
@@ -37,11 +47,17 @@ class FrameHistory:
         return self._parent
 
     def append(
-        self, timestamp_s: float, keyframe_id: int, T_world_keyframe: Array, T_world_camera: Array
+        self,
+        timestamp_s: float,
+        keyframe_id: int,
+        T_world_keyframe: Array,
+        T_world_camera: Array,
+        information: Array | None = None,
     ) -> None:
         """Append a frame's pose relative to a keyframe whose current pose is given."""
         T_keyframe_camera = inverse(T_world_keyframe) @ T_world_camera
-        self.extend(np.array([(timestamp_s, keyframe_id, T_keyframe_camera)], ENTRY))
+        known = UNKNOWN if information is None else information
+        self.extend(np.array([(timestamp_s, keyframe_id, T_keyframe_camera, known)], ENTRY))
 
     def since(self, count: int) -> Entries:
         """What was appended after the first ``count`` frames."""
@@ -68,20 +84,34 @@ class FrameHistory:
 
     def trajectories(self, world: WorldMap) -> dict[int, Trajectory]:
         """Every tracked frame whose keyframe was not lost, by map segment, from current poses."""
-        entries = self._store[: self._size]
-        poses, segments = np.empty((len(entries), 4, 4)), np.full(len(entries), NO_KEYFRAME)
-        for keyframe_id, rows in self._by_keyframe():
-            owner, T = self._resolve(keyframe_id, entries["T_keyframe_camera"][rows])
-            if owner == NO_KEYFRAME:
-                continue
-            keyframe = world.keyframes[owner]
-            poses[rows], segments[rows] = keyframe.T_world_camera @ T, keyframe.segment
+        stamps_s = self._store["timestamp_s"][: self._size]
+        origins, segments = self._origins(world)
+        poses = origins @ self._store["T_keyframe_camera"][: self._size]
         return {
-            segment: Trajectory(
-                entries["timestamp_s"][segments == segment], poses[segments == segment]
-            )
+            segment: Trajectory(stamps_s[segments == segment], poses[segments == segment])
             for segment in np.unique(segments[segments != NO_KEYFRAME]).tolist()
         }
+
+    def smooth(self, world: WorldMap) -> None:
+        """Give the frames the poses that the camera's inertia makes the most probable."""
+        entries = self._store[: self._size]
+        origins, segments = self._origins(world)
+        for segment, measured in self.trajectories(world).items():
+            rows = np.flatnonzero(segments == segment)
+            found = smooth(measured, entries["information"][rows])
+            poses = inverse(origins[rows]) @ found.poses_world_camera
+            self._store["T_keyframe_camera"][rows] = poses
+
+    def _origins(self, world: WorldMap) -> tuple[Array, Ints]:
+        """T_world_keyframe (N, 4, 4) of what each entry is relative to, and its segment (N,)."""
+        origins = np.zeros((self._size, 4, 4))
+        segments = np.full(self._size, NO_KEYFRAME)
+        for keyframe_id, rows in self._by_keyframe():
+            owner, T = self._resolve(keyframe_id, np.eye(4))
+            if owner != NO_KEYFRAME:
+                keyframe = world.keyframes[owner]
+                origins[rows], segments[rows] = keyframe.T_world_camera @ T, keyframe.segment
+        return origins, segments
 
     def without_map(self) -> list[Trajectory]:
         """The frames of each keyframe whose pose was lost, in that keyframe's frame."""
@@ -113,6 +143,7 @@ class FrameHistory:
             "timestamps_s": entries["timestamp_s"].copy(),
             "keyframe_ids": entries["keyframe_id"].copy(),
             "T_keyframe_camera": entries["T_keyframe_camera"].copy(),
+            "information": entries["information"].copy(),
             "culled_ids": np.array(list(self._parent), np.int64),
             "heir_ids": np.array([parent for parent, _ in parents], np.int64),
             "T_heir_culled": _stacked([T for _, T in parents]),
@@ -122,7 +153,9 @@ class FrameHistory:
         """Become the history of a state. Raises ValueError for keyframes in a circle."""
         self._size = len(state["timestamps_s"])
         self._store = np.zeros(max(self._size, 1024), ENTRY)
-        columns = ("timestamps_s", "keyframe_ids", "T_keyframe_camera")
+        if len(state["information"]) != self._size:  # of a file that was written without
+            state = {**state, "information": np.broadcast_to(UNKNOWN, (self._size, 6, 6))}
+        columns = ("timestamps_s", "keyframe_ids", "T_keyframe_camera", "information")
         for name, column in zip(ENTRY.names or (), columns, strict=True):
             self._store[name][: self._size] = state[column]
         parents = zip(state["heir_ids"].tolist(), state["T_heir_culled"], strict=True)

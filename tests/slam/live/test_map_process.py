@@ -30,7 +30,7 @@ from bmask_slam.semantics.instances.instances import PackedMask
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import untracked
-from bmask_slam.world.frame_history import ENTRY, NO_KEYFRAME
+from bmask_slam.world.frame_history import ENTRY, NO_KEYFRAME, UNKNOWN
 
 NO_IDS = np.zeros(0, np.int64)
 
@@ -43,7 +43,7 @@ def keyframe(
 ) -> NewKeyframe:
     T_world_camera = se3_exp(np.array([0, 0, 0, 0.02 * number, 0, 0]))
     frame = render_plane(T_world_camera, number)
-    entries = np.array([(number / 30, number, np.eye(4))], ENTRY)
+    entries = np.array([(number / 30, number, np.eye(4), UNKNOWN)], ENTRY)
     return NewKeyframe(
         number,
         frame.index,

@@ -4,7 +4,7 @@ import numpy as np
 from synthetic_view import add_keyframe, make_features
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.geometry import inverse, se3_exp
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import WorldMap
 
@@ -83,3 +83,45 @@ def test_segments_are_separate_until_their_keyframes_are_joined() -> None:
 
 def test_no_frames_give_no_trajectories() -> None:
     assert FrameHistory().trajectories(WorldMap()) == {}
+
+
+def noisy_frames(history: FrameHistory, keyframe_poses: Array, count: int) -> Array:
+    """Frames of a camera that moves steadily, with noise; returns the true positions (N, 3)."""
+    path = np.arange(count)[:, None] * np.array([0.01, 0.0, 0.005])
+    for i, place in enumerate(path):
+        noise = RNG.normal(size=6) * np.repeat([1e-3, 4e-3], 3)
+        T_world_camera = make_pose(np.eye(3), place) @ se3_exp(noise)
+        information = np.diag(np.repeat([1e6, 1 / 16e-6], 3))
+        poses = keyframe_poses[i % 3], T_world_camera
+        history.append(i / 30, i % 3, *poses, information if i else None)
+    return path
+
+
+def test_smoothed_frames_follow_their_keyframes_and_the_state() -> None:
+    keyframe_poses = random_poses(3)
+    world, history = world_of(keyframe_poses), FrameHistory()
+    path = noisy_frames(history, keyframe_poses, 90)
+    history.hand_over(1, 2, inverse(keyframe_poses[2]) @ keyframe_poses[1])
+    del world.keyframes[1]
+    before = history.trajectories(world)[0].poses_world_camera[:, :3, 3] - path
+    again = FrameHistory()
+    again.restore(history.state())
+    history.smooth(world)
+    after = history.trajectories(world)[0].poses_world_camera[:, :3, 3] - path
+    assert np.abs(after).mean() < 0.5 * np.abs(before).mean()
+    again.smooth(world)
+    np.testing.assert_array_equal(
+        again.state()["T_keyframe_camera"], history.state()["T_keyframe_camera"]
+    )
+
+
+def test_a_state_without_information_is_not_smoothed() -> None:
+    keyframe_poses = random_poses(3)
+    world, history = world_of(keyframe_poses), FrameHistory()
+    noisy_frames(history, keyframe_poses, 90)
+    history.restore(history.state() | {"information": np.zeros((0, 6, 6))})
+    before = history.trajectories(world)[0].poses_world_camera
+    history.smooth(world)
+    np.testing.assert_allclose(
+        history.trajectories(world)[0].poses_world_camera, before, atol=1e-12
+    )
