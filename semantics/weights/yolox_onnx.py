@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import in_short, read_bytes
 from bmask_slam.semantics.network.yolox.layers import convolutions
 from bmask_slam.semantics.network.yolox.network import YoloxNano
 
@@ -40,12 +41,13 @@ def load_onnx(path: Path) -> YoloxNano:
     Raises:
         InputError: no such file, or not YOLOX-Nano for 80 classes with batch norm folded.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the published yolox_nano.onnx")
+    data = read_bytes(path, "give the published yolox_nano.onnx")
     try:
-        found = _convolutions(memoryview(path.read_bytes()))
+        found = _convolutions(memoryview(data))
     except (IndexError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: not an ONNX file that can be read ({error})") from error
+        raise InputError(
+            f"{path}: not an ONNX file that can be read ({in_short(error)}); get it again"
+        ) from error
     with torch.device("meta"):
         model = YoloxNano()
     expected = convolutions(model)

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import read_text
 from bmask_slam.graph.whole_file import open_plain, whole_file
 
 CHUNK_BYTES = 1 << 20
@@ -158,7 +159,7 @@ def _receive(file: WebFile, part: Path, progress: Progress) -> None:
     mark, begin = _mark_file(part), _size(part)
     if begin and mark.is_file():
         request.add_header("Range", f"bytes={begin}-")
-        request.add_header("If-Range", mark.read_text(encoding="utf-8"))
+        request.add_header("If-Range", " ".join(read_text(mark, "remove it").split()))
     try:
         response = urllib.request.urlopen(request, timeout=TIMEOUT_S)  # nosec B310 # see download
     except urllib.error.HTTPError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ from engine import Count, Reader, fuzz, table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from readers import all_readers
+from source_tree import SOURCES, location, parse
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import format_yaml, parse_yaml
@@ -36,6 +38,36 @@ def test_every_reader_refuses_broken_files(folder: Path, silent: None) -> None:
     counts = [fuzz(r, folder / f"{k}", INPUTS, each_s) for k, r in enumerate(readers)]
     assert not any(count.faulty for count in counts), table(counts)
     assert all(count.inputs for count in counts)
+
+
+READS = {
+    *("read_text", "read_bytes", "imread", "fromfile", "safe_open", "load_file", "loadtxt"),
+    *("json.loads", "json.load", "np.load", "torch.load", "csv.reader", "csv.DictReader", "YAML"),
+}
+ELSEWHERE = {
+    "semantics/weights/checkpoints.py": "torch's and safetensors' own readers, after a bounded one",
+    "semantics/weights/light_weights.py": "whether a file says that it is one",
+    "slam/job_process.py": "its own argument",
+    "slam/dense/folder.py": "what it has just made",
+    "slam/runtime/machine.py": "/proc",
+    "slam/runtime/memory.py": "/proc",
+    "slam/comparison/report/report.py": "the project's own style",
+    "mapping/products/cloud.py": "temporary files of its own",
+}
+"""Modules that read without graph/files, and what."""
+
+
+def test_files_are_read_by_graph_files() -> None:
+    found = set()
+    for path in SOURCES:
+        for node in ast.walk(parse(path)):
+            if isinstance(node, ast.Call) and isinstance(node.func, (ast.Attribute, ast.Name)):
+                name = ast.unparse(node.func)
+                bounded = isinstance(node.func, ast.Name) and name in ("read_text", "read_bytes")
+                if not bounded and READS & {name, name.rpartition(".")[2]}:
+                    found.add(location(path))
+    found = {path for path in found if not path.startswith("graph/files/")}
+    assert found == set(ELSEWHERE)
 
 
 def crash(path: Path) -> None:

@@ -21,6 +21,7 @@ from bmask_slam import __version__, graph, mapping, semantics
 from bmask_slam.comparison.experiment.experiment import OPTIONS, Configuration, Experiment
 from bmask_slam.config.configuration import differences, dump, find_config, resolve
 from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.files.reading import read_bytes, read_text
 from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.runtime.machine import commit, describe_machine, versions
 from bmask_slam.system_config import SystemConfig
@@ -102,7 +103,7 @@ def folder_hash(folder: Path, camera: Path | None) -> str:
         f"{p.relative_to(folder)} {p.stat().st_size}" for p in files if p.name != "groundtruth.txt"
     )
     lists = _contents((p for p in files if p.name in CONTENTS), folder)
-    given = [camera.read_text(encoding="utf-8")] if camera else []
+    given = [read_text(camera, "give a camera.yaml")] if camera else []
     return _digest([*sizes, *lists, *given])
 
 
@@ -116,7 +117,7 @@ def configuration_hash(configuration: Configuration, settings: tuple[str, ...]) 
 def _contents(files: Iterable[Path], root: Path) -> Iterator[str]:
     for path in sorted(files):
         yield f"{path.relative_to(root) if path.is_relative_to(root) else path.name} "
-        yield hashlib.sha256(path.read_bytes()).hexdigest()
+        yield hashlib.sha256(read_bytes(path, "restore it")).hexdigest()
 
 
 def _digest(texts: Iterable[str]) -> str:
