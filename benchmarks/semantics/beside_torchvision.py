@@ -51,7 +51,7 @@ def make(name: str) -> dict[str, Callable[[], Detected]]:
 
     from bmask_slam.semantics.network import config  # noqa: PLC0415
     from bmask_slam.semantics.network.model import MaskRCNN  # noqa: PLC0415
-    from bmask_slam.semantics.network.paste import paste  # noqa: PLC0415
+    from bmask_slam.semantics.segmenters.network_segmenter import paste  # noqa: PLC0415
 
     torch.set_num_threads(2)
     torch.manual_seed(0)

@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib.figure
 import numpy as np
 import torch
+from torch import Tensor
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import read_table
@@ -21,7 +22,6 @@ from bmask_slam.semantics.network.config import LIGHT
 from bmask_slam.semantics.network.model import MaskRCNN
 from bmask_slam.semantics.training.dataset import Dataset, JoinedDatasets, split
 from bmask_slam.semantics.training.loop import CURVES, TrainingConfig, train
-from bmask_slam.semantics.training.transfer import transferred
 from bmask_slam.semantics.weights.checkpoints import (
     TrainedNetwork,
     load_mobilenet,
@@ -36,6 +36,13 @@ from bmask_slam.semantics.weights.light_weights import (
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 
 SMOOTHING_STEPS = 25
+PER_CLASS = {
+    "roi_heads.box_predictor.cls_score": 1,
+    "roi_heads.box_predictor.bbox_pred": 4,
+    "roi_heads.mask_predictor.mask_fcn_logits": 1,
+    "roi_heads.maskiou_head.maskiou": 1,
+}
+"""Layers with outputs for each class, and the number of outputs a class."""
 ONNX = ".onnx"
 DETECTOR = "detector."
 """Beginning of the names of the light network's parameters that are never trained."""
@@ -65,8 +72,6 @@ class TrainingRun:
         data: sources of images; one that is listed twice is drawn twice as often.
         out: folder of the results.
         weights: to start from; None: the light network with new heads.
-        light: whether ``weights`` get the light network's anchors and numbers of proposals and
-            detections.
         backbone: the published YOLOX-Nano in ONNX, in place of the one that comes with the project;
             or weights of an ImageNet MobileNetV2, for a network on it.
         labels: label set, by name or file.
@@ -77,7 +82,6 @@ class TrainingRun:
     data: tuple[Source, ...]
     out: Path
     weights: Path | None = None
-    light: bool = False
     backbone: Path | None = None
     labels: str = "coco"
     freeze: tuple[str, ...] = ()
@@ -117,8 +121,7 @@ def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork | Li
     """The initial network."""
     torch.manual_seed(seed)
     if run.weights is not None and not is_light(run.weights):
-        like = LIGHT if run.light else None
-        return transferred(load_network(run.weights), labels, like)
+        return transferred(load_network(run.weights), labels)
     if run.weights is None and run.backbone is not None and run.backbone.suffix != ONNX:
         model = MaskRCNN(replace(LIGHT, classes=len(labels)))
         load_mobilenet(model, run.backbone)
@@ -131,6 +134,39 @@ def _start(run: TrainingRun, labels: LabelSet, seed: int) -> TrainedNetwork | Li
     if run.weights is not None:
         return load_light(run.weights)
     return new_light(load_onnx(run.backbone) if run.backbone else None)
+
+
+def transferred(network: TrainedNetwork, labels: LabelSet) -> TrainedNetwork:
+    """The network with other labels and a MaskIoU head.
+
+    Parameters that do not depend on the classes are copied; in layers that do, the rows of classes
+    of the same name and of the background. New rows and a new MaskIoU head are random at first.
+    """
+    config = replace(network.model.config, classes=len(labels))
+    config = config if config.maskiou_channels else config.with_maskiou()
+    model = MaskRCNN(config)
+    old, new = network.model.state_dict(), model.state_dict()
+    pairs = [
+        (k, network.labels.names.index(name))
+        for k, name in enumerate(labels.names)
+        if name in network.labels.names
+    ]
+    for name, value in new.items():
+        layer = name.rpartition(".")[0]
+        if name not in old:
+            continue
+        if layer in PER_CLASS and len(old[name]) > 1:
+            _copy_rows(value, old[name], pairs, PER_CLASS[layer])
+        else:
+            value.copy_(old[name])
+    return TrainedNetwork(model, labels)
+
+
+@torch.no_grad()
+def _copy_rows(new: Tensor, old: Tensor, pairs: list[tuple[int, int]], each: int) -> None:
+    """Copy the outputs of classes (new label, old label), ``each`` rows a class."""
+    for to, origin in pairs:
+        new[to * each : (to + 1) * each] = old[origin * each : (origin + 1) * each]
 
 
 def draw_losses(curves: Path, picture: Path) -> None:

@@ -28,8 +28,8 @@ from bmask_slam.semantics.network.config import (
 from bmask_slam.semantics.network.images import prepare
 from bmask_slam.semantics.network.model import MaskRCNN
 from bmask_slam.semantics.network.nms import grouped_nms, nms
-from bmask_slam.semantics.network.paste import paste
 from bmask_slam.semantics.network.roi_align import assign_levels, feature_table, roi_align
+from bmask_slam.semantics.segmenters.network_segmenter import paste
 
 TOLERANCE = 1e-4
 GOLDEN: Mapping[str, NDArray] = dict(np.load(Path(__file__).parent / "golden.npz"))

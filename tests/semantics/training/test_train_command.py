@@ -13,9 +13,9 @@ from repository import SHARED
 from bmask_slam.cli import main
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.semantics.labels import label_set, read_label_set
-from bmask_slam.semantics.network.config import LIGHT, AnchorConfig
+from bmask_slam.semantics.network.config import LIGHT
 from bmask_slam.semantics.network.model import MaskRCNN
-from bmask_slam.semantics.training.transfer import transferred
+from bmask_slam.semantics.training.run import transferred
 from bmask_slam.semantics.weights.checkpoints import TrainedNetwork, load_network
 from bmask_slam.semantics.weights.light_weights import SHIPPED, load_light
 
@@ -115,23 +115,3 @@ def test_transfer_keeps_the_weights_of_common_classes() -> None:
             assert torch.equal(now[[0, 1, 3]], was[[0, 3, 1]])
             assert end == "bias" or not torch.equal(now[2], was[2])
     assert torch.equal(after["rpn.head.cls_logits.weight"], before["rpn.head.cls_logits.weight"])
-
-
-def test_transfer_to_more_anchors_keeps_the_weights_of_old_ones() -> None:
-    torch.manual_seed(0)
-    config = replace(LIGHT, classes=3, anchors=AnchorConfig())
-    old = TrainedNetwork(MaskRCNN(config).eval(), label_set(["person", "cup"]))
-    new = transferred(old, old.labels, LIGHT)
-    assert new.model.config == replace(LIGHT, classes=3)
-    levels = [torch.randn(1, LIGHT.channels, 4 >> k, 4 >> k) for k in range(2)]
-    with torch.no_grad():
-        heads = [network.model.rpn.head(levels) for network in (old, new)]
-    for before, after in zip(*heads, strict=True):
-        for a, b in zip(before, after, strict=True):
-            cells = b.unflatten(1, (-1, LIGHT.anchors.count))
-            kept = cells[:, :, : config.anchors.count].flatten(1, 2)
-            torch.testing.assert_close(kept, a)
-    assert torch.equal(
-        new.model.state_dict()["rpn.head.conv.0.0.weight"],
-        old.model.state_dict()["rpn.head.conv.0.0.weight"],
-    )

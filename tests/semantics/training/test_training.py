@@ -13,7 +13,7 @@ from repository import SHARED
 from bmask_slam.semantics.network.box_head import ClassifiedBoxes
 from bmask_slam.semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
 from bmask_slam.semantics.network.model import MaskRCNN
-from bmask_slam.semantics.network.paste import paste
+from bmask_slam.semantics.segmenters.network_segmenter import paste
 from bmask_slam.semantics.training.losses import Only, dice_loss, network_losses
 from bmask_slam.semantics.training.targets import (
     BOX_RULE,
