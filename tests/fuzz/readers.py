@@ -490,8 +490,8 @@ def read_message(path: Path) -> None:
         raise InputError("not of the message's type")  # which rosbags would not give either
     for name, length in (("k", 9), ("p", 12), ("d", None)):
         row = fields.get(name, [0.0] * 12)
-        sized = length in (None, len(row)) or name not in fields
-        if not sized or not all(map(is_float, row)):
+        listed = isinstance(row, list) and (length in (None, len(row)) or name not in fields)
+        if not listed or not all(map(is_float, row)):
             raise InputError("not of the message's type")
     if hasattr(message, "k"):
         for rectified in (False, True):
