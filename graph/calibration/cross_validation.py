@@ -8,6 +8,7 @@ one that was there before. Nothing of a half is in the calibration that it judge
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,10 +20,11 @@ from bmask_slam.graph.calibration.calibration import (
     calibrate,
 )
 from bmask_slam.graph.calibration.equations import CAUCHY, squared
-from bmask_slam.graph.calibration.model import CalibrationViews, linearise
+from bmask_slam.graph.calibration.model import PARAMETERS, CalibrationViews, linearise
 from bmask_slam.graph.calibration.problem import CalibrationProblem, CalibrationState
 
 MIN_KEYFRAMES = 5
+ALL = range(len(PARAMETERS))
 QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
 
 
@@ -47,13 +49,22 @@ class CrossValidation:
         return float(self.gains.mean() / max(error, 1e-12))
 
 
-def cross_validate(problem: CalibrationProblem) -> CrossValidation | None:
-    """Calibrate from each half of the keyframes, and judge by the other; None: too few views."""
+def cross_validate(
+    problem: CalibrationProblem, judged: Sequence[int] = ALL
+) -> CrossValidation | None:
+    """Calibrate from each half of the keyframes, and judge by the other; None: too few views.
+
+    Parameters that are free but not among those ``judged``, by their places in PARAMETERS, are
+    fitted to the half that judges, with what was there before and with what was found.
+    """
     first, second = halves_of(problem)
     if first is None or second is None:
         return None
     found = [calibrate(half, QUICK) for half in (first, second)]
-    gains = [_gains(judge, result) for judge, result in zip((second, first), found, strict=True)]
+    gains = [
+        _gains(judge, result, list(judged))
+        for judge, result in zip((second, first), found, strict=True)
+    ]
     return CrossValidation(
         np.array([result.calibration for result in found]),
         np.array([np.sqrt(np.diag(result.covariance)) for result in found]),
@@ -96,15 +107,18 @@ def _select(
     return CalibrationViews(**{**columns, "keyframes": keyframes, "landmarks": landmarks})
 
 
-def _gains(problem: CalibrationProblem, result: CalibrationResult) -> Array:
+def _gains(problem: CalibrationProblem, result: CalibrationResult, judged: list[int]) -> Array:
     """Of each keyframe (K,), the drop of its cost from the problem's calibration to another's.
 
     Poses and points are fitted with each. Both times the noise is that of the other result, so that
     both are the smallest costs of the same kind.
     """
-    scales, costs = result.noise_scales, []
+    scales, costs, sigmas = result.noise_scales, [], problem.prior_sigmas.copy()
+    sigmas[judged] = 0.0
     for calibration in (problem.calibration, result.calibration):
-        fixed = dataclasses.replace(problem, calibration=calibration, prior_sigmas=np.zeros(13))
+        start = problem.calibration.copy()
+        start[judged] = calibration[judged]
+        fixed = dataclasses.replace(problem, calibration=start, prior_sigmas=sigmas)
         costs.append(_costs(fixed, calibrate(fixed, QUICK, scales), scales))
     drop = np.zeros(len(problem.poses_world_camera))
     np.add.at(drop, problem.views.keyframes, costs[0] - costs[1])

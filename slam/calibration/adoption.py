@@ -114,9 +114,13 @@ class Estimate:
         return bool((np.abs(self.found - self.before)[chosen] <= bounds).all())
 
     def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
-        """Whether both halves alone find a parameter, as far as they show it."""
+        """Whether both halves alone find a parameter: within their bounds, or nearer to what was
+        found than to what the camera has.
+        """
         bounds = config.min_change_sigmas * np.hypot(halves.sigmas[:, i], self.sigmas[i])
-        return bool((np.abs(halves.calibrations[:, i] - self.found[i]) <= bounds).all())
+        nearer = abs(self.found[i] - self.before[i]) / 2
+        off = np.abs(halves.calibrations[:, i] - self.found[i])
+        return bool((off <= np.maximum(bounds, nearer)).all())
 
 
 def estimate_times(problem: CalibrationProblem) -> Estimate:
@@ -185,7 +189,7 @@ def newly_sure(
 ) -> list[int]:
     """Those of the parameters tried that are to be adopted."""
     sure = [i for i in tried if estimate.differs(i, config)]
-    halves = cross_validate(estimate.problem) if sure else None
+    halves = cross_validate(estimate.problem, FREE) if sure else None
     if halves is None:
         return []
     logger.info(

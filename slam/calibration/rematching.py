@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.calibration.adoption import FIXED, FREE, Estimate, estimate_of
+from bmask_slam.calibration.adoption import FREE, Estimate, estimate_of
 from bmask_slam.calibration.calibrate import (
     GAUGE_SIGMAS,
     MIN_KEYFRAMES,
@@ -39,6 +39,7 @@ from bmask_slam.graph.calibration.model import (
     PARAMETERS,
     SHUTTER,
     CalibrationViews,
+    F,
     parameters_of,
 )
 from bmask_slam.graph.calibration.problem import CalibrationProblem
@@ -52,6 +53,9 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 MAX_KEYFRAMES, MAX_OBSERVATIONS = 40, 8000
 """Those with most observations are used of more, and the landmarks that are seen most often."""
 QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
+FOCAL_SHARE = 0.01
+"""Standard deviation of the focal lengths, which are estimated along but not adopted: published
+ones are up to 2 % from what the motion shows, which would pass for a readout time."""
 RADII_PX = (24.0, 8.0)
 """Of the windows around predicted pixels: by the run's camera, then by the one found so far."""
 
@@ -232,9 +236,9 @@ class RunProblem:
             sigma_inverse=np.hypot(nominal, depths.rms),
             shutter_velocity=share_of_rows(found.pixels[:, 1], camera)[:, None] * moving,
         )
-        sigmas = CalibrationPriors().sigmas(camera)
-        sigmas[[PARAMETERS.index(name) for name in FIXED]] = 0.0
-        start = parameters_of(camera, camera.depth_scale)
+        start, sigmas = parameters_of(camera, camera.depth_scale), np.zeros(len(PARAMETERS))
+        sigmas[list(FREE)] = CalibrationPriors().sigmas(camera)[list(FREE)]
+        sigmas[F] = FOCAL_SHARE * start[F]
         poses, points_world = self._poses[keyframe_rows], self._points[landmark_rows]
         return CalibrationProblem(views, poses, points_world, start, sigmas, GAUGE_SIGMAS)
 

@@ -1,11 +1,12 @@
 """Self-calibration in a run: what its first frames show of the camera, found and adopted.
 
 The run itself is the first stretch. After some frames the readout time of the rolling shutter and
-the delay of the depth images are estimated from its map (`calibration.rematching`), with the
-intrinsics held fixed: those of a published calibration are better than what a short stretch shows,
-and an error of the depth scale, which images and depths alone do not show, would be taken for one
-of the focal length. Whether a time is adopted is decided in `calibration.adoption`. If none is, the
-run goes on; else it begins anew, once, with the camera that was found.
+the delay of the depth images are estimated from its map (`calibration.rematching`). The focal
+lengths are estimated along with them but keep their values: those of a published calibration are
+better than what a short stretch shows, and an error of the depth scale, which images and depths
+alone do not show, would be taken for one of theirs. Whether a time is adopted is decided in
+`calibration.adoption`. If none is, the run goes on; else it begins anew, once, with the camera that
+was found.
 """
 
 from __future__ import annotations

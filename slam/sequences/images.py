@@ -66,13 +66,13 @@ def depth_between(near_m: Floats, other_m: Floats, share: float) -> Floats:
     """Depth (H, W) at a time between two depth images, ``share`` of the way to the other.
 
     At a fixed pixel on a surface the INVERSE depth changes linearly (exactly for a plane and a
-    small motion). Where the two show different surfaces, or one has no depth, the value is that of
-    the image nearer in time.
+    small motion). Where the two show different surfaces it cannot be told which one the pixel shows
+    in between: NaN. Where the other one has no depth, the value is that of the nearer image.
     """
     one_surface = np.abs(near_m - other_m) < SURFACE_STEP * near_m
     with np.errstate(divide="ignore"):
         between = near_m * other_m / (other_m + np.float32(share) * (near_m - other_m))
-    return np.where(one_surface, between, near_m)
+    return np.where(one_surface, between, np.where(np.isnan(other_m), near_m, np.float32(np.nan)))
 
 
 def _check_size(path: Path, image: NDArray, camera: Camera) -> None:

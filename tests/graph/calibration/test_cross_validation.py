@@ -47,5 +47,17 @@ def test_a_delay_is_confirmed_although_it_hides_in_the_noise_of_depth() -> None:
     assert found.gains.sum() > 0.35 * (z**2).sum()  # each half's cost drops by z^2 / 2
 
 
+def test_what_is_fitted_along_is_no_gain() -> None:
+    """Focal lengths 2 % off, the times right: only the focal lengths are to be changed."""
+    off = np.where(np.arange(13) < 2, 1.02 * ROLLING, ROLLING)
+    problem, _, _ = make_problem(truth=ROLLING, start=off, noise=1.0, keyframes=20)
+    along = np.where(np.arange(13) < 2, 0.02 * ROLLING, TIMES_ONLY)
+    problem = dataclasses.replace(problem, prior_sigmas=along)
+    whole, times = cross_validate(problem), cross_validate(problem, (TIME, SHUTTER))
+    assert whole is not None and times is not None
+    assert whole.gain_sigmas > 4 and abs(times.gain_sigmas) < 2
+    assert np.abs(times.calibrations - ROLLING)[:, SHUTTER].max() < 0.001
+
+
 def test_too_few_keyframes_give_no_result() -> None:
     assert cross_validate(make_problem(keyframes=8)[0]) is None

@@ -18,6 +18,7 @@ from bmask_slam.calibration.adoption import (
 from bmask_slam.calibration.report import parameter_named
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Image
+from bmask_slam.graph.calibration.cross_validation import CrossValidation
 from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -138,6 +139,27 @@ def test_only_observable_parameters_are_changed(
     config = SelfCalibrationConfig()
     assert estimate.differs(TIME, config) is differs
     assert not estimate.differs(SHUTTER, config)
+
+
+@pytest.mark.parametrize(
+    ("halves_ms", "agrees"),
+    [((-19.0, -21.0), True), ((-12.0, -24.0), True), ((-9.0, -21.0), False), ((-20, 20), False)],
+)
+def test_both_halves_have_to_find_what_is_adopted(
+    halves_ms: tuple[float, float], agrees: bool
+) -> None:
+    """Of -20 +- 1 ms found for a camera without delay, halves with sigmas of 1 ms."""
+    found = np.where(np.arange(13) == TIME, -0.020, 0.0)
+    estimate = Estimate(
+        np.zeros(13),
+        found,
+        np.full(13, 0.001),
+        None,  # type: ignore[arg-type]
+    )
+    calibrations = np.zeros((2, 13))
+    calibrations[:, TIME] = 1e-3 * np.array(halves_ms)
+    halves = CrossValidation(calibrations, np.full((2, 13), 0.001), np.zeros(4))
+    assert estimate.agrees(TIME, halves, SelfCalibrationConfig()) is agrees
 
 
 @pytest.mark.parametrize(

@@ -147,9 +147,9 @@ def test_no_camera(tmp_path, name):
     [
         ("rgbd_dataset_freiburg1_rpy", 0.026),
         ("tum_fr2_desk", 0.026),
-        ("rgbd_dataset_freiburg3_walking_xyz", 0.0248),
-        ("rgbd_bonn_crowd", 0.0248),
-        ("bonn_moving", 0.0248),
+        ("rgbd_dataset_freiburg3_walking_xyz", 0.0310),
+        ("rgbd_bonn_crowd", 0.0310),
+        ("bonn_moving", 0.0310),
         ("bonnet", 0.0),
         ("kitchen", 0.0),
     ],
@@ -219,7 +219,7 @@ def test_a_camera_is_read_as_it_was_written(tmp_path):
 def test_a_device_overrides_the_preset():
     own = Camera(640, 480, 611.0, 612.0, 320.0, 240.0)
     camera = given_camera(Path("xtion"), own)
-    assert (camera.fx, camera.rolling_shutter_s) == (611.0, 0.0248)
+    assert (camera.fx, camera.rolling_shutter_s) == (611.0, 0.0310)
 
 
 def test_all_presets_are_valid_cameras():
