@@ -25,7 +25,6 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.offline import checkpoint, runner
 from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
 from bmask_slam.offline.self_calibration import RememberingSegmenter, SelfCalibrator
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.run_folder.map_file import read_run
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
@@ -35,60 +34,54 @@ from bmask_slam.sequences import read_camera
 from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
-DELAY_S = 0.012
+FRAMES = 100
 
 
 @pytest.fixture(scope="module")
-def late_depth(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered sequence with delayed depth images, without the delay in its camera."""
-    folder = tmp_path_factory.mktemp("late") / "office"
-    config = RenderConfig(
-        "office", 100, fps=15.0, width=320, height=240, sweeping=True, depth_delay_ms=1e3 * DELAY_S
-    )
-    return render_sequence(config, folder)
-
-
-@pytest.fixture(scope="module")
-def found(late_depth: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+def found(late_sweep: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
     """A run with checkpoints that finds the delay."""
-    return run(late_options(late_depth, tmp_path_factory.mktemp("found") / "run"))
+    return run(late_options(late_sweep, tmp_path_factory.mktemp("found") / "run"))
 
 
 def late_options(sequence: Path, out: Path) -> RunOptions:
-    return RunOptions(sequence, CONFIG, quiet=True, checkpoint_every=40, out=out)
+    return RunOptions(sequence, CONFIG, quiet=True, checkpoint_every=40, out=out, max_frames=FRAMES)
 
 
-def test_a_delay_is_found_and_adopted(found: RunSummary, late_depth: Path, tmp_path: Path) -> None:
+def test_a_delay_is_found_and_adopted(
+    found: RunSummary, late_sweep: Path, sweep_camera: Camera, tmp_path: Path
+) -> None:
     assert found.calibration.startswith("colour-depth delay")
     assert found.calibration.endswith("found and applied")
     camera = read_camera(found.folder / "camera.yaml")
-    assert camera.depth_time_offset_s == pytest.approx(DELAY_S, abs=0.0015)
+    assert camera.depth_time_offset_s == pytest.approx(sweep_camera.depth_time_offset_s, abs=0.0015)
     assert camera.rolling_shutter_s == 0.0
     saved = read_run(found.folder)
     assert saved.camera == camera
-    assert len(Run(found.folder).frames.timestamps_s) == 100  # those tracked first are taken back
+    assert (
+        len(Run(found.folder).frames.timestamps_s) == FRAMES
+    )  # those tracked first are taken back
     out, known = tmp_path / "known", found.folder / "camera.yaml"
-    run(replace(late_options(late_depth, out), camera=known, calibrate="off"))
+    run(replace(late_options(late_sweep, out), camera=known, calibrate="off"))
     for name in ("trajectory.txt", "map", "graph"):  # as a run that has known the camera
         assert (out / name).read_bytes() == (found.folder / name).read_bytes(), name
 
 
 def test_the_map_of_such_a_run_is_continued_with_its_camera(
-    found: RunSummary, late_depth: Path, tmp_path: Path
+    found: RunSummary, late_sweep: Path, tmp_path: Path
 ) -> None:
-    gone_on = RunOptions(late_depth, CONFIG, out=tmp_path / "on", map=found.folder, quiet=True)
+    gone_on = RunOptions(late_sweep, CONFIG, out=tmp_path / "on", map=found.folder, quiet=True)
     with pytest.raises(InputError, match="can only be continued with its own camera"):
         run(dataclasses.replace(gone_on, calibrate="off"))
-    later = runner.inherited_calibration(gone_on, runner.open_sequence(late_depth))
+    later = runner.inherited_calibration(gone_on, runner.open_sequence(late_sweep))
     assert later.camera == read_camera(found.folder / "camera.yaml")
 
 
 @pytest.mark.parametrize("number", [4, 5, 6, 7])
 def test_killed_before_and_after_the_adoption_and_resumed(
-    number: int, found: RunSummary, late_depth: Path, tmp_path: Path
+    number: int, found: RunSummary, late_sweep: Path, tmp_path: Path
 ) -> None:
     """Killed after and before the checkpoints of 40 and 80 frames, and of the new beginning."""
-    options, written = late_options(late_depth, tmp_path / "run"), 0
+    options, written = late_options(late_sweep, tmp_path / "run"), 0
     write = checkpoint.write_checkpoint
 
     def killed(path: Path, content: checkpoint.Checkpoint) -> None:
@@ -110,8 +103,8 @@ def test_killed_before_and_after_the_adoption_and_resumed(
         assert (tmp_path / "run" / name).read_bytes() == (found.folder / name).read_bytes(), name
 
 
-def test_report_and_off_change_nothing(late_depth: Path, tmp_path: Path) -> None:
-    options = RunOptions(late_depth, CONFIG, quiet=True, max_frames=100)
+def test_report_and_off_change_nothing(late_sweep: Path, tmp_path: Path) -> None:
+    options = RunOptions(late_sweep, CONFIG, quiet=True, max_frames=FRAMES)
     reported = run(dataclasses.replace(options, out=tmp_path / "r", calibrate="report"))
     off = run(dataclasses.replace(options, out=tmp_path / "o", calibrate="off"))
     assert reported.calibration.endswith("found, not applied") and off.calibration == ""
