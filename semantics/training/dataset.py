@@ -138,13 +138,14 @@ def split(content: CocoFile, share: float, seed: int) -> tuple[CocoFile, CocoFil
     """Split a file's images at random into a training part and a validation part.
 
     Images are drawn in the order of their ids, so that the split depends only on these and the
-    seed. ``share`` is that of the validation part.
+    seed; the parts keep the file's order. ``share`` is that of the validation part.
     """
     images = sorted(content.images, key=lambda i: i.number)
     order = np.random.default_rng(seed).permutation(len(images))
     held_out = {images[k].number for k in order[: round(share * len(images))].tolist()}
     parts = [
-        tuple(i for i in images if (i.number in held_out) == second) for second in (False, True)
+        tuple(i for i in content.images if (i.number in held_out) == second)
+        for second in (False, True)
     ]
     training, validation = (
         CocoFile(content.labels, content.category_ids, part, content.problems) for part in parts

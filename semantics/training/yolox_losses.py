@@ -17,7 +17,7 @@ from bmask_slam.semantics.network.yolox.selection import SelectionConfig, select
 from bmask_slam.semantics.training.losses import Losses, Rois, around_objects, dice_loss
 from bmask_slam.semantics.training.targets import Target, iou_targets, mask_targets
 
-DETECTED = SelectionConfig(min_score=0.05)
+DETECTED = SelectionConfig(min_score=0.05, nms_iou=0.65)
 MATCH_IOU = 0.4
 """A detected box is an example if it overlaps an object of its class by this."""
 
