@@ -152,7 +152,7 @@ def sees_the_same(judged: Judged, T_a_b: Array, camera: Any) -> bool:
         pixels = camera.project(points) if len(points) else np.zeros((0, 2))
         inside = ((pixels > 0) & (pixels < [camera.width - 1, camera.height - 1])).all(axis=1)
         shares.append(inside.sum() / max(np.isfinite(view.points_camera[:, 2]).sum(), 1))
-    return min(shares) > SEEN_SHARE
+    return bool(min(shares) > SEEN_SHARE)
 
 
 def nees(errors: list[Array], covariances: list[Array]) -> float:
