@@ -53,11 +53,16 @@ def write_ply(path: Path, columns: Mapping[str, NDArray[Any]], comment: str = ""
         temporary.write_bytes("\n".join(header).encode("ascii") + vertices.tobytes())
 
 
-def read_ply(path: Path) -> Arrays:
+POINTS = ("x", "y", "z", "red", "green", "blue")
+"""Columns of coloured points."""
+
+
+def read_ply(path: Path, needed: tuple[str, ...] = ()) -> Arrays:
     """Columns (N,) of the vertices of a file as ``write_ply`` makes them.
 
     Raises:
-        InputError: no such file, another format, or fewer bytes than the header promises.
+        InputError: no such file, another format, fewer bytes than the header promises, or a column
+            of ``needed`` that it does not have.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a binary PLY file")
@@ -76,7 +81,16 @@ def read_ply(path: Path) -> Arrays:
     if len(body) < count * dtype.itemsize:
         raise InputError(f"{path}: {len(body)} bytes for {count} vertices; the file is cut off")
     vertices = np.frombuffer(body, dtype, count)
-    return {name: vertices[name].copy() for name in vertices.dtype.names or ()}
+    columns = {name: vertices[name].copy() for name in vertices.dtype.names or ()}
+    check_columns(columns, needed, path)
+    return columns
+
+
+def check_columns(columns: Arrays, needed: tuple[str, ...], path: Path) -> None:
+    """Raise InputError for a column of a file that is not there."""
+    for name in needed:
+        if name not in columns:
+            raise InputError(f"{path}: has no column {name!r}; make it again")
 
 
 def _layout(lines: list[str]) -> tuple[int, np.dtype]:

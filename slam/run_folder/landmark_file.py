@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.ply import read_ply, write_ply
+from bmask_slam.graph.files.ply import POINTS, check_columns, read_ply, write_ply
 from bmask_slam.labelling.results import LandmarkCloud
 
 LANDMARKS = "landmarks.ply"
@@ -123,14 +123,11 @@ def _columns(
 
     The columns ``together`` are needed if the first of them is there.
     """
-    columns = read_ply(path)
-    position, colour = ("x", "y", "z"), ("red", "green", "blue")
-    needed = (*needed, *together) if columns.keys() & set(together[:1]) else needed
-    missing = [name for name in (*position, *colour, *needed) if name not in columns]
-    if missing:
-        raise InputError(f"{path}: has no column {missing[0]!r}; make it again")
-    columns["xyz"] = np.stack([columns[name] for name in position], axis=1).astype(float)
-    columns["rgb"] = np.stack([columns[name] for name in colour], axis=1)
+    columns = read_ply(path, (*POINTS, *needed))
+    if columns.keys() & set(together[:1]):
+        check_columns(columns, together, path)
+    columns["xyz"] = np.stack([columns[name] for name in POINTS[:3]], axis=1).astype(float)
+    columns["rgb"] = np.stack([columns[name] for name in POINTS[3:]], axis=1)
     return columns
 
 

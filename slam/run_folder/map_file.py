@@ -20,7 +20,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.array_file import FileKind, part, read_arrays, write_arrays
-from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.files.ply import POINTS, read_ply
 from bmask_slam.graph.marginals.landmark_marginalisation import reinsert
 from bmask_slam.graph.smoother.storage import read_camera, read_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum
@@ -102,7 +102,7 @@ def read_run(path: Path) -> SavedRun:
         _keyframe_stamps(path / FRAMES, tables.keyframes.ids),
         {file.name: read_tum(file) for file in trajectory_files(path)},
         read_tum(path / "keyframes.txt"),
-        read_ply(path / "landmarks.ply"),
+        read_ply(path / "landmarks.ply", (*POINTS, "observations", "id")),
     )
     _check_same_run(run)
     return run

@@ -9,7 +9,7 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Arrays, Bytes
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import RelativePose
-from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.files.ply import POINTS, read_ply
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.run_folder.frame_file import FRAMES, FrameTable, read_frames
 from bmask_slam.run_folder.map_file import SavedRun, read_run
@@ -55,7 +55,7 @@ def _show_map(run: SavedRun, scene: Scene) -> None:
         scene.log_boxes(_boxes(run.path))
     dense = run.path / "dense" / "cloud.ply"
     if dense.is_file():
-        cloud = read_ply(dense)
+        cloud = read_ply(dense, POINTS)
         step = max(len(cloud["x"]) // MAX_DENSE_POINTS, 1)
         some = {name: column[::step] for name, column in cloud.items()}
         scene.log_points("world/dense", _xyz(some), _rgb(some), 0.006)

@@ -15,8 +15,9 @@ from bmask_slam.datasets.weights import find_weights
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.json_file import STRICT, Name, read_json
-from bmask_slam.graph.files.ply import read_ply
+from bmask_slam.graph.files.ply import POINTS, read_ply
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
 from bmask_slam.graph.trajectory import associate, nearest_indices, read_tum
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
@@ -75,7 +76,9 @@ def label_accuracy(run: Path, sequence: Sequence) -> float | None:
     keyframes, truth = associate(read_tum(run / "keyframes.txt"), sequence.groundtruth)
     if not len(keyframes):
         return None
-    cloud, labels = read_ply(run / "landmarks.ply"), read_labels(run)
+    cloud, labels = read_ply(run / "landmarks.ply", POINTS[:3]), read_labels(run)
+    if len(labels.ids) != len(cloud["x"]):
+        raise InputError(f"{run / LABELS}: not a line for each of landmarks.ply; run again")
     points_world = np.column_stack([cloud[axis] for axis in "xyz"]).astype(float)
     points_truth = transform(
         truth_from_world(keyframes.poses_world_camera, truth.poses_world_camera), points_world

@@ -88,3 +88,10 @@ def test_data_after_the_vertices_is_skipped(tmp_path: Path) -> None:
     header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     path.write_bytes(header.encode() + b"\x05\x07" + b"\x03abcdefghijkl")
     assert {name: column.tolist() for name, column in read_ply(path).items()} == {"x": [5, 7]}
+
+
+def test_a_column_that_is_needed(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", {"x": np.zeros(2, np.float32), "y": np.ones(2, np.float32)})
+    assert list(read_ply(tmp_path / "a.ply", ("x", "y"))) == ["x", "y"]
+    with pytest.raises(InputError, match=r"a\.ply: has no column 'z'; make it again"):
+        read_ply(tmp_path / "a.ply", ("x", "z"))
