@@ -9,7 +9,7 @@ from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import carried_along, inverse, orthonormalised, se3_exp, se3_log
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.tracking.guided_landmarks import GuidedLandmarks
+from bmask_slam.tracking.guided_landmarks import Guided, GuidedLandmarks
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
@@ -258,23 +258,33 @@ class CameraTracker:
         self._images.follow(features, T_last_next, self._now_s - self._last_s)
 
     def _tracked_in_image(self, features: Features) -> Tracked:
-        """The pose by the local map, with the help of the image's motion where there is need."""
-        if self._images.followed is not None:
-            guided = self._guided(features)
-            if guided.status is TrackingStatus.OK:
-                return guided
-            return more(guided, self._tracked(features, self._local_ids))
-        tracked = self._tracked(features, self._local_ids)
-        if tracked.firm < self._images.config.few_inliers:
-            self._follow(features)
-        return tracked if self._images.followed is None else more(tracked, self._guided(features))
+        """The pose by the local map, with the help of the image's motion where there is need.
 
-    def _guided(self, features: Features) -> Tracked:
-        """The pose by the local map, of which landmarks were followed from the last image."""
-        world, local_ids = self._map.world, self._local_ids
-        guided = self._images.guided(features, local_ids, world.landmarks)
+        Landmarks are followed only where few are matched: those that are matched lie better.
+        """
+        enough = self._images.config.few_inliers
+        expected = self._images.followed is None
+        tracked = self._tracked(features, self._local_ids) if expected else self._refined(features)
+        if tracked.firm >= enough:
+            return tracked
+        if expected:
+            self._follow(features)
+        if self._images.followed is not None:
+            guided = self._images.guided(features, self._local_ids, self._map.world.landmarks)
+            tracked = more(tracked, self._refined(features, guided))
+        if expected or tracked.status is TrackingStatus.OK:
+            return tracked
+        return more(tracked, self._tracked(features, self._local_ids))
+
+    def _refined(self, features: Features, guided: Guided | None = None) -> Tracked:
+        """The pose by the local map, from where the image's motion expects it."""
         return self.tracker.refine(
-            features, self._predicted(), local_ids, world, self._previous(), guided
+            features,
+            self._predicted(),
+            self._local_ids,
+            self._map.world,
+            self._previous(),
+            guided,
         )
 
     def _predicted(self) -> Array:
