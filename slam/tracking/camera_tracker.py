@@ -243,14 +243,8 @@ class CameraTracker:
         self._local_ids = local_landmarks(world, observed, self._local_map)
 
     def _tracked(self, features: Features, local_ids: Ints) -> Tracked:
-        return self.tracker.track(
-            features,
-            self._predicted(),
-            self._recent_ids,
-            local_ids,
-            self._map.world,
-            self._previous(),
-        )
+        T, recent_ids, world = self._predicted(), self._recent_ids, self._map.world
+        return self.tracker.track(features, T, recent_ids, local_ids, world, self._previous())
 
     def _follow(self, features: Features) -> None:
         """Follow the last frame's corners into this one."""
@@ -262,30 +256,24 @@ class CameraTracker:
 
         Landmarks are followed only where few are matched: those that are matched lie better.
         """
-        enough = self._images.config.few_inliers
-        expected = self._images.followed is None
-        tracked = self._tracked(features, self._local_ids) if expected else self._refined(features)
-        if tracked.firm >= enough:
+        images, local_ids = self._images, self._local_ids
+        seen = images.followed is not None
+        tracked = self._refined(features) if seen else self._tracked(features, local_ids)
+        if tracked.firm >= images.config.few_inliers:
             return tracked
-        if expected:
+        if not seen:
             self._follow(features)
-        if self._images.followed is not None:
-            guided = self._images.guided(features, self._local_ids, self._map.world.landmarks)
+        if images.followed is not None:
+            guided = images.guided(features, local_ids, self._map.world.landmarks)
             tracked = more(tracked, self._refined(features, guided))
-        if expected or tracked.status is TrackingStatus.OK:
-            return tracked
-        return more(tracked, self._tracked(features, self._local_ids))
+        if seen and tracked.firm < self.tracker.config.min_inliers:
+            tracked = more(tracked, self._tracked(features, local_ids))
+        return tracked
 
     def _refined(self, features: Features, guided: Guided | None = None) -> Tracked:
         """The pose by the local map, from where the image's motion expects it."""
-        return self.tracker.refine(
-            features,
-            self._predicted(),
-            self._local_ids,
-            self._map.world,
-            self._previous(),
-            guided,
-        )
+        T, ids, world = self._predicted(), self._local_ids, self._map.world
+        return self.tracker.refine(features, T, ids, world, self._previous(), guided)
 
     def _predicted(self) -> Array:
         """T_world_camera (4, 4), by the image's motion if that is known, else by velocity."""

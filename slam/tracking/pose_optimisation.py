@@ -53,6 +53,11 @@ class PoseEstimate:
     noise_scale: float
     ok: bool
 
+    @property
+    def position_sigma_m(self) -> float:
+        """Standard deviation of the position, over all directions, by the information."""
+        return float(np.sqrt(np.trace(np.linalg.inv(self.information)[3:, 3:])))
+
 
 def residuals(
     T_world_camera: Array, points_world: Array, measurements: Array, camera: Camera

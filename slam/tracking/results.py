@@ -13,7 +13,7 @@ from bmask_slam.graph.arrays import Array, Ints
 
 
 class TrackingStatus(Enum):
-    """OK: enough inliers. WEAK: a pose from few inliers. LOST: no pose."""
+    """OK: a pose. WEAK: an uncertain one: few or contradictory matches, far points. LOST: none."""
 
     OK = "OK"
     WEAK = "WEAK"
@@ -61,14 +61,11 @@ def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked
 
 
 def more(first: Tracked, second: Tracked) -> Tracked:
-    """That of two results with a better status, then with more landmarks; else the first.
+    """That of two results with more landmarks, else the first; a lost one has none.
 
     Landmarks that rest on the flow alone count at most as many as the others.
     """
-    found = [
-        (r.status is TrackingStatus.OK, min(len(r.landmark_ids), 2 * r.firm), len(r.landmark_ids))
-        for r in (first, second)
-    ]
+    found = [(min(len(r.landmark_ids), 2 * r.firm), len(r.landmark_ids)) for r in (first, second)]
     return second if found[1] > found[0] else first
 
 

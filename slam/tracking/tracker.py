@@ -42,11 +42,12 @@ COARSE_STEP = 1e-3
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Search windows in pixels, and the numbers of inliers for the status OK and WEAK.
+    """Search windows in pixels, and what a frame needs for the status OK and WEAK.
 
-    The first search is for the landmarks of the last frame only, around their predicted places; if
-    it fails, for the whole local map, finally in windows of ``wide_radius_px``. The second search
-    is for the whole local map in windows of ``local_radius_px``.
+    A frame is WEAK with ``weak_inliers``; it is OK with ``min_inliers`` that are at least half of
+    its matches, and a position with a standard deviation of at most ``max_sigma_m``. The first
+    search is for the last frame's landmarks around their predicted places; if it fails, for the
+    whole local map, then with ``wide_radius_px``; the second, with ``local_radius_px``, for all.
     """
 
     search_radius_px: float = 20.0
@@ -54,6 +55,7 @@ class TrackingConfig:
     local_radius_px: float = 6.0
     min_inliers: int = 30
     weak_inliers: int = 15
+    max_sigma_m: float = 0.005
     max_view_angle_deg: float = 60.0
     match: MatchConfig = field(default_factory=MatchConfig)
     pose: PoseOptimisationConfig = field(default_factory=PoseOptimisationConfig)
@@ -141,13 +143,14 @@ class Tracker:
         estimate: PoseEstimate,
         firm: int,
     ) -> Tracked:
-        """The frame with its pose, of which some landmarks in view and their matches agree."""
+        """The frame with its pose, which some landmarks in view and their matches agree with."""
         kept = matches[estimate.inliers]
-        status = TrackingStatus.OK if firm >= self.config.min_inliers else TrackingStatus.WEAK
+        agreed = firm >= self.config.min_inliers and 2 * len(kept) >= len(matches)
+        certain = agreed and estimate.position_sigma_m <= self.config.max_sigma_m
         noise = np.array([estimate.noise_scale, estimate.noise_scale, 1.0])
         features = replace(features, sigmas_px=features.sigmas_px * noise)
         return Tracked(
-            status=status,
+            status=TrackingStatus.OK if certain else TrackingStatus.WEAK,
             T_world_camera=estimate.T_world_camera,
             features=features,
             keypoints=kept.train,

@@ -112,6 +112,33 @@ def test_the_status_depends_on_the_inliers(seen: int, status: TrackingStatus) ->
         assert len(tracked.keypoints) == len(tracked.landmark_ids) == 0
 
 
+@pytest.mark.parametrize(("wrong", "status"), [(80, TrackingStatus.OK), (120, TrackingStatus.WEAK)])
+def test_a_pose_that_most_matches_contradict_is_weak(wrong: int, status: TrackingStatus) -> None:
+    rng = np.random.default_rng(5)
+    world, _ = make_map(200, rng)
+    features = observe(world, rng, clutter=0, noise=0.1)
+    pixels = features.pixels.copy()
+    turn = rng.uniform(0, 2 * np.pi, wrong)
+    pixels[:wrong] += 25 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    config = replace(PLAIN, local_radius_px=30.0)
+    tracked = track(world, replace(features, pixels=pixels), T_WORLD_CAMERA, config)
+    assert tracked.matches > 190
+    assert len(tracked.landmark_ids) == pytest.approx(200 - wrong, abs=15)
+    assert tracked.status is status
+
+
+def test_a_position_that_is_uncertain_is_weak() -> None:
+    rng = np.random.default_rng(6)
+    world, _ = make_map(200, rng)
+    features = observe(world, rng, clutter=0, noise=0.1)
+    near = track(world, features, T_WORLD_CAMERA)
+    assert near.status is TrackingStatus.OK
+    sigma_m = float(np.sqrt(np.trace(np.linalg.inv(near.information)[3:, 3:])))
+    for share, status in ((0.9, TrackingStatus.WEAK), (1.1, TrackingStatus.OK)):
+        config = replace(PLAIN, max_sigma_m=share * sigma_m)
+        assert track(world, features, T_WORLD_CAMERA, config).status is status
+
+
 @pytest.mark.parametrize("what", ["no keypoints", "no landmarks", "other place", "dead landmarks"])
 def test_a_wrong_map_gives_lost(what: str) -> None:
     rng = np.random.default_rng(4)
