@@ -56,8 +56,11 @@ class Input:
 
 RENDERED = {
     "office-300": RenderConfig("office", frames=300),
+    "living_room-360": RenderConfig("living_room", frames=360),
+    "room7-360": RenderConfig("room", frames=360, seed=7),
 }
 """Rendered sources; all others are recordings."""
+FAST = Hardship(shutter=0.5, readout_s=0.02, restamp=True)
 INPUTS = {
     "rpy": Input("tum_fr1_rpy", timing=KINECT_V1),
     "rpy-x2": Input("tum_fr1_rpy", stride=2, timing=KINECT_V1),
@@ -66,8 +69,11 @@ INPUTS = {
     "kitchen-x3": Input("redkitchen", stride=3, hand_eye=True),
     "kitchen-x3-blur": Input("redkitchen", Hardship(stride=3, shutter=0.6), hand_eye=True),
     "kitchen-box": Input("redkitchen", Hardship(max_frames=200, box_px=11), hand_eye=True),
-    "office-x2": Input("office-300", Hardship(stride=2, shutter=0.5, readout_s=0.02, restamp=True)),
-    "office-x3": Input("office-300", Hardship(stride=3, shutter=0.5, readout_s=0.02, restamp=True)),
+    **{
+        f"{source.split('-')[0]}-x{speed}": Input(source, replace(FAST, stride=speed))
+        for source in RENDERED
+        for speed in (2, 3)
+    },
     "kitchen": Input("redkitchen", hand_eye=True),
     "office": Input("office-300"),
 }
