@@ -166,6 +166,7 @@ def nees(errors: list[Array], covariances: list[Array]) -> float:
 def with_and_without(name: str, folder: Path, segmenter: str, work: Path) -> Row:
     """Run a sequence twice and judge its loops."""
     made: list[Observed] = []
+    last: list[Observed] = []
     sequence, hand_eye = open_sequence(folder), name in ONLY_BY_HAND_EYE
     errors_m = []
     for k, settings in enumerate(("loops.enabled=true", "loops.enabled=false")):
@@ -181,8 +182,9 @@ def with_and_without(name: str, folder: Path, segmenter: str, work: Path) -> Row
 
         run(RunOptions(folder, config, out=out, overwrite=True, quiet=True), make)
         closing.verify_loop = verify_loop
+        last.append(made[-1])  # a run makes others before, to look at its camera
         errors_m.append(evaluate(out, folder, with_body=hand_eye).value("ate_rmse"))
-    return judge(name, made[0], sequence, (errors_m[0], errors_m[1]))
+    return judge(name, last[0], sequence, (errors_m[0], errors_m[1]))
 
 
 def judge(name: str, system: Observed, sequence: Sequence, ate_m: tuple[float, float]) -> Row:
