@@ -6,7 +6,6 @@ import json
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -43,23 +42,16 @@ def sequence(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("arguments", [["--help"], *([c, "--help"] for c in COMMANDS)])
-def test_help_answers_in_half_a_second_without_heavy_imports(arguments: list[str]) -> None:
+def test_help_answers_without_heavy_imports(arguments: list[str]) -> None:
     code = (
         "import sys; from bmask_slam.cli import main\n"
         f"try: main({arguments!r})\n"
         f"finally: print(set({HEAVY!r}) & set(sys.modules))"
     )
-    taken_s = []
-    for _ in range(3):  # the best of three: the machine may be busy
-        start_s = time.perf_counter()
-        command = [sys.executable, "-c", code]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-        taken_s.append(time.perf_counter() - start_s)
-        if taken_s[-1] < 0.5:
-            break
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert "usage: bmask-slam" in done.stdout
     assert done.stdout.endswith("set()\n")
-    assert min(taken_s) < 0.5
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -222,7 +222,7 @@ def test_a_run_can_fuse_keyframes_while_tracking(
     assert main([*arguments, "--out", str(run), "--quiet"]) == 0
     counts = json.loads((run / "dense" / "dense.json").read_text())
     total = counts["keyframes_fused"] + counts["keyframes_reused"]
-    assert total == len(open_run(run).keyframes) > 8
+    assert total == len(open_run(run).keyframes) >= 8
     assert counts["keyframes_reused"] >= total - 7 - len(counts["keyframes_left_out"])
     assert len(counts["label_shares"]) > 3
     capsys.readouterr()
