@@ -9,7 +9,7 @@ from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import carried_along, inverse, orthonormalised, se3_exp, se3_log
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.tracking.guided_landmarks import Guided, GuidedLandmarks
+from bmask_slam.tracking.guided_landmarks import GuidedLandmarks
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
@@ -252,27 +252,24 @@ class CameraTracker:
         self._images.follow(features, T_last_next, self._now_s - self._last_s)
 
     def _tracked_in_image(self, features: Features) -> Tracked:
-        """The pose by the local map, with the help of the image's motion where there is need.
-
-        Landmarks are followed only where few are matched: those that are matched lie better.
-        """
-        images, local_ids = self._images, self._local_ids
-        seen = images.followed is not None
-        tracked = self._refined(features) if seen else self._tracked(features, local_ids)
-        if tracked.firm >= images.config.few_inliers:
-            return tracked
-        if not seen:
+        """The pose by the local map, with the help of the image's motion where there is need."""
+        enough = self.tracker.config.min_inliers
+        if self._images.followed is not None:
+            guided = self._guided(features)
+            if guided.firm >= enough:
+                return guided
+            return more(guided, self._tracked(features, self._local_ids), enough)
+        tracked = self._tracked(features, self._local_ids)
+        if tracked.firm < self._images.config.few_inliers:
             self._follow(features)
-        if images.followed is not None:
-            guided = images.guided(features, local_ids, self._map.world.landmarks)
-            tracked = more(tracked, self._refined(features, guided))
-        if seen and tracked.firm < self.tracker.config.min_inliers:
-            tracked = more(tracked, self._tracked(features, local_ids))
-        return tracked
+        if self._images.followed is None:
+            return tracked
+        return more(tracked, self._guided(features), enough)
 
-    def _refined(self, features: Features, guided: Guided | None = None) -> Tracked:
-        """The pose by the local map, from where the image's motion expects it."""
+    def _guided(self, features: Features) -> Tracked:
+        """The pose by the local map, of which landmarks were followed from the last image."""
         T, ids, world = self._predicted(), self._local_ids, self._map.world
+        guided = self._images.guided(features, ids, world.landmarks)
         return self.tracker.refine(features, T, ids, world, self._previous(), guided)
 
     def _predicted(self) -> Array:

@@ -60,12 +60,15 @@ def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked
     return replace(begun, status=TrackingStatus.LOST, matches=matches)
 
 
-def more(first: Tracked, second: Tracked) -> Tracked:
-    """That of two results with more landmarks, else the first; a lost one has none.
+def more(first: Tracked, second: Tracked, enough: int) -> Tracked:
+    """That of two results with enough firm landmarks, then with more of all; else the first.
 
     Landmarks that rest on the flow alone count at most as many as the others.
     """
-    found = [(min(len(r.landmark_ids), 2 * r.firm), len(r.landmark_ids)) for r in (first, second)]
+    found = [
+        (r.firm >= enough, min(len(r.landmark_ids), 2 * r.firm), len(r.landmark_ids))
+        for r in (first, second)
+    ]
     return second if found[1] > found[0] else first
 
 
