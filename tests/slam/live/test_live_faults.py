@@ -182,14 +182,14 @@ def test_a_viewer_that_is_closed_changes_nothing(tmp_path, monkeypatch) -> None:
     def spawn(stream: rerun.RecordingStream) -> None:
         """Start a viewer without a window, since tests have no display."""
         command = [sys.executable, "-m", "rerun", "--serve-grpc", "--port", str(port)]
-        viewers.append(subprocess.Popen(command, stdout=-3, stderr=-3))
+        viewers.append(subprocess.Popen(command, stdout=-3, stderr=-3, process_group=0))
         stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
 
     monkeypatch.setattr(rerun.RecordingStream, "spawn", spawn)
     options = LiveOptions(tmp_path / "run", view=ViewOptions(window=True))
     with LiveSlam(CAMERA, CONFIG, options) as slam:
         track_frames(slam, FRAMES[:8])
-        viewers[0].kill()
+        os.killpg(viewers[0].pid, signal.SIGKILL)  # the program is a child of Python's
         viewers[0].wait()
         assert set(track_frames(slam, FRAMES[8:])) == {TrackingStatus.OK}
         started_s = time.monotonic()
