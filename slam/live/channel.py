@@ -21,6 +21,8 @@ from typing import Any
 
 from bmask_slam.live.shared_memory import Ring
 
+logger = logging.getLogger(__name__)
+
 LARGE = 1 << 15
 """Bytes from which on an array goes through shared memory."""
 _END = object()
@@ -100,9 +102,12 @@ class Channel:
                     logging.getLogger(message.name).handle(message)
                 else:
                     self._inbox.put(message)
-        except (EOFError, OSError):
-            self.open = False
-            self._inbox.put(_END)
+        except (EOFError, OSError):  # the other side has ended
+            pass
+        except Exception:  # a message that this side cannot read, as after a change of its files
+            logger.exception("a message between processes cannot be read")
+        self.open = False
+        self._inbox.put(_END)
 
     def _pack(self, message: Any) -> tuple[bytes, list[bytes | tuple[int, int]]]:
         """The pickled message and its large buffers: (position, size) in the ring, or bytes."""

@@ -101,6 +101,24 @@ def test_a_workers_error_is_raised() -> None:
     assert not worker.is_running
 
 
+class Unreadable:
+    """Raises where it is unpickled."""
+
+    def __reduce__(self) -> tuple[type[int], tuple[str]]:
+        return int, ("no number",)
+
+
+def test_a_message_that_cannot_be_read_ends_the_worker(caplog) -> None:
+    worker = Worker("echo", f"{HERE}:echo", "a")
+    worker.send(1)
+    answers(worker, 1)
+    worker.send(Unreadable())
+    assert has_ended(worker.pid, 30.0)
+    worker.receive(1.0)
+    assert any("cannot be read" in text and "no number" in text for text in caplog.messages)
+    worker.stop()
+
+
 def test_a_killed_worker_is_detected_and_sending_is_safe() -> None:
     worker = Worker("echo", f"{HERE}:echo", "a")
     worker.send(1)
