@@ -130,4 +130,6 @@ def _write_run(
     keyframes = Trajectory(np.round(times_s, 6), tables.keyframes.values)
     write_tum(run / "keyframes.txt", keyframes)
     x, y, z = tables.landmarks.values.T.astype(np.float32)
-    write_ply(run / "landmarks.ply", {"x": x, "y": y, "z": z})
+    colours = dict.fromkeys(("red", "green", "blue"), np.zeros(len(x), np.uint8))
+    numbers = {"observations": np.ones(len(x), np.int32), "id": np.arange(len(x), dtype=np.int32)}
+    write_ply(run / "landmarks.ply", {"x": x, "y": y, "z": z, **colours, **numbers})
