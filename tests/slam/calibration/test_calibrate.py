@@ -107,7 +107,7 @@ def test_the_next_run_reads_what_was_written(made: tuple[Path, Path], tmp_path: 
     def typical_error_m(index: int, camera: Camera) -> float:
         T = camera_path(opened.timestamps_s[[index]])[0]
         depth_m = open_sequence(sequence, camera=camera).load(index).depth_m
-        assert np.isfinite(depth_m).mean() > 0.9  # missing where the surface changes
+        assert np.isfinite(depth_m).mean() > 0.6  # missing where the surface changes
         apart_m = np.abs(depth_m - room_depth(T, TRUTH, pixels).reshape(240, 320))
         return float(np.nanmedian(apart_m))
 
