@@ -61,11 +61,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = make_parser().parse_args(argv)
     try:
         with _terminations():
-            return int(arguments.handler(arguments))
+            code = int(arguments.handler(arguments))
+        if code == 128 + signal.SIGHUP:  # the terminal was closed: nobody reads on
+            _discard_output()
+        return code
     except InputError as error:
         return _fail(str(error))
     except BrokenPipeError:  # `bmask-slam info ... | head`: nobody reads on
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
         return 128 + signal.SIGPIPE
     except (OSError, MemoryError) as error:
         return _after_refusal(error)
@@ -78,11 +81,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 128 + ended.number
 
 
+def _discard_output() -> None:
+    """Let the rest of what was printed go nowhere: the end of Python would fail to write it."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(nowhere, stream.fileno())
+
+
 def _after_refusal(error: OSError | MemoryError) -> int:
     """The exit status after what the machine refuses; another error is raised again."""
     if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
         return _fail(MEMORY)
-    if error.errno == errno.EIO and error.filename is None:
+    if error.errno == errno.EIO and error.filename is None:  # the terminal was closed
+        _discard_output()
         return 128 + signal.SIGHUP
     if error.errno not in CURES:
         raise error

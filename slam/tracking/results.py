@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.events import Event
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, no_ids
 
 
 class TrackingStatus(Enum):
@@ -34,6 +34,7 @@ class Tracked:
         matches: number of matches before the robust estimate.
         visible_ids: landmarks of the local map that project into the frame.
         information: (6, 6) of the pose.
+        flow_only: those of the landmarks that rest on the flow of the image alone.
     """
 
     status: TrackingStatus
@@ -45,6 +46,7 @@ class Tracked:
     visible_ids: Ints
     information: Array
     firm: int
+    flow_only: Ints = field(default_factory=no_ids)
 
     @property
     def landmark_of(self) -> Ints:

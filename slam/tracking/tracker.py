@@ -15,7 +15,7 @@ from bmask_slam.features.matching import (
     match_pairs,
 )
 from bmask_slam.features.patch_alignment import SubpixelConfig, register_patches
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.tracking.guided_landmarks import Guided, weighted, with_guided, without_unused
@@ -131,9 +131,8 @@ class Tracker:
         )
         if not estimate.ok or estimate.inliers.sum() < self.config.weak_inliers:
             return lost(T_world_camera, detected, len(matches))
-        firm = int((estimate.inliers & ~loose).sum())
-        tracked = self._result(features, matches, visible, estimate, firm)
-        return tracked if guided is None else without_unused(tracked, guided)
+        found = self._result(features, matches, visible, estimate, loose)
+        return without_unused(found, guided) if guided else found
 
     def _result(
         self,
@@ -141,14 +140,14 @@ class Tracker:
         matches: Matches,
         visible: Ints,
         estimate: PoseEstimate,
-        firm: int,
+        loose: Mask,
     ) -> Tracked:
-        """The frame with its pose, which some landmarks in view and their matches agree with."""
-        kept = matches[estimate.inliers]
-        agreed = firm >= self.config.min_inliers and 2 * len(kept) >= len(matches)
+        """The frame with its pose; ``loose`` are the matches that rest on the flow alone."""
+        kept, loose = matches[estimate.inliers], loose[estimate.inliers]
+        agreed = (~loose).sum() >= self.config.min_inliers and 2 * len(kept) >= len(matches)
         certain = agreed and estimate.position_sigma_m <= self.config.max_sigma_m
-        noise = np.array([estimate.noise_scale, estimate.noise_scale, 1.0])
-        features = replace(features, sigmas_px=features.sigmas_px * noise)
+        scale = estimate.noise_scale
+        features = replace(features, sigmas_px=features.sigmas_px * [scale, scale, 1.0])
         return Tracked(
             status=TrackingStatus.OK if certain else TrackingStatus.WEAK,
             T_world_camera=estimate.T_world_camera,
@@ -158,7 +157,8 @@ class Tracker:
             matches=len(matches),
             visible_ids=visible,
             information=estimate.information,
-            firm=firm,
+            firm=int((~loose).sum()),
+            flow_only=visible[kept.query[loose]],
         )
 
     def _refined(

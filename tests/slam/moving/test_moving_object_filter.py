@@ -224,8 +224,8 @@ def test_landmarks_are_kept_until_their_object_moves(frames: list[Frame]) -> Non
     for frame in standing(27)[20:]:
         system.process(frame)
     assert landmarks_on_card(system) > 0.8 * before > 50
-    for frame in frames[9:]:
-        system.process(replace(frame, index=frame.index + 20, timestamp_s=frame.timestamp_s + 0.6))
+    for frame in frames:
+        system.process(replace(frame, index=frame.index + 27, timestamp_s=frame.timestamp_s + 0.9))
     assert landmarks_on_card(system) < 0.1 * before
 
 

@@ -87,9 +87,10 @@ def test_no_frames_give_no_trajectories() -> None:
 
 def noisy_frames(history: FrameHistory, keyframe_poses: Array, count: int) -> Array:
     """Frames of a camera that moves steadily, with noise; returns the true positions (N, 3)."""
+    draw = np.random.default_rng(8)
     path = np.arange(count)[:, None] * np.array([0.01, 0.0, 0.005])
     for i, place in enumerate(path):
-        noise = RNG.normal(size=6) * np.repeat([1e-3, 4e-3], 3)
+        noise = draw.normal(size=6) * np.repeat([1e-3, 4e-3], 3)
         T_world_camera = make_pose(np.eye(3), place) @ se3_exp(noise)
         information = np.diag(np.repeat([1e6, 1 / 16e-6], 3))
         poses = keyframe_poses[i % 3], T_world_camera
