@@ -23,7 +23,7 @@ from bmask_slam.calibration.calibrate import camera_from, with_rate_error
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
 from bmask_slam.graph.calibration.cross_validation import CrossValidation, cross_validate
-from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, TIME, parameters_of
+from bmask_slam.graph.calibration.model import SHUTTER, TIME, parameters_of
 from bmask_slam.graph.calibration.problem import CalibrationProblem
 from bmask_slam.graph.camera import Camera
 
@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 
 FREE = (SHUTTER, TIME)
 """The parameters that are estimated, by their places in PARAMETERS."""
-FIXED = tuple(name for i, name in enumerate(PARAMETERS) if i not in FREE)
 CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
@@ -47,7 +46,7 @@ class SelfCalibrationConfig:
             many, as long as the motion does not show the parameters.
         min_frames: fewer are not looked at, at the end of a sequence.
         stretches: how often it is looked at in vain at most.
-        rounds: how often the first frames are tracked at most.
+        rounds: number of estimates of a live run at most.
         max_sigma_s: largest standard deviation of a parameter that counts as observable.
         min_change_sigmas: what is adopted differs by so many standard deviations,
         min_change_s: and by so much.

@@ -64,9 +64,14 @@ def check_frame(frame: Frame, camera: Camera, last_stamp_s: float = -math.inf) -
     return replace(frame, depth_m=_checked_depth(frame.depth_m, where))
 
 
-def _check_stamp(stamp_s: float, last_stamp_s: float) -> None:
+def check_finite_stamp(stamp_s: float) -> None:
+    """Raise InputError for a stamp that is no finite number."""
     if not isinstance(stamp_s, Real) or not math.isfinite(stamp_s):
         raise InputError(f"frame at {stamp_s!r}: the stamp is not a finite number of seconds")
+
+
+def _check_stamp(stamp_s: float, last_stamp_s: float) -> None:
+    check_finite_stamp(stamp_s)
     if stamp_s <= last_stamp_s:
         raise InputError(
             f"frame at {stamp_s}: not later than the frame before, at {last_stamp_s}; leave it "

@@ -30,7 +30,6 @@ class Tracked:
         features: the frame's, with the registered pixels of the matches, and pixel sigmas that
             agree with the frame's residuals.
         keypoints, landmark_ids: (M,) inlier matches.
-        firm: how many of them do not rest on the flow of the image alone; by them a frame is WEAK.
         matches: number of matches before the robust estimate.
         visible_ids: landmarks of the local map that project into the frame.
         information: (6, 6) of the pose.
@@ -45,8 +44,12 @@ class Tracked:
     matches: int
     visible_ids: Ints
     information: Array
-    firm: int
     flow_only: Ints = field(default_factory=no_ids)
+
+    @property
+    def firm(self) -> int:
+        """How many landmarks do not rest on the flow alone; by them a frame is WEAK."""
+        return len(self.landmark_ids) - len(self.flow_only)
 
     @property
     def landmark_of(self) -> Ints:
@@ -78,7 +81,7 @@ def untracked(T_world_camera: Array, features: Features) -> Tracked:
     """A frame that begins a map at a given pose (4, 4)."""
     none = np.zeros(0, np.int64)
     information = np.zeros((6, 6))
-    return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information, 0)
+    return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information)
 
 
 @dataclass(frozen=True)

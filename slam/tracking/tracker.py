@@ -157,7 +157,6 @@ class Tracker:
             matches=len(matches),
             visible_ids=visible,
             information=estimate.information,
-            firm=int((~loose).sum()),
             flow_only=visible[kept.query[loose]],
         )
 

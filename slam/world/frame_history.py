@@ -84,26 +84,18 @@ class FrameHistory:
 
     def trajectories(self, world: WorldMap) -> dict[int, Trajectory]:
         """Every tracked frame whose keyframe was not lost, by map segment, from current poses."""
-        stamps_s = self._store["timestamp_s"][: self._size]
-        origins, segments = self._origins(world)
-        poses = origins @ self._store["T_keyframe_camera"][: self._size]
-        return {
-            segment: Trajectory(stamps_s[segments == segment], poses[segments == segment])
-            for segment in np.unique(segments[segments != NO_KEYFRAME]).tolist()
-        }
+        return {segment: path for segment, _, _, path in self._segments(world)}
 
     def smooth(self, world: WorldMap) -> None:
         """Give the frames the poses that the camera's inertia makes the most probable."""
-        entries = self._store[: self._size]
-        origins, segments = self._origins(world)
-        for segment, measured in self.trajectories(world).items():
-            rows = np.flatnonzero(segments == segment)
-            found = smooth(measured, entries["information"][rows])
-            poses = inverse(origins[rows]) @ found.poses_world_camera
-            self._store["T_keyframe_camera"][rows] = poses
+        for _, rows, origins, measured in self._segments(world):
+            found = smooth(measured, self._store["information"][rows])
+            self._store["T_keyframe_camera"][rows] = inverse(origins) @ found.poses_world_camera
 
-    def _origins(self, world: WorldMap) -> tuple[Array, Ints]:
-        """T_world_keyframe (N, 4, 4) of what each entry is relative to, and its segment (N,)."""
+    def _segments(self, world: WorldMap) -> Iterator[tuple[int, Ints, Array, Trajectory]]:
+        """Each map segment: its number, rows (N,) of its entries, what these are relative to,
+        T_world_keyframe (N, 4, 4), and the poses.
+        """
         origins = np.zeros((self._size, 4, 4))
         segments = np.full(self._size, NO_KEYFRAME)
         for keyframe_id, rows in self._by_keyframe():
@@ -111,7 +103,10 @@ class FrameHistory:
             if owner != NO_KEYFRAME:
                 keyframe = world.keyframes[owner]
                 origins[rows], segments[rows] = keyframe.T_world_camera @ T, keyframe.segment
-        return origins, segments
+        for segment in np.unique(segments[segments != NO_KEYFRAME]).tolist():
+            rows = np.flatnonzero(segments == segment)
+            poses = origins[rows] @ self._store["T_keyframe_camera"][rows]
+            yield segment, rows, origins[rows], Trajectory(self._store["timestamp_s"][rows], poses)
 
     def without_map(self) -> list[Trajectory]:
         """The frames of each keyframe whose pose was lost, in that keyframe's frame."""

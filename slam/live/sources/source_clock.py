@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 import math
-from numbers import Real
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.frame import check_finite_stamp
 
 logger = logging.getLogger(__name__)
 
@@ -42,8 +42,7 @@ class SourceClock:
         Raises:
             InputError: a stamp that is not finite, or doubted; the frame is to be left out.
         """
-        if not isinstance(stamp_s, Real) or not math.isfinite(stamp_s):
-            raise InputError(f"frame at {stamp_s!r}: the stamp is not a finite number of seconds")
+        check_finite_stamp(stamp_s)
         found_s = float(stamp_s) + self.offset_s
         step_s = found_s - self._doubted_s  # NaN where none is doubted
         if not 0 < found_s - self._last_s <= MAX_GAP_S and math.isfinite(self._last_s):

@@ -30,9 +30,7 @@ T_SEGMENT_WORLD = T_NEW_OLD
 def tracked(T: np.ndarray, features: Features, keypoints: np.ndarray, ids: np.ndarray) -> Tracked:
     nothing = np.zeros(0, np.int64)
     count = len(ids)
-    return Tracked(
-        TrackingStatus.OK, T, features, keypoints, ids, count, nothing, np.zeros((6, 6)), count
-    )
+    return Tracked(TrackingStatus.OK, T, features, keypoints, ids, count, nothing, np.zeros((6, 6)))
 
 
 def two_segments() -> tuple[WorldMap, np.ndarray, Features]:
