@@ -69,8 +69,8 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
         StopRequest() as stop,
     ):
         describe_run(folder, options, sequence)
-        make = make_system or _with_segmenter(options, sequence)
-        calibrator = _calibrator(options, inherited_calibration(options, sequence), make)
+        make, masks = _system_maker(make_system, options, sequence)
+        calibrator = _calibrator(options, inherited_calibration(options, sequence), masks)
         if calibrator.state.adopted:
             sequence = open_sequence(options.sequence, camera=calibrator.state.camera)
         system = start_system(options, sequence, make)
@@ -97,7 +97,7 @@ def resume(
     sequence = _reopened(options, checkpoint)
     checkpoint.check_sequence(sequence)
     reference = find_reference(options.reference, sequence)
-    make = make_system or _with_segmenter(options, sequence)
+    make, masks = _system_maker(make_system, options, sequence)
     system, counters = make(sequence.camera, options.config), checkpoint.counters
     system.restore(checkpoint.state, path / CHECKPOINT)
     with RunFolder(path, resume_bytes=checkpoint.sizes) as folder, StopRequest() as stop:
@@ -106,7 +106,7 @@ def resume(
             logger.warning("%s: no checkpoint was reached; starting from the beginning", path)
         for index, reason in checkpoint.skipped:
             sequence.skip(index, reason)
-        calibrator = _calibrator(options, checkpoint.calibration, make)
+        calibrator = _calibrator(options, checkpoint.calibration, masks)
         active = ActiveRun(options, sequence, reference, system, folder, stop, calibrator, counters)
         return _finished(active, make)
 
@@ -125,13 +125,11 @@ def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
 
 
 def _calibrator(
-    options: RunOptions, state: SelfCalibration, make_system: MakeSystem
+    options: RunOptions, state: SelfCalibration, masks: RememberingSegmenter | None
 ) -> SelfCalibrator:
     """What looks for the camera's times; nothing in a run that uses a map."""
     mode = "off" if options.map or options.localise else options.calibrate
-    masks = getattr(make_system, "keywords", {}).get("segmenter")
-    kept = masks if isinstance(masks, RememberingSegmenter) else None
-    return SelfCalibrator(state, mode, kept)
+    return SelfCalibrator(state, mode, masks)
 
 
 def _reopened(options: RunOptions, checkpoint: Checkpoint) -> Sequence:
@@ -195,15 +193,23 @@ def describe_run(folder: RunFolder, options: RunOptions, sequence: Sequence) -> 
         logger.info("frame %d is broken: %s", index, reason)
 
 
-def _with_segmenter(options: RunOptions, sequence: Sequence) -> MakeSystem:
-    """A maker of `SlamSystem` with the segmenter of its configuration. Raises InputError."""
+def _system_maker(
+    given: MakeSystem | None, options: RunOptions, sequence: Sequence
+) -> tuple[MakeSystem, RememberingSegmenter | None]:
+    """A given maker of systems, or that of `SlamSystem` with the segmenter of its configuration.
+
+    The second is that segmenter if it keeps masks for a run that begins anew. Raises InputError.
+    """
+    if given is not None:
+        return given, None
     chosen = options.config.semantics.segmenter
     segmenter = (
         NoSegmenter() if options.localise else make_segmenter(chosen, sequence.folder, find_weights)
     )
-    if options.calibrate == "auto" and options.map is None and options.localise is None:
-        segmenter = RememberingSegmenter(segmenter)
-    return partial(SlamSystem, segmenter=segmenter)
+    if options.calibrate != "auto" or options.map or options.localise:
+        return partial(SlamSystem, segmenter=segmenter), None
+    masks = RememberingSegmenter(segmenter)
+    return partial(SlamSystem, segmenter=masks), masks
 
 
 def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSystem) -> System:
