@@ -55,7 +55,6 @@ class LandmarkMotion:
         removed = motions == PointMotion.MOVING
         tracked_now = np.zeros(len(landmarks), bool)
         tracked_now[tracked.landmark_ids] = True
-        tracked_now[tracked.flow_only] = False  # the flow follows what moves, too
         found = tracked_now[ids]
         removed &= ~found
         judged = found | removed
