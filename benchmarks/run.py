@@ -198,11 +198,17 @@ def main() -> None:
 
 
 def measure_real_cameras(arguments: argparse.Namespace) -> None:
-    """The tables of docs/results/real-cameras.md and README; none where there are no data."""
+    """The tables of docs/results/real-cameras.md and README, and the labels of real rooms.
+
+    None where there are no data.
+    """
     if not SHARED.is_dir():
         return
     report, command = REPORTS["real-cameras"], ["-m", "benchmarks.cameras.real_sequences"]
     if not arguments.report_only:
+        rooms = make_section(REPORTS["semantics"], "rooms", arguments.work)
+        replace_section(REPORTS["semantics"], rooms)
+        print(rooms)
         for section in ("table", "loops"):
             replace_section(report, make_section(report, section, arguments.work))
     printed = ["--report-only", "--work", str(arguments.work), "--readme", str(ROOT / "README.md")]

@@ -95,6 +95,10 @@ REPORTS = {
             "Labels and objects from true masks",
             "semantics.labels {sequences}/office-300 {sequences}/room-930 {sequences}/room-931",
         ),
+        "rooms": (
+            "Labels and objects of real rooms, judged by eye",
+            "semantics.real_rooms --out {sequences}/rooms",
+        ),
         "store": ("Time of the label store", "semantics.label_store"),
         "dynamic": (
             "People who walk, a carried box and a pulled chair",
@@ -128,7 +132,7 @@ REPORTS = {
             "A real man put into a real recording",
             "moving.composited --segmenter light --out {sequences}/composited",
         ),
-    }),
+    }, markdown=frozenset({"rooms"})),
     "mapping": Report(RESULTS / "mapping.md", "Results: the dense map", {
         "dense": ("Depth, surface, labels and time", "mapping.dense {sequences}/dense"),
         "loop": (

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import importlib
+import json
 import logging
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from repository import ROOT
 
 from benchmarks.pages import table, written_sections
 from benchmarks.paths import RESULTS
 from benchmarks.section_report import REPORTS
+from benchmarks.semantics.real_rooms import ROOMS, score_objects
 from benchmarks.suite import never_lost
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import inverse, se3_exp
+from bmask_slam.run_folder.semantic_files import SavedObject
+from bmask_slam.semantics.objects.boxes3d import OrientedBox
 
 SCRIPTS = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -102,3 +108,32 @@ def test_a_recording_that_is_missing_is_no_rendered_room(
             with pytest.raises(InputError, match=entry.source):
                 never_lost.sequence_of(entry, tmp_path / "into")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_objects_that_are_the_truth_are_right_in_any_world(room: str) -> None:
+    truth = json.loads((ROOT / "tests" / "data" / f"{room}_truth.json").read_text())
+    T_truth_world = se3_exp(np.array([0.3, -1.2, 0.5, 2.0, -1.0, 0.7]))
+    found = []
+    for k, o in enumerate(truth["objects"]):
+        T = np.eye(4)
+        T[:3, 3] = o["centre_m"]
+        box = OrientedBox(inverse(T_truth_world) @ T, np.array(o["size_m"]))
+        none = np.zeros(0, np.int64)
+        found.append(SavedObject(k, o["labels"][0], 0.9, T[:3, 3], box, none, none, 0.0, 1.0))
+    score = score_objects(found, truth, T_truth_world)
+    assert score.reported == score.right == score.true
+    elsewhere = score_objects(found, truth, T_truth_world @ T_truth_world)
+    assert elsewhere.right == 0
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_point_of_a_room_is_of_a_known_kind(room: str) -> None:
+    truth = json.loads((ROOT / "tests" / "data" / f"{room}_truth.json").read_text())
+    up = np.array(truth["up"])
+    for x, y, z, *_, kind in truth["points"]:
+        assert kind in truth["kinds"]
+        height_m = up @ [x, y, z] - truth["floor_m"]
+        assert -0.1 < height_m < 3, kind  # metres above the floor
+        assert kind != "floor" or height_m < 0.1
+        assert not kind.startswith("table") or 0.6 < height_m < 0.8
