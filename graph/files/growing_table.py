@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import os
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import IO, Any
 
 from bmask_slam.graph.errors import InputError
 
@@ -19,8 +21,33 @@ class GrowingTable:
 
     def __init__(self, path: Path, columns: tuple[str, ...], mode: str) -> None:
         """Open a file, in mode "x" a new one, in mode "a" one that may be there; OSError if not."""
-        self.file = path.open(mode, encoding="utf-8", newline="")
-        self._rows = csv.DictWriter(self.file, columns, lineterminator="\n")
+        self._columns, self._is_locked = columns, False
+        self._open(path, mode)
+
+    def _open(self, path: Path, mode: str) -> None:
+        self.file = path.open(f"{mode}+", encoding="utf-8", newline="")
+        self._rows = csv.DictWriter(self.file, self._columns, lineterminator="\n")
+
+    @property
+    def is_removed(self) -> bool:
+        """Whether the file has no name any more."""
+        return os.fstat(self.file.fileno()).st_nlink == 0
+
+    def lock(self, folder: Path) -> None:
+        """Lock the file until it is closed. Raises InputError if another process holds the lock."""
+        lock_file(self.file, folder)
+        self._is_locked = True
+
+    def restore(self, path: Path) -> None:
+        """Write all lines to a new file, and go on there. Raises OSError."""
+        old = self.file
+        text = contents(old)
+        self._open(path, "x")
+        self.file.write(text)
+        self.file.flush()
+        if self._is_locked:
+            self.lock(path.parent)
+        old.close()
 
     def begin(self, size: int) -> None:
         """Cut the file to its first bytes; one that is empty then gets its header."""
@@ -44,6 +71,27 @@ class GrowingTable:
     def close(self) -> None:
         """Close the file."""
         self.file.close()
+
+
+def contents(file: IO[str]) -> str:
+    """The whole text of an open UTF-8 file, also of one that was removed, with what is buffered."""
+    file.flush()
+    size = os.fstat(file.fileno()).st_size
+    return os.pread(file.fileno(), size, 0).decode(errors="replace")
+
+
+def lock_file(file: IO[Any], folder: Path) -> None:
+    """Lock a file until it is closed. Raises InputError if another process holds the lock."""
+    if sys.platform == "win32":
+        return
+    import fcntl  # noqa: PLC0415 - Unix only
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise InputError(
+            f"{folder}: a process is writing a run there; wait for it, or choose another --out"
+        ) from error
 
 
 def check_grown(path: Path, columns: tuple[str, ...], size: int) -> None:

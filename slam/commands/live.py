@@ -107,7 +107,7 @@ def _live(arguments: argparse.Namespace) -> int:
                 print(f"in a browser: {slam.viewer_url}", flush=True)
             ended_by = play(slam, source, PlayOptions(not source.waits, quiet=arguments.quiet))
     if arguments.quiet:
-        print(options.out)
+        print(slam.out)
     else:
         _print_summary(slam, source)
     return 128 + ended_by if ended_by else 0
@@ -117,7 +117,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     """Where the run is written, and what the source says about itself."""
     from bmask_slam.live.live_slam import LiveOptions
     from bmask_slam.live.sources.bags import is_bag
-    from bmask_slam.run_folder.folder import free_run_path
+    from bmask_slam.run_folder.open_files import free_run_path
 
     folder = Path(arguments.source)
     return LiveOptions(
@@ -137,8 +137,8 @@ def _print_summary(slam: LiveSlam, source: Source) -> None:
     print(format_summary(slam.rows))
     if slam.calibration:
         print(f"\nCamera      {slam.calibration}")
-    print(f"\nRun folder  {slam.options.out}")
+    print(f"\nRun folder  {slam.out}")
     if slam.dense is not None:
-        print(f"Dense map   {slam.options.out}/dense, {slam.dense.points} points")
+        print(f"Dense map   {slam.out}/dense, {slam.dense.points} points")
     if counts := source.counts.line():
         print(f"Source      {counts}")

@@ -105,15 +105,22 @@ class DenseFolder:
         Raises:
             InputError: it cannot be written.
         """
+        self.settings = settings
+        self.open_in(run)
+
+    def open_in(self, run: Path) -> None:
+        """Go on in the folder of this run; raises InputError if it cannot be written."""
         self.path = run / "dense"
         for path in (self.path, *(self.path / name for name in PARTS)):
             refuse_link(path)
         try:
             self.path.mkdir(exist_ok=True)
-            self._clear_unless(settings)
+            self._clear_unless(self.settings)
             for name in PARTS:
                 (self.path / name).mkdir(exist_ok=True)
-            self.write_text("settings.json", json.dumps(settings, indent=1, sort_keys=True) + "\n")
+            self.write_text(
+                "settings.json", json.dumps(self.settings, indent=1, sort_keys=True) + "\n"
+            )
         except OSError as error:
             raise InputError(
                 f"{self.path}: cannot be written ({error.strerror}); free some space"

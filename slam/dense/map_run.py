@@ -168,19 +168,28 @@ def dense_follower(
     """A function that fuses the keyframes of a run while it goes on, to be called every frame.
 
     It saves no state of its own: keyframes that a killed run did not fuse, and those that still
-    wait for neighbours at the end, are fused by ``map_run``.
+    wait for neighbours at the end, are fused by ``map_run``. So are all others from the moment on
+    when one cannot be written, as on a full disk.
 
     Raises:
-        InputError: also by the function, when the disk is full.
+        InputError: the folder cannot be written.
     """
     segmenter = semantics.segmenter = CachingSegmenter(semantics.segmenter)
     mapped = MappedRun(run, world, [], sequence.camera, sequence=sequence)
     fusion = RunFusion(mapped, segmenter, MapOptions(run, masks=semantics.config.segmenter))
 
+    ended = False
+
     def follow(result: FrameResult) -> None:
+        nonlocal ended
         keyframe = world.keyframes.get(-1 if result.keyframe_id is None else result.keyframe_id)
-        if keyframe is not None:
+        if keyframe is None or ended:
+            return
+        try:
             fusion.add(keyframe)
+        except InputError as error:
+            ended = True
+            logger.warning("%s; the rest of the dense map is made at the end", error)
 
     return follow
 

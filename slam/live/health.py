@@ -35,7 +35,7 @@ class Health:
         frames_refused: that were broken, or not later than the one before.
         masks_dropped: keyframes that the segmenter skipped.
         submaps_dropped: keyframes that the dense map skipped.
-        unwritten: how often something could not be written, because the disk was full.
+        unwritten: how often something could not be written, as on a full disk.
         lost_frames: without a pose.
         lost_episodes: how often tracking was lost.
         map_deaths, segmenter_deaths, dense_deaths: how often these processes died or hung and were

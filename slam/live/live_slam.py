@@ -27,7 +27,7 @@ from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.live.sources.source_clock import SourceClock
 from bmask_slam.live.start import LiveOptions, start_system
 from bmask_slam.run_folder import metrics
-from bmask_slam.run_folder.folder import DISK_ERRORS, HEALTH, RunFolder
+from bmask_slam.run_folder.folder import HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, row
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
@@ -186,6 +186,8 @@ class LiveSlam:
         """Write and display a frame."""
         if self._recorder is not None:
             self._recorder.frame(result, self.health, self.trajectory)
+            if self._system.dense is not None:
+                self._system.dense.follow(self._recorder.folder.last_path)
         if self._display is not None and self._display.frame(result, rgb, self._system):
             self._display.map(self._system, self.health())
 
@@ -202,6 +204,11 @@ class LiveSlam:
         """What was found of the camera, in one line; "" if nothing, or if it was not tried."""
         found = self._system.calibration
         return "" if found is None else found.text
+
+    @property
+    def out(self) -> Path | None:
+        """The run folder: another one than asked for if that was renamed or removed meanwhile."""
+        return self._recorder.folder.last_path if self._recorder else None
 
     def trajectory(self) -> Trajectory:
         """Every frame of the largest map segment so far, from the keyframes' present poses."""
@@ -247,10 +254,8 @@ class LiveSlam:
             try:
                 self._save(self.health())
             except OSError as error:
-                if self.options.out is None or error.errno not in DISK_ERRORS:
-                    raise
                 where = rescued(self.trajectory())
-                raise InputError(f"{self.options.out}: {error.strerror}; {where}") from error
+                raise InputError(f"{self.out}: {error.strerror or error}; {where}") from error
 
     def _save(self, health: Health) -> None:
         """Save what an offline run saves; poses and points only if the map is lost."""
@@ -285,15 +290,11 @@ class LiveSlam:
 
     def _finish_dense(self, dense: RemoteDenseMapper, folder: RunFolder, health: Health) -> None:
         """Let the dense map's process finish, and log which keyframes are missing."""
-        world, run = self._system.mapper.world, folder.path
+        world = self._system.mapper.world
+        dense.follow(folder.path)
         self.dense = dense.finish(world, DENSE_FINISH_S)
         if self._display is not None:
             self._display.submaps(dense, world, True, len(world.keyframes))
-        if self.dense.failure:
-            logger.error("%s; bmask-slam map %s completes it", self.dense.failure, run)
-        elif self.dense.missing:
-            count, here = len(self.dense.missing), self.options.images != Path()
-            cure = "adds" if here else "with their images as --sequence adds"
-            logger.warning("bmask-slam map %s %s the %d keyframes left out", run, cure, count)
+        self.dense.log_missing(folder.path, self.options.images != Path())
         ended = replace(health, submaps=len(dense.submaps), submaps_waiting=0)
         folder.write_text(HEALTH, ended.as_json())

@@ -1,4 +1,4 @@
-"""Writes files while a live run goes on; a full disk does not end the run."""
+"""Writes files while a live run goes on; what cannot be written does not end the run."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.live.health import Health
-from bmask_slam.run_folder.folder import CAMERA, DISK_ERRORS, HEALTH, RunFolder
-from bmask_slam.sequences import write_camera
+from bmask_slam.run_folder.folder import CAMERA, HEALTH, RunFolder
+from bmask_slam.sequences import format_camera
 from bmask_slam.tracking.results import FrameResult
 
 logger = logging.getLogger(__name__)
@@ -25,14 +25,14 @@ SNAPSHOT_S = 5.0
 SNAPSHOT_SHARE = 0.005
 """Largest share of the time that is spent on trajectory.txt, which takes longer as it grows."""
 MESSAGE_S = 60.0
-"""Interval of the message that the disk is full."""
+"""Interval of the message that something cannot be written."""
 
 
 class Recorder:
     """Writes frames.csv, and now and then health.json and trajectory.txt, into a run folder.
 
     Attributes:
-        unwritten: how often something could not be written because the disk was full.
+        unwritten: how often something could not be written, as on a full disk.
     """
 
     def __init__(self, folder: RunFolder) -> None:
@@ -44,7 +44,7 @@ class Recorder:
 
     def camera(self, camera: Camera, text: str) -> None:
         """Write the camera that was found, with a comment that says how."""
-        self._guarded(lambda: write_camera(self.folder.path / CAMERA, camera, text))
+        self._guarded(lambda: self.folder.write_text(CAMERA, format_camera(camera, text)))
 
     def frames_apart(self, lost: list[Trajectory], first: int) -> None:
         """Write the frames of keyframes that no map has, as segments numbered from ``first``."""
@@ -57,23 +57,18 @@ class Recorder:
         health: Callable[[], Health],
         trajectory: Callable[[], Trajectory],
     ) -> None:
-        """Write a frame, and the other files when they are due; a full disk is logged."""
+        """Write a frame, and the other files when they are due; what cannot be is logged."""
         self._guarded(lambda: self._write(result, health, trajectory))
 
     def _guarded(self, write: Callable[[], None]) -> None:
         try:
             write()
         except OSError as error:
-            if error.errno not in DISK_ERRORS:
-                raise
             self.unwritten += 1
             if time.monotonic() - self._message_s > MESSAGE_S:
                 self._message_s = time.monotonic()
-                logger.error(
-                    "%s: %s; tracking goes on, free some space before it ends",
-                    self.folder.path,
-                    error.strerror,
-                )
+                text = "%s; tracking goes on, free some space or change permissions before it ends"
+                logger.error(text, error)
 
     def _write(
         self,

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import logging
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, nested, part, read_arrays, write_arrays
 from bmask_slam.graph.smoother.storage import read_camera
+from bmask_slam.graph.whole_file import remove
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.self_calibration import SelfCalibrator
 from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
@@ -82,7 +84,11 @@ def digest(sequence: Sequence) -> str:
 
 
 class Checkpoints:
-    """Writes the checkpoints of one run; none without ``checkpoint_every``."""
+    """Writes the checkpoints of one run; none without ``checkpoint_every``.
+
+    One that cannot be written, as on a full disk, does not end the run: the next one may be, and
+    what the run writes at its end does not depend on it.
+    """
 
     def __init__(
         self,
@@ -90,12 +96,15 @@ class Checkpoints:
         options: RunOptions,
         sequence: Sequence,
         calibrator: SelfCalibrator,
+        unwritten: list[str],
     ) -> None:
+        """``unwritten`` gets the reason for every checkpoint that cannot be written."""
         self._folder = folder
         self._options = options
         self._sequence = sequence
         self._calibrator = calibrator
         self._every = options.checkpoint_every
+        self._unwritten = unwritten
         self._frames = -1  # number of frames at the last checkpoint
 
     def after_frame(self, system: System, counters: RunCounters) -> None:
@@ -113,7 +122,6 @@ class Checkpoints:
         start_s = time.perf_counter()
         system.restart()
         skipped = [(i, reason) for i, reason in self._sequence.skipped if i < counters.next_index]
-        path = self._folder.path / CHECKPOINT
         checkpoint = Checkpoint(
             self._options,
             self._sequence.camera,
@@ -124,10 +132,24 @@ class Checkpoints:
             counters,
             system.state(),
         )
-        write_checkpoint(path, checkpoint)
         self._frames = counters.frames
-        megabytes, ms = path.stat().st_size / 1e6, 1e3 * (time.perf_counter() - start_s)
+        try:
+            self._folder.written(lambda path: write_checkpoint(path / CHECKPOINT, checkpoint))
+        except InputError as error:
+            self._note_failure(error)
+            return
+        size = (self._folder.path / CHECKPOINT).stat().st_size
+        megabytes, ms = size / 1e6, 1e3 * (time.perf_counter() - start_s)
         logger.info("checkpoint after %d frames: %.1f MB, %.0f ms", counters.frames, megabytes, ms)
+
+    def _note_failure(self, error: InputError) -> None:
+        """Warn once; before the first frame an older checkpoint, of another beginning, goes."""
+        level = logging.INFO if self._unwritten else logging.WARNING
+        logger.log(level, "%s; the run goes on and tries again at the next checkpoint", error)
+        self._unwritten.append(str(error))
+        if not self._frames:
+            with suppress(OSError):
+                remove(self._folder.path / CHECKPOINT)
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:

@@ -19,11 +19,11 @@ from bmask_slam.graph.whole_file import remove
 from bmask_slam.offline.checkpoint import Checkpoints
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.self_calibration import SelfCalibrator
-from bmask_slam.run_folder.folder import CAMERA, DENSE, RunFolder
+from bmask_slam.run_folder.folder import CAMERA, CHECKPOINT, DENSE, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, measure, save
 from bmask_slam.runtime.progress import Progress
 from bmask_slam.runtime.stop_request import StopRequest
-from bmask_slam.sequences import Sequence, write_camera
+from bmask_slam.sequences import Sequence, format_camera
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_interface import System
@@ -48,6 +48,7 @@ class ActiveRun:
         stop: says when a signal asked to end the run.
         calibrator: finds what the camera file does not say; ``sequence`` has the camera in use.
         counters: of the frames processed so far.
+        unwritten: why checkpoints could not be written, each.
     """
 
     options: RunOptions
@@ -58,6 +59,7 @@ class ActiveRun:
     stop: StopRequest
     calibrator: SelfCalibrator
     counters: RunCounters = field(default_factory=RunCounters)
+    unwritten: list[str] = field(default_factory=list)
 
     @property
     def indices(self) -> range:
@@ -112,7 +114,7 @@ def _begin(run: ActiveRun, checkpoints: Checkpoints) -> None:
     """
     found, events, first = run.calibrator.state, run.system.events, run.indices[:1]
     if found.adopted:
-        write_camera(run.folder.path / CAMERA, found.camera, found.text)
+        run.folder.write_text(CAMERA, format_camera(found.camera, found.text))
     checkpoints.write(run.system, run.counters)
     run.folder.begin_anew()
     if found.adopted and not run.options.map:
@@ -129,7 +131,7 @@ def process_frames(run: ActiveRun) -> bool:
     frames = run.sequence.frames(
         remaining.start, remaining.stop, remaining.step, prepare=_timed(system.prepare)
     )
-    checkpoints = Checkpoints(run.folder, run.options, run.sequence, run.calibrator)
+    checkpoints = Checkpoints(run.folder, run.options, run.sequence, run.calibrator, run.unwritten)
     if not counters.frames:
         _begin(run, checkpoints)
     fuse = _dense_follower(run) if run.options.dense else None
@@ -192,18 +194,26 @@ def finish_run(run: ActiveRun) -> RunSummary:
     if stopped_by is None:
         run.folder.complete()
     skipped = sum(index < counters.next_index for index, _ in run.sequence.skipped)
-    resumable = stopped_by is not None and options.checkpoint_every is not None
+    folder = run.folder.path
+    resumable = stopped_by is not None and (folder / CHECKPOINT).is_file()
     text = run.calibrator.state.text
     return RunSummary(
-        run.folder.path,
+        folder,
         rows,
         counters.frames,
         skipped,
         stopped_by,
         resumable,
         text,
-        checked.warnings,
+        checked.warnings + _unwritten_checkpoints(run),
     )
+
+
+def _unwritten_checkpoints(run: ActiveRun) -> tuple[str, ...]:
+    """A warning if there are any; a resumed run would have begun with an earlier one."""
+    if not run.unwritten:
+        return ()
+    return (f"{len(run.unwritten)} checkpoints not written, the last: {run.unwritten[-1]}",)
 
 
 def _camera_checked(run: ActiveRun) -> CameraCheck:
@@ -238,17 +248,24 @@ def _dense_follower(run: ActiveRun) -> Callable[[FrameResult], None]:
 def _snapshots(run: ActiveRun) -> Iterator[Callable[[], None]]:
     """A function, to be called after every frame, that saves the trajectory now and then.
 
-    The interval grows with the trajectory, so that the mean cost of a frame does not. When the
-    block ends, for whatever reason, the trajectory is saved once more if there were any frames.
+    The interval grows with the trajectory, so that the mean cost of a frame does not. One that
+    cannot be written does not end the run. When the block ends, for whatever reason, the trajectory
+    is saved once more if there were any frames.
     """
-    counters = run.counters
+    counters, failures = run.counters, 0
     due = counters.frames + SNAPSHOT_FRAMES
 
     def snapshot() -> None:
-        nonlocal due
-        if counters.frames >= due:
+        nonlocal due, failures
+        if counters.frames < due:
+            return
+        due = int(counters.frames * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
+        try:
             run.folder.write_trajectory(run.system.trajectory())
-            due = int(counters.frames * SNAPSHOT_GROWTH) + SNAPSHOT_FRAMES
+        except OSError as error:
+            failures += 1
+            level = logging.INFO if failures > 1 else logging.WARNING
+            logger.log(level, "trajectory.txt: %s; the run goes on", error.strerror)
 
     try:
         yield snapshot

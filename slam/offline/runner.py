@@ -30,9 +30,10 @@ from bmask_slam.offline.frame_loop import (
 from bmask_slam.offline.map_localisation import MapLocalisation
 from bmask_slam.offline.options import RunOptions
 from bmask_slam.offline.self_calibration import RememberingSegmenter, SelfCalibrator
-from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder, free_run_path
+from bmask_slam.run_folder.folder import CHECKPOINT, RunFolder
 from bmask_slam.run_folder.map_file import read_map
 from bmask_slam.run_folder.metrics import RunCounters
+from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.run_folder.origin import Origin
 from bmask_slam.runtime.stop_request import StopRequest
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter

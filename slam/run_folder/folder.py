@@ -33,24 +33,22 @@ temporary name and renamed, so that a killed run leaves complete files.
 from __future__ import annotations
 
 import errno
-import itertools
 import logging
 import os
-import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
 
 from bmask_slam.events import EVENT_COLUMNS, EVENTS, Event, event_row
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import refuse_link
-from bmask_slam.graph.files.growing_table import GrowingTable, check_grown
+from bmask_slam.graph.files.growing_table import check_grown, lock_file
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.graph.whole_file import remove, remove_partial, whole_file
 from bmask_slam.run_folder.covariance_file import COVARIANCES
 from bmask_slam.run_folder.frame_file import COLUMNS, FRAMES, frame_row
+from bmask_slam.run_folder.open_files import LOG, OpenFiles
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
 from bmask_slam.tracking.results import FrameResult
 
@@ -65,7 +63,7 @@ FILES = (
     "map",
     "metrics.json",
     "trajectory.png",
-    "log.txt",
+    LOG,
 )
 CAMERA = "camera.yaml"
 CHECKPOINT = "checkpoint"
@@ -80,23 +78,9 @@ GROWING = {FRAMES: COLUMNS, EVENTS: EVENT_COLUMNS}
 """The files that grow by lines with these columns."""
 
 
-def free_run_path(stem: str, root: Path = Path("runs")) -> Path:
-    """``root/stem``, or with -2, -3, ... the first that does not exist yet."""
-    names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
-    return next(root / name for name in names if not os.path.lexists(root / name))
-
-
 def trajectory_files(run: Path) -> list[Path]:
     """trajectory.txt of a run folder, then the file of each other map segment."""
     return [run / "trajectory.txt", *sorted(run.glob("trajectory_segment_*.txt"))]
-
-
-class _LogFile(logging.FileHandler):
-    """A log file that ignores its own OSErrors: a full disk is reported where data are written."""
-
-    def handleError(self, record: logging.LogRecord) -> None:
-        if not isinstance(sys.exc_info()[1], OSError):
-            super().handleError(record)
 
 
 class RunFolder:
@@ -117,22 +101,20 @@ class RunFolder:
             InputError: it cannot be written, another process writes there, it holds a run and
                 ``overwrite`` is not set, or a file does not belong to the run to resume.
         """
-        self.path = path
         self._keep = resume_bytes is not None
         self._made = [] if self._keep else _make_folder(path)
         kept = resume_bytes or {}
         if resume_bytes is None:
             _clear(path, overwrite)
         else:
-            for name in (*GROWING, "log.txt"):
+            for name in (*GROWING, LOG):
                 refuse_link(path / name, "start the run again with --overwrite")
         for name, size in kept.items():
             check_grown(path / name, GROWING[name], size)
         try:
-            mode = "a" if self._keep else "x"
-            self._tables = {n: GrowingTable(path / n, c, mode) for n, c in GROWING.items()}
-            _lock(self._tables[FRAMES].file, path)
-            self._log = _LogFile(path / "log.txt", mode=mode, encoding="utf-8")
+            self._files = OpenFiles(path, GROWING, "a" if self._keep else "x")
+            self._tables, self._log = self._files.tables, self._files.log
+            self._tables[FRAMES].lock(path)
             for name, table in self._tables.items():
                 table.begin(kept.get(name, 0))
             remove_partial(path)
@@ -140,6 +122,16 @@ class RunFolder:
             _remove_empty(self._made)
             raise _unwritable(path, error) from error
         self._levels: dict[str, int] = {}
+
+    @property
+    def path(self) -> Path:
+        """The folder; another one from when that was renamed or removed, see `OpenFiles.follow`."""
+        return self._files.follow()
+
+    @property
+    def last_path(self) -> Path:
+        """The folder as it was last found, without looking whether it is still there."""
+        return self._files.path
 
     def __enter__(self) -> RunFolder:
         self._log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
@@ -166,18 +158,16 @@ class RunFolder:
         for name, level in self._levels.items():
             logging.getLogger(name).removeHandler(self._log)
             logging.getLogger(name).setLevel(level)
-        for close in (self._log.close, *(table.close for table in self._tables.values())):
-            try:
-                close()
-            except OSError as unwritten:
-                error = error or unwritten
+        try:
+            self._files.close()
+        except OSError as unwritten:
+            error = error or unwritten
         if isinstance(error, InputError) and not self._keep:
-            _remove(self.path, (*SOMETIMES, *FILES))
+            _remove(self.last_path, (*SOMETIMES, *FILES))
             _remove_empty(self._made)
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
-            raise InputError(
-                f"{self.path}: {error.strerror}; free some space, what was written before is kept"
-            ) from error
+            cure = "free some space, what was written before is kept"
+            raise InputError(f"{self.last_path}: {error.strerror}; {cure}") from error
 
     def write_frame(self, result: FrameResult) -> None:
         """Append a frame to frames.csv, and its events to events.csv; both are flushed.
@@ -185,6 +175,7 @@ class RunFolder:
         Raises:
             ValueError: ``stage_ms`` has an unknown stage.
         """
+        self._files.follow()
         self._tables[FRAMES].append([frame_row(result)])
         self.write_events(result.events)
         self._keep = True
@@ -209,16 +200,36 @@ class RunFolder:
 
     def complete(self) -> None:
         """Mark the run as finished by removing its checkpoint."""
+        self._files.write_missing_texts()
         _remove(self.path, [CHECKPOINT])
 
     def write_trajectory(self, trajectory: Trajectory, name: str = "trajectory.txt") -> None:
         """Replace trajectory.txt, or the file ``name``, by the poses T_world_camera."""
-        write_tum(self.path / name, trajectory)
+        self.written(lambda path: write_tum(path / name, trajectory))
 
     def write_text(self, name: str, text: str) -> None:
-        """Replace a text file."""
-        with whole_file(self.path / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        """Replace a text file, which is written again if it is removed during the run."""
+        self._files.texts[name] = text
+        self.write_file(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def write_file(self, name: str, write: Callable[[Path], object]) -> None:
+        """Replace a file by what a function writes to another path."""
+
+        def replace(path: Path) -> None:
+            with whole_file(path / name) as temporary:
+                write(temporary)
+
+        self.written(replace)
+
+    def written(self, write: Callable[[Path], None]) -> None:
+        """Let a function write into the folder; once more if that was moved in the meantime."""
+        path = self.path
+        try:
+            write(path)
+        except (OSError, InputError):
+            if self.path == path:
+                raise
+            write(self.path)
 
 
 def _clear(path: Path, overwrite: bool) -> None:
@@ -236,24 +247,10 @@ def _clear(path: Path, overwrite: bool) -> None:
     try:
         if FRAMES in held:
             with (path / FRAMES).open("rb") as file:
-                _lock(file, path)
+                lock_file(file, path)
         _remove(path, held)
     except OSError as error:
         raise _unwritable(path, error) from error
-
-
-def _lock(file: IO[Any], path: Path) -> None:
-    """Lock the file until it is closed. Raises InputError if another process holds the lock."""
-    if sys.platform == "win32":
-        return
-    import fcntl  # noqa: PLC0415 - Unix only
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise InputError(
-            f"{path}: a process is writing a run there; wait for it, or choose another --out"
-        ) from error
 
 
 def _make_folder(path: Path) -> list[Path]:

@@ -12,7 +12,6 @@ from bmask_slam.evaluation.plot import plot_trajectory
 from bmask_slam.events import read_events
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
-from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.run_folder.folder import RunFolder
 from bmask_slam.run_folder.landmark_file import write_landmarks
 from bmask_slam.runtime.memory import peak_rss_mb
@@ -113,7 +112,8 @@ def save_poses_and_points(system: System, folder: RunFolder) -> None:
     for number, segment in system.segments().items():
         if segment.timestamps_s[0] not in trajectory.timestamps_s:
             folder.write_trajectory(segment, f"trajectory_segment_{number}.txt")
-    write_landmarks(folder.path / "landmarks.ply", system.landmarks())
+    landmarks = system.landmarks()
+    folder.written(lambda path: write_landmarks(path / "landmarks.ply", landmarks))
 
 
 def save(
@@ -124,11 +124,11 @@ def save(
     save_poses_and_points(system, folder)
     files = system.files()
     for name, write in files.items():
-        with whole_file(folder.path / name) as temporary:
-            write(temporary)
+        folder.write_file(name, write)
     folder.write_text("metrics.json", format_json(rows))
     events = read_events(folder.path)
-    plot_trajectory(folder.path / "trajectory.png", trajectory, reference, title, events)
+    picture = trajectory, reference, title, events
+    folder.written(lambda path: plot_trajectory(path / "trajectory.png", *picture))
     for name in files:
         size_mb = (folder.path / name).stat().st_size / 1e6
         logger.info("%s: %.1f MB", name, size_mb)

@@ -1,6 +1,6 @@
 """Reading RGB-D sequences in TUM layout."""
 
-from bmask_slam.sequences.cameras import read_camera, write_camera
+from bmask_slam.sequences.cameras import format_camera, read_camera, write_camera
 from bmask_slam.sequences.info import SequenceInfo, format_info, sequence_info
 from bmask_slam.sequences.sequence import Sequence, SequenceConfig, open_sequence
 
@@ -8,6 +8,7 @@ __all__ = [
     "Sequence",
     "SequenceConfig",
     "SequenceInfo",
+    "format_camera",
     "format_info",
     "open_sequence",
     "read_camera",

@@ -165,9 +165,18 @@ def _values(path: Path) -> dict[str, object]:
 
 
 def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
-    """Write a camera.yaml that ``read_camera`` reads back as the same camera.
+    """Write a camera.yaml, the text of ``format_camera``; it appears whole or not at all."""
+    try:
+        with whole_file(path) as temporary:
+            temporary.write_text(format_camera(camera, comment), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
-    The file begins with ``comment``, each line after a #. It appears whole or not at all.
+
+def format_camera(camera: Camera, comment: str = "") -> str:
+    """The text of a camera.yaml that ``read_camera`` reads back as the same camera.
+
+    It begins with ``comment``, each line after a #.
     """
     values: dict[str, object] = {key: getattr(camera, key) for key in REQUIRED}
     values |= {"distortion": list(camera.distortion)}
@@ -176,11 +185,7 @@ def write_camera(path: Path, camera: Camera, comment: str = "") -> None:
         values["depth_noise"] = list(astuple(camera.depth_noise))
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines.append(format_yaml(values).rstrip())
-    try:
-        with whole_file(path) as temporary:
-            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    return "\n".join(lines) + "\n"
 
 
 def _number(path: Path, key: str, value: object) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,13 @@ class RemoveKeyframes:
     """To the process: these keyframes are no longer in the map."""
 
     keyframe_ids: list[int]
+
+
+@dataclass(frozen=True)
+class RunMoved:
+    """To the process: the run folder is another one from now on."""
+
+    run: Path
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,3 +136,12 @@ class MapWritten:
     points: int = 0
     missing: list[int] = field(default_factory=list)
     failure: str = ""
+
+    def log_missing(self, run: Path, has_images: bool) -> None:
+        """Log how the map of a run is completed, if it has to be."""
+        if self.failure:
+            logger.error("%s; bmask-slam map %s completes it", self.failure, run)
+        elif self.missing:
+            cure = "adds" if has_images else "with their images as --sequence adds"
+            text = "bmask-slam map %s %s the %d keyframes left out"
+            logger.warning(text, run, cure, len(self.missing))

@@ -6,6 +6,8 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -31,6 +33,7 @@ from bmask_slam.live.processes.dense_messages import (
     NotMapped,
     Preview,
     RemoveKeyframes,
+    RunMoved,
 )
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 from bmask_slam.mapping.products.submaps import Submap
@@ -60,7 +63,14 @@ class RetryingFolder(DenseFolder):
         unwritten: keyframes whose submaps could not be written, and why.
     """
 
-    unwritten: dict[int, str]
+    def __init__(self, run: Path, settings: dict[str, Any]) -> None:
+        self.unwritten: dict[int, str] = {}
+        super().__init__(run, settings)
+
+    def follow(self, run: Path) -> None:
+        """Go on in another run folder; if that cannot be used, ``write`` says so each time."""
+        with suppress(InputError):
+            self.open_in(run)
 
     def write(self, submap: Submap, fused: InverseDepthMap, evidence: InstanceEvidence) -> None:
         """Save a finished keyframe, or record why it cannot be saved."""
@@ -76,12 +86,11 @@ class DenseServer:
 
     def __init__(self, setup: DenseSetup, send: Callable[[Any], None]) -> None:
         """Start a dense map, or continue one that another process left. Raises InputError."""
-        self._setup, self._send = setup, send
+        self._setup, self._send, self._run = setup, send, setup.run
         self._labels = LabelSet(setup.labels)
         self._options = resolve_options(MapOptions(setup.run, masks=setup.masks), self._labels)
         settings = folder_settings(self._options, self._labels)
         self._folder = RetryingFolder(setup.run, settings)
-        self._folder.unwritten = {}
         self._fusion = KeyframeFusion(setup.camera, self._labels, self._folder, self._options)
 
     def handle(self, message: Any) -> None:
@@ -94,6 +103,9 @@ class DenseServer:
                 self.relabel(message)
             case RemoveKeyframes():
                 self._fusion.remove(message.keyframe_ids)
+            case RunMoved():
+                self._run = message.run
+                self._folder.follow(message.run)
             case FinishMap():
                 self._fusion.update_poses(message.poses)
                 self._report(self._fusion.finish())
@@ -130,7 +142,7 @@ class DenseServer:
         """Write the clouds from the run folder's final map."""
         started_s = time.perf_counter()
         try:
-            run = read_saved_map(self._setup.run)
+            run = read_saved_map(self._run)
             missing = [k.id for k in run.keyframes if not self._folder.is_done(k.id)]
             fused = FusedMap(run, self._labels, self._folder, self._options)
             if not fused.keyframes():

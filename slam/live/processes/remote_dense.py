@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from bmask_slam.dense.keyframe_input import KeyframeSnapshot
 from bmask_slam.live.messages import Masks
@@ -29,6 +30,7 @@ from bmask_slam.live.processes.dense_messages import (
     NotMapped,
     Preview,
     RemoveKeyframes,
+    RunMoved,
 )
 from bmask_slam.live.processes.supervision import RestartPolicy, SupervisedWorker
 from bmask_slam.semantics.instances.instances import Instance
@@ -79,6 +81,7 @@ class RemoteDenseMapper:
         self._crashes_with: Counter[int] = Counter()
         self._written: MapWritten | None = None
         target = "bmask_slam.live.processes.dense_process:serve_dense"
+        self._setup = setup
         self.worker = SupervisedWorker("dense mapper", target, (setup,), policy or RestartPolicy())
 
     @property
@@ -94,6 +97,13 @@ class RemoteDenseMapper:
     def wait_until_ready(self) -> None:
         """Wait until the process is ready. Raises InputError if it cannot start."""
         self.worker.wait_until_ready()
+
+    def follow(self, run: Path) -> None:
+        """Let the process, and one that is started in its place, write to this run folder."""
+        if run != self._setup.run:
+            self._setup = replace(self._setup, run=run)
+            self.worker.arguments = (self._setup,)
+            self.worker.send(RunMoved(run))
 
     def add_keyframe(self, keyframe_id: int, frame: Frame) -> None:
         """Queue a keyframe; its images are copied."""

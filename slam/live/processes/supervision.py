@@ -43,6 +43,7 @@ class SupervisedWorker:
     Attributes:
         name: of the worker, for messages.
         crashes: how often a process died or hung.
+        arguments: of a process that is started in its place.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class SupervisedWorker:
     ) -> None:
         self.name = name
         self.crashes = 0
-        self._target, self._arguments, self._policy = target, arguments, policy
+        self._target, self.arguments, self._policy = target, arguments, policy
         self._heard_s = time.monotonic()
         self._is_ready = False
         self._worker = self._start()
@@ -129,4 +130,4 @@ class SupervisedWorker:
         self._worker.kill()
 
     def _start(self) -> Worker:
-        return Worker(self.name, self._target, *self._arguments)
+        return Worker(self.name, self._target, *self.arguments)

@@ -22,6 +22,7 @@ from bmask_slam.live.processes.dense_messages import (
     Mapped,
     NotMapped,
     RemoveKeyframes,
+    RunMoved,
 )
 from bmask_slam.live.processes.dense_process import DenseServer
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
@@ -169,6 +170,23 @@ def test_a_removed_keyframe_is_removed_before_and_after_saving(tmp_path) -> None
     folder = DenseFolder.open(tmp_path / "run")
     assert [k for k in POSES if folder.is_done(k)] == [1, 2, 4, 5, 6]
     assert not list(folder.path.glob("*/000000"))
+
+
+def test_a_run_folder_that_moves_is_followed(tmp_path) -> None:
+    server, answers = make_server(tmp_path / "run")
+    for number in range(7):
+        server.handle(to_map(number, []))
+    assert mapped(answers) == [0]
+    (tmp_path / "run").rename(tmp_path / "moved")
+    server._report(server._fusion.finish()[:2])  # written nowhere
+    assert [m.keyframe_id for m in answers if isinstance(m, NotMapped)] == [1, 2]
+    server.handle(RunMoved(tmp_path / "moved"))
+    server.handle(to_map(7, []))
+    server._report(server._fusion.finish())
+    assert mapped(answers) == [0, 7]
+    folder = DenseFolder.open(tmp_path / "moved")
+    assert [k for k in POSES if folder.is_done(k)] == [0, 7]
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_keyframe_that_cannot_be_mapped_is_reported(tmp_path) -> None:

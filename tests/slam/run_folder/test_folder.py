@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.run_folder.folder import FILES, RunFolder, free_run_path
+from bmask_slam.run_folder.folder import FILES, RunFolder
+from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 RESULT = FrameResult(3, 0.1, TrackingStatus.OK, None, stage_ms={"tracking": 1.5})
