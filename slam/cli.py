@@ -29,6 +29,7 @@ from bmask_slam.commands.segmentation import add_evaluate_segmentation, add_segm
 from bmask_slam.commands.sequences import add_download, add_info, add_render
 from bmask_slam.commands.view import add_view
 from bmask_slam.graph.errors import InputError
+from bmask_slam.runtime.memory import is_out_of_memory, memory_limit_bytes
 from bmask_slam.runtime.stop_request import SIGNALS
 
 DESCRIPTION = "RGB-D SLAM on a GTSAM factor graph: a trajectory and a landmark map from a sequence."
@@ -38,18 +39,22 @@ first steps:
   bmask-slam run office                                run on it; results go to runs/office
   bmask-slam evaluate runs/office --reference office   compare a trajectory with a reference
 """
-SPACE, RIGHTS, DESCRIPTORS = (
+SPACE, RIGHTS, DESCRIPTORS, DEVICE = (
     "free some space",
     "change its permissions, or choose another place",
     "raise the limit of open files: ulimit -n 4096",
+    "the disk or the connection to it fails; try again on another",
 )
 CURES = {
     **{errno.ENOSPC: SPACE, errno.EDQUOT: SPACE, errno.EFBIG: SPACE},
     **{errno.EACCES: RIGHTS, errno.EPERM: RIGHTS, errno.EROFS: RIGHTS},
     **{errno.EMFILE: DESCRIPTORS, errno.ENFILE: DESCRIPTORS},
+    **{errno.EIO: DEVICE, errno.ESTALE: DEVICE, errno.ENODEV: DEVICE},
     **{errno.ENAMETOOLONG: "choose a shorter name", errno.ELOOP: "remove the link"},
 }
 MEMORY = "out of memory; free some, raise its limit (ulimit -v), or take smaller input"
+MIN_MEMORY_BYTES = 3_000_000_000
+"""Of addresses. With less OpenBLAS does not load, crashes, or tries without an end to get some."""
 MAX_LINE = 480
 """Characters of an error: what a file holds may be of any length."""
 
@@ -60,6 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = make_parser().parse_args(argv)
     try:
+        _check_memory()
         with _terminations():
             code = int(arguments.handler(arguments))
         if code == 128 + signal.SIGHUP:  # the terminal was closed: nobody reads on
@@ -70,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `bmask-slam info ... | head`: nobody reads on
         _discard_output()
         return 128 + signal.SIGPIPE
-    except (OSError, MemoryError) as error:
+    except (OSError, MemoryError, ImportError, RuntimeError) as error:
         return _after_refusal(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -88,10 +94,20 @@ def _discard_output() -> None:
         os.dup2(nowhere, stream.fileno())
 
 
-def _after_refusal(error: OSError | MemoryError) -> int:
+def _check_memory() -> None:
+    """Raise InputError if a limit leaves too little memory for the libraries."""
+    limit = memory_limit_bytes()
+    if limit is not None and limit < MIN_MEMORY_BYTES:
+        cure = f"this program needs {MIN_MEMORY_BYTES / 1e9:g} GB: ulimit -v unlimited"
+        raise InputError(f"memory is limited to {limit / 1e9:.2g} GB (ulimit -v); {cure}")
+
+
+def _after_refusal(error: Exception) -> int:
     """The exit status after what the machine refuses; another error is raised again."""
-    if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
+    if is_out_of_memory(error):
         return _fail(MEMORY)
+    if not isinstance(error, OSError):
+        raise error
     if error.errno == errno.EIO and error.filename is None:  # the terminal was closed
         _discard_output()
         return 128 + signal.SIGHUP

@@ -5,7 +5,9 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
-from collections.abc import Callable
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,6 +63,19 @@ def office(rendered: Callable[[RenderConfig], Path]) -> Path:
     from bmask_slam.rendering.sequence import RenderConfig
 
     return rendered(RenderConfig("office", frames=15, width=160, height=120, true_depth=True))
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """A file system of 300 kB, too small for a run folder's map, or of another size."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    size = getattr(request, "param", "300k")
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(path)]
+    if shutil.which("mount") is None or subprocess.call(command, stderr=-3):
+        pytest.skip("a small file system cannot be mounted: not root, or not Linux")
+    yield path
+    subprocess.run(["umount", str(path)], check=True)
 
 
 SWEEP_DELAY_S = 0.016

@@ -91,6 +91,10 @@ def read_arrays(path: Path, kind: FileKind) -> tuple[Header, Arrays]:
         found = header["format"], header["version"]
         if found == (kind.format, kind.version) and header["arrays"] != list(arrays):
             raise ValueError("an array is missing")
+    except PermissionError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); change its permissions"
+        ) from error
     except _UNREADABLE as error:
         raise InputError(
             f"{path}: not a saved {kind.noun}, or a damaged one ({in_short(error)}); save it again"

@@ -123,7 +123,8 @@ class DenseFolder:
             )
         except OSError as error:
             raise InputError(
-                f"{self.path}: cannot be written ({error.strerror}); free some space"
+                f"{self.path}: cannot be written ({error.strerror}); free some space, or change "
+                "its permissions"
             ) from error
 
     @classmethod

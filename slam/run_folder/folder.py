@@ -50,6 +50,7 @@ from bmask_slam.run_folder.covariance_file import COVARIANCES
 from bmask_slam.run_folder.frame_file import COLUMNS, FRAMES, frame_row
 from bmask_slam.run_folder.open_files import LOG, OpenFiles
 from bmask_slam.run_folder.semantic_files import SEMANTIC_FILES
+from bmask_slam.runtime.memory import is_out_of_memory
 from bmask_slam.tracking.results import FrameResult
 
 FILES = (
@@ -86,8 +87,8 @@ def trajectory_files(run: Path) -> list[Path]:
 class RunFolder:
     """An open run folder; a context manager that closes its files.
 
-    If an InputError ends the block before the first frame, the folder is removed again. While it
-    is open, no other process can write a run there.
+    If anything but a bug ends the block before the first frame, the folder is removed again. While
+    it is open, no other process can write a run there.
     """
 
     def __init__(
@@ -114,11 +115,14 @@ class RunFolder:
         try:
             self._files = OpenFiles(path, GROWING, "a" if self._keep else "x")
             self._tables, self._log = self._files.tables, self._files.log
-            self._tables[FRAMES].lock(path)
-            for name, table in self._tables.items():
-                table.begin(kept.get(name, 0))
-            remove_partial(path)
+            with self._files.closed_on_error():
+                self._tables[FRAMES].lock(path)
+                for name, table in self._tables.items():
+                    table.begin(kept.get(name, 0))
+                remove_partial(path)
         except OSError as error:
+            if not self._keep:
+                _remove(path, (*GROWING, LOG))  # none was there
             _remove_empty(self._made)
             raise _unwritable(path, error) from error
         self._levels: dict[str, int] = {}
@@ -162,7 +166,7 @@ class RunFolder:
             self._files.close()
         except OSError as unwritten:
             error = error or unwritten
-        if isinstance(error, InputError) and not self._keep:
+        if error is not None and not self._keep and not _is_bug(error):
             _remove(self.last_path, (*SOMETIMES, *FILES))
             _remove_empty(self._made)
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
@@ -268,6 +272,12 @@ def _make_folder(path: Path) -> list[Path]:
 def _unwritable(path: Path, error: OSError) -> InputError:
     reason = error.strerror or error
     return InputError(f"{path}: cannot be written ({reason}); choose another folder with --out")
+
+
+def _is_bug(error: BaseException) -> bool:
+    """Whether the log with its traceback may be needed: not after bad input, a signal, a limit."""
+    is_outside = isinstance(error, (InputError, OSError)) or is_out_of_memory(error)
+    return isinstance(error, Exception) and not is_outside
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:

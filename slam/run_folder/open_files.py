@@ -11,10 +11,11 @@ import itertools
 import logging
 import os
 import sys
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.growing_table import GrowingTable, contents
 from bmask_slam.graph.whole_file import whole_file
 
@@ -113,6 +114,16 @@ class OpenFiles:
                 error = error or unwritten
         if error is not None:
             raise error
+
+    @contextmanager
+    def closed_on_error(self) -> Iterator[None]:
+        """Close all files if the block raises an error."""
+        try:
+            yield
+        except (OSError, InputError):
+            with suppress(OSError):
+                self.close()
+            raise
 
     def write_missing_texts(self) -> None:
         """Write the texts that are not there, removed or not written because the disk was full."""

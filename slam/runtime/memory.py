@@ -7,6 +7,14 @@ import re
 import sys
 from pathlib import Path
 
+NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
+"""What the dynamic linker and Python say where there is no memory for a library or a thread."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that there is no memory, or that a limit of it was reached."""
+    return isinstance(error, MemoryError) or any(text in str(error) for text in NO_MEMORY)
+
 
 def peak_rss_mb() -> float:
     """Largest resident memory of this process so far in MB (1e6 bytes).
@@ -22,6 +30,16 @@ def peak_rss_mb() -> float:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak * (1 if sys.platform == "darwin" else 1024) / 1e6
+
+
+def memory_limit_bytes() -> int | None:
+    """How much memory this process may reserve (``ulimit -v``); None without such a limit."""
+    if sys.platform == "win32":
+        return None
+    import resource  # noqa: PLC0415 - Unix only
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
 
 
 def give_back_memory() -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults import fill, running
 from feeding import track_frames
 from synthetic_view import CAMERA, render_plane, sideways_path
-from test_live_faults import fill, running
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.folder import DenseFolder

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults import fill, running
 from feeding import track_frames
 from synthetic_view import CAMERA, render_plane, sideways_path
 
@@ -34,27 +35,6 @@ from bmask_slam.tracking.results import TrackingStatus
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
 FRAMES = [render_plane(T, k) for k, T in enumerate(sideways_path(0.02 * np.arange(20)))]
-
-
-def running(pids: list[int]) -> list[int]:
-    """The processes that still run, without zombies."""
-    states = {}
-    for pid in pids:
-        path = Path(f"/proc/{pid}/stat")
-        if path.is_file():
-            states[pid] = path.read_text().rsplit(")", 1)[1].split()[0]
-    return [pid for pid, state in states.items() if state != "Z"]
-
-
-def fill(disk: Path) -> Path:
-    """Fill the file system."""
-    ballast = disk / "ballast"
-    with ballast.open("wb", buffering=0) as file:
-        try:
-            while True:
-                file.write(bytes(1024))
-        except OSError:
-            return ballast
 
 
 def test_tracking_continues_while_the_disk_is_full(small_disk, caplog) -> None:
