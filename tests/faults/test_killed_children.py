@@ -1,6 +1,7 @@
 """Children of a live run are killed at random moments: every tracked pose is on the disk.
 
-``BMASK_SLAM_FAULT_SEEDS=20 pytest tests/faults`` tries more than the usual two seeds.
+``BMASK_SLAM_FAULT_SEEDS=20 pytest tests/faults`` tries more than the usual two seeds; every third
+one has a dense map too.
 """
 
 from __future__ import annotations
@@ -33,9 +34,15 @@ def recording(rendered) -> Path:
 
 def kills(seed: int) -> Iterator[tuple[int, str]]:
     """Frames before which a child is killed, and its name."""
-    draw = random.Random(seed)
+    draw, names = random.Random(seed), ["map", "map", "segmenter", "calibration"]
+    names += ["dense", "dense"] if has_dense(seed) else []
     for _ in range(draw.randint(1, 5)):
-        yield draw.randrange(2, FRAMES), draw.choice(["map", "map", "segmenter", "calibration"])
+        yield draw.randrange(2, FRAMES), draw.choice(names)
+
+
+def has_dense(seed: int) -> bool:
+    """Whether a run has a dense map."""
+    return seed % 3 == 2
 
 
 def children() -> set[int]:
@@ -47,7 +54,13 @@ def children() -> set[int]:
 def test_every_tracked_pose_is_saved(recording: Path, tmp_path: Path, seed: int) -> None:
     plan, before, memory = sorted(kills(seed)), children(), set(os.listdir("/dev/shm"))
     sequence, tracked = open_sequence(recording), []
-    options = LiveOptions(tmp_path / "run", images=recording, calibrate="report", interpolates=True)
+    options = LiveOptions(
+        tmp_path / "run",
+        images=recording,
+        dense=has_dense(seed),
+        calibrate="report",
+        interpolates=True,
+    )
     with LiveSlam(sequence.camera, CONFIG, options) as slam:
         for frame in sequence.frames():
             for name in (name for at, name in plan if at == frame.index):

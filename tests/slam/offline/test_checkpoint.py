@@ -5,12 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
-import random
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -19,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence, signal_at
-from repository import KITCHEN
 
 from bmask_slam.events import EventKind, read_events
 from bmask_slam.graph.errors import InputError
@@ -311,32 +306,3 @@ def rewrite_header(path: Path, change: Callable[[dict[str, object]], object]) ->
     change(header)
     with path.open("wb") as file:
         np.savez(file, **{**arrays, "header": json.dumps(header)})
-
-
-def kill_after_lines(command: list[str], frames: Path, lines: int, delay_s: float) -> None:
-    """Start the program and kill it soon after frames.csv has this many lines."""
-    with subprocess.Popen([sys.executable, "-m", "bmask_slam", *command]) as process:
-        while process.poll() is None:
-            if frames.exists() and frames.read_bytes().count(b"\n") >= lines:
-                time.sleep(delay_s)
-                break
-            time.sleep(0.005)
-        process.kill()
-
-
-def test_the_real_program_killed_twice_on_real_frames(tmp_path: Path) -> None:
-    if not KITCHEN.is_dir():
-        pytest.skip("no ../shared/data/redkitchen here")
-    rng, whole, out = random.Random(0), tmp_path / "whole", tmp_path / "out"
-    common = RunOptions(KITCHEN, max_frames=24, checkpoint_every=EVERY, quiet=True)
-    run(replace(common, out=whole))
-    begin = ["run", str(KITCHEN), "--max-frames", "24", "--checkpoint-every", str(EVERY)]
-    begin += ["--segmenter", "none"]
-    for command, lines in (
-        ([*begin, "--out", str(out)], rng.randint(7, 12)),
-        (["run", "--resume", str(out)], rng.randint(14, 25)),
-    ):
-        kill_after_lines([*command, "--quiet"], out / "frames.csv", lines, rng.uniform(0, 0.05))
-        assert (out / CHECKPOINT).exists()
-    assert resume(out, {"quiet": True}) is not None
-    assert result(out) == result(whole)
