@@ -24,6 +24,7 @@ from bmask_slam.sequences.lists import read_associations
 logger = logging.getLogger(__name__)
 
 SUMS = "SHA256SUMS"
+RECEIVED = "received.txt"
 LISTS = ("rgb.txt", "associations.txt")
 ICL_FPS = 30.0
 ICL_FIRST_POSE = 1
@@ -43,7 +44,7 @@ def obtain(
 
     The folder appears when it is complete. The archive's SHA-256 is stored in ``folder/SHA256SUMS``
     (in the format of ``sha256sum``); if the catalogue has none, a later download must agree with
-    it.
+    it. Where the archive came from, its size and SHA-256 are in RECEIVED in the recording's folder.
 
     Raises:
         InputError: no connection, a file that is not the one expected, a broken or dangerous
@@ -58,7 +59,9 @@ def obtain(
     shutil.rmtree(unpacked, ignore_errors=True)
     try:
         unpack(archive, unpacked, lambda done, total: report("unpack", done, total))
-        os.replace(_completed(unpacked, recording), place)
+        root = _completed(unpacked, recording)
+        _write_received(root / RECEIVED, recording, archive, read_sums(folder / SUMS))
+        os.replace(root, place)
     finally:
         shutil.rmtree(unpacked, ignore_errors=True)
     if not keep_archive:
@@ -100,6 +103,18 @@ def write_sums(path: Path, sums: dict[str, str]) -> None:
     text = "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items()))
     with whole_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _write_received(path: Path, recording: Recording, archive: Path, sums: dict[str, str]) -> None:
+    """Write what was received, beside the data: it stays with them where they are moved to."""
+    check = "that of the catalogue" if recording.sha256 else "not known to the catalogue"
+    lines = [
+        f"url     {recording.url}",
+        f"bytes   {archive.stat().st_size}",
+        f"sha256  {sums[archive.name]} ({check})",
+    ]
+    with whole_file(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _completed(unpacked: Path, recording: Recording) -> Path:

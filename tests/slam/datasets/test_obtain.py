@@ -18,7 +18,7 @@ from bmask_slam.cli import main
 from bmask_slam.comparison.experiment.experiment_file import read_experiment
 from bmask_slam.datasets import web_file
 from bmask_slam.datasets.catalogue import Recording, find, read_catalogue
-from bmask_slam.datasets.obtain import SUMS, obtain, read_sums
+from bmask_slam.datasets.obtain import RECEIVED, SUMS, obtain, read_sums
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
@@ -97,6 +97,11 @@ def test_the_first_hash_is_kept_and_a_later_file_must_agree(server, tmp_path, ca
         in (caplog.text)
     )
     assert received in caplog.text
+    size, kept = len(server.files["tiny.tgz"]), (folder / RECEIVED).read_text()
+    assert kept == (
+        f"url     {server.url}/tiny.tgz\nbytes   {size}\n"
+        f"sha256  {received} (not known to the catalogue)\n"
+    )
     folder.rename(tmp_path / "moved")
     (tmp_path / "tum" / "tiny.tgz").unlink()
     server.files["tiny.tgz"] = as_tar(TUM, "other/")
