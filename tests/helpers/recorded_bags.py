@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from synthetic_view import CAMERA, render_plane
@@ -68,9 +68,12 @@ def camera_info(distortion: tuple[float, ...] = (0.1, -0.2, 0.001, 0.002, 0.05))
 
 
 class BagMaker:
-    """Writes a bag: .bag is ROS 1, .mcap one file, else a folder (``sqlite3`` or ``mcap``)."""
+    """Writes a bag: .bag is ROS 1, .mcap one file, else a folder (``sqlite3`` or ``mcap``).
 
-    def __init__(self, path: Path, storage: str = "sqlite3") -> None:
+    ``packing``: "bz2" or "lz4" for ROS 1, "message", "file" or "storage" (of mcap) for ROS 2.
+    """
+
+    def __init__(self, path: Path, storage: str = "sqlite3", packing: str = "none") -> None:
         self.is1, self.path = path.suffix == ".bag", path
         self._types = TYPES[self.is1]
         self._folder = path.with_suffix("") if path.suffix == ".mcap" else path
@@ -79,6 +82,10 @@ class BagMaker:
         self._writer: Any = (
             Writer1(path) if self.is1 else Writer2(self._folder, version=9, storage_plugin=plugin)
         )
+        if packing != "none" and self.is1:
+            self._writer.set_compression(Writer1.CompressionFormat[packing.upper()])
+        elif packing != "none":
+            self._writer.set_compression(CompressionMode[packing.upper()], CompressionFormat.ZSTD)
         self._connections: dict[str, Any] = {}
         self._received_ns = int(BEGIN_S * 1e9)
 
@@ -122,9 +129,9 @@ class BagMaker:
         return types[name](header=header, **given)
 
 
-def write_bag(path: Path, frames: int = 4, storage: str = "sqlite3") -> Path:
+def write_bag(path: Path, frames: int = 4, storage: str = "sqlite3", packing: str = "none") -> Path:
     """A bag in TUM's layout: rgb8, and 32FC1 whose stamps are 4 ms later; four views in turn."""
-    with BagMaker(path, storage) as bag:
+    with BagMaker(path, storage, packing) as bag:
         bag.write(INFO, BEGIN_S, camera_info())
         for k in range(frames):
             frame, stamp_s = view(k % 4), BEGIN_S + k * STEP_S

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import bz2
+import logging
 import struct
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.reading import MAX_RATIO, SMALL_BYTES
 from bmask_slam.live.sources.checks import import_optional
+
+logger = logging.getLogger(__name__)
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _CURE = (
@@ -42,8 +50,9 @@ class Bag:
         duration_s: time from the first message to the last, by the time of recording.
     """
 
-    def __init__(self, path: Path, reader: Any) -> None:
+    def __init__(self, path: Path, reader: Any, allowance: Allowance) -> None:
         self.path = path
+        self._allowance = allowance
         self.duration_s = max(float(reader.duration), 0.0) * 1e-9
         self._reader = reader
         self.topics = sorted(
@@ -63,7 +72,7 @@ class Bag:
         with _translated(self.path):
             raw = iter(self._reader.messages(chosen))
         while True:
-            with _translated(self.path):
+            with _translated(self.path), self._allowance.in_use():
                 found = next(raw, None)
                 if found is None:
                     return
@@ -83,17 +92,99 @@ def open_bag(path: Path) -> Iterator[Bag]:
         raise InputError(f"{path}: no such bag")
     typesys = import_optional("rosbags.typesys", "ros", str(path))
     highlevel = import_optional("rosbags.highlevel", "ros", str(path))
-    with _translated(path):
+    allowance = Allowance(path)
+    _bound_unpacking(path)
+    with _translated(path), allowance.in_use():
         types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         reader = highlevel.AnyReader([path], default_typestore=types)
         reader.open()
     try:
         with _translated(path):
-            bag = Bag(path, reader)
+            bag = Bag(path, reader, allowance)
         yield bag
     finally:
         with _translated(path):
             reader.close()
+
+
+class Allowance:
+    """How many bytes all that is compressed in a bag may unpack to, while it is open.
+
+    As for other files, 256 MB, or 100 times the size of the bag where that is more.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        """That of a bag; without one there is no limit."""
+        if path is None:
+            self.left = sys.maxsize - 1
+            return
+        files = path.iterdir() if path.is_dir() else [path]
+        self.left = max(SMALL_BYTES, MAX_RATIO * sum(file.stat().st_size for file in files))
+
+    def take(self, size: int) -> None:
+        """Count what was unpacked. Raises ValueError if it is too much."""
+        self.left -= size
+        if self.left < 0:
+            raise ValueError("it unpacks to far more than its size")
+
+    @contextmanager
+    def in_use(self) -> Iterator[None]:
+        """What rosbags unpacks in this block, in this thread, is counted."""
+        token = _ALLOWANCE.set(self)
+        try:
+            yield
+        finally:
+            _ALLOWANCE.reset(token)
+
+
+_ALLOWANCE: ContextVar[Allowance | None] = ContextVar("allowance", default=None)
+
+
+def _unpack(make: Callable[[], Any], data: bytes) -> bytes:
+    """What compressed data unpack to, by decompressors of ``make``; no more than is allowed."""
+    allowance = _ALLOWANCE.get() or Allowance()
+    parts: list[bytes] = []
+    while data:
+        stream = make()
+        parts.append(stream.decompress(data, max_length=allowance.left + 1))
+        allowance.take(len(parts[-1]))
+        if not stream.eof:
+            raise EOFError("compressed data are cut off")
+        data = stream.unused_data or b""
+    return b"".join(parts)
+
+
+def _bound_unpacking(path: Path) -> None:
+    """Let rosbags unpack by ``_unpack``: its own functions have no limit."""
+    names = ("rosbag1.reader", "rosbag2.reader", "rosbag2.storage_mcap")
+    modules: list[Any] = [import_optional(f"rosbags.{name}", "ros", str(path)) for name in names]
+    one, two, mcap = modules
+    lz4 = import_optional("lz4.frame", "ros", str(path))
+    zstd = two.zstd
+    if isinstance(zstd, ModuleType):
+        one.decompressors["bz2"] = lambda data: _unpack(bz2.BZ2Decompressor, data)
+        one.decompressors["lz4"] = lambda data: _unpack(lz4.LZ4FrameDecompressor, data)
+        mcap.DECOMPRESSORS["lz4"] = lambda data, _: _unpack(lz4.LZ4FrameDecompressor, data)
+        mcap.DECOMPRESSORS["zstd"] = lambda data, _: _unpack(zstd.ZstdDecompressor, data)
+        two.zstd = SimpleNamespace(
+            ZstdError=zstd.ZstdError,
+            decompress=lambda data: _unpack(zstd.ZstdDecompressor, data),
+            open=lambda file, mode: _counted(zstd.open(file, mode)),
+        )
+
+
+@contextmanager
+def _counted(file: Any) -> Iterator[Any]:
+    """A compressed file of which no more than is allowed is read."""
+    allowance = _ALLOWANCE.get() or Allowance()
+
+    def read(size: int) -> bytes:
+        data: bytes = file.read(size)
+        allowance.take(len(data))
+        return data
+
+    with file:
+        yield SimpleNamespace(read=read)
 
 
 def format_topics(bag: Bag) -> str:

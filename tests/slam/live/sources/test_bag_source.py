@@ -24,6 +24,7 @@ from recorded_bags import (
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.live.sources import bags
 from bmask_slam.live.sources.bag_source import BagSource, BagTopics
 from bmask_slam.live.sources.bags import format_topics, is_bag, open_bag
 from bmask_slam.sequences import write_camera
@@ -243,3 +244,32 @@ def test_memory_does_not_grow_with_the_bag(tmp_path: Path, name: str, storage: s
     finally:
         tracemalloc.stop()
     assert peak < 4e6
+
+
+PACKED = [
+    *(("a.bag", "", "bz2"), ("a.bag", "", "lz4"), ("folder", "mcap", "storage")),
+    *(("folder", "sqlite3", "message"), ("folder", "sqlite3", "file")),
+]
+
+
+@pytest.mark.parametrize(("name", "storage", "packing"), PACKED)
+def test_a_compressed_bag_unpacks_to_no_more_than_is_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, storage: str, packing: str
+) -> None:
+    """A black image is packed to a five-hundredth or less; rosbags itself has no limit."""
+    (tmp_path / "usual").mkdir()
+    small = write_bag(tmp_path / "usual" / name, storage=storage, packing=packing)
+    assert_same(list(BagSource(small).frames()), [0, 1, 2, 3])
+    path, black = tmp_path / name, np.zeros((1200, 1600, 3), np.uint8)
+    with BagMaker(path, storage, packing) as maker:
+        maker.write(RGB, BEGIN_S, image("rgb8", black))
+
+    def read() -> int:
+        with open_bag(path) as bag:
+            return sum(message.data.nbytes for _, message in bag.messages(RGB))
+
+    assert read() == black.nbytes
+    assert read() == black.nbytes, "every opening has its own allowance"
+    monkeypatch.setattr(bags, "SMALL_BYTES", black.nbytes - 1)
+    with pytest.raises(InputError, match="it unpacks to far more than its size"):
+        read()
