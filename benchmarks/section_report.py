@@ -86,6 +86,7 @@ REPORTS = {
         "photographs": (
             "Masks of photographs that no training saw", "semantics.segmentation photographs"
         ),
+        "stuff": ("A class for every pixel, on NYU Depth v2's test images", "semantics.stuff"),
         "cost": ("Time and memory of the networks", "semantics.segmentation cost"),
         "beside": (
             "Beside torchvision's network",

@@ -35,6 +35,7 @@ NEWER_ARRAYS = (
     "mapper.history.information",
     "mapper.loops.noise.",
     "localiser.images.",
+    "semantics.surfaces.",
 )
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 

@@ -80,7 +80,7 @@ class SystemResults(ABC):
         chosen = self.map.world.in_segment(largest(self.segments()))
         hosts = [k.id for k in chosen]
         ids = np.flatnonzero(table.in_map & np.isin(table.host, hosts))
-        labels = self.semantics.landmark_labels(ids)
+        labels = self.semantics.landmark_labels(ids, chosen)
         columns = table.points_world[ids], table.colours[ids], table.observations[ids]
         return LandmarkCloud(ids, *columns, labels)
 

@@ -128,7 +128,8 @@ def test_the_wheel_holds_every_module_all_data_and_nothing_else(wheel: Path) -> 
     assert {name for name in names if not name.startswith("bmask_slam-")} == files_of_the_tree()
     assert "bmask_slam/py.typed" in names
     assert "bmask_slam/graph/geometry.py" in names
-    assert "bmask_slam/data/weights/light.safetensors" in names
+    for weights in ("light", "stuff"):
+        assert f"bmask_slam/data/weights/{weights}.safetensors" in names
 
 
 def test_the_licence_and_the_command_are_in_the_wheel(wheel: Path) -> None:

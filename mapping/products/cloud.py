@@ -127,7 +127,7 @@ def merge_points(rows: NDArray, voxel_m: float, table: LabelTable) -> Cloud:
     best = np.zeros(count, np.float32)
     np.maximum.at(best, voxel, rows["weight"])
     cell = np.unique(voxel_keys(points, CELL_VOXELS * voxel_m), return_inverse=True)[1]
-    labels, probabilities = _fused_labels(voxel, cell, rows["instance"], table)
+    labels, probabilities = _fused_labels(voxel, cell, rows["instance"], table, points, normals)
     return Cloud(
         points.astype(np.float32),
         normals.astype(np.float32),
@@ -146,19 +146,21 @@ def _mean(voxel: NDArray, values: NDArray, weight: Array, total: Array) -> Array
 
 
 def _fused_labels(
-    voxel: NDArray, cell: NDArray, instance: NDArray, table: LabelTable
+    voxel: NDArray,
+    cell: NDArray,
+    instance: NDArray,
+    table: LabelTable,
+    points_world: Array,
+    normals_world: Array,
 ) -> tuple[NDArray[np.uint16], Floats]:
-    """Class (M,) and its probability (M,) of voxels.
+    """Class (M,) and its probability (M,) of voxels at points (M, 3) with normals (M, 3).
 
     ``voxel`` (N,) and ``instance`` (N,) are those of the points, ``cell`` (M,) those of the voxels.
     """
     if table.log_likelihoods.shape[1] == 1:
         return np.zeros(len(cell), np.uint16), np.ones(len(cell), np.float32)
-    evidence = table.fused(_views(voxel, cell, instance, table.submaps))
-    evidence -= evidence.max(axis=1, keepdims=True)
-    label = evidence.argmax(axis=1)
-    probability = 1 / np.exp(evidence, out=evidence).sum(axis=1)
-    return label.astype(np.uint16), probability
+    views = _views(voxel, cell, instance, table.submaps)
+    return table.labels(views, points_world, normals_world)
 
 
 def _views(voxel: NDArray, cell: NDArray, instance: NDArray, submap_of: Ints) -> csr_matrix:

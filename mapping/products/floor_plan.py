@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Image, Ints
 from bmask_slam.mapping.products.cloud import Cloud
-from bmask_slam.mapping.products.pictures import EMPTY, palette, with_legend
+from bmask_slam.mapping.products.pictures import EMPTY, WALL, palette, with_legend
+from bmask_slam.mapping.products.surface_regions import STRUCTURE
+from bmask_slam.semantics.beliefs.surface_geometry import FLOORS
 
 FLOOR_COLOUR = (235, 230, 215)
 HEIGHTS_M = (0.1, 1.9)
-"""Heights above the floor between which points are obstacles."""
+"""Heights above the floor between which points are obstacles; walls may be higher."""
+CEILING = "ceiling"
+GAP_M = 0.3
 UPRIGHT_COSINE = 0.95
 BIN_M = 0.04
 GUESS_DEG, CANDIDATES = 45.0, 400
@@ -87,17 +91,16 @@ class PlanFrame:
     cell_m: float
 
 
-def plan_frame(cloud_sample: Cloud, first_guess: Array, cell_m: float) -> PlanFrame:
-    """The plan's frame from a sample of the cloud: up from the floor, right along the walls."""
-    up = up_direction(cloud_sample.normals, first_guess)
-    facing_up = cloud_sample.normals @ up > UPRIGHT_COSINE
-    facing = cloud_sample.points[facing_up].astype(float)
+def plan_frame(points: Array, normals: Array, first_guess: Array, cell_m: float) -> PlanFrame:
+    """The plan's frame by points (N, 3) with normals: up from the floor, right along the walls."""
+    up = up_direction(normals, first_guess)
+    facing = points[normals @ up > UPRIGHT_COSINE].astype(float)
     up, floor_m = fit_floor(facing, up, floor_height(facing @ up))
     helper = np.eye(3)[np.argmin(np.abs(up))]
     right = np.cross(helper, up)
     right /= np.linalg.norm(right)
     forward = np.cross(up, right)
-    walls = cloud_sample.normals[np.abs(cloud_sample.normals @ up) < 0.1]
+    walls = normals[np.abs(normals @ up) < 0.1]
     angle = np.arctan2(walls @ forward, walls @ right)
     turn = np.angle(np.exp(4j * angle).sum()) / 4 if len(walls) else 0.0
     right, forward = (
@@ -108,11 +111,16 @@ def plan_frame(cloud_sample: Cloud, first_guess: Array, cell_m: float) -> PlanFr
 
 
 class FloorPlan:
-    """A grid of cells that counts the points of a cloud, block by block."""
+    """A grid of cells that counts the points of a cloud, block by block.
 
-    def __init__(self, frame: PlanFrame, classes: int) -> None:
+    Where the labels ``names`` tell walls, floor and ceiling, the walls of the plan are theirs.
+    """
+
+    def __init__(self, frame: PlanFrame, names: Sequence[str]) -> None:
         self.frame = frame
-        self._classes = classes
+        self._names = tuple(names)
+        self._structure = np.isin(self._names, STRUCTURE)
+        self._flat = np.isin(self._names, (*FLOORS, CEILING))
         self._standing = np.zeros((0, 4), np.int64)  # column, row, label, points
         self._floor = np.zeros((0, 2), np.int64)
 
@@ -121,7 +129,8 @@ class FloorPlan:
         placed = cloud.points.astype(float) @ self.frame.axes.T
         height_m = placed[:, 2] - self.frame.floor_m
         cells = np.floor(placed[:, :2] / self.frame.cell_m).astype(np.int64)
-        standing = (height_m > HEIGHTS_M[0]) & (height_m < HEIGHTS_M[1])
+        below = (height_m < HEIGHTS_M[1]) | self._structure[cloud.labels]
+        standing = (height_m > HEIGHTS_M[0]) & below & ~self._flat[cloud.labels]
         rows = np.column_stack([cells[standing], cloud.labels[standing].astype(np.int64)])
         found, count = np.unique(rows, axis=0, return_counts=True)
         self._standing = np.concatenate([self._standing, np.column_stack([found, count])])
@@ -139,18 +148,29 @@ class FloorPlan:
         width, height = high - low + 1
         grid = np.full((height, width), -2, np.int16)
         grid[high[1] - self._floor[:, 1], self._floor[:, 0] - low[0]] = -1
-        votes = np.zeros((height, width, self._classes), np.int64)
+        votes = np.zeros((height, width, len(self._names)), np.int64)
         column, row, label, points = self._standing.T
         np.add.at(votes, (high[1] - row, column - low[0], label), points)
         occupied = votes.any(axis=2)
         grid[occupied] = _labels(votes[occupied])
+        if WALL in self._names:
+            self._close_walls(grid)
         return grid, np.column_stack([path[:, 0] - low[0], high[1] + 1 - path[:, 1]])
 
-    def picture(self, names: Sequence[str], path_world: Array) -> Image:
+    def _close_walls(self, grid: NDArray[np.int16]) -> None:
+        """Fill gaps of up to GAP_M in the walls, which run along the axes, of cells (H, W)."""
+        wall = self._names.index(WALL)
+        mask, length = (grid == wall).astype(np.uint8), round(GAP_M / self.frame.cell_m) + 1
+        for size in ((1, length), (length, 1)):
+            closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones(size, np.uint8)) > 0
+            grid[closed & (grid < 0)] = wall
+
+    def picture(self, path_world: Array) -> Image:
         """The plan (H, W, 3), red first, with scale bar, legend and the camera's path (N, 3)."""
         grid, path = self.grid(path_world)
         scale = max(1, round(900 / max(grid.shape)))
-        colours = np.vstack([[[EMPTY] * 3, FLOOR_COLOUR], palette(len(names))]).astype(np.uint8)
+        names = self._names
+        colours = np.vstack([[[EMPTY] * 3, FLOOR_COLOUR], palette(names)]).astype(np.uint8)
         image = np.kron(colours[grid + 2], np.ones((scale, scale, 1), np.uint8))
         line = np.rint(path * scale).astype(np.int32)
         cv2.polylines(image, [line], False, (220, 30, 30), 2, cv2.LINE_AA)

@@ -17,14 +17,18 @@ from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.products.cloud import Cloud
 
-BACKGROUND_COLOUR = (150, 150, 150)
+BACKGROUND_COLOUR, WALL_COLOUR = (150, 150, 150), (70, 70, 80)
+WALL = "wall"
 EMPTY = 255
 
 
-def palette(classes: int) -> Bytes:
-    """Colours (classes, 3) of labels: grey for the background, distinct hues for the others."""
+def palette(names: Sequence[str]) -> Bytes:
+    """Colours (C, 3) of labels: greys for background and walls, distinct hues for the others."""
     colours = [BACKGROUND_COLOUR]
-    for k in range(1, classes):
+    for k, name in enumerate(names[1:], 1):
+        if name == WALL:
+            colours.append(WALL_COLOUR)
+            continue
         hue = (k * 0.618034) % 1.0  # steps of the golden ratio keep any number of hues apart
         rgb = colorsys.hsv_to_rgb(hue, (0.85, 0.6)[k % 2], (0.95, 0.75)[k // 2 % 2])
         colours.append((round(255 * rgb[0]), round(255 * rgb[1]), round(255 * rgb[2])))
@@ -81,7 +85,7 @@ def _offsets(size: int) -> list[tuple[int, int]]:
 
 def with_legend(image: Image, names: Sequence[str], labels: Sequence[int]) -> Bytes:
     """The image (H, W, 3) with a column of class names and colours at its right."""
-    colours = palette(len(names))
+    colours = palette(names)
     column = np.full((max(image.shape[0], 24 * len(labels) + 16), 190, 3), EMPTY, np.uint8)
     for row, label in enumerate(labels):
         y = 16 + 24 * row
@@ -111,7 +115,7 @@ class CloudPictures:
         self, views: Mapping[str, tuple[Camera, Array]], point_m: float, names: Sequence[str]
     ) -> None:
         """``views`` are cameras with their T_world_camera (4, 4), by name."""
-        self.names, self.palette = names, palette(len(names))
+        self.names, self.palette = names, palette(names)
         self.counts = np.zeros(len(names), np.int64)
         self._coloured = {n: Picture(*view, point_m) for n, view in views.items()}
         self._labelled = {n: Picture(*view, point_m) for n, view in views.items()}

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from bmask_slam.graph.arrays import Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.mapping.products.surface_regions import Regions, StuffFusion, find_regions
 from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
 from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.instances.surfaces import surfaces_of
 
 OTHER_SHARE = 0.1
 """Probability that an instance's classes do not hold for a point: no view excludes a class."""
@@ -23,16 +25,19 @@ MIN_LANDMARKS = 3
 
 @dataclass(frozen=True, eq=False)
 class KeyframeLabels:
-    """The instances in a keyframe's image.
+    """The instances in a keyframe's image, and regions of stuff where there is none.
 
     Attributes:
-        numbers: (H, W) uint16, the instance at each pixel, from 1; 0 for none.
+        numbers: (H, W) uint16, the instance at each pixel, from 1; 0 for none. A number above I is
+            that of a region plus I.
         log_likelihoods: (I + 1, C) float32 of each class given the instance, relative to no view;
             row 0, for no instance, is zero. Column 0 is the background.
+        stuff: the regions.
     """
 
     numbers: NDArray[np.uint16]
     log_likelihoods: Floats
+    stuff: Regions
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +48,15 @@ class InstanceEvidence:
         log_likelihoods: (I + 1, C) float32 from their masks, as in KeyframeLabels.
         landmark_ids: (L,) landmarks observed on instances.
         landmark_instances: (L,) uint16, the instance of each, from 1.
+        stuff: (R, S) float32 log probabilities of the classes ``stuff_names`` of the regions, whose
+            numbers follow those of the instances.
     """
 
     log_likelihoods: Floats
     landmark_ids: Ints
     landmark_instances: NDArray[np.uint16]
+    stuff: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    stuff_names: tuple[str, ...] = ()
 
     def with_landmarks(
         self,
@@ -80,23 +89,41 @@ class InstanceEvidence:
 
 @dataclass(frozen=True, eq=False)
 class LabelTable:
-    """The log likelihoods of the instances of all submaps.
+    """The evidence of the instances and regions of all submaps.
 
     Attributes:
-        log_likelihoods: (I, C) float32 as in KeyframeLabels, one keyframe's rows after the other's.
+        log_likelihoods: (I, C) float32 as in KeyframeLabels, one keyframe's rows after the other's;
+            zeros for regions.
         submaps: (I,) index of each row's submap, sorted.
         fusion: parameters of the fusion of views.
+        stuff: (I, S) float32 log probabilities of the regions' classes; zeros for instances.
+        stuff_fusion: how these are fused.
     """
 
     log_likelihoods: Floats
     submaps: Ints
     fusion: LabelStoreConfig
+    stuff: Floats
+    stuff_fusion: StuffFusion
 
     @classmethod
-    def of(cls, keyframes: Sequence[Floats], fusion: LabelStoreConfig) -> LabelTable:
-        """The table of keyframes, each with its rows (I_k + 1, C)."""
-        submaps = np.repeat(np.arange(len(keyframes)), [len(k) for k in keyframes])
-        return cls(np.concatenate(keyframes), submaps, fusion)
+    def of(
+        cls,
+        keyframes: Sequence[Floats],
+        fusion: LabelStoreConfig,
+        stuff: Sequence[Floats] = (),
+        stuff_fusion: StuffFusion | None = None,
+    ) -> LabelTable:
+        """The table of keyframes, each with its rows (I_k + 1, C) and those of regions (R_k, S)."""
+        together = stuff_fusion or StuffFusion(())
+        none = np.zeros((0, len(together.stuff)), np.float32)
+        regions = [r if r.shape[1] == none.shape[1] else none for r in stuff]
+        regions = regions or [none] * len(keyframes)
+        pairs = list(zip(keyframes, regions, strict=True))
+        likelihoods = [np.pad(k, ((0, len(r)), (0, 0))) for k, r in pairs]
+        submaps = np.repeat(np.arange(len(pairs)), [len(rows) for rows in likelihoods])
+        below = [np.pad(r, ((len(k), 0), (0, 0))) for k, r in pairs]
+        return cls(np.concatenate(likelihoods), submaps, fusion, np.concatenate(below), together)
 
     @property
     def first(self) -> Ints:
@@ -109,13 +136,40 @@ class LabelTable:
         As the label store fuses views of a landmark: the likelihoods of the instances, and the
         probability that all views without an instance missed the object.
         """
-        none = np.zeros(len(self.submaps), np.float32)
+        none = self._is_region.astype(np.float32)
         none[self.first] = 1
         evidence = np.asarray(views @ self.log_likelihoods)
         evidence += np.log(self.fusion.prior(evidence.shape[1])).astype(np.float32)
         missed = self.fusion.log_missed(np.asarray(views @ none))
         evidence[:, 1:] += missed[:, None].astype(np.float32)
         return evidence
+
+    def labels(
+        self, views: csr_matrix, points_world: Array, normals_world: Array
+    ) -> tuple[NDArray[np.uint16], Floats]:
+        """Label (N,) and its probability (N,) of points (N, 3) with ``views`` (N, I).
+
+        A point is a thing if one is likelier than none; else what the regions tell.
+        """
+        evidence = self.fused(views)
+        evidence -= evidence.max(axis=1, keepdims=True)
+        label = evidence.argmax(axis=1)
+        probability = 1 / np.exp(evidence, out=evidence).sum(axis=1)
+        free = np.flatnonzero(label == 0)
+        if len(self.stuff_fusion.stuff) and len(free):
+            seen = np.asarray(views[free] @ self._is_region.astype(np.float32))
+            sums, on = (
+                np.asarray(views[free] @ self.stuff),
+                (points_world[free], normals_world[free]),
+            )
+            below, sure = self.stuff_fusion.labels(sums, seen, *on)
+            label[free] = below
+            probability[free] *= np.where(below > 0, sure, 1)
+        return label.astype(np.uint16), probability
+
+    @property
+    def _is_region(self) -> Mask:
+        return np.asarray(self.stuff.any(axis=1))
 
 
 def keyframe_labels(
@@ -127,6 +181,8 @@ def keyframe_labels(
     the class score as weight, and of no information.
     """
     numbers = np.zeros(shape, np.uint16)
+    stuff = find_regions(surfaces_of(instances), _free(instances, shape))
+    numbers[stuff.numbers > 0] = stuff.numbers[stuff.numbers > 0] + len(instances)
     order = sorted(range(len(instances)), key=lambda k: instances[k].mask_score)
     for k in order:
         numbers[instances[k].mask] = k + 1
@@ -136,7 +192,15 @@ def keyframe_labels(
         distributions = np.stack([i.distribution for i in instances]).astype(np.float32)
         weights = (1 - OTHER_SHARE) * np.clip(trust, 0, 1).astype(np.float32)
         table[1:] = np.log(fusion.likelihoods(distributions, weights))
-    return KeyframeLabels(numbers, table)
+    return KeyframeLabels(numbers, table, stuff)
+
+
+def _free(instances: Sequence[Instance], shape: tuple[int, int]) -> Mask:
+    """The pixels (H, W) without an instance."""
+    free = np.ones(shape, bool)
+    for instance in instances:
+        free &= ~instance.mask
+    return free
 
 
 def dilate(mask: Mask, margin_px: int = 5) -> Mask:

@@ -9,9 +9,12 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Bytes, Floats, Image
 from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.instances.surfaces import SurfaceClasses, most_probable
 from bmask_slam.semantics.labels import LabelSet
 
-OPACITY = 0.45
+OPACITY, SURFACE_OPACITY = 0.45, 0.6
+NAMED_SHARE = 0.01
+"""Areas of this share of the image have their class written on them."""
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -32,6 +35,29 @@ def draw(image: Image, instances: Sequence[Instance], labels: LabelSet) -> Bytes
         corner = (int(instance.box[0]) + 2, max(int(instance.box[1]) + 12, 12))
         cv2.putText(drawn, text, corner, FONT, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
         cv2.putText(drawn, text, corner, FONT, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
+    return drawn
+
+
+def draw_surfaces(image: Image, seen: SurfaceClasses) -> Image:
+    """The image (H, W, 3) with the likeliest class of every pixel, and its name in large areas.
+
+    The surer the class, the stronger its colour.
+    """
+    label, probability = most_probable(seen)
+    colours = np.array([class_colour(k) * 0.8 for k in range(len(seen.labels))], np.float32)
+    share = SURFACE_OPACITY * probability[..., None]
+    drawn = ((1 - share) * image + share * colours[label]).round().astype(np.uint8)
+    for k in np.unique(label).tolist():
+        count, parts, stats, _ = cv2.connectedComponentsWithStats((label == k).astype(np.uint8))
+        for part in range(1, count):
+            if stats[part, cv2.CC_STAT_AREA] >= NAMED_SHARE * label.size:
+                inside = np.pad((parts == part).astype(np.uint8), 1)
+                far = cv2.distanceTransform(inside, cv2.DIST_L2, 3)
+                row, column = np.unravel_index(int(far.argmax()), far.shape)
+                corner = (max(int(column) - 20, 2), int(row) + 4)
+                name = seen.labels.names[k]
+                cv2.putText(drawn, name, corner, FONT, 0.45, (0, 0, 0), 3, cv2.LINE_AA)
+                cv2.putText(drawn, name, corner, FONT, 0.45, (255, 255, 160), 1, cv2.LINE_AA)
     return drawn
 
 

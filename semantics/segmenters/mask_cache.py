@@ -18,7 +18,9 @@ from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.instances.instances import as_annotation
-from bmask_slam.semantics.instances.overlay import draw
+from bmask_slam.semantics.instances.overlay import draw, draw_surfaces
+from bmask_slam.semantics.instances.surface_files import write_surfaces
+from bmask_slam.semantics.instances.surfaces import surfaces_of
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 
@@ -129,8 +131,12 @@ def _segmented(
     """The entry of one image; writes its overlay if asked."""
     image = read_colour(path)
     instances = segmenter.segment(image, name)
+    seen = surfaces_of(instances)
+    if seen is not None:
+        write_surfaces(options.out, name, seen)
     if options.overlays:
-        picture = draw(image, instances, segmenter.labels)
+        below = image if seen is None else draw_surfaces(image, seen)
+        picture = draw(below, instances, segmenter.labels)
         target = target_below(options.out, f"overlays/{name}").with_suffix(".jpg")
         with whole_file(target) as temporary:
             cv2.imwrite(str(temporary), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

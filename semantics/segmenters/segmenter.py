@@ -13,6 +13,8 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.coco_files import CocoImage, read_coco
 from bmask_slam.semantics.instances.image_files import decode_image
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.instances.surface_files import read_surfaces, surface_labels
+from bmask_slam.semantics.instances.surfaces import Segmented
 from bmask_slam.semantics.labels import LabelSet, label_set
 
 INSTANCES_A_CLASS = 1000
@@ -27,7 +29,8 @@ class Segmenter(Protocol):
     def segment(self, image: Image, name: str) -> list[Instance]:
         """Instances in an image (H, W, 3), red first, best mask score first.
 
-        ``name`` is the image's file name relative to its sequence, for look-ups and errors.
+        ``name`` is the image's file name relative to its sequence, for look-ups and errors. A
+        segmenter that also tells what all pixels are gives a ``Segmented``.
         """
 
 
@@ -56,13 +59,17 @@ class NoSegmenter:
 
 
 class CocoSegmenter:
-    """Reads instances from a COCO file: cached masks, or the truth of a rendered sequence."""
+    """Reads instances from a COCO file: cached masks, or the truth of a rendered sequence.
+
+    Beside cached masks lie the classes of all pixels, if their segmenter told them.
+    """
 
     def __init__(self, path: Path) -> None:
         content = read_coco(path)
         self.path = path
         self.labels = content.labels
         self._images = {Path(i.file_name).as_posix(): i for i in content.images}
+        self._surface_labels = surface_labels(path.parent)
 
     def segment(self, image: Image, name: str) -> list[Instance]:
         """The instances in the file for the image of this name.
@@ -79,8 +86,11 @@ class CocoSegmenter:
                 f"{self.path}: {name} has {known.width}x{known.height} pixels there, but "
                 f"{image.shape[1]}x{image.shape[0]} here; make the masks of this sequence"
             )
-        found = _instances(known, len(self.labels))
-        return sorted(found, key=lambda i: -i.mask_score)
+        found = sorted(_instances(known, len(self.labels)), key=lambda i: -i.mask_score)
+        if self._surface_labels is None:
+            return found
+        size = (known.height, known.width)
+        return Segmented(found, read_surfaces(self.path.parent, name, self._surface_labels, size))
 
 
 def _instances(image: CocoImage, classes: int) -> list[Instance]:

@@ -38,6 +38,7 @@ class SegmenterOptions:
         masks: COCO file or folder of label PNGs, for "precomputed".
         labels: label set of the weights or the PNGs, where the file does not name it.
         min_score: class score below which a network's detection is dropped.
+        surfaces: whether the light network gives every pixel a class, walls and floors too.
         ray: address of a Ray cluster to run on, see `semantics.segmenters.ray_segmenter`; "" for
             this process.
     """
@@ -48,6 +49,7 @@ class SegmenterOptions:
     masks: Path | None = None
     labels: str | None = None
     min_score: float = 0.5
+    surfaces: bool = True
     ray: str = ""
 
     def described(self) -> dict[str, str]:
@@ -106,6 +108,8 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     from bmask_slam.semantics.segmenters.yolox import YoloxConfig, YoloxDetector  # noqa: PLC0415
     from bmask_slam.semantics.weights.checkpoints import load_network  # noqa: PLC0415
     from bmask_slam.semantics.weights.light_weights import SHIPPED, is_light, load_light  # noqa: PLC0415
+    from bmask_slam.semantics.weights.stuff_weights import SHIPPED as STUFF  # noqa: PLC0415
+    from bmask_slam.semantics.weights.stuff_weights import load_stuff  # noqa: PLC0415
 
     labels = read_label_set(options.labels) if options.labels else None
     path = find_weights(options.weights) if options.weights else data_path(*SHIPPED)
@@ -115,11 +119,13 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
         detector = YoloxDetector(options.proposals, YoloxConfig(selection))
     if is_light(path):
         _check_kind(options, "light", "YOLOX-Nano")
-        return LightSegmenter(load_light(path, labels), options.min_score, detector)
-    network = load_network(path, labels)
-    body = network.model.config.backbone
+        stuff = load_stuff(data_path(*STUFF)) if options.surfaces else None
+        network = load_light(path, labels)
+        return LightSegmenter(network, options.min_score, detector, stuff=stuff)
+    other = load_network(path, labels)
+    body = other.model.config.backbone
     _check_kind(options, "light" if body == "mobilenet_v2" else "mask-scoring-rcnn", body)
-    return NetworkSegmenter(network, options.min_score, detector)
+    return NetworkSegmenter(other, options.min_score, detector)
 
 
 def _check_kind(options: SegmenterOptions, name: str, body: str) -> None:

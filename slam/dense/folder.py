@@ -30,12 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.dense.options import MapOptions, fusion_config
-from bmask_slam.graph.arrays import Mask
+from bmask_slam.graph.arrays import Arrays, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
 from bmask_slam.graph.files.file_names import refuse_link
-from bmask_slam.graph.files.json_file import read_json
+from bmask_slam.graph.files.json_file import Name, check_json, read_json
 from bmask_slam.graph.files.reading import MAX_LINE
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.inverse_depth.depth_map import (
@@ -154,7 +154,7 @@ class DenseFolder:
     def write(self, submap: Submap, fused: InverseDepthMap, evidence: InstanceEvidence) -> None:
         """Save a finished keyframe. Raises InputError, with no half-written file, if it cannot."""
         write_depth_map(self._file("depth", submap.anchor), fused)
-        write_arrays(self._file("labels", submap.anchor), LABEL_FILE, {}, vars(evidence))
+        _write_evidence(self._file("labels", submap.anchor), evidence)
         write_submap(self._file("submaps", submap.anchor), submap)
         give_back_memory()
 
@@ -176,7 +176,7 @@ class DenseFolder:
             write_depth_map(
                 self._file("depth", keyframe_id), self.fused(keyframe_id).without(excluded)
             )
-        write_arrays(self._file("labels", keyframe_id), LABEL_FILE, {}, vars(evidence))
+        _write_evidence(self._file("labels", keyframe_id), evidence)
         write_submap(self._file("submaps", keyframe_id), submap)
 
     def remove(self, keyframe_id: int) -> None:
@@ -200,15 +200,15 @@ class DenseFolder:
     def evidence(self, keyframe_id: int) -> InstanceEvidence:
         """The evidence of a finished keyframe about the classes of its instances."""
         path = self._file("labels", keyframe_id)
-        arrays = read_arrays(path, LABEL_FILE)[1]
-        types = {name: array.dtype for name, array in vars(_NO_EVIDENCE).items()}
-        arrays = {
-            name: array.astype(types.get(name, array.dtype)) for name, array in arrays.items()
-        }
-        check_like(arrays, vars(_NO_EVIDENCE), path)
+        header, arrays = read_arrays(path, LABEL_FILE)
+        arrays.setdefault("stuff", _NO_EVIDENCE.stuff)  # older files have none
+        kinds = _arrays(_NO_EVIDENCE)
+        arrays = {n: a.astype(kinds[n].dtype) if n in kinds else a for n, a in arrays.items()}
+        check_like(arrays, kinds, path)
         if len(arrays["landmark_ids"]) != len(arrays["landmark_instances"]):
             raise InputError(f"{path}: its arrays have different lengths; remove it and map again")
-        return InstanceEvidence(**arrays)
+        names = check_json(header.get("stuff", []), list[Name], f"{path}: its classes", "map again")
+        return InstanceEvidence(**arrays, stuff_names=tuple(names))
 
     def fused(self, keyframe_id: int) -> InverseDepthMap:
         """The fused inverse depth of a finished keyframe."""
@@ -221,3 +221,11 @@ class DenseFolder:
 
     def _file(self, kind: str, keyframe_id: int) -> Path:
         return self.path / kind / f"{keyframe_id:06d}"
+
+
+def _write_evidence(path: Path, evidence: InstanceEvidence) -> None:
+    write_arrays(path, LABEL_FILE, {"stuff": list(evidence.stuff_names)}, _arrays(evidence))
+
+
+def _arrays(evidence: InstanceEvidence) -> Arrays:
+    return {name: a for name, a in vars(evidence).items() if isinstance(a, np.ndarray)}

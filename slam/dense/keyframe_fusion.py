@@ -20,6 +20,7 @@ from bmask_slam.mapping.products.submaps import Submap, make_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence, dilate, keyframe_labels
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.instances.surfaces import Segmented, surfaces_of
 from bmask_slam.semantics.labels import LabelSet
 
 
@@ -83,12 +84,15 @@ class KeyframeFusion:
         ``pixels`` (L, 2) are where the landmarks were detected; like the masks they are distorted.
         Instances with a class score below the run's ``object_score`` do not count.
         """
-        instances = [i for i in instances if i.class_score >= self._semantics.object_score]
+        strong = [i for i in instances if i.class_score >= self._semantics.object_score]
+        instances = Segmented(strong, surfaces_of(instances))
         shape = self._camera.height, self._camera.width
         labels = keyframe_labels(instances, shape, self._classes, self._semantics.labels)
         columns, lines = np.rint(pixels).astype(np.int64).T
         on = labels.numbers[lines.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)]
-        evidence = InstanceEvidence(labels.log_likelihoods, landmark_ids[on > 0], on[on > 0])
+        known = (on > 0) & (on <= len(instances))
+        observed, stuff = (landmark_ids[known], on[known]), labels.stuff
+        evidence = InstanceEvidence(labels.log_likelihoods, *observed, stuff.log_p, stuff.names)
         numbers = undistort_labels(labels.numbers, self._camera)
         excluded = [k for k, found in enumerate(instances, 1) if found.label in self._excluded]
         return KeyframeInstances(numbers, np.isin(numbers, excluded), evidence)

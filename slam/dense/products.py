@@ -14,13 +14,13 @@ from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.keyframe_input import load_keyframe
 from bmask_slam.dense.options import MapOptions
 from bmask_slam.dense.saved_map import MappedRun, SavedMap
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.file_names import file_stem
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.mapping.products.cloud import Cloud, PlacedSubmap, merge_blocks, sort_into_blocks
 from bmask_slam.mapping.products.cloud_files import CloudWriter
-from bmask_slam.mapping.products.floor_plan import FloorPlan, plan_frame
+from bmask_slam.mapping.products.floor_plan import FloorPlan, plan_frame, up_direction
 from bmask_slam.mapping.products.mesh import (
     DepthView,
     sampled,
@@ -31,12 +31,14 @@ from bmask_slam.mapping.products.mesh import (
 from bmask_slam.mapping.products.object_clouds import ObjectClouds, ObjectRegion
 from bmask_slam.mapping.products.pictures import CloudPictures, Picture, palette, write_picture
 from bmask_slam.mapping.products.surface_labels import LabelTable
+from bmask_slam.mapping.products.surface_regions import StuffFusion
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
+from bmask_slam.semantics.beliefs.surface_geometry import FLOORS, find_ground
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.world.world_map import Keyframe
 
-PLAN_CELL_M, PLAN_SAMPLE = 0.03, 10
+PLAN_CELL_M, SAMPLE_STEP = 0.03, 20
 OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
 OVERVIEW_TILT_DEG = -20.0
 """The overview is taken from behind and above a keyframe, tilted down."""
@@ -78,43 +80,82 @@ class FusedMap:
 def write_clouds(fused: FusedMap) -> Products:
     """Write the coloured and the semantic cloud, and the plan and pictures, in one pass a cloud."""
     folder, voxel_m = fused.folder, fused.options.voxel_m
-    names, keyframes = fused.labels.names, fused.keyframes()
+    keyframes = fused.keyframes()
+    sample = sample_points(fused, keyframes)
     with tempfile.TemporaryDirectory(dir=folder.path, prefix=".blocks-") as temporary:
-        table = label_table(fused, keyframes)
+        table = label_table(fused, keyframes, sample)
+        names = table.stuff_fusion.names
         rows = zip(keyframes, table.first.tolist(), strict=True)
         submaps = (PlacedSubmap(folder.submap(k.id), k.T_world_camera, row) for k, row in rows)
         files = sort_into_blocks(submaps, voxel_m, Path(temporary))
         plan = None
         if fused.options.plan:
-            plan = _empty_plan(merge_blocks(files, voxel_m, table), keyframes, len(names))
+            frame = plan_frame(sample.points, sample.normals, sample.up_guess, PLAN_CELL_M)
+            plan = FloorPlan(frame, names)
         pictures = CloudPictures(_viewpoints(fused.run.camera, keyframes), voxel_m, names)
         written = _write_blocks(fused, merge_blocks(files, voxel_m, table), pictures, plan)
         written += pictures.write(folder.path)
         written += _write_excluded(fused, keyframes, table, Path(temporary))
     if plan is not None:
         path_world = np.stack([k.T_world_camera[:3, 3] for k in keyframes])
-        written.append(write_picture(folder.path / "plan.png", plan.picture(names, path_world)))
-    legend = dict(zip(names, palette(len(names)).tolist(), strict=True))
+        written.append(write_picture(folder.path / "plan.png", plan.picture(path_world)))
+    legend = dict(zip(names, palette(names).tolist(), strict=True))
     folder.write_text("legend.json", json.dumps(legend, indent=1) + "\n")
     points = int(pictures.counts.sum())
     shares = {names[k]: float(pictures.counts[k] / max(points, 1)) for k in pictures.present}
     return Products(written, points, shares)
 
 
-def label_table(fused: FusedMap, keyframes: list[Keyframe]) -> LabelTable:
-    """The label evidence of all keyframes' instances.
+def label_table(fused: FusedMap, keyframes: list[Keyframe], sample: Sample) -> LabelTable:
+    """The label evidence of all keyframes' instances and regions.
 
     It includes the current beliefs of the run's label store about the landmarks on the instances,
     so that a label that changes there changes in the dense map.
     """
     store_config = run_semantics(fused.run.path).labels
     prior = store_config.prior(len(fused.labels))
+    evidence = [fused.folder.evidence(k.id) for k in keyframes]
     rows = []
+    for one in evidence:
+        distributions, known = fused.run.label_distributions(one.landmark_ids, fused.labels)
+        rows.append(one.with_landmarks(distributions, known, prior))
+    names: tuple[str, ...] = next(filter(None, (e.stuff_names for e in evidence)), ())
+    cameras = np.stack([k.T_world_camera[:3, 3] for k in keyframes])
+    up_world = up_direction(sample.normals, sample.up_guess)
+    ground = find_ground(sample.points[sample.floor], cameras, up_world)
+    stuff = StuffFusion.of(fused.labels.names, names, ground)
+    return LabelTable.of(rows, store_config, [e.stuff for e in evidence], stuff)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Some points of all submaps in the world.
+
+    Attributes:
+        points, normals: (N, 3).
+        floor: (N,) whether each looks like floor in its keyframe.
+        up_guess: (3,) the cameras' mean upward axis.
+    """
+
+    points: Array
+    normals: Array
+    floor: Mask
+    up_guess: Array
+
+
+def sample_points(fused: FusedMap, keyframes: list[Keyframe]) -> Sample:
+    """Every SAMPLE_STEP-th point of the submaps."""
+    some = slice(None, None, SAMPLE_STEP)
+    parts = []
     for keyframe in keyframes:
-        evidence = fused.folder.evidence(keyframe.id)
-        distributions, known = fused.run.label_distributions(evidence.landmark_ids, fused.labels)
-        rows.append(evidence.with_landmarks(distributions, known, prior))
-    return LabelTable.of(rows, store_config)
+        submap, evidence = fused.folder.submap(keyframe.id), fused.folder.evidence(keyframe.id)
+        points, normals = submap.placed(keyframe.T_world_camera)
+        best = [evidence.stuff_names[row.argmax()] for row in evidence.stuff]
+        numbers = np.flatnonzero(np.isin(best, FLOORS)) + len(evidence.log_likelihoods)
+        parts.append((points[some], normals[some], np.isin(submap.instances[some], numbers)))
+    points, normals, floor = (np.concatenate(part) for part in zip(*parts, strict=True))
+    up_guess = -np.mean([k.T_world_camera[:3, 1] for k in keyframes], axis=0)
+    return Sample(points.astype(float), normals.astype(float), floor, up_guess)
 
 
 def _write_blocks(
@@ -170,13 +211,6 @@ def _regions(fused: FusedMap) -> list[ObjectRegion]:
         for o in read_objects(fused.run.path)[1]
         if number(o.label)
     ]
-
-
-def _empty_plan(blocks: Iterator[Cloud], keyframes: list[Keyframe], classes: int) -> FloorPlan:
-    """An empty floor plan in the frame of a sample of the cloud."""
-    up_guess = -np.mean([k.T_world_camera[:3, 1] for k in keyframes], axis=0)
-    sample = Cloud.concatenate([block.select(slice(None, None, PLAN_SAMPLE)) for block in blocks])
-    return FloorPlan(plan_frame(sample, up_guess, PLAN_CELL_M), classes)
 
 
 def _viewpoints(camera: Camera, keyframes: list[Keyframe]) -> dict[str, tuple[Camera, Array]]:

@@ -11,8 +11,10 @@ from bmask_slam.graph.arrays import Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.labelling.landmark_visibility import Observed, VisibleLandmarks, observed_by
 from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.surface_store import SurfaceStore
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, VoteConfig, vote
 from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.instances.surfaces import SurfaceClasses
 from bmask_slam.world.map_editor import MapReader
 
 RECENT = 8
@@ -35,8 +37,11 @@ class LabelVotes:
 
     def vote(
         self, keyframe_id: int, assignment: PixelAssignment, observed: Observed, store: LabelStore
-    ) -> Ints:
-        """Let a keyframe's instances vote on all visible landmarks; returns their ids (N,)."""
+    ) -> tuple[Ints, VisibleLandmarks]:
+        """Let a keyframe's instances vote on all visible landmarks, which are returned too.
+
+        The ids (N,) are those of the landmarks that were voted on.
+        """
         world = self._map.world
         new = world.landmarks.in_map.copy()
         new[store.known()] = False
@@ -52,7 +57,7 @@ class LabelVotes:
         self._recent[keyframe_id] = replace(assignment, instances=tuple(without))
         if len(self._recent) > RECENT:
             del self._recent[min(self._recent)]
-        return ids
+        return ids, located
 
     def _vote(
         self, assignment: PixelAssignment, visible: VisibleLandmarks, store: LabelStore
@@ -98,6 +103,14 @@ class LabelVotes:
             self._recent[keyframe_id] = PixelAssignment(
                 tuple(instances[rows]), owner, under, inner, depths_m[k], ranges_m[rows]
             )
+
+
+def vote_on_surfaces(
+    seen: SurfaceClasses | None, visible: VisibleLandmarks, store: SurfaceStore
+) -> None:
+    """Let the classes of a keyframe's pixels vote on the landmarks there, if it has them."""
+    if seen is not None:
+        store.update(seen.labels, visible.landmark_ids, seen.at(visible.pixels))
 
 
 def _instances(state: Arrays) -> Sequence[Instance]:

@@ -6,16 +6,21 @@ from dataclasses import dataclass
 
 from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.semantics.beliefs.label_store import LabelEstimates
+from bmask_slam.semantics.beliefs.surface_store import SurfaceEstimates
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.object_map import MapObject
 
 
 @dataclass(frozen=True)
 class LandmarkLabels:
-    """The labels of landmarks (N,): estimates of ``names``."""
+    """The labels of landmarks (N,): estimates of ``names``, and of what they lie on.
+
+    ``surfaces`` is None where the segmenter tells instances alone.
+    """
 
     names: LabelSet
     estimates: LabelEstimates
+    surfaces: SurfaceEstimates | None = None
 
 
 @dataclass(frozen=True)

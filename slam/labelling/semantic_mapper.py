@@ -15,12 +15,15 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
-from bmask_slam.labelling.landmark_votes import LabelVotes
+from bmask_slam.labelling.landmark_votes import LabelVotes, vote_on_surfaces
 from bmask_slam.labelling.results import LandmarkLabels, MapObjects
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.surface_geometry import by_height
+from bmask_slam.semantics.beliefs.surface_store import SurfaceEstimates, SurfaceStore
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, assign_pixels, check_instances, vote
 from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.instances.surfaces import surfaces_of
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.gravity import GravityEstimator
 from bmask_slam.semantics.objects.object_map import KeyframeView, ObjectMap, pixel_rays
@@ -120,6 +123,8 @@ class SemanticMapper:
     def attach(self, keyframe_id: int, instances: Sequence[Instance]) -> Attachment:
         """Use the masks of a keyframe, at any time after it was made, once.
 
+        What they tell about all pixels (``Segmented``) is used as well.
+
         Landmarks that were fused since are replaced by their successors; the masks of a culled
         keyframe still label its landmarks.
 
@@ -145,15 +150,15 @@ class SemanticMapper:
         ids = observed.landmark_ids[votes.rows[votes.sure]]
         on = votes.instances[votes.sure]
         everything = assign_pixels(instances, waiting.depth_m, size, self.config.votes, True)
-        spoken = self._label_votes.vote(keyframe_id, everything, observed, self.labels)
+        spoken, landmarks = self._label_votes.vote(keyframe_id, everything, observed, self.labels)
+        vote_on_surfaces(surfaces_of(instances), landmarks, self.surfaces)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
             objects = self._add_objects((keyframe_id, waiting), assignment, observed)[on]
             self.objects.place_landmarks(ids[objects >= 0], objects[objects >= 0])
         if self._on_masks is not None:
             about = (ids, on, self.labels.probabilities(ids))
             view = (assignment, waiting.depth_m, observed.T_world_camera)
-            masks = KeyframeMasks(keyframe_id, self.names, *view, *about)
-            self._on_masks(masks)
+            self._on_masks(KeyframeMasks(keyframe_id, self.names, *view, *about))
         return Attachment(keyframe_id, len(instances), spoken)
 
     def follow_map(self) -> None:
@@ -164,21 +169,33 @@ class SemanticMapper:
         """
         landmarks, keyframes = self._map.world.landmarks, self._map.world.keyframes
         known = np.union1d(self.labels.known(), self.objects.points.landmarks())
+        known = np.union1d(known, self.surfaces.known())
         removed = known[~landmarks.in_map[known]]
         if len(removed):
             parents = landmarks.current(removed)
             kept = landmarks.in_map[parents]
-            self.labels.move(removed[kept], parents[kept])
-            self.labels.drop(removed[~kept])
+            for store in (self.labels, self.surfaces):
+                store.move(removed[kept], parents[kept])
+                store.drop(removed[~kept])
             self.objects.points.rename_landmarks(removed, np.where(kept, parents, -1))
         for keyframe_id in self.objects.points.anchors():
             if keyframe_id not in keyframes:
                 self.objects.points.reanchor(keyframe_id, *self._map.history.parent(keyframe_id))
         self._gravity.keep(keyframes.keys() | self._waiting.keys())
 
-    def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
-        """The labels of landmarks (N,); None without a segmenter."""
-        return LandmarkLabels(self.names, self.labels.estimates(ids)) if self.enabled else None
+    def landmark_labels(self, ids: Ints, keyframes: Sequence[Keyframe]) -> LandmarkLabels | None:
+        """The labels of landmarks (N,) in the segment of keyframes; None without a segmenter."""
+        if not self.enabled:
+            return None
+        surfaces = None
+        if len(self.surfaces.names) > 1:
+            poses = {k.id: k.T_world_camera for k in keyframes}
+            points = self._map.world.landmarks.points_world[ids]
+            cameras = np.array([T[:3, 3] for T in poses.values()]).reshape(-1, 3)
+            names, p = self.surfaces.names, self.surfaces.probabilities(ids)
+            p = by_height(names, p, points, cameras, self._gravity.up_world(poses))
+            surfaces = SurfaceEstimates.of(names, p)
+        return LandmarkLabels(self.names, self.labels.estimates(ids), surfaces)
 
     def map_objects(self, keyframes: Sequence[Keyframe]) -> MapObjects:
         """The objects that these keyframes, all of one map segment, saw."""
@@ -201,6 +218,7 @@ class SemanticMapper:
                 votes=self._label_votes.state(),
                 objects=self.objects.state(),
                 upright=self._gravity.state(),
+                surfaces=self.surfaces.state(),
             ),
         }
 
@@ -224,6 +242,7 @@ class SemanticMapper:
             self._label_votes.restore(votes)
         self.objects.restore(part(state, "objects"))
         self._gravity.restore(part(state, "upright"))
+        self.surfaces.restore(part(state, "surfaces"))
         self._done = set(state["done"].tolist())
         shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
         depths_m = state["waiting_depth_m"].reshape(len(state["waiting"]), *shape)
@@ -238,6 +257,7 @@ class SemanticMapper:
         """Begin with empty stores."""
         self.names = names
         self.labels = LabelStore(len(names), self.config.labels)
+        self.surfaces = SurfaceStore()
         self._label_votes = LabelVotes(self.camera, self.config.votes, self._map)
         self.objects = ObjectMap(self.camera, len(names), self.config.objects, self.config.labels)
         self._gravity = GravityEstimator()

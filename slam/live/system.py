@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -244,6 +244,6 @@ class _RemoteSemantics(SemanticMapper):
         if self._system.dense is not None:
             self._system.dense.add_keyframe(keyframe.id, frame)
 
-    def landmark_labels(self, ids: Ints) -> LandmarkLabels | None:
+    def landmark_labels(self, ids: Ints, keyframes: Sequence[Keyframe]) -> LandmarkLabels | None:
         """None: the map's process has them."""
         return None

@@ -27,6 +27,7 @@ from bmask_slam.calibration.rematching import estimate_again
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
+from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses, surfaces_of
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.sequences import Sequence
 from bmask_slam.system import SlamSystem
@@ -34,6 +35,7 @@ from bmask_slam.system_interface import System
 
 logger = logging.getLogger(__name__)
 
+_Packed = tuple[list[tuple[Instance, PackedMask]], SurfaceClasses | None]
 UNOBSERVABLE = "readout and delay not observable in the motion"
 
 
@@ -43,19 +45,19 @@ class RememberingSegmenter:
     def __init__(self, segmenter: Segmenter) -> None:
         self.labels = segmenter.labels
         self._segmenter = segmenter
-        self._found: dict[str, list[tuple[Instance, PackedMask]]] | None = {}
+        self._found: dict[str, _Packed] | None = {}
 
     def segment(self, image: Image, name: str) -> list[Instance]:
         """The instances in an image, as the segmenter found them the first time."""
         if self._found is None:
             return self._segmenter.segment(image, name)
         if name in self._found:
-            return [replace(i, mask=mask.unpacked()) for i, mask in self._found[name]]
+            packed, surfaces = self._found[name]
+            whole = [replace(i, mask=mask.unpacked()) for i, mask in packed]
+            return Segmented(whole, surfaces)
         instances = self._segmenter.segment(image, name)
-        packed = [PackedMask.of(i.mask) for i in instances]
-        self._found[name] = [
-            (replace(i, mask=i.mask[:0]), mask) for i, mask in zip(instances, packed, strict=True)
-        ]
+        packed = [(replace(i, mask=i.mask[:0]), PackedMask.of(i.mask)) for i in instances]
+        self._found[name] = packed, surfaces_of(instances)
         return instances
 
     def forget(self) -> None:

@@ -29,6 +29,9 @@ def write_landmarks(path: Path, cloud: LandmarkCloud) -> None:
         columns["label"] = found.labels.astype(np.int32)
         columns["probability"] = found.probability.astype(np.float32)
         columns["entropy"] = found.entropy.astype(np.float32)
+        if (on := cloud.labels.surfaces) is not None:
+            columns["surface"] = on.labels.astype(np.int32)
+            columns["surface_probability"] = on.probability.astype(np.float32)
     write_ply(path, columns, LANDMARKS_COMMENT)
 
 

@@ -31,6 +31,7 @@ SEMANTIC_FILES = (LABELS, OBJECTS, BOXES, OBJECTS_PICTURE)
 UNKNOWN_COLOUR = "#c9c9c4"
 _MIN_NAMED_M = 0.25
 _COLUMNS = ("id", "label", "probability", "entropy", "views")
+_SURFACE_COLUMNS = ("surface", "surface_probability")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,18 +69,21 @@ def write_labels(path: Path, cloud: LandmarkCloud) -> None:
     """Write one line a landmark."""
     assert cloud.labels is not None
     names, found = cloud.labels.names, cloud.labels.estimates
-    rows = zip(
+    columns = [
         cloud.ids.tolist(),
         [names.map_name(label) for label in found.labels.tolist()],
         [f"{p:.5f}" for p in found.probability.tolist()],
         [f"{h:.5f}" for h in found.entropy.tolist()],
         found.views.tolist(),
-        strict=True,
-    )
+    ]
+    on = cloud.labels.surfaces
+    if on is not None:
+        columns.append([on.names.map_name(label) for label in on.labels.tolist()])
+        columns.append([f"{p:.5f}" for p in on.probability.tolist()])
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows(rows)
+        writer.writerow((*_COLUMNS, *_SURFACE_COLUMNS)[: len(columns)])
+        writer.writerows(zip(*columns, strict=True))
 
 
 def read_labels(run: Path) -> LabelTable:

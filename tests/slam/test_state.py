@@ -24,6 +24,7 @@ from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.moving.static_verification import PendingMovable, Removed
 from bmask_slam.semantics.instances.instances import Instance, PackedMask, certain, mask_box
+from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.tracks.instance_track import Sighting
 from bmask_slam.system import SlamSystem
@@ -47,17 +48,23 @@ def poses(count: int) -> list[Array | None]:
 
 
 class Halves:
-    """A segmenter: the left half of every image is one instance, the right half another."""
+    """A segmenter: the left half of every image is one instance, the right half another.
+
+    All of it is more of a wall than of a floor.
+    """
 
     labels = label_set(("left", "right"))
 
     def segment(self, image: Image, name: str) -> list[Instance]:
         left = np.zeros(image.shape[:2], bool)
         left[:, : image.shape[1] // 2] = True
-        return [
+        found = [
             Instance(m, mask_box(m), k, certain(k, 3, 0.8), 0.8, 0.7)
             for k, m in ((1, left), (2, ~left))
         ]
+        p = np.broadcast_to(np.array([0.6, 0.4], np.float16), (6, 8, 2))
+        names, size = label_set(("wall", "floor")), (image.shape[0], image.shape[1])
+        return Segmented(found, SurfaceClasses(names, p, image.shape[1] / 8, size))
 
 
 FRAMES = [render_or_black(pose, index) for index, pose in enumerate(poses(14))]
@@ -180,6 +187,18 @@ def test_a_state_without_events_is_restored(system: SlamSystem) -> None:
     for name, array in older.state().items():
         expected = empty[name] if name in events else state[name]
         np.testing.assert_array_equal(array, expected)
+
+
+def test_a_state_without_surfaces_is_restored(system: SlamSystem) -> None:
+    """Versions before them did not save them: landmarks lie on nothing known."""
+    state = system.state()
+    surfaces = {name for name in state if name.startswith("semantics.surfaces.")}
+    older = restored({name: array for name, array in state.items() if name not in surfaces})
+    assert len(surfaces) == 4
+    assert len(system.semantics.surfaces.known()) > len(older.semantics.surfaces.known()) == 0
+    labels = older.semantics.landmark_labels(np.array([0]), [])
+    assert labels is not None
+    assert labels.surfaces is None
 
 
 def test_every_attribute_is_restored(system: SlamSystem) -> None:

@@ -31,7 +31,7 @@ PAD_VALUE = 114
 CLASSES = 80
 GEOMETRY = 5
 """x, y, width, height and objectness come before the class probabilities."""
-STEM_CHANNELS, EDGE_CHANNELS, LEVEL_CHANNELS = 16, 32, (64, 128, 256)
+STEM_CHANNELS, EDGE_CHANNELS, PART_CHANNELS, LEVEL_CHANNELS = 16, 32, 64, (64, 128, 256)
 HEAD_CHANNELS = 64
 _STAGES = ((16, 32, 1), (32, 64, 3), (64, 128, 3))
 
@@ -42,11 +42,13 @@ class Features(NamedTuple):
     Attributes:
         stem: (B, 16, H/2, W/2), of the first layer.
         edges: (B, 32, H/4, W/4), of the body's first stage.
+        parts: (B, 64, H/8, W/8), of the body's second stage.
         levels: (B, 64, 128, 256; H/8, H/16, H/32; ...) the pyramid's outputs.
     """
 
     stem: Tensor
     edges: Tensor
+    parts: Tensor
     levels: tuple[Tensor, Tensor, Tensor]
 
 
@@ -147,7 +149,7 @@ class YoloxNano(nn.Module):
     def features(self, images: Tensor) -> Features:
         """Features of images (B, 3, H, W), red first in 0..255; sides are multiples of 32."""
         stem, edges, *rest = self.body(images)
-        return Features(stem, edges, self.pyramid(*rest))
+        return Features(stem, edges, rest[0], self.pyramid(*rest))
 
     def detections(self, features: Features) -> Tensor:
         """(B, P, 85), to be decoded by ``decode``: cells of stride 8, then 16, then 32."""

@@ -82,7 +82,9 @@ def test_labels_equal_a_loop_over_voxels_and_submaps() -> None:
     voxel = np.r_[np.arange(voxels), RNG.integers(0, voxels, points - voxels)]
     cell = np.arange(voxels) // 7
     instance = RNG.integers(0, len(log_likelihoods.submaps), points)
-    labels, probabilities = _fused_labels(voxel, cell, instance, log_likelihoods)
+    labels, probabilities = _fused_labels(
+        voxel, cell, instance, log_likelihoods, *np.zeros((2, voxels, 3))
+    )
     store, rows = LabelStoreConfig(), log_likelihoods.log_likelihoods.astype(float)
     for v in range(voxels):
         evidence, misses = np.log(store.prior(5)), 0.0
@@ -112,7 +114,9 @@ def test_objects_in_several_views_are_kept_and_in_one_view_dropped() -> None:
         evidence = LabelTable.of(keyframes, store)
         instance = evidence.first + (np.arange(found + missed) < found)
         views = np.zeros(len(instance), np.int64)
-        assert _fused_labels(views, np.zeros(1, np.int64), instance, evidence)[0] == [label]
+        assert _fused_labels(
+            views, np.zeros(1, np.int64), instance, evidence, *np.zeros((2, 1, 3))
+        )[0] == [label]
         labels = LabelStore(classes, store)
         for k in range(found + missed):
             if k < found:
@@ -156,7 +160,7 @@ def test_files_are_read_back(tmp_path: Path) -> None:
 
 def test_a_failure_leaves_no_file(tmp_path: Path) -> None:
     try:
-        with CloudWriter(tmp_path / "cloud", palette(3)):
+        with CloudWriter(tmp_path / "cloud", palette(("background", "table", "cup"))):
             raise KeyError
     except KeyError:
         assert list(tmp_path.iterdir()) == []

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import make_pose, so3_exp
 from bmask_slam.mapping.products.cloud import Cloud
-from bmask_slam.mapping.products.floor_plan import FloorPlan, floor_height, plan_frame, up_direction
+from bmask_slam.mapping.products.floor_plan import (
+    FloorPlan,
+    PlanFrame,
+    floor_height,
+    plan_frame,
+    up_direction,
+)
 from bmask_slam.mapping.products.pictures import EMPTY, Picture, palette, with_legend
 
 RNG = np.random.default_rng(4)
@@ -43,6 +47,7 @@ def room(R: np.ndarray) -> Cloud:
     )
 
 
+NAMES = ("background", "table", "cup")
 TURN = so3_exp(np.array([1.3, 0.2, -0.4]))
 
 
@@ -53,7 +58,7 @@ def test_walls_do_not_tilt_the_up_direction(noise: float) -> None:
     normals = given.normals + noise * RNG.standard_normal(given.normals.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     guess = TURN @ np.array([0.42, -0.43, 0.8])
-    frame = plan_frame(replace(given, normals=normals.astype(np.float32)), guess, 0.05)
+    frame = plan_frame(given.points, normals, guess, 0.05)
     tilt_deg = np.degrees(np.arccos(min(frame.axes[2] @ TURN[:, 2], 1.0)))
     assert tilt_deg < (0.01 if noise == 0 else 0.2)
     assert frame.floor_m == pytest.approx(0.0, abs=0.01)
@@ -72,8 +77,8 @@ def test_the_floor_is_below_the_table() -> None:
 
 def test_cells_have_the_labels_of_the_points_above() -> None:
     cloud = room(TURN)
-    frame = plan_frame(cloud, TURN @ np.array([0.2, 0.1, 1.0]), 0.1)
-    plan = FloorPlan(frame, 3)
+    frame = plan_frame(cloud.points, cloud.normals, TURN @ np.array([0.2, 0.1, 1.0]), 0.1)
+    plan = FloorPlan(frame, NAMES)
     plan.add(cloud)
     path = np.array([[0.5, 0.5, 1.2], [3.5, 0.5, 1.2]]) @ TURN.T
     grid, line = plan.grid(path)
@@ -89,9 +94,9 @@ def test_cells_have_the_labels_of_the_points_above() -> None:
 
 def test_the_picture_includes_a_path_outside_the_map() -> None:
     cloud = room(np.eye(3))
-    plan = FloorPlan(plan_frame(cloud, np.array([0, 0, 1.0]), 0.05), 2)
+    plan = FloorPlan(plan_frame(cloud.points, cloud.normals, np.array([0, 0, 1.0]), 0.05), NAMES)
     plan.add(cloud)
-    image = plan.picture(["background", "table"], np.array([[1.0, 1, 1], [6.0, 1, 1]]))
+    image = plan.picture(np.array([[1.0, 1, 1], [6.0, 1, 1]]))
     red = (image == (220, 30, 30)).all(axis=2)
     grid, line = plan.grid(np.array([[1.0, 1, 1], [6.0, 1, 1]]))
     scale = round(900 / max(grid.shape))
@@ -112,8 +117,30 @@ def test_the_nearer_point_is_on_top() -> None:
 
 
 def test_labels_have_different_colours_and_a_legend() -> None:
-    colours = palette(24)
+    colours = palette([f"class {k}" for k in range(24)])
     assert len(np.unique(colours, axis=0)) == 24
     picture = with_legend(np.zeros((40, 30, 3), np.uint8), ["none", "chair", "desk"], [0, 2])
     assert picture.shape[1] == 30 + 190
     assert (picture.reshape(-1, 3) == colours[2]).all(axis=1).any()
+
+
+def test_walls_are_those_of_the_labels_and_their_gaps_are_closed() -> None:
+    """A wall with a gap of 0.2 m; what is labelled floor or ceiling is no obstacle."""
+    names = ("background", "table", "wall", "ceiling", "floor")
+    x = np.arange(0.0, 3.0, 0.02)
+    x = x[(x < 1.0) | (x > 1.2)]
+    wall = np.column_stack([x, np.full(len(x), 2.02), np.full(len(x), 2.2)])  # above 1.9 m
+    hanging = np.array([[1.0, 1.0, 1.8]] * 9)
+    low = np.array([[2.0, 1.0, 0.15]] * 9)  # a fold of the carpet
+    points = np.concatenate([wall, hanging, low]).astype(np.float32)
+    labels = np.repeat([2, 3, 4], [len(wall), 9, 9])
+    ones = np.ones(len(points), np.float32)
+    colours, views = np.zeros((len(points), 3), np.uint8), ones.astype(np.uint16)
+    cloud = Cloud(points, points, colours, ones, labels.astype(np.uint16), ones, views)
+    plan = FloorPlan(PlanFrame(np.eye(3), 0.0, 0.05), names)
+    plan.add(cloud)
+    grid, _ = plan.grid(np.array([[0.0, 0.0, 1.0], [3.0, 2.0, 1.0]]))
+    assert np.unique(grid).tolist() == [-2, 2]
+    row = np.flatnonzero((grid == 2).any(axis=1))
+    assert len(row) == 1
+    assert (grid[row[0]] == 2)[: round(2.95 / 0.05)].all()

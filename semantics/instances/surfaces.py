@@ -1,0 +1,98 @@
+"""What every part of an image is: classes of things and of stuff, such as walls and floors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from bmask_slam.graph.arrays import Array, Bytes, Floats
+from bmask_slam.semantics.instances.instances import Instance
+from bmask_slam.semantics.labels import LabelSet
+
+LEVELS = 255
+"""Of a probability in the 16 bits of a code; the class is above it."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceClasses:
+    """Class probabilities of an image's cells.
+
+    Attributes:
+        labels: their label set; column k of the probabilities is of label k + 1.
+        probabilities: (h, w, C) float16. Row and column 0 are at the upper left; the cells cover
+            the image, the last ones may reach beyond it.
+        cell_px: edge of a cell.
+        size: (H, W) of the image.
+    """
+
+    labels: LabelSet
+    probabilities: Array
+    cell_px: float
+    size: tuple[int, int]
+
+    def at(self, pixels: Array) -> Floats:
+        """Probabilities (N, C) at pixels (N, 2), linear between the centres of cells."""
+        limits = np.array(self.probabilities.shape[1::-1]) - 1
+        place = np.clip((pixels + 0.5) / self.cell_px - 0.5, 0, limits)
+        low = np.minimum(place.astype(np.int64), np.maximum(limits - 1, 0))
+        high = np.minimum(low + 1, limits)
+        (x, y), (x0, y0), (x1, y1) = (place - low).T, low.T, high.T
+        p = self.probabilities
+        upper = (1 - x)[:, None] * p[y0, x0] + x[:, None] * p[y0, x1]
+        lower = (1 - x)[:, None] * p[y1, x0] + x[:, None] * p[y1, x1]
+        return ((1 - y)[:, None] * upper + y[:, None] * lower).astype(np.float32)
+
+    def pixels(self) -> Floats:
+        """Probabilities (H, W, C) of all pixels, linear between the centres of cells."""
+        cells = np.asarray(self.probabilities, np.float32)
+        height, width = cells.shape[:2]
+        whole = np.rint(np.array([width, height]) * self.cell_px).astype(int)
+        found = cv2.resize(cells, (int(whole[0]), int(whole[1])), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(found[: self.size[0], : self.size[1]], np.float32)
+
+    def codes(self) -> Array:
+        """(h, w) uint16: the likeliest label times 256 plus its probability in 255ths."""
+        best = self.probabilities.max(axis=2).astype(np.float32)
+        label = self.probabilities.argmax(axis=2) + 1
+        return (label * (LEVELS + 1) + np.rint(LEVELS * best)).astype(np.uint16)
+
+    @classmethod
+    def from_codes(
+        cls, codes: Array, labels: LabelSet, cell_px: float, size: tuple[int, int]
+    ) -> SurfaceClasses:
+        """The inverse of ``codes``: what is not the likeliest class's is shared by the others."""
+        label, best = codes // (LEVELS + 1), (codes % (LEVELS + 1)) / LEVELS
+        classes = len(labels) - 1
+        p = np.repeat(((1 - best) / max(classes - 1, 1))[..., None], classes, axis=2)
+        rows, columns = np.nonzero(label > 0)
+        p[rows, columns, label[rows, columns] - 1] = best[rows, columns]
+        p[label == 0] = 1 / classes
+        return cls(labels, p.astype(np.float16), cell_px, size)
+
+
+class Segmented(list[Instance]):
+    """The instances in an image, best first, and what all of it is.
+
+    Attributes:
+        surfaces: classes of all pixels; None where the segmenter does not tell.
+    """
+
+    def __init__(
+        self, instances: Iterable[Instance] = (), surfaces: SurfaceClasses | None = None
+    ) -> None:
+        super().__init__(instances)
+        self.surfaces = surfaces
+
+
+def surfaces_of(instances: object) -> SurfaceClasses | None:
+    """What a segmenter told about all pixels with its instances; None for a plain list."""
+    return instances.surfaces if isinstance(instances, Segmented) else None
+
+
+def most_probable(seen: SurfaceClasses) -> tuple[Bytes, Floats]:
+    """The likeliest label, from 1, of every pixel (H, W), and its probability (H, W)."""
+    p = seen.pixels()
+    return (p.argmax(axis=2) + 1).astype(np.uint8), p.max(axis=2)

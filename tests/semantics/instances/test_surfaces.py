@@ -1,0 +1,77 @@
+"""Classes of all pixels: their places, their codes, their files and pictures."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.instances.overlay import draw_surfaces
+from bmask_slam.semantics.instances.surface_files import (
+    read_surfaces,
+    surface_labels,
+    write_surfaces,
+)
+from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses, most_probable
+from bmask_slam.semantics.labels import label_set
+
+NAMES = label_set(("wall", "floor", "door"))
+
+
+def classes(size: tuple[int, int] = (48, 64)) -> SurfaceClasses:
+    """Wall above floor: the border is between rows 23 and 24, cells are of 8 pixels."""
+    p = np.zeros((6, 8, 3), np.float16)
+    p[:3, :, 0] = p[3:, :, 1] = 0.9
+    p[:, :, 2] = 0.1
+    return SurfaceClasses(NAMES, p, 8.0, size)
+
+
+def test_a_pixel_lies_between_the_centres_of_cells() -> None:
+    """The centre of the cell in row r is at pixel 8 r + 3.5."""
+    seen = classes()
+    found = seen.at(np.array([[20.0, 3.5], [20.0, 19.5], [20.0, 23.5], [20.0, 25.5], [63.0, 47.0]]))
+    assert found[:, 0] == pytest.approx([0.9, 0.9, 0.45, 0.225, 0.0], abs=1e-3)
+    assert found[:, 1] == pytest.approx([0.0, 0.0, 0.45, 0.675, 0.9], abs=1e-3)
+    whole = seen.pixels()
+    grid = np.stack(np.meshgrid(np.arange(64), np.arange(48)), axis=-1).reshape(-1, 2)
+    np.testing.assert_allclose(whole.reshape(-1, 3), seen.at(grid.astype(float)), atol=1e-3)
+
+
+def test_the_likeliest_class_of_pixels() -> None:
+    label, p = most_probable(classes((45, 60)))
+    assert label.shape == p.shape == (45, 60)
+    assert (label[:24] == 1).all()
+    assert (label[24:] == 2).all()
+    assert p[0, 0] == pytest.approx(0.9, abs=1e-3)
+
+
+def test_files_keep_the_likeliest_class(tmp_path: Path) -> None:
+    seen = classes()
+    assert surface_labels(tmp_path) is None
+    write_surfaces(tmp_path, "rgb/1.5.jpg", seen)
+    labels = surface_labels(tmp_path)
+    assert labels == NAMES
+    again = read_surfaces(tmp_path, "rgb/1.5.jpg", NAMES, (48, 64))
+    assert again is not None
+    assert again.cell_px == 8
+    np.testing.assert_array_equal(again.codes(), seen.codes())
+    assert again.probabilities[0, 0] == pytest.approx([0.9, 0.05, 0.05], abs=3e-3)
+    assert read_surfaces(tmp_path, "rgb/2.jpg", NAMES, (48, 64)) is None
+    with pytest.raises(InputError, match="another shape"):
+        read_surfaces(tmp_path, "rgb/1.5.jpg", NAMES, (64, 48))
+
+
+def test_segmented_is_a_list_that_other_processes_get_whole() -> None:
+    found = pickle.loads(pickle.dumps(Segmented([], classes())))
+    assert found == []
+    np.testing.assert_array_equal(found.surfaces.probabilities, classes().probabilities)
+
+
+def test_areas_have_their_colours() -> None:
+    large = SurfaceClasses(NAMES, classes().probabilities, 40.0, (240, 320))
+    drawn = draw_surfaces(np.zeros((240, 320, 3), np.uint8), large).astype(int)
+    assert (drawn[2, 2] == drawn[2, 300]).all()
+    assert np.abs(drawn[2, 2] - drawn[235, 2]).max() > 40
