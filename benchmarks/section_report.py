@@ -81,6 +81,13 @@ REPORTS = {
         "session": (
             "Thirty minutes", "live.session {sequences}/office-300 --minutes 30 --hz 10"
         ),
+        "soak": (
+            "An hour at 30 Hz, in several places",
+            "live.soak {sequences}/office-300 {sequences}/living_room --minutes 60 "
+            "--picture docs/images/live_soak.png",
+        ),
+    }, pictures={
+        "soak": {"live_soak.png": "Latency, memory, descriptors and keyframes over the hour"},
     }),
     "semantics": Report(RESULTS / "semantics.md", "Results: masks, labels, moving things", {
         "photographs": (

@@ -65,7 +65,7 @@ def test_another_name_is_an_attribute_error() -> None:
 
 
 def test_the_import_is_quick_and_loads_nothing_else() -> None:
-    code = "import time; t = time.perf_counter(); import bmask_slam; print(time.perf_counter() - t)"
+    code = "import time; t = time.process_time(); import bmask_slam; print(time.process_time() - t)"
     assert min(float(output(code)) for _ in range(3)) < MAX_IMPORT_S
     assert loaded_by("import bmask_slam, bmask_slam.graph.geometry") == set()
 

@@ -1,8 +1,35 @@
-"""Faults for tests: full disks, and what is left of processes."""
+"""Faults for tests: full disks, time that passes at once, and what is left of processes."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
+
+LONG_S = 300.0
+"""Longest time that a test waits for what must happen; a busy machine needs its time."""
+
+
+class Clock:
+    """The clock that ``time.monotonic`` is in a module; ``pass_s`` moves it ahead at once."""
+
+    def __init__(self) -> None:
+        self._passed_s = 0.0
+
+    def monotonic(self) -> float:
+        return time.monotonic() + self._passed_s
+
+    def pass_s(self, seconds: float) -> None:
+        """Let so much time pass."""
+        self._passed_s += seconds
+
+
+def wait_until(happened: Callable[[], object], limit_s: float = LONG_S) -> None:
+    """Wait for something; raises AssertionError if it does not happen."""
+    end_s = time.monotonic() + limit_s
+    while not happened():
+        assert time.monotonic() < end_s, "it has not happened"
+        time.sleep(0.01)
 
 
 def fill(disk: Path) -> Path:

@@ -8,7 +8,7 @@ from bmask_slam.live.live_slam import LiveSlam
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import TrackingStatus
 
-MAX_WAIT_S = 2
+MAX_WAIT_S = 60
 
 
 def track_frames(slam: LiveSlam, frames: list[Frame], waiting: int = 1) -> list[TrackingStatus]:
@@ -19,6 +19,8 @@ def track_frames(slam: LiveSlam, frames: list[Frame], waiting: int = 1) -> list[
         statuses.append(tracked.status)
         deadline_s = time.monotonic() + MAX_WAIT_S
         while slam.health().keyframes_waiting > waiting and time.monotonic() < deadline_s:
+            if slam._system.remote.given_up:
+                break
             time.sleep(0.01)
             slam.catch_up()
     return statuses

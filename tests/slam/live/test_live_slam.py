@@ -7,13 +7,13 @@ import json
 import os
 import signal
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import faiss
 import numpy as np
 import pytest
+from faults import wait_until
 from feeding import track_frames
 from synthetic_view import CAMERA, render_plane, sideways_path
 
@@ -104,12 +104,14 @@ def test_a_killed_map_process_is_restarted_without_losing_frames(tmp_path) -> No
     assert (tmp_path / "run" / "map").stat().st_size > 10_000
 
 
+def wait_for_death(slam: LiveSlam, number: int) -> None:
+    wait_until(lambda: slam.catch_up() or slam.health().map_deaths >= number)
+
+
 def kill_until_it_is_given_up(slam: LiveSlam) -> None:
     for _ in range(MAX_CRASHES):
         os.kill(slam.processes()["map"], signal.SIGKILL)
-        crashes, deadline_s = slam.health().map_deaths, time.monotonic() + 60
-        while slam.health().map_deaths == crashes and time.monotonic() < deadline_s:
-            slam.catch_up()
+        wait_for_death(slam, slam.health().map_deaths + 1)
 
 
 def test_a_map_process_that_is_killed_again_and_again_is_tried_once_more(tmp_path) -> None:
@@ -155,9 +157,7 @@ def poison_next_keyframe(slam: LiveSlam, monkeypatch: pytest.MonkeyPatch) -> lis
 
 
 def wait_for_the_map(slam: LiveSlam) -> None:
-    deadline_s = time.monotonic() + 60
-    while slam.health().keyframes_waiting and time.monotonic() < deadline_s:
-        slam.catch_up()
+    wait_until(lambda: slam.catch_up() or not slam.health().keyframes_waiting)
 
 
 def test_a_keyframe_that_crashes_the_map_process_is_skipped(tmp_path, monkeypatch) -> None:

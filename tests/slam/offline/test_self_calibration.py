@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,12 +36,32 @@ from bmask_slam.system_config import SystemConfig
 
 CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=none",))
 FRAMES = 100
+KILLED = (4, 5, 6, 7)
+"""After and before the checkpoints of 40 and 80 frames, and of the new beginning."""
 
 
 @pytest.fixture(scope="module")
 def found(late_sweep: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    """A run with checkpoints that finds the delay."""
-    return run(late_options(late_sweep, tmp_path_factory.mktemp("found") / "run"))
+    """A run with checkpoints that finds the delay.
+
+    Beside it lie copies of its folder as a kill would leave it, before (odd) and after (even
+    numbers) each checkpoint of KILLED.
+    """
+    out, written = tmp_path_factory.mktemp("found") / "run", 0
+    write = checkpoint.write_checkpoint
+
+    def copied(path: Path, content: checkpoint.Checkpoint) -> None:
+        nonlocal written
+        written += 1
+        for number in (2 * written - 1, 2 * written):
+            if number == 2 * written:
+                write(path, content)
+            if number in KILLED:
+                shutil.copytree(out, out.with_name(f"killed-{number}"))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bmask_slam.offline.checkpoint.write_checkpoint", copied)
+        return run(late_options(late_sweep, out))
 
 
 def late_options(sequence: Path, out: Path) -> RunOptions:
@@ -76,31 +97,13 @@ def test_the_map_of_such_a_run_is_continued_with_its_camera(
     assert later.camera == read_camera(found.folder / "camera.yaml")
 
 
-@pytest.mark.parametrize("number", [4, 5, 6, 7])
-def test_killed_before_and_after_the_adoption_and_resumed(
-    number: int, found: RunSummary, late_sweep: Path, tmp_path: Path
-) -> None:
-    """Killed after and before the checkpoints of 40 and 80 frames, and of the new beginning."""
-    options, written = late_options(late_sweep, tmp_path / "run"), 0
-    write = checkpoint.write_checkpoint
-
-    def killed(path: Path, content: checkpoint.Checkpoint) -> None:
-        nonlocal written
-        written += 1
-        if written == number // 2 + 1 and number % 2:
-            raise KeyboardInterrupt
-        write(path, content)
-        if written == number // 2 and not number % 2:
-            raise KeyboardInterrupt
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bmask_slam.offline.checkpoint.write_checkpoint", killed)
-        with pytest.raises(KeyboardInterrupt):
-            run(options)
-    resumed = resume(tmp_path / "run", {"quiet": True})
+@pytest.mark.parametrize("number", KILLED)
+def test_killed_before_and_after_the_adoption_and_resumed(number: int, found: RunSummary) -> None:
+    killed = found.folder.with_name(f"killed-{number}")
+    resumed = resume(killed, {"quiet": True})
     assert resumed is not None and resumed.calibration == found.calibration
     for name in ("trajectory.txt", "camera.yaml", "map", "graph", "events.csv"):
-        assert (tmp_path / "run" / name).read_bytes() == (found.folder / name).read_bytes(), name
+        assert (killed / name).read_bytes() == (found.folder / name).read_bytes(), name
 
 
 def test_report_and_off_change_nothing(late_sweep: Path, tmp_path: Path) -> None:

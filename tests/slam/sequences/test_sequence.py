@@ -49,7 +49,7 @@ def test_prepare_runs_ahead_in_one_other_thread(folder):
         prepare=lambda _: names.append(threading.current_thread().name)
     )
     next(frames)
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + 60
     while len(names) < 5 and time.monotonic() < deadline:
         time.sleep(0.005)
     time.sleep(0.02)
