@@ -22,7 +22,7 @@ def test_a_notebook_runs_and_is_kept_without_its_output(path, tmp_path, monkeypa
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     done = nbclient.NotebookClient(
         notebook,
-        timeout=300,
+        timeout=900,
         kernel_name="python3",
         resources={"metadata": {"path": str(tmp_path)}},
     ).execute()

@@ -36,7 +36,7 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_live_and_its_processes(office: Path, hostile: Path) -> None:
     words = ["live", str(office), "--segmenter", "none", "--quiet", "--out", "run"]
     command = [sys.executable, "-P", "-m", "bmask_slam", *words]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     assert (hostile / "run" / "trajectory.txt").is_file()
 
@@ -53,7 +53,7 @@ def test_the_web_viewer(hostile: Path) -> None:
 
     viewer = WebViewer(rerun_cli, "127.0.0.1", _free_port("127.0.0.1", 0))
     try:
-        with urllib.request.urlopen(viewer.url.partition("?")[0], timeout=20) as page:
+        with urllib.request.urlopen(viewer.url.partition("?")[0], timeout=120) as page:
             assert page.status == 200
     finally:
         viewer.close()

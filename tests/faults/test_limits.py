@@ -29,7 +29,7 @@ COMMAND = [sys.executable, "-m", "bmask_slam"]
 def limited(limit: str, words: list[str]) -> tuple[int, str]:
     """Exit status and error lines of a command under a limit of the shell."""
     shell = ["sh", "-c", f'ulimit {limit}; exec "$@"', "sh", *COMMAND, *words]
-    done = subprocess.run(shell, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(shell, capture_output=True, text=True, timeout=600, check=False)
     return done.returncode, done.stderr
 
 

@@ -120,7 +120,7 @@ def _heeds_interrupts() -> None:
 
 
 def wait_for(path: Path, process: subprocess.Popen) -> None:
-    end_s = time.monotonic() + 60
+    end_s = time.monotonic() + 300
     while not path.exists():
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < end_s
