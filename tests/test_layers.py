@@ -38,6 +38,7 @@ ROOMS = {
                system_interface  run_folder  system_results  system  dense  calibration
                refinement  viewer  offline  live  comparison  api  commands  cli  job_process
                __init__  __main__""",
+    "slam/run_folder": "[...]  scene  export",
     "slam/rendering": "engine  things  rooms  [...]",
     "slam/live": """[...]  sources  processes  system  start  health  display  recorder  live_slam
                     play""",

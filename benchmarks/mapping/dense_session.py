@@ -32,7 +32,7 @@ from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.mapping.products.submaps import Submap, make_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence, LabelTable
 from bmask_slam.runtime.memory import peak_rss_mb
-from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.sequences import Sequence, open_sequence
 
 VOXEL_M = 0.01

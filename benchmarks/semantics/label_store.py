@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
 
 

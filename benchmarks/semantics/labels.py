@@ -37,7 +37,8 @@ from bmask_slam.rendering.annotations import OBJECTS_TRUTH
 from bmask_slam.rendering.engine.sensor import depth_sigma_m
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around, box_iou
-from bmask_slam.semantics.objects.object_map import MapObject, pixel_rays
+from bmask_slam.semantics.objects.object_map import pixel_rays
+from bmask_slam.semantics.objects.publication import MapObject
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
 from bmask_slam.sequences import Sequence, open_sequence
 from bmask_slam.system import SlamSystem

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
 from bmask_slam.mapping.products.surface_regions import Regions, StuffFusion, find_regions
-from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.instances.surfaces import surfaces_of
 

@@ -7,70 +7,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaln
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.files.array_file import check_ids
+from bmask_slam.semantics.beliefs.class_sizes import ANY, SUPPORT, TOP
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
+from bmask_slam.semantics.beliefs.observation import GROUPS, ObservationModel, score_logits
 
 _MIN_CAPACITY = 1024
-
-
-@dataclass(frozen=True)
-class LabelStoreConfig:
-    """How views are fused.
-
-    The prior probability of "unknown" is ``prior_unknown``; the other labels share the rest.
-    Errors of one network in views of the same thing are correlated; to give each view less weight,
-    its likelihood is raised to a ``power`` below 1. No class falls more than ``max_log_odds``
-    below the likeliest one, so that a wrong belief can be corrected.
-
-    A view in which no mask covers a thing is evidence for "unknown", with less weight the more
-    such views there are: what a network missed in one view it misses in the next. The network's
-    recall of a thing is a Beta variable with the parameters ``recall_found`` a and
-    ``recall_missed`` b, so that m misses of a thing of a known class have the probability
-    B(a, b + m) / B(a, b). Like what masks say, misses are bounded: m is their sum over about the
-    last ``recall_views`` views, so that it tells how often a thing is missed and not how often it
-    was seen.
-    """
-
-    prior_unknown: float = 0.5
-    recall_found: float = 2.0
-    recall_missed: float = 0.4
-    recall_views: float = 10.0
-    power: float = 1.0
-    max_log_odds: float = 9.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.power <= 1 or not 1 <= self.max_log_odds < np.inf:
-            raise ValueError("power must be in (0, 1], max_log_odds at least 1")
-        if not 0 < self.prior_unknown < 1:
-            raise ValueError("prior_unknown must be between 0 and 1")
-        if min(self.recall_found, self.recall_missed) <= 0:
-            raise ValueError("recall_found and recall_missed must be positive")
-        if self.recall_views < 1:
-            raise ValueError("recall_views must be at least 1")
-
-    def prior(self, classes: int) -> Array:
-        """The prior (C,) over classes."""
-        if classes == 1:
-            return np.ones(1)
-        rest = (1 - self.prior_unknown) / (classes - 1)
-        return np.array([self.prior_unknown] + [rest] * (classes - 1))
-
-    def likelihoods(self, distributions: Floats, weights: Floats) -> Floats:
-        """Likelihoods (N, C) of each class, relative to no view.
-
-        A view is a distribution p (C,) that is right with probability ``weights`` w (N,) and
-        uninformative otherwise. A network's distribution is a posterior, so the likelihood is
-        w p(c) / prior(c) + 1 - w: after one view the belief is w p + (1 - w) prior.
-        """
-        prior = self.prior(distributions.shape[1]).astype(np.float32)
-        return weights[:, None] * distributions / prior + (1 - weights[:, None])
-
-    def log_missed(self, misses: Floats) -> Array:
-        """log P(m misses (N,) | a known class); m is the sum of the views' weights."""
-        a, b = self.recall_found, self.recall_missed
-        return np.asarray(betaln(a, b + misses.astype(float)) - betaln(a, b))
 
 
 @dataclass(frozen=True)
@@ -86,12 +30,22 @@ class LabelEstimates:
 class LabelStore:
     """A categorical distribution over C labels for every id >= 0; label 0 is "unknown".
 
-    Kept as the log likelihood of all views, relative to the prior.
+    Kept as the log likelihood of all views, relative to the prior. With a ``model`` this says what
+    a thing looks like; what it is then follows from the model's precision and confusion, for
+    landmarks or ``of_objects``.
     """
 
-    def __init__(self, classes: int, config: LabelStoreConfig | None = None) -> None:
+    def __init__(
+        self,
+        classes: int,
+        config: LabelStoreConfig | None = None,
+        model: ObservationModel | None = None,
+        of_objects: bool = False,
+    ) -> None:
         self.classes = classes
         self.config = config or LabelStoreConfig()
+        self.model = model
+        self._of_objects = of_objects
         self._prior = self.config.prior(classes)
         self._clear()
 
@@ -100,27 +54,43 @@ class LabelStore:
         known = self.known()
         return int(known[-1]) + 1 if len(known) else 0
 
-    def update(self, ids: Ints, distributions: Floats, weights: Floats) -> None:
+    def update(
+        self, ids: Ints, distributions: Floats, weights: Floats, viewpoints: Ints | None = None
+    ) -> None:
         """Fuse views of ids (N,), which may repeat.
 
         Each view is a distribution (N, C) that is right with probability weight (N,) and
-        uninformative otherwise.
+        uninformative otherwise; ``viewpoints`` (N,) below 64 say from where.
         """
         if not len(ids):
             return
         self._reserve(int(ids.max()) + 1)
+        new = self._novelty(ids, viewpoints)
         likelihood = self.config.likelihoods(distributions, weights)
         floor = np.float32(np.exp(-self.config.max_log_odds))
         gained = np.float32(self.config.power) * np.log(np.maximum(likelihood, floor))
+        gained *= new[:, None]
+        if self.model is not None and not self._of_objects:
+            self._limit_supports(ids, distributions, gained)
         self._add(ids, gained, np.ones(len(ids), np.int32))
-        np.multiply.at(self._misses, ids, np.float32(1 - 1 / self.config.recall_views))
+        worth = weights * new
+        scored = np.stack([worth * score_logits(distributions), worth], axis=1)
+        np.add.at(self._scores, ids, scored)
+        kept = (1 - new / np.float32(self.config.recall_views))[:, None]
+        np.multiply.at(self._misses, ids, kept)
 
-    def miss(self, ids: Ints, weights: Floats) -> None:
-        """Count views of ids (N,), which may repeat, that no mask covers, with weights (N,)."""
+    def miss(self, ids: Ints, weights: Floats, viewpoints: Ints | None = None) -> None:
+        """Count views of ids (N,), which may repeat, that no mask covers.
+
+        Weights (N,) or, for each group of classes of like size, (N, GROUPS).
+        """
         if len(ids):
             self._reserve(int(ids.max()) + 1)
-            np.multiply.at(self._misses, ids, 1 - weights / np.float32(self.config.recall_views))
-            np.add.at(self._misses, ids, weights)
+            worth = weights.reshape(len(ids), -1) * self._novelty(ids, viewpoints)[:, None]
+            worth = np.broadcast_to(worth, (len(ids), self._misses.shape[1]))
+            kept = (1 - worth / np.float32(self.config.recall_views)).astype(np.float32)
+            np.multiply.at(self._misses, ids, kept)
+            np.add.at(self._misses, ids, worth.astype(np.float32))
             np.add.at(self._views, ids, 1)
 
     def move(self, from_ids: Ints, to_ids: Ints) -> None:
@@ -129,10 +99,12 @@ class LabelStore:
             return
         self._reserve(int(max(from_ids.max(), to_ids.max())) + 1)
         gained, views = self._log_p[from_ids], self._views[from_ids]
-        misses = self._misses[from_ids]
+        misses, scores, seen = (t[from_ids] for t in (self._misses, self._scores, self._seen))
         self._reset(from_ids)
         self._add(to_ids, gained, views)
         np.add.at(self._misses, to_ids, misses)
+        np.add.at(self._scores, to_ids, scores)
+        np.bitwise_or.at(self._seen, to_ids, seen)
         self._limit_misses(to_ids)
         self._resize(len(self))
 
@@ -145,14 +117,55 @@ class LabelStore:
         """Ids (N,) that had a view, ascending."""
         return np.flatnonzero(self._views)
 
-    def probabilities(self, ids: Ints) -> Array:
-        """Distributions (N, C) of any ids (N,); the prior where there was no view."""
+    def appearance(self, ids: Ints) -> Array:
+        """P(class that it looks like) (N, C) of any ids (N,); the prior where there was no view."""
         inside = ids < len(self._views)
         log_p = np.tile(np.log(self._prior), (len(ids), 1))
         log_p[inside] += self._log_p[ids[inside]]
-        log_p[inside, 1:] += self.config.log_missed(self._misses[ids[inside]])[:, None]
+        log_p[inside, 1:] += self._log_missed(ids[inside])
         p = np.exp(log_p - log_p.max(axis=1, keepdims=True, initial=-np.inf))
-        return p / p.sum(axis=1, keepdims=True)
+        return np.asarray(p / p.sum(axis=1, keepdims=True))
+
+    def probabilities(self, ids: Ints) -> Array:
+        """Distributions (N, C) of any ids (N,): what they are, as far as that is known."""
+        p = self.appearance(ids)
+        if self.model is None:
+            return p
+        inside, scores = ids < len(self._views), np.zeros((len(ids), 2))
+        scores[inside] = self._scores[ids[inside]]
+        scores[:, 0] /= np.maximum(scores[:, 1], 1e-9)
+        right = self.model.object_precision(scores)
+        if self._of_objects:
+            return self.model.truth(p, scores, right)
+        of_corner = np.minimum(self.model.corner_precision(scores) / right, 1.0)
+        rows, judged = np.flatnonzero(inside), self._judged[ids[inside]]
+        at = rows, judged[:, 0].astype(int)
+        odds = right[at] / (1 - right[at]) * np.exp(judged[:, 1])
+        right[at] = odds / (1 + odds)
+        return self.model.truth(p, scores, right * of_corner)
+
+    def evidence(self, ids: Ints) -> Array:
+        """Number of views (N,) of any ids (N,) by their weights and whether they were new."""
+        found, inside = np.zeros(len(ids)), ids < len(self._views)
+        found[inside] = self._scores[ids[inside], 1]
+        return found
+
+    def judge(self, ids: Ints, labels: Ints, log_factors: Array) -> None:
+        """Set what else is known of ids (N,), in place of all that was set before.
+
+        A log likelihood (N,) of one class (N,) of the thing that each is on, relative to others.
+        """
+        self._judged[:] = 0
+        if len(ids):
+            self._reserve(int(ids.max()) + 1)
+            self._judged[ids] = np.stack([labels, log_factors], axis=1)
+
+    def _log_missed(self, ids: Ints) -> Array:
+        """log P(misses | class) (N, C - 1) or (N, 1) of ids (N,) in the tables."""
+        if self.model is None:
+            return self.config.log_missed(self._misses[ids])
+        groups, recall = self.model.groups[1:], self.model.best_recall[1:]
+        return self.config.log_missed(self._misses[ids][:, groups], recall)
 
     def estimates(self, ids: Ints) -> LabelEstimates:
         """The likeliest label of any ids (N,), with its probability, entropy and views."""
@@ -172,20 +185,25 @@ class LabelStore:
             "log_p": self._log_p[ids].ravel(),
             "views": self._views[ids],
             "misses": self._misses[ids],
+            "scores": self._scores[ids],
+            "seen": self._seen[ids],
+            "judged": self._judged[ids],
         }
 
     def restore(self, state: Arrays) -> None:
-        """Replace the content by a state.
-
-        Further arrays, as older files hold, are ignored. Older files count all misses.
-        """
+        """Replace the content by a state; those of older versions lack some arrays."""
         ids = state["ids"]
         check_ids(ids, int(ids.max(initial=-1)) + 1)
         self._clear()
         self._reserve(int(ids.max(initial=-1)) + 1)
         self._log_p[ids] = state["log_p"].reshape(len(ids), self.classes)
         self._views[ids] = state["views"]
-        self._misses[ids] = state["misses"]
+        misses = state["misses"].reshape(len(ids), -1)
+        fits = misses.shape[1] == self._misses.shape[1]
+        self._misses[ids] = misses if fits else misses.mean(axis=1, keepdims=True)
+        self._scores[ids] = state.get("scores", np.zeros((len(ids), 2), np.float32))
+        self._seen[ids] = state.get("seen", np.zeros(len(ids), np.uint64))
+        self._judged[ids] = state.get("judged", np.zeros((len(ids), 2), np.float32))
         self._limit_misses(ids)
         self._resize(len(self))
 
@@ -200,18 +218,50 @@ class LabelStore:
         log_p -= log_p.max(axis=1, keepdims=True)
         self._log_p[ids] = np.maximum(log_p, np.float32(-self.config.max_log_odds))
 
+    def _novelty(self, ids: Ints, viewpoints: Ints | None) -> Floats:
+        """Weights (N,) of views by whether their viewpoints (N,) are new; they then are no more."""
+        if viewpoints is None:
+            return np.ones(len(ids), np.float32)
+        bits = np.left_shift(np.uint64(1), viewpoints.astype(np.uint64))
+        known = (self._seen[ids] & bits) > 0
+        np.bitwise_or.at(self._seen, ids, bits)
+        return np.where(known, np.float32(self.config.again), np.float32(1))
+
+    def _limit_supports(self, ids: Ints, distributions: Floats, gained: Floats) -> None:
+        """Limit what masks of supports add (N, C) to ids (N,), in place.
+
+        Nothing is taken from what may lie on them.
+        """
+        assert self.model is not None
+        supports = self.model.sizes.is_in(SUPPORT)
+        labels = distributions[:, 1:].argmax(axis=1) + 1
+        rows = np.flatnonzero(supports[labels])
+        k = labels[rows]
+        over = self._log_p[ids[rows], k] - self._log_p[ids[rows], 0]
+        room = np.maximum(np.float32(self.config.support_log_odds) - over, 0)
+        own, nothing = gained[rows, k], gained[rows, 0]
+        small = np.flatnonzero(self.model.sizes.is_in(TOP, ANY))
+        at = np.ix_(rows, small)
+        gained[at] = np.maximum(gained[at], nothing[:, None])
+        gained[rows, k] = np.minimum(own, nothing + room)
+
     def _limit_misses(self, ids: Ints) -> None:
         limit = np.float32(self.config.recall_views)
         self._misses[ids] = np.minimum(self._misses[ids], limit)
 
     def _reset(self, ids: Ints) -> None:
-        self._log_p[ids] = 0.0
-        self._views[ids] = self._misses[ids] = 0
+        for table in (self._log_p, self._views, self._misses, self._scores):
+            table[ids] = 0
+        self._seen[ids] = self._judged[ids] = 0
 
     def _clear(self) -> None:
         self._log_p: Floats = np.zeros((_MIN_CAPACITY, self.classes), np.float32)
         self._views: NDArray[np.int32] = np.zeros(_MIN_CAPACITY, np.int32)
-        self._misses: Floats = np.zeros(_MIN_CAPACITY, np.float32)
+        groups = 1 if self.model is None else GROUPS
+        self._misses: Floats = np.zeros((_MIN_CAPACITY, groups), np.float32)
+        self._scores: Floats = np.zeros((_MIN_CAPACITY, 2), np.float32)
+        self._seen: NDArray[np.uint64] = np.zeros(_MIN_CAPACITY, np.uint64)
+        self._judged: Floats = np.zeros((_MIN_CAPACITY, 2), np.float32)
 
     def _reserve(self, size: int) -> None:
         if size > len(self._views):
@@ -224,6 +274,9 @@ class LabelStore:
             self._log_p = _resized(self._log_p, capacity)
             self._views = _resized(self._views, capacity)
             self._misses = _resized(self._misses, capacity)
+            self._scores = _resized(self._scores, capacity)
+            self._seen = _resized(self._seen, capacity)
+            self._judged = _resized(self._judged, capacity)
 
 
 def _resized(table: NDArray[Any], rows: int) -> NDArray[Any]:

@@ -9,17 +9,21 @@ from bmask_slam.graph.arrays import Array, Arrays, Floats
 _SAMPLES = 64
 _MAX_STEP = 0.05  # relative to the depth
 _UP_CAMERA = np.array([0.0, -1.0, 0.0])
+_UPWARD = np.deg2rad(12)
+_ENOUGH, _LOWEST, _CAMERA_ABOVE_M = 40, 0.03, (0.8, 2.3)
 
 
 class GravityEstimator:
-    """Estimates the up direction from normals, stored in the frames of their keyframes."""
+    """Estimates up and the floor from surface samples, stored in the frames of their keyframes."""
 
     def __init__(self) -> None:
         self._normals: dict[int, Floats] = {}
+        self._points: dict[int, Floats] = {}
 
     def add(self, keyframe_id: int, depth_m: Floats, rays: Array) -> None:
-        """Add normals sampled from a depth image (h, w); ``rays`` (h, w, 3) have z = 1."""
-        self._normals[keyframe_id] = sample_normals(depth_m, rays)
+        """Add samples of a depth image (h, w); ``rays`` (h, w, 3) have z = 1."""
+        found = sample_surface(depth_m, rays)
+        self._points[keyframe_id], self._normals[keyframe_id] = found
 
     def up_world(self, poses: dict[int, Array]) -> Array:
         """The up direction, a unit vector (3,), given T_world_keyframe by keyframe id."""
@@ -30,28 +34,53 @@ class GravityEstimator:
         ups = np.array([poses[k][:3, :3] @ _UP_CAMERA for k in known])
         return up_direction(np.concatenate(normals).astype(float), ups)
 
+    def floor_m(self, poses: dict[int, Array], up_world: Array) -> float:
+        """The floor's height along the up direction (3,), NaN if none was seen.
+
+        It is the lowest surface with an upward normal, if that is where a camera's floor can be:
+        the lowest may as well be a table's top.
+        """
+        known = [k for k in self._points if k in poses]
+        heights = [np.zeros(0)]
+        for k in known:
+            upward = self._normals[k] @ (up_world @ poses[k][:3, :3]) > np.cos(_UPWARD)
+            points = self._points[k][upward] @ poses[k][:3, :3].T + poses[k][:3, 3]
+            heights.append(points @ up_world)
+        heights_m = np.concatenate(heights)
+        if len(heights_m) < _ENOUGH:
+            return float("nan")
+        low_m = float(np.quantile(heights_m, _LOWEST))
+        camera_m = float(np.median([poses[k][:3, 3] @ up_world for k in known]))
+        near, far = _CAMERA_ABOVE_M
+        return low_m if near < camera_m - low_m < far else float("nan")
+
     def keep(self, keyframe_ids: set[int]) -> None:
         """Drop all other keyframes."""
         self._normals = {k: n for k, n in self._normals.items() if k in keyframe_ids}
+        self._points = {k: p for k, p in self._points.items() if k in keyframe_ids}
 
     def state(self) -> Arrays:
         """The normals as named arrays."""
-        rows = list(self._normals.values())
+        rows, points = list(self._normals.values()), list(self._points.values())
         return {
             "keyframes": np.array(list(self._normals), np.int64),
             "normals": np.array(rows, np.float32).reshape(-1, _SAMPLES, 3),
+            "points": np.array(points, np.float32).reshape(-1, _SAMPLES, 3),
         }
 
     def restore(self, state: Arrays) -> None:
-        """Replace the content by a state."""
-        self._normals = dict(zip(state["keyframes"].tolist(), state["normals"], strict=True))
+        """Replace the content by a state; files of older versions have no points."""
+        keyframes, normals = state["keyframes"].tolist(), state["normals"]
+        points = state.get("points", np.full_like(normals, np.nan))
+        self._normals = dict(zip(keyframes, normals, strict=True))
+        self._points = dict(zip(keyframes, points, strict=True))
 
 
-def sample_normals(depth_m: Floats, rays: Array) -> Floats:
-    """Unit normals (64, 3) toward the camera, spread over the smooth parts of a depth image.
+def sample_surface(depth_m: Floats, rays: Array) -> tuple[Floats, Floats]:
+    """Points (64, 3), spread over the smooth parts of a depth image, and their unit normals.
 
-    All zeros if there are fewer than 64. They are cross products of differences over four pixels,
-    since depth is noisy.
+    In the camera's frame, normals toward the camera; all zeros if there are fewer than 64. Normals
+    are cross products of differences over four pixels, since depth is noisy.
     """
     points = rays[::2, ::2] * depth_m[::2, ::2, None]
     step = 2
@@ -61,11 +90,12 @@ def sample_normals(depth_m: Floats, rays: Array) -> Floats:
         steps = np.maximum(np.abs(across[..., 2]), np.abs(down[..., 2]))
         smooth = steps < _MAX_STEP * points[:-step, :-step, 2]
     normals = np.cross(down, across)[smooth]  # x right, y down: toward the camera
-    found = np.zeros((_SAMPLES, 3), np.float32)
+    places, found = np.zeros((2, _SAMPLES, 3), np.float32)
     if len(normals) >= _SAMPLES:
-        chosen = normals[np.linspace(0, len(normals) - 1, _SAMPLES).astype(int)]
-        found[:] = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
-    return found
+        rows = np.linspace(0, len(normals) - 1, _SAMPLES).astype(int)
+        places[:] = points[:-step, :-step][smooth][rows]
+        found[:] = normals[rows] / np.linalg.norm(normals[rows], axis=1, keepdims=True)
+    return places, found
 
 
 def up_direction(normals_world: Array, camera_ups_world: Array, cone_deg: float = 40.0) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -11,41 +11,22 @@ from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.geometry import inverse, transform
-from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.semantics.beliefs.class_sizes import ClassSizes
+from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.observation import viewpoint_cells
 from bmask_slam.semantics.beliefs.votes import NO_INSTANCE, PixelAssignment
 from bmask_slam.semantics.objects.association import (
-    AssociationConfig,
     Evidence,
     Overlap,
     assign,
     points_on_objects,
     shares,
 )
-from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around, supported, without_noise
-from bmask_slam.semantics.objects.detections import DetectionConfig, Detections, detect
+from bmask_slam.semantics.objects.config import ObjectConfig
+from bmask_slam.semantics.objects.detections import Detections, detect
 from bmask_slam.semantics.objects.points import ObjectPoints, Sightings
-from bmask_slam.semantics.objects.revision import MergeEvidence, RevisionConfig, merges, splits
-
-
-@dataclass(frozen=True)
-class ObjectConfig:
-    """How objects are made of detections.
-
-    Objects observed by fewer than ``min_keyframes`` are not reported; each keeps at most
-    ``max_points`` points. Its box is fitted to the points with ``neighbours`` others within
-    ``support_m``; each side is moved in by one sigma of the depth, but leaves at most the share
-    ``trim`` of the points outside.
-    """
-
-    enabled: bool = True
-    min_keyframes: int = 2
-    max_points: int = 2000
-    neighbours: int = 2
-    support_m: float = 0.03
-    trim: float = 0.02
-    detections: DetectionConfig = field(default_factory=DetectionConfig)
-    association: AssociationConfig = field(default_factory=AssociationConfig)
-    revision: RevisionConfig = field(default_factory=RevisionConfig)
+from bmask_slam.semantics.objects.publication import Ground, MapObject, ObjectPublisher
+from bmask_slam.semantics.objects.revision import MergeEvidence, merges, splits
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,39 +70,22 @@ class _Association:
     points_camera: Array
 
 
-@dataclass(frozen=True, eq=False)
-class MapObject:
-    """One object.
-
-    Attributes:
-        id: unique, never reused.
-        label: the likeliest class; distribution: (C,) over all classes.
-        centroid_world: (3,) m, mean of its points without outliers. box: around them.
-        keyframe_ids: keyframes that observed it. landmark_ids: landmarks on it.
-        first_seen_s, last_seen_s: timestamps of the first and last of these keyframes.
-    """
-
-    id: int
-    label: int
-    distribution: Array
-    centroid_world: Array
-    box: OrientedBox
-    keyframe_ids: Ints
-    landmark_ids: Ints
-    first_seen_s: float
-    last_seen_s: float
-
-
 class ObjectMap:
     """Objects by id; their points are in keyframes' frames, so that they move with the graph."""
 
     def __init__(
-        self, camera: Camera, classes: int, config: ObjectConfig, labels: LabelStoreConfig
+        self,
+        camera: Camera,
+        labels: LabelStore,
+        config: ObjectConfig | None = None,
+        sizes: ClassSizes | None = None,
     ) -> None:
+        """``labels`` is an empty store, of objects; ``sizes`` are those of its classes."""
         self.camera = camera
-        self.config = config
-        self.labels = LabelStore(classes, labels)
+        self.labels = labels
+        self.config = config = config or ObjectConfig()
         self.points = ObjectPoints()
+        self._publisher = ObjectPublisher(self.points, labels, config, sizes)
         self._merging = MergeEvidence(config.revision)
         self._splitting = MergeEvidence(config.revision)
 
@@ -137,7 +101,10 @@ class ObjectMap:
         objects[fresh] = self.points.new_ids(int(fresh.sum()))
         objects = self._revise(matched, found, objects)
         scores = np.array([i.mask_score for i in instances], np.float32)
-        self.labels.update(objects, detected, scores)
+        centres = transform(view.T_world_camera, _means(found.points_camera, found.owners))
+        cells = viewpoint_cells(centres, view.T_world_camera[:3, 3])
+        self.labels.update(objects, detected, scores, cells)
+        self._miss(matched, view, objects)
         sightings = Sightings(view.keyframe_id, view.timestamp_s, objects)
         self.points.add(sightings, found.points_camera, objects[found.owners])
         self.points.thin(self.config.max_points)
@@ -147,35 +114,15 @@ class ObjectMap:
         """Record that landmarks (N,) lie on objects (N,)."""
         self.points.place_landmarks(landmark_ids, object_ids)
 
-    def objects(self, poses: dict[int, Array], up_world: Array) -> list[MapObject]:
+    def objects(self, poses: dict[int, Array], ground: Ground) -> list[MapObject]:
         """The current objects by id, from the keyframes whose poses are given."""
-        owners, points = self.points.in_world(poses)
-        noise = self.config.association.depth_sigma_m * self.points.rays_in_world(poses)
-        found = []
-        for i in np.unique(owners).tolist():
-            keyframe_ids, stamps_s = self.points.sightings(i)
-            if len(keyframe_ids) < self.config.min_keyframes:
-                continue
-            distribution = self.labels.probabilities(np.array([i]))[0]
-            own_points = points[owners == i]
-            near = supported(own_points, self.config.neighbours, self.config.support_m)
-            own_points = own_points[near]
-            inner = without_noise(own_points, noise[owners == i][near], up_world, self.config.trim)
-            box = box_around(inner, up_world)
-            found.append(
-                MapObject(
-                    id=i,
-                    label=int(distribution.argmax()),
-                    distribution=distribution,
-                    centroid_world=own_points.mean(axis=0),
-                    box=box,
-                    keyframe_ids=keyframe_ids,
-                    landmark_ids=self.points.landmarks_of(i),
-                    first_seen_s=float(stamps_s.min()),
-                    last_seen_s=float(stamps_s.max()),
-                )
-            )
-        return found
+        return self._publisher.objects(poses, ground)
+
+    def landmark_evidence(
+        self, poses: dict[int, Array], ground: Ground
+    ) -> tuple[Ints, Ints, Array]:
+        """Landmarks (N,) on objects, each one's class (N,), and log P(size and place | class)."""
+        return self._publisher.landmark_evidence(poses, ground)
 
     def state(self) -> Arrays:
         """The object map as named arrays."""
@@ -211,7 +158,7 @@ class ObjectMap:
         of_object = shares(*pairs, in_view, (len(ids), len(found))).T
         overlap = Overlap(of_detection, of_object, in_view)
         unseen_s = np.maximum(view.timestamp_s - self.points.last_seen_s(ids), 0.0)
-        evidence = Evidence(detected, self.labels.probabilities(ids), unseen_s)
+        evidence = Evidence(detected, self.labels.appearance(ids), unseen_s)
         assigned = assign(overlap, evidence, config)
         rows = self.points.rows(view.poses)
         return _Association(ids, evidence.known, overlap, assigned, rows, all_owners, all_points)
@@ -239,6 +186,23 @@ class ObjectMap:
         owners = view.assignment.owner[pixels[:, 1], pixels[:, 0]].astype(np.int64)
         detections = found.number[np.where(visible, owners, NO_INSTANCE)]
         return detections, visible
+
+    def _miss(self, matched: _Association, view: KeyframeView, detected: Ints) -> None:
+        """Count what the keyframe shows and no detection is on, by the recall to expect there."""
+        if self.labels.model is None or not len(matched.ids):
+            return
+        overlap, config = matched.overlap, self.config
+        counts = np.array([np.count_nonzero(matched.owners == i) for i in matched.ids.tolist()])
+        missed = overlap.in_view >= config.shown * counts
+        missed &= overlap.of_object.max(axis=0, initial=0.0) < config.on
+        missed &= ~np.isin(matched.ids, detected)
+        ids = matched.ids[missed]
+        own = np.isin(matched.owners, ids)
+        centres = _means(matched.points_camera[own], np.searchsorted(ids, matched.owners[own]))
+        expected = self.labels.model.group_recall(centres[:, 2], self.camera.fx, self.camera.width)
+        T = view.T_world_camera
+        cells = viewpoint_cells(transform(T, centres), T[:3, 3])
+        self.labels.miss(ids, expected.astype(np.float32), cells)
 
     def _revise(self, matched: _Association, found: Detections, objects: Ints) -> Ints:
         """Merge and split objects with enough evidence; the objects (D,) of the detections then."""
@@ -277,6 +241,13 @@ class ObjectMap:
             if objects[d] != split:
                 self.points.reassign(matched.rows[rows[of_detection == d]], int(objects[d]))
         self._splitting.drop(split)
+
+
+def _means(points: Array, groups: Ints) -> Array:
+    """The mean (G, 3) of the points (N, 3) of each group 0, 1, ... (N,)."""
+    sums = np.zeros((int(groups.max(initial=-1)) + 1, 3))
+    np.add.at(sums, groups, points)
+    return np.asarray(sums / np.bincount(groups, minlength=len(sums))[:, None])
 
 
 def pixel_rays(camera: Camera, step: int) -> Array:

@@ -37,7 +37,13 @@ class LightSegmenter:
         detector: finds the boxes in place of the network's own.
         device: "cpu", "cuda", or None for CUDA if available.
         stuff: gives every pixel a class; None for instances alone.
+
+    Attributes:
+        labels: the label set.
+        measured: under what name the errors of its masks were measured, "" if they were not.
     """
+
+    measured = ""
 
     def __init__(
         self,

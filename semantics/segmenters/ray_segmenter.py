@@ -32,7 +32,10 @@ class RaySegmenter:
 
     Attributes:
         labels: label set of the remote segmenter.
+        measured: under what name the errors of its masks were measured, "" if they were not.
     """
+
+    measured = ""
 
     def __init__(self, make: Callable[[], Segmenter], address: str) -> None:
         """Start ``make()``, which must be picklable, in an actor of the cluster at ``address``.

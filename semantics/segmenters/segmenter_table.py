@@ -57,6 +57,15 @@ class SegmenterOptions:
         return {key: str(value) for key, value in asdict(self).items()}
 
 
+def measured_name(options: SegmenterOptions) -> str:
+    """The name under which the masks of these options were measured; "" if they were not.
+
+    See `semantics.beliefs.observation`.
+    """
+    given = options.weights or options.proposals or options.labels
+    return options.name if options.name == "light" and not given else ""
+
+
 FindWeights = Callable[[str], Path]
 """Path of the weights of a name, which it may download."""
 
@@ -79,7 +88,9 @@ def make_segmenter(
         from bmask_slam.semantics.segmenters.ray_segmenter import RaySegmenter  # noqa: PLC0415
 
         here = replace(options, ray="")
-        return RaySegmenter(partial(make_segmenter, here, sequence, find_weights), options.ray)
+        remote = RaySegmenter(partial(make_segmenter, here, sequence, find_weights), options.ray)
+        remote.measured = measured_name(options)
+        return remote
     if options.name == "truth":
         path = sequence / TRUTH_FILE
         if not path.is_file():
@@ -121,7 +132,9 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
         _check_kind(options, "light", "YOLOX-Nano")
         stuff = load_stuff(data_path(*STUFF)) if options.surfaces else None
         network = load_light(path, labels)
-        return LightSegmenter(network, options.min_score, detector, stuff=stuff)
+        light = LightSegmenter(network, options.min_score, detector, stuff=stuff)
+        light.measured = measured_name(options)
+        return light
     other = load_network(path, labels)
     body = other.model.config.backbone
     _check_kind(options, "light" if body == "mobilenet_v2" else "mask-scoring-rcnn", body)

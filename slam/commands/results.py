@@ -12,12 +12,15 @@ QUERY = "say where a run has found the objects of a label"
 QUERY_MORE = """\
 For each object: position and size in metres in the run's world frame (the first keyframe's
 camera; sizes are length, width, height), how sure its label is, and the keyframes that saw it.
-Without a label the surest are listed. objects.json in the run folder holds the same and more."""
+Without a label the surest are listed, with --near the nearest. Relations are those of boxes: on,
+under, inside, or beside with less than half a metre between. objects.json holds the same."""
 EXPORT = "write a trajectory, a graph or landmarks in a format that other programs read"
 EXPORT_MORE = """\
 From a run folder: its trajectory as tum, kitti or euroc, its graph with landmarks and what was seen
-of them as g2o, its landmarks as ply. From a trajectory: tum, kitti, euroc, or its positions as ply.
-From a g2o file with landmarks: ply. KITTI's format has no stamps: they go to a second file."""
+of them as g2o, its landmarks as ply, those on objects in the objects' colours as objects-ply, and
+room, surfaces, objects and their relations as scene-graph (JSON). From a trajectory: tum, kitti,
+euroc, or its positions as ply. From a g2o file with landmarks: ply. KITTI's format has no stamps:
+they go to a second file."""
 
 
 def add_query(commands: Commands) -> None:
@@ -28,13 +31,30 @@ def add_query(commands: Commands) -> None:
     text = f'class name, such as "chair"; default: the {MOST} surest objects of all classes'
     parser.add_argument("label", nargs="?", help=text)
     parser.add_argument("--all", action="store_true", help="without a label: all objects")
+    text = "the nearest to a place first: its coordinates in the world frame, in metres"
+    parser.add_argument("--near", nargs=3, type=float, metavar=("X", "Y", "Z"), help=text)
+    related = parser.add_mutually_exclusive_group()
+    for kind in ("on", "under", "inside", "beside"):
+        text = f"only what is {kind} an object of this label or id; without it, {kind} any"
+        related.add_argument(f"--{kind}", nargs="?", const="", metavar="OTHER", help=text)
 
 
 def _query(arguments: argparse.Namespace) -> int:
-    from bmask_slam.run_folder.query import format_answer, query
+    import numpy as np
 
-    limited = arguments.label is None and not arguments.all
-    print(format_answer(query(arguments.run, arguments.label, MOST if limited else None)))
+    from bmask_slam.run_folder.scene.query import RELATIONS, Asked, ask, format_answer
+
+    given = {kind: getattr(arguments, kind) for kind in RELATIONS}
+    relation = next((kind for kind, other in given.items() if other is not None), None)
+    limited = arguments.label is None and not arguments.all and relation is None
+    asked = Asked(
+        arguments.label,
+        None if arguments.near is None else np.array(arguments.near),
+        relation,
+        given[relation] if relation is not None else "",
+        MOST if limited else None,
+    )
+    print(format_answer(ask(arguments.run, asked)))
     return 0
 
 
@@ -43,7 +63,7 @@ def add_export(commands: Commands) -> None:
     parser = commands.add_parser("export", help=EXPORT, description=f"{EXPORT}. {EXPORT_MORE}")
     parser.set_defaults(handler=_export)
     parser.add_argument("input", type=Path, metavar="INPUT", help="run folder, trajectory, or g2o")
-    formats = ("tum", "kitti", "euroc", "g2o", "ply")
+    formats = ("tum", "kitti", "euroc", "g2o", "ply", "scene-graph", "objects-ply")
     parser.add_argument("--format", choices=formats, required=True, help="what to write")
     parser.add_argument("--out", type=Path, required=True, metavar="F", help="file to write")
     parser.add_argument(

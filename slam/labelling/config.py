@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.beliefs.votes import VoteConfig
-from bmask_slam.semantics.objects.object_map import ObjectConfig
+from bmask_slam.semantics.objects.config import ObjectConfig
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 
 DEFAULT_SEGMENTER = "light"
@@ -20,7 +20,9 @@ class SemanticsConfig:
     is lower, vote on labels only: they make no objects, and are no evidence of motion.
     """
 
-    segmenter: SegmenterOptions = field(default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER))
+    segmenter: SegmenterOptions = field(
+        default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER, min_score=0.3)
+    )
     object_score: float = 0.5
     votes: VoteConfig = field(default_factory=VoteConfig)
     labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Arrays, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.labelling.landmark_visibility import Observed, VisibleLandmarks, observed_by
 from bmask_slam.semantics.beliefs.label_store import LabelStore
-from bmask_slam.semantics.beliefs.surface_store import SurfaceStore
+from bmask_slam.semantics.beliefs.observation import viewpoint_cells
+from bmask_slam.semantics.beliefs.surface_geometry import by_height
+from bmask_slam.semantics.beliefs.surface_store import SurfaceEstimates, SurfaceStore
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, VoteConfig, vote
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.instances.surfaces import SurfaceClasses
@@ -64,8 +66,15 @@ class LabelVotes:
     ) -> Ints:
         votes = vote(assignment, visible.pixels, visible.z_m, store.classes, self._config)
         ids, hit = visible.landmark_ids[votes.rows], ~votes.missed
-        store.update(ids[hit], votes.distributions[hit], votes.weights[hit])
-        store.miss(ids[~hit], votes.weights[~hit])
+        points_world = self._map.world.landmarks.points_world[ids]
+        cells = viewpoint_cells(points_world, visible.T_world_camera[:3, 3])
+        store.update(ids[hit], votes.distributions[hit], votes.weights[hit], cells[hit])
+        missed = votes.weights[~hit]
+        if store.model is not None:
+            z_m, camera = visible.z_m[votes.rows[~hit]], self._camera
+            expected = store.model.group_recall(z_m, camera.fx, camera.width)
+            missed = (missed[:, None] * expected).astype(np.float32)
+        store.miss(ids[~hit], missed, cells[~hit])
         return ids
 
     def state(self) -> Arrays:
@@ -111,6 +120,17 @@ def vote_on_surfaces(
     """Let the classes of a keyframe's pixels vote on the landmarks there, if it has them."""
     if seen is not None:
         store.update(seen.labels, visible.landmark_ids, seen.at(visible.pixels))
+
+
+def estimated_surfaces(
+    store: SurfaceStore, ids: Ints, points_world: Array, poses: dict[int, Array], up_world: Array
+) -> SurfaceEstimates | None:
+    """What landmarks (N,) at (N, 3) lie on, seen by cameras at these poses; None if not known."""
+    if len(store.names) < 2:
+        return None
+    cameras = np.array([T[:3, 3] for T in poses.values()]).reshape(-1, 3)
+    p = by_height(store.names, store.probabilities(ids), points_world, cameras, up_world)
+    return SurfaceEstimates.of(store.names, p)
 
 
 def _instances(state: Arrays) -> Sequence[Instance]:

@@ -1,14 +1,33 @@
-"""The results of mapping: landmarks with their labels, and objects."""
+"""The results of mapping: what became of masks, landmarks with their labels, and objects."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.semantics.beliefs.label_store import LabelEstimates
 from bmask_slam.semantics.beliefs.surface_store import SurfaceEstimates
 from bmask_slam.semantics.labels import LabelSet
-from bmask_slam.semantics.objects.object_map import MapObject
+from bmask_slam.semantics.objects.publication import MapObject
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """What became of a keyframe's masks.
+
+    Attributes:
+        keyframe_id: of the keyframe.
+        instances: number of instances.
+        landmark_ids: (N,) landmarks that they voted on.
+        refused: why they were not used; "" if they were.
+    """
+
+    keyframe_id: int
+    instances: int = 0
+    landmark_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    refused: str = ""
 
 
 @dataclass(frozen=True)
@@ -44,8 +63,13 @@ class LandmarkCloud:
 
 @dataclass(frozen=True)
 class MapObjects:
-    """The objects of a map's largest segment, with labels of ``names``; ``up_world`` (3,)."""
+    """The objects of a map's largest segment, with labels of ``names``.
+
+    Attributes:
+        up_world: (3,) the direction of up. floor_m: the floor's height along it, NaN if unknown.
+    """
 
     names: LabelSet
     objects: list[MapObject]
     up_world: Array
+    floor_m: float = float("nan")

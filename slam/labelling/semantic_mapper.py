@@ -4,29 +4,35 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Arrays, Floats, Ints
+from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
-from bmask_slam.labelling.landmark_votes import LabelVotes, vote_on_surfaces
-from bmask_slam.labelling.results import LandmarkLabels, MapObjects
+from bmask_slam.labelling.landmark_votes import (
+    LabelVotes,
+    estimated_surfaces,
+    vote_on_surfaces,
+)
+from bmask_slam.labelling.results import Attachment, LandmarkLabels, MapObjects
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
+from bmask_slam.semantics.beliefs.class_sizes import read_sizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
-from bmask_slam.semantics.beliefs.surface_geometry import by_height
-from bmask_slam.semantics.beliefs.surface_store import SurfaceEstimates, SurfaceStore
+from bmask_slam.semantics.beliefs.observation import observation_model
+from bmask_slam.semantics.beliefs.surface_store import SurfaceStore
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, assign_pixels, check_instances, vote
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.instances.surfaces import surfaces_of
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.gravity import GravityEstimator
 from bmask_slam.semantics.objects.object_map import KeyframeView, ObjectMap, pixel_rays
+from bmask_slam.semantics.objects.publication import Ground
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter, Segmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.world.map_editor import MapReader
@@ -37,23 +43,6 @@ logger = logging.getLogger(__name__)
 DEPTH_STEP = 2
 """Every second pixel of a keyframe's depth image is kept until its masks arrive."""
 MAX_WAITING = 100
-
-
-@dataclass(frozen=True)
-class Attachment:
-    """What became of a keyframe's masks.
-
-    Attributes:
-        keyframe_id: of the keyframe.
-        instances: number of instances.
-        landmark_ids: (N,) landmarks that they voted on.
-        refused: why they were not used; "" if they were.
-    """
-
-    keyframe_id: int
-    instances: int = 0
-    landmark_ids: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
-    refused: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +77,7 @@ class SemanticMapper:
         self.config = config
         self.segmenter = segmenter or NoSegmenter()
         self._rays = pixel_rays(camera, DEPTH_STEP)
-        self._begin(self.segmenter.labels)
+        self._begin(self.segmenter.labels, getattr(self.segmenter, "measured", ""))
 
     @property
     def enabled(self) -> bool:
@@ -153,10 +142,9 @@ class SemanticMapper:
         spoken, landmarks = self._label_votes.vote(keyframe_id, everything, observed, self.labels)
         vote_on_surfaces(surfaces_of(instances), landmarks, self.surfaces)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
-            objects = self._add_objects((keyframe_id, waiting), assignment, observed)[on]
-            self.objects.place_landmarks(ids[objects >= 0], objects[objects >= 0])
+            self._add_objects((keyframe_id, waiting), assignment, observed)
         if self._on_masks is not None:
-            about = (ids, on, self.labels.probabilities(ids))
+            about = (ids, on, self.labels.appearance(ids))
             view = (assignment, waiting.depth_m, observed.T_world_camera)
             self._on_masks(KeyframeMasks(keyframe_id, self.names, *view, *about))
         return Attachment(keyframe_id, len(instances), spoken)
@@ -184,30 +172,36 @@ class SemanticMapper:
         self._gravity.keep(keyframes.keys() | self._waiting.keys())
 
     def landmark_labels(self, ids: Ints, keyframes: Sequence[Keyframe]) -> LandmarkLabels | None:
-        """The labels of landmarks (N,) in the segment of keyframes; None without a segmenter."""
+        """The labels of landmarks (N,) of the segment of these keyframes; None without a segmenter.
+
+        The size and place of its object count for a landmark too.
+        """
         if not self.enabled:
             return None
-        surfaces = None
-        if len(self.surfaces.names) > 1:
-            poses = {k.id: k.T_world_camera for k in keyframes}
-            points = self._map.world.landmarks.points_world[ids]
-            cameras = np.array([T[:3, 3] for T in poses.values()]).reshape(-1, 3)
-            names, p = self.surfaces.names, self.surfaces.probabilities(ids)
-            p = by_height(names, p, points, cameras, self._gravity.up_world(poses))
-            surfaces = SurfaceEstimates.of(names, p)
+        poses, ground = self._posed(keyframes)
+        self.labels.judge(*self.objects.landmark_evidence(poses, ground))
+        points = self._map.world.landmarks.points_world[ids]
+        surfaces = estimated_surfaces(self.surfaces, ids, points, poses, ground.up_world)
         return LandmarkLabels(self.names, self.labels.estimates(ids), surfaces)
 
     def map_objects(self, keyframes: Sequence[Keyframe]) -> MapObjects:
         """The objects that these keyframes, all of one map segment, saw."""
+        poses, ground = self._posed(keyframes)
+        found = self.objects.objects(poses, ground)
+        return MapObjects(self.names, found, ground.up_world, ground.floor_m)
+
+    def _posed(self, keyframes: Sequence[Keyframe]) -> tuple[dict[int, Array], Ground]:
+        """The poses of keyframes by their ids, and the ground that they saw."""
         poses = {k.id: k.T_world_camera for k in keyframes}
         up_world = self._gravity.up_world(poses)
-        return MapObjects(self.names, self.objects.objects(poses, up_world), up_world)
+        return poses, Ground(up_world, self._gravity.floor_m(poses, up_world))
 
     def state(self) -> Arrays:
         """All labels and objects, as named arrays."""
         waiting = list(self._waiting.values())
         return {
             "names": np.array(self.names.names),
+            "measured": np.array([self._measured]),
             "done": np.array(sorted(self._done), np.int64),
             "waiting": np.array(list(self._waiting), np.int64),
             "waiting_s": np.array([w.timestamp_s for w in waiting], float),
@@ -236,7 +230,7 @@ class SemanticMapper:
             )
         if len(names) == 1:
             return  # nothing was learned
-        self._begin(names)
+        self._begin(names, str(state.get("measured", np.array([""]))[0]))
         self.labels.restore(part(state, "labels"))
         if votes := part(state, "votes"):
             self._label_votes.restore(votes)
@@ -253,21 +247,24 @@ class SemanticMapper:
         """Another recording begins: masks of earlier keyframes are not awaited."""
         self._waiting = {}
 
-    def _begin(self, names: LabelSet) -> None:
-        """Begin with empty stores."""
-        self.names = names
-        self.labels = LabelStore(len(names), self.config.labels)
+    def _begin(self, names: LabelSet, measured: str) -> None:
+        """Begin with empty stores; ``measured`` names what is known of the masks' errors."""
+        self.names, self._measured = names, measured
+        model = observation_model(measured, names)
+        self.labels = LabelStore(len(names), self.config.labels, model)
         self.surfaces = SurfaceStore()
         self._label_votes = LabelVotes(self.camera, self.config.votes, self._map)
-        self.objects = ObjectMap(self.camera, len(names), self.config.objects, self.config.labels)
+        of_objects = LabelStore(len(names), self.config.labels, model, of_objects=True)
+        sizes = read_sizes(names)
+        self.objects = ObjectMap(self.camera, of_objects, self.config.objects, sizes)
         self._gravity = GravityEstimator()
         self._done = set()
         self._waiting = {}
 
     def _add_objects(
         self, waited: tuple[int, _Waiting], assignment: PixelAssignment, observed: Observed
-    ) -> Ints:
-        """The object of each of the assignment's instances (K,), and -1 for "none" as the last."""
+    ) -> None:
+        """Fuse a keyframe's instances into objects, and place its landmarks on them."""
         keyframe_id, waiting = waited
         here = self._map.world.in_segment(observed.anchor.segment)
         T_world_camera = observed.T_world_camera
@@ -284,7 +281,11 @@ class SemanticMapper:
         if keyframe_id != observed.anchor.id:
             parent = observed.anchor.id, observed.T_anchor_camera
             self.objects.points.reanchor(keyframe_id, *parent)
-        return np.append(objects, -1)
+        visible = observed.located(self._map.world)
+        votes = vote(assignment, visible.pixels, visible.z_m, len(self.names), self.config.votes)
+        on = np.append(objects, -1)[votes.instances[votes.sure]]
+        ids = observed.landmark_ids[votes.rows[votes.sure]]
+        self.objects.place_landmarks(ids[on >= 0], on[on >= 0])
 
 
 def kept_depth(depth_m: Floats) -> Floats:

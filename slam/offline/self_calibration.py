@@ -44,6 +44,7 @@ class RememberingSegmenter:
 
     def __init__(self, segmenter: Segmenter) -> None:
         self.labels = segmenter.labels
+        self.measured = getattr(segmenter, "measured", "")
         self._segmenter = segmenter
         self._found: dict[str, _Packed] | None = {}
 

@@ -25,8 +25,9 @@ from bmask_slam.graph.trajectory_formats import (
 )
 from bmask_slam.run_folder.folder import trajectory_files
 from bmask_slam.run_folder.landmark_file import LANDMARKS_COMMENT
+from bmask_slam.run_folder.scene.scene_graph import write_object_points, write_scene_graph
 
-ExportFormat = Literal["tum", "kitti", "euroc", "g2o", "ply"]
+ExportFormat = Literal["tum", "kitti", "euroc", "g2o", "ply", "scene-graph", "objects-ply"]
 POSITIONS_COMMENT = "bmask-slam camera positions, world frame, metres, seconds"
 POINTS_COMMENT = "bmask-slam landmarks of a graph, world frame, metres"
 
@@ -58,6 +59,11 @@ def export(source: Path, form: ExportFormat, out: Path, times: Path | None = Non
         raise InputError(f"{out}: is (in) the input, which stays as it is; choose another --out")
     if form == "g2o":
         return _graph(source, out)
+    if form in ("scene-graph", "objects-ply"):
+        if not source.is_dir():
+            raise InputError(f"{source}: {form} needs the folder of a run with a segmenter")
+        write = write_scene_graph if form == "scene-graph" else write_object_points
+        return Exported((out,), write(source, out))
     if source.is_file() and has_landmarks(source):
         return _points_of_graph(source, form, out)
     if form == "ply" and source.is_dir():

@@ -28,6 +28,7 @@ from bmask_slam.run_folder.folder import trajectory_files
 from bmask_slam.run_folder.frame_file import FRAMES, MAX_STAMP_ERROR_S, read_frames
 from bmask_slam.run_folder.origin import CONFIG
 from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.observation import observation_model
 from bmask_slam.semantics.labels import LabelSet, label_set
 
 if TYPE_CHECKING:
@@ -154,6 +155,7 @@ def saved_labels(state: Arrays, path: Path) -> RunLabels | None:
     names = LabelSet(tuple(state["names"].tolist())) if state else label_set(())
     if len(names) < 2:
         return None
-    store = LabelStore(len(names), run_semantics(path).labels)
+    model = observation_model(str(state.get("measured", np.array([""]))[0]), names)
+    store = LabelStore(len(names), run_semantics(path).labels, model)
     store.restore(part(state, "labels"))
     return RunLabels(names, store)

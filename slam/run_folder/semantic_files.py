@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,17 +18,16 @@ from bmask_slam.graph.files.json_file import STRICT, Name, read_json
 from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
+from bmask_slam.run_folder.object_picture import draw_objects
 from bmask_slam.semantics.instances.overlay import class_colour
-from bmask_slam.semantics.objects.boxes3d import EDGES, OrientedBox, gravity_axes
-from bmask_slam.semantics.objects.object_map import MapObject
+from bmask_slam.semantics.objects.boxes3d import EDGES, OrientedBox
+from bmask_slam.semantics.objects.publication import MapObject
 
 LABELS = "labels.csv"
 OBJECTS = "objects.json"
 BOXES = "objects.ply"
 OBJECTS_PICTURE = "objects.png"
 SEMANTIC_FILES = (LABELS, OBJECTS, BOXES, OBJECTS_PICTURE)
-UNKNOWN_COLOUR = "#c9c9c4"
-_MIN_NAMED_M = 0.25
 _COLUMNS = ("id", "label", "probability", "entropy", "views")
 _SURFACE_COLUMNS = ("surface", "surface_probability")
 
@@ -140,6 +138,8 @@ class _ObjectFile(BaseModel):
     model_config = STRICT
     labels: list[Name]
     objects: list[_Object]
+    up_world: Point = (0.0, -1.0, 0.0)
+    floor_m: Metres | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,11 +168,27 @@ class SavedObject:
     last_seen_s: float
 
 
+@dataclass(frozen=True, eq=False)
+class SavedScene:
+    """What objects.json holds.
+
+    Attributes:
+        names: class names of the segmenter. objects: of the run.
+        up_world: (3,) the direction of up. floor_m: the floor's height along it, NaN if unknown.
+    """
+
+    names: tuple[str, ...]
+    objects: tuple[SavedObject, ...]
+    up_world: Array
+    floor_m: float
+
+
 def write_objects(path: Path, found: MapObjects) -> None:
     """Write objects as JSON: metres, in the run's world frame."""
     content = {
         "labels": [found.names.map_name(k) for k in range(len(found.names))],
         "up_world": _rounded(found.up_world),
+        "floor_m": None if np.isnan(found.floor_m) else round(float(found.floor_m), 6),
         "objects": [_as_json(o, found) for o in found.objects],
     }
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -205,7 +221,13 @@ def _rounded(values: Array) -> list[float]:
 
 
 def read_objects(run: Path) -> tuple[tuple[str, ...], list[SavedObject]]:
-    """The class names of a run's segmenter, and its objects.
+    """The class names of a run's segmenter, and its objects. Raises InputError as `read_scene`."""
+    scene = read_scene(run)
+    return scene.names, list(scene.objects)
+
+
+def read_scene(run: Path) -> SavedScene:
+    """The objects of a run, and where up and the floor are.
 
     Raises:
         InputError: no such file, or a file that `write_objects` did not make.
@@ -214,7 +236,9 @@ def read_objects(run: Path) -> tuple[tuple[str, ...], list[SavedObject]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a run that had a segmenter")
     content = read_json(path, _ObjectFile, "run again")
-    return tuple(content.labels), [_saved(o) for o in content.objects]
+    floor_m = np.nan if content.floor_m is None else content.floor_m
+    objects = tuple(_saved(o) for o in content.objects)
+    return SavedScene(tuple(content.labels), objects, np.array(content.up_world), floor_m)
 
 
 def _saved(o: _Object) -> SavedObject:
@@ -251,44 +275,3 @@ def write_boxes(path: Path, found: MapObjects) -> None:
     for k in range(count):
         lines += [f"{8 * k + a} {8 * k + b}" for a, b in EDGES.tolist()]
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
-def draw_objects(
-    path: Path, cloud: LandmarkCloud, found: MapObjects, trajectory: Trajectory
-) -> None:
-    """Draw the map along ``up_world``, in metres, and write the picture.
-
-    Only larger objects get their id; the legend has the number of objects of each class.
-    """
-    from matplotlib.collections import LineCollection  # noqa: PLC0415 - loads slowly
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    assert cloud.labels is not None
-    R_upright_world = gravity_axes(found.up_world).T
-    figure = Figure(figsize=(11, 9), dpi=120, layout="constrained")
-    axes = figure.add_subplot()
-    labels, points = cloud.labels.estimates.labels, cloud.points_world @ R_upright_world.T
-    unknown = labels == 0
-    x, y = points[:, 0], points[:, 1]
-    axes.scatter(x[unknown], y[unknown], s=1.5, c=UNKNOWN_COLOUR, linewidths=0)
-    colours = np.array([class_colour(k) / 255 for k in labels[~unknown].tolist()]).reshape(-1, 3)
-    axes.scatter(x[~unknown], y[~unknown], s=3, c=0.85 * colours, linewidths=0)
-    for o in found.objects:
-        corners = (o.box.corners_world @ R_upright_world.T)[:, :2]
-        colour = 0.7 * class_colour(o.label) / 255
-        axes.add_collection(LineCollection(list(corners[EDGES]), colors=[colour], linewidths=0.8))
-        if o.box.size_m.max() > _MIN_NAMED_M:
-            text = f"{found.names.map_name(o.label)} {o.id}"
-            axes.annotate(text, corners.mean(axis=0), fontsize=6, ha="center", color=0.6 * colour)
-    path_points = trajectory.positions_world @ R_upright_world.T
-    axes.plot(*path_points[:, :2].T, color="black", lw=0.9, label="camera")
-    counts = Counter(o.label for o in found.objects)
-    for label in sorted(counts, key=lambda k: (-counts[k], k)):
-        name = f"{found.names.map_name(label)} ({counts[label]})"
-        axes.plot([], [], "s", ms=5, color=0.8 * class_colour(label) / 255, label=name)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("m")
-    axes.set_ylabel("m")
-    axes.set_title(f"{len(found.objects)} objects, {int((~unknown).sum())} labelled landmarks")
-    axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    figure.savefig(path, format="png")

@@ -46,6 +46,7 @@ from bmask_slam.live.replica import DeltaMaker
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
+from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, measured_name
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
@@ -61,8 +62,9 @@ NICENESS = 5
 class LabelsOnly(NoSegmenter):
     """No segmenter, but the labels of one: masks come from another process."""
 
-    def __init__(self, names: tuple[str, ...]) -> None:
+    def __init__(self, names: tuple[str, ...], options: SegmenterOptions) -> None:
         self.labels = LabelSet(names)
+        self.measured = measured_name(options)
 
 
 def serve_map(
@@ -78,7 +80,7 @@ def serve_map(
     Messages up to the number ``resent`` had been sent to a process that died.
     """
     os.nice(NICENESS)
-    segmenter = LabelsOnly(names)
+    segmenter = LabelsOnly(names, config.semantics.segmenter)
     saved = None
     if state is not None:
         header, saved = read_arrays(state, STATE_FILE)

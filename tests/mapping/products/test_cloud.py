@@ -21,7 +21,8 @@ from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.mapping.products.pictures import palette
 from bmask_slam.mapping.products.submaps import Submap
 from bmask_slam.mapping.products.surface_labels import LabelTable, keyframe_labels
-from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 
 RNG = np.random.default_rng(0)

@@ -7,7 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from bmask_slam.semantics.beliefs.label_store import LabelStore, LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_store import LabelStore
 
 C = 5
 PRIOR = np.array([0.5, *4 * [0.125]])

@@ -17,7 +17,7 @@ from bmask_slam.semantics.objects.boxes3d import (
     supported,
     without_noise,
 )
-from bmask_slam.semantics.objects.gravity import GravityEstimator, sample_normals, up_direction
+from bmask_slam.semantics.objects.gravity import GravityEstimator, sample_surface, up_direction
 from bmask_slam.semantics.objects.object_map import pixel_rays
 
 T_B_A = se3_exp(np.array([0.7, -0.4, 1.9, 1.0, -2.0, 3.0]))
@@ -151,7 +151,7 @@ def test_normals_of_a_floor_point_up() -> None:
     up_camera = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
     depth_m = (-1.5 / (rays @ up_camera)).astype(np.float32)
     depth_m[(depth_m < 0) | (depth_m > 6)] = np.nan
-    assert np.allclose(sample_normals(depth_m, rays), up_camera, atol=1e-4)
+    assert np.allclose(sample_surface(depth_m, rays)[1], up_camera, atol=1e-4)
     upright = GravityEstimator()
     upright.add(4, depth_m, rays)
     found = upright.up_world({4: T_B_A})

@@ -10,17 +10,17 @@ import pytest
 from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import se3_exp, transform
-from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
+from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.objects.association import AssociationConfig, Evidence, Overlap, assign
+from bmask_slam.semantics.objects.config import ObjectConfig
 from bmask_slam.semantics.objects.object_map import (
     KeyframeView,
-    MapObject,
-    ObjectConfig,
     ObjectMap,
     pixel_rays,
 )
+from bmask_slam.semantics.objects.publication import Ground, MapObject
 
 CAMERA = Camera(320, 240, fx=260.0, fy=262.0, cx=160.5, cy=119.0)
 SIZE = (240, 320)
@@ -50,7 +50,7 @@ class Scene:
 
     def __init__(self, T_world_scene: Array = HERE, config: ObjectConfig | None = None) -> None:
         self.T_world_scene = T_world_scene
-        self.map = ObjectMap(CAMERA, C, config or ObjectConfig(), LabelStoreConfig())
+        self.map = ObjectMap(CAMERA, LabelStore(C), config)
         self.poses: dict[int, Array] = {}
 
     def show(self, x: float, cards: list[Card], score: float = 0.9) -> np.ndarray:
@@ -69,7 +69,7 @@ class Scene:
         return objects[order]
 
     def objects(self) -> list[MapObject]:
-        return self.map.objects(self.poses, self.T_world_scene[:3, :3] @ UP)
+        return self.map.objects(self.poses, Ground(self.T_world_scene[:3, :3] @ UP))
 
 
 def instances_of(T: Array, cards: list[Card], score: float) -> tuple[list[Instance], np.ndarray]:

@@ -191,7 +191,7 @@ def test_a_weak_detection_votes_but_makes_no_object() -> None:
     on_right = system.landmarks().points_world[:, 0] > EDGE_M + 0.05
     often = on_right & (estimates(system).views > 5)
     assert often.sum() > 100
-    assert (estimates(system).labels[often] == 2).mean() > 0.98
+    assert (estimates(system).labels[often] == 2).mean() > 0.8  # most viewpoints are not new
     assert {o.label for o in system.objects().objects} == {1}
 
 

@@ -11,9 +11,11 @@ import pytest
 from bmask_slam.cli import main
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.labelling.results import MapObjects
-from bmask_slam.run_folder.query import format_answer, query
+from bmask_slam.run_folder.export import export
+from bmask_slam.run_folder.scene.query import Asked, ask, format_answer, query
 from bmask_slam.run_folder.semantic_files import (
     BOXES,
     OBJECTS,
@@ -23,7 +25,7 @@ from bmask_slam.run_folder.semantic_files import (
 )
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
-from bmask_slam.semantics.objects.object_map import MapObject
+from bmask_slam.semantics.objects.publication import MapObject
 
 NAMES = label_set(("chair", "desk", "cup"))
 
@@ -121,3 +123,72 @@ def test_boxes_are_written_as_lines(run: Path) -> None:
     edges = np.array(rows[24:], int)
     lengths = np.linalg.norm(corners[edges[:, 0]] - corners[edges[:, 1]], axis=1)
     assert set(np.round(lengths, 3)) == {0.4, 1.25, 0.9}
+
+
+def furnished(tmp_path: Path) -> Path:
+    """A run with a desk, a cup on it, a chair beside it and one far away; z is up."""
+    sizes = {1: (0.5, 0.5, 0.9), 2: (1.6, 0.8, 0.7), 3: (0.1, 0.1, 0.1)}
+    made = []
+    things = ((0, 2, 0, 0), (1, 3, 0.2, 0.75), (2, 1, 1.2, 0), (5, 1, 9, 0))
+    for number, label, x_m, bottom_m in things:
+        T = np.eye(4)
+        T[:3, 3] = x_m, 0, bottom_m + 0.5 * sizes[label][2]
+        box = OrientedBox(T, np.array(sizes[label]))
+        p = np.eye(4)[label]
+        ids = np.arange(3), np.array([10 * number, 10 * number + 1])
+        made.append(MapObject(number, label, p, T[:3, 3], box, *ids, 0.5, 2.25))
+    found = MapObjects(NAMES, made, np.array([0.0, 0.0, 1.0]), -0.01)
+    write_objects(tmp_path / OBJECTS, found)
+    return tmp_path
+
+
+def test_objects_by_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = furnished(tmp_path)
+    answer = ask(run, Asked(near_world=np.array([9.5, 0.0, 0.2]), most=2))
+    assert [o.id for o in answer.objects] == [5, 2]
+    assert answer.distances_m == pytest.approx((0.25, 9.5 - 1.45))
+    assert main(["query", str(run), "chair", "--near", "0", "-1", "0.5"]) == 0
+    head, first, _ = capsys.readouterr().out.splitlines()
+    assert "distance (m)" in head
+    assert first.split()[:2] == ["chair", "2"]
+
+
+def test_objects_by_relation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = furnished(tmp_path)
+    assert [o.id for o in ask(run, Asked(relation="on", other="desk")).objects] == [1]
+    assert [o.id for o in ask(run, Asked("chair", relation="beside", other="0")).objects] == [2]
+    assert ask(run, Asked(relation="inside")).objects == ()
+    assert main(["query", str(run), "--on"]) == 0
+    assert "on desk 0" in capsys.readouterr().out
+    with pytest.raises(InputError, match="has no object 7"):
+        ask(run, Asked(relation="on", other="7"))
+    with pytest.raises(InputError, match="label set has no 'sofa'"):
+        ask(run, Asked(relation="on", other="sofa"))
+
+
+def test_the_scene_graph_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, out = furnished(tmp_path), tmp_path.parent / "scene.json"
+    points = np.random.default_rng(0).uniform([-1, -1, 0], [10, 1, 2], (60, 3)).astype(np.float32)
+    ids = np.arange(60, dtype=np.int32)
+    grey = dict.fromkeys(("red", "green", "blue"), np.zeros(60, np.uint8))
+    columns = dict(zip("xyz", points.T, strict=True))
+    write_ply(run / "landmarks.ply", {**columns, **grey, "observations": ids, "id": ids})
+    rows = [f"{k},{'desk' if k < 20 else 'unknown'},0.75000,0.5,3" for k in range(60)]
+    text = "\n".join(["id,label,probability,entropy,views", *rows]) + "\n"
+    (run / "labels.csv").write_text(text)
+    assert main(["export", str(run), "--format", "scene-graph", "--out", str(out)]) == 0
+    content = json.loads(out.read_text())
+    assert [o["label"] for o in content["objects"]] == ["desk", "cup", "chair", "chair"]
+    assert {"subject": 1, "relation": "on", "object": 0} in content["relations"]
+    assert content["room"]["floor_height_along_up_m"] == -0.01
+    assert max(content["room"]["box"]["size"]) == pytest.approx(11, abs=1)
+    surface = content["surfaces"][0]
+    assert (surface["label"], surface["landmarks"], surface["probability"]) == ("desk", 20, 0.75)
+    cloud = tmp_path.parent / "objects.ply"
+    assert main(["export", str(run), "--format", "objects-ply", "--out", str(cloud)]) == 0
+    found = read_ply(cloud)
+    assert found["id"].tolist() == [0, 0, 1, 1, 2, 2, 5, 5]
+    assert np.allclose(found["x"][2:4], points[10:12, 0])
+    assert len({tuple(found[c][k] for c in ("red", "green", "blue")) for k in range(8)}) == 4
+    with pytest.raises(InputError, match="needs the folder of a run"):
+        export(out, "scene-graph", tmp_path.parent / "other.json")

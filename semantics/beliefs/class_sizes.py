@@ -1,0 +1,58 @@
+"""How large things of a class are, and where they are: data/labels/sizes.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.graph.arrays import Array, Mask
+from bmask_slam.graph.data_files import data_path
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.yaml_file import read_yaml
+from bmask_slam.semantics.labels import LabelSet
+
+FLOOR, SUPPORT, TOP, WALL, ANY, NEVER = "floor", "support", "top", "wall", "any", "never"
+PLACES = (FLOOR, SUPPORT, TOP, WALL, ANY, NEVER)
+_ALL_M = (0.01, 100.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ClassSizes:
+    """Of each class of a label set (C,), the first of which is "unknown".
+
+    Attributes:
+        shortest_m, longest_m: (C,) the usual range of the longest side.
+        places: C of PLACES, where such a thing is.
+    """
+
+    shortest_m: Array
+    longest_m: Array
+    places: tuple[str, ...]
+
+    @property
+    def typical_m(self) -> Array:
+        """Longest side (C,) in the middle of its range, by its logarithm."""
+        return np.asarray(np.sqrt(self.shortest_m * self.longest_m))
+
+    def is_in(self, *places: str) -> Mask:
+        """Which of the classes (C,) are in one of the places."""
+        return np.array([p in places for p in self.places])
+
+
+def read_sizes(labels: LabelSet) -> ClassSizes:
+    """The sizes of a label set's classes; classes that the file lacks may have any.
+
+    Raises:
+        InputError: the file is not a table of two lengths and a place by class name.
+    """
+    path = data_path("labels", "sizes.yaml")
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: needs lines 'class: [shortest, longest, place]'")
+    rows = [content.get(name, (*_ALL_M, ANY)) for name in labels.names]
+    for name, row in zip(labels.names, rows, strict=True):
+        if len(row) != 3 or row[2] not in PLACES or not 0 < row[0] < row[1]:
+            raise InputError(f"{path}: {name}: {row!r}; give two rising lengths and a place")
+    shortest_m, longest_m = (np.array([row[k] for row in rows], float) for k in (0, 1))
+    return ClassSizes(shortest_m, longest_m, tuple(row[2] for row in rows))

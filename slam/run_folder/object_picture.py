@@ -1,0 +1,62 @@
+"""objects.png: a map from above, with its objects."""
+
+from __future__ import annotations
+
+import colorsys
+from pathlib import Path
+
+import numpy as np
+
+from bmask_slam.graph.trajectory import Trajectory
+from bmask_slam.labelling.results import LandmarkCloud, MapObjects
+from bmask_slam.semantics.objects.boxes3d import EDGES, gravity_axes
+
+UNKNOWN_COLOUR = "#c9c9c4"
+_GOLDEN = 0.61803398875
+
+
+def distinct_colour(number: int) -> tuple[float, float, float]:
+    """A colour, red first in 0..1; those of consecutive numbers are far apart."""
+    lightness = (0.42, 0.55, 0.33)[number % 3]
+    return colorsys.hls_to_rgb((0.03 + _GOLDEN * number) % 1.0, lightness, 0.75)
+
+
+def draw_objects(
+    path: Path, cloud: LandmarkCloud, found: MapObjects, trajectory: Trajectory
+) -> None:
+    """Draw the map along ``up_world``, in metres, and write the picture.
+
+    Every object has a colour of its own, for its box, its landmarks and its name, which is the
+    label and the id; the legend lists them with probability and size. Small ones are drawn last.
+    """
+    from matplotlib.collections import LineCollection  # noqa: PLC0415 - loads slowly
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    R_upright_world = gravity_axes(found.up_world).T
+    figure = Figure(figsize=(13, 9), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    flat = (cloud.points_world @ R_upright_world.T)[:, :2]
+    axes.scatter(flat[:, 0], flat[:, 1], s=1.5, c=UNKNOWN_COLOUR, linewidths=0)
+    ordered = sorted(found.objects, key=lambda o: -o.box.volume_m3)
+    for number, o in enumerate(ordered):
+        colour = distinct_colour(number)
+        own = np.isin(cloud.ids, o.landmark_ids)
+        axes.scatter(flat[own, 0], flat[own, 1], s=5, color=colour, linewidths=0)
+        corners = (o.box.corners_world @ R_upright_world.T)[:, :2]
+        axes.add_collection(LineCollection(list(corners[EDGES]), colors=[colour], linewidths=1.6))
+        name = f"{found.names.map_name(o.label)} {o.id}"
+        place = corners.mean(axis=0)
+        box = {"facecolor": "white", "alpha": 0.7, "pad": 0.8, "linewidth": 0}
+        axes.annotate(name, place, fontsize=9, ha="center", va="center", color=colour, bbox=box)
+        long_m, short_m = np.sort(o.box.size_m[:2])[::-1]
+        size = f"{long_m:.2f} x {short_m:.2f} x {o.box.size_m[2]:.2f} m"
+        text = f"{name}: {o.distribution[o.label]:.2f}, {size}"
+        axes.plot([], [], "s", ms=6, color=colour, label=text)
+    path_points = trajectory.positions_world @ R_upright_world.T
+    axes.plot(*path_points[:, :2].T, color="black", lw=0.9, label="camera")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("m")
+    axes.set_ylabel("m")
+    axes.set_title(f"{len(found.objects)} objects from above, {len(cloud.ids)} landmarks")
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.savefig(path, format="png")

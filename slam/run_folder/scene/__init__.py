@@ -1,0 +1,1 @@
+"""The objects of a run: queried, and written as a scene graph."""
