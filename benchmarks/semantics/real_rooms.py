@@ -9,7 +9,8 @@ if it is one of that point's, be it a thing of COCO or a surface of NYU40. An ob
 is of the class of a true one, its centre within half the true one's largest extent (10 cm to 50 cm)
 of the true centre, its largest extent within a factor of 3 of the true one's; one to one. Doubtful
 things (a booklet on a wall as a book) count neither as right nor as wrong. The calibration error
-(ECE) is that of labelled landmarks in ten bins of probability.
+(ECE) is that of labelled landmarks in ten bins of probability. Surfaces are what the network that
+gives every pixel a class says that landmarks lie on.
 """
 
 from __future__ import annotations
@@ -32,10 +33,11 @@ from benchmarks.semantics.labels import calibration_error
 from benchmarks.suite.measure import call
 from bmask_slam.comparison.jobs.truth_figures import truth_from_world
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.geometry import transform
 from bmask_slam.graph.trajectory import associate, read_tum
 from bmask_slam.run_folder.reader import Run
-from bmask_slam.run_folder.semantic_files import SavedObject
+from bmask_slam.run_folder.semantic_files import LABELS, SavedObject
 
 ROOMS = ("redkitchen", "bonn_crowd")
 UNKNOWN = ("unknown", "background")
@@ -43,7 +45,7 @@ CENTRE_M, EXTENT_FACTOR = (0.1, 0.5), 3.0
 PEOPLE = "person"
 HEADER = (
     "room", "landmarks at points", "labelled", "of them right", "ECE", "on things: labelled right",
-    "objects", "right", "precision", "true", "recall", "persons",
+    "surfaces known", "of them right", "objects", "right", "precision", "true", "recall", "persons",
 )  # fmt: skip
 
 
@@ -55,6 +57,8 @@ class Labels:
         count, labelled: of all; decided: of the labelled ones, those that are not doubtful.
         right: of those, the right ones. ece: their calibration error.
         things, things_right: landmarks on things of COCO; those of them with the right label.
+        surfaces, surfaces_right: landmarks of which it is said what they lie on, where the truth
+            knows that; the right ones of them.
         wrong: number by (what it is, label).
     """
 
@@ -65,6 +69,8 @@ class Labels:
     ece: float
     things: int
     things_right: int
+    surfaces: int
+    surfaces_right: int
     wrong: Counter[tuple[str, str]]
 
 
@@ -140,10 +146,18 @@ def score_labels(run: Run, truth: dict[str, Any], T_truth_world: Array) -> Label
             sure.append(found.probabilities[k])
             correct.append(right)
             wrong[kind, label] += not right
+    surfaces = surfaces_right = 0
+    columns = read_table(run.path / LABELS, ("label",), "run again")
+    for k in near.tolist():
+        true = kinds[truth["points"][nearest[k]][6]]
+        told = columns["surface"][k] if "surface" in columns else UNKNOWN[0]
+        if told not in UNKNOWN and true["surfaces"]:
+            surfaces += 1
+            surfaces_right += told in true["surfaces"]
     ece = calibration_error(np.array(sure), np.array(correct, float))[0] if sure else np.nan
     wrong = Counter({pair: n for pair, n in wrong.items() if n})
     counts = (len(near), labelled, len(sure), sum(correct))
-    return Labels(*counts, ece, things, things_right, wrong)
+    return Labels(*counts, ece, things, things_right, surfaces, surfaces_right, wrong)
 
 
 def score_objects(
@@ -186,6 +200,7 @@ def row(name: str, labels: Labels, objects: Objects) -> tuple[str, ...]:
     return (
         name, str(labels.count), share(labels.labelled, labels.count),
         share(labels.right, labels.decided), f"{labels.ece:.3f}", on_things,
+        share(labels.surfaces, labels.count), share(labels.surfaces_right, labels.surfaces),
         str(objects.reported), str(objects.right), share(objects.right, objects.reported),
         str(objects.true), share(objects.right, objects.true), str(objects.persons),
     )  # fmt: skip

@@ -11,10 +11,11 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import POINTS, read_ply, write_ply
+from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.run_folder.landmark_file import LANDMARKS
 from bmask_slam.run_folder.object_picture import distinct_colour
-from bmask_slam.run_folder.semantic_files import SavedObject, SavedScene, read_labels, read_scene
+from bmask_slam.run_folder.semantic_files import LABELS, SavedObject, SavedScene, read_scene
 from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around
 from bmask_slam.semantics.objects.relations import relations
 
@@ -124,15 +125,16 @@ def _within(points_world: Array, up_world: Array) -> OrientedBox | None:
 
 
 def _surfaces(run: Path, scene: SavedScene, points_world: Array) -> list[dict[str, Any]]:
-    """Label, number of landmarks, mean probability and box of each label of a surface."""
-    labels = read_labels(run)
-    names = np.array(labels.labels)
+    """Label, number of landmarks, mean probability and box of all that lies on each surface."""
+    columns = read_table(run / LABELS, ("label", "probability"), "run again")
+    names = np.array(columns.get("surface", columns["label"]))
+    sure = np.array(columns.get("surface_probability", columns["probability"]), float)
     found = []
     for name in sorted(set(names.tolist()) & set(SURFACES)):
         own = names == name
         box = _within(points_world[own], scene.up_world)
         if own.sum() >= _FEW and box is not None:
-            probability = round(float(labels.probability[own].mean()), 4)
+            probability = round(float(sure[own].mean()), 4)
             row = {"label": name, "landmarks": int(own.sum()), "probability": probability}
             found.append({**row, "box": _box(box)})
     return found

@@ -184,6 +184,12 @@ def test_the_scene_graph_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert max(content["room"]["box"]["size"]) == pytest.approx(11, abs=1)
     surface = content["surfaces"][0]
     assert (surface["label"], surface["landmarks"], surface["probability"]) == ("desk", 20, 0.75)
+    rows = [f"{k},unknown,0.9,0.5,3,{'wall' if k < 15 else 'unknown'},0.5" for k in range(60)]
+    head = "id,label,probability,entropy,views,surface,surface_probability"
+    (run / "labels.csv").write_text("\n".join([head, *rows]) + "\n")
+    assert main(["export", str(run), "--format", "scene-graph", "--out", str(out)]) == 0
+    surfaces = json.loads(out.read_text())["surfaces"]
+    assert [(s["label"], s["landmarks"], s["probability"]) for s in surfaces] == [("wall", 15, 0.5)]
     cloud = tmp_path.parent / "objects.ply"
     assert main(["export", str(run), "--format", "objects-ply", "--out", str(cloud)]) == 0
     found = read_ply(cloud)
