@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from bmask_slam.graph.arrays import Array, Mask
@@ -66,6 +68,22 @@ def supported(points: Array, neighbours: int, reach_m: float) -> Mask:
     farthest_m = KDTree(points).query(points, neighbours + 1)[0][:, -1]
     near = np.asarray(farthest_m <= max(reach_m, 3 * float(np.median(farthest_m))))
     return near if near.any() else np.ones(len(points), bool)
+
+
+def main_part(points: Array, cell_m: float, share: float) -> Mask:
+    """Which of the points (N, 3) hang together with most, over cells of ``cell_m`` that touch.
+
+    Parts with at least the ``share`` of the largest one's points are kept too. A mask with holes,
+    such as a chair's, shows in some views what is behind, and that hangs apart.
+    """
+    cells = np.floor((points - points.min(axis=0)) / cell_m).astype(np.int64)
+    occupied, where = np.unique(cells, axis=0, return_inverse=True)
+    pairs = KDTree(occupied).query_pairs(1.8, output_type="ndarray")  # also over corners
+    count = len(occupied)
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    parts = connected_components(graph, directed=False)[1][where.ravel()]
+    sizes = np.bincount(parts)
+    return np.asarray(sizes[parts] >= share * sizes.max())
 
 
 def box_around(points_world: Array, up_world: Array) -> OrientedBox:

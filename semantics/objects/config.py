@@ -13,13 +13,16 @@ from bmask_slam.semantics.objects.revision import RevisionConfig
 class BoxConfig:
     """How a box is fitted.
 
-    To the points with ``neighbours`` others within ``support_m``; each side is moved in by one
-    sigma of the depth, but leaves at most the share ``trim`` of the points outside.
+    To the points with ``neighbours`` others within ``support_m`` that hang together over cells of
+    ``cell_m``, without parts of fewer points than the share ``part`` of the largest; each side is
+    moved in by one sigma of the depth, but leaves at most the share ``trim`` of the points outside.
     """
 
     neighbours: int = 2
     support_m: float = 0.03
     trim: float = 0.02
+    cell_m: float = 0.12
+    part: float = 0.35
 
 
 @dataclass(frozen=True)

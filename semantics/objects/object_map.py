@@ -158,10 +158,22 @@ class ObjectMap:
         of_object = shares(*pairs, in_view, (len(ids), len(found))).T
         overlap = Overlap(of_detection, of_object, in_view)
         unseen_s = np.maximum(view.timestamp_s - self.points.last_seen_s(ids), 0.0)
-        evidence = Evidence(detected, self.labels.appearance(ids), unseen_s)
+        evidence = Evidence(detected, self._known(ids), unseen_s)
         assigned = assign(overlap, evidence, config)
         rows = self.points.rows(view.poses)
         return _Association(ids, evidence.known, overlap, assigned, rows, all_owners, all_points)
+
+    def _known(self, ids: Ints) -> Array:
+        """The classes (O, C) that objects look like, to be told apart by.
+
+        With a measured model, given that they are of some class: that two things are both uncertain
+        does not make them alike.
+        """
+        p = self.labels.appearance(ids)
+        if self.labels.model is not None:
+            p[:, 0] = 0.0
+            p = p / p.sum(axis=1, keepdims=True)
+        return p
 
     def _inside(self, points: Array) -> tuple[Ints, Ints]:
         """Indices (M,) of camera-frame points (N, 3) in the image, and their pixels (M, 2)."""

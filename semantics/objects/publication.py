@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.semantics.beliefs.class_sizes import FLOOR, NEVER, SUPPORT, TOP, WALL, ClassSizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
-from bmask_slam.semantics.objects.boxes3d import OrientedBox, box_around, supported, without_noise
+from bmask_slam.semantics.objects.boxes3d import (
+    OrientedBox,
+    box_around,
+    main_part,
+    supported,
+    without_noise,
+)
 from bmask_slam.semantics.objects.config import BoxConfig, ObjectConfig, PublicationConfig
 from bmask_slam.semantics.objects.points import ObjectPoints
 
@@ -57,6 +63,7 @@ def fitted(
 ) -> tuple[Array, OrientedBox]:
     """The centroid (3,) of points (N, 3) and the box around them, without outliers and noise."""
     near = supported(points_world, config.neighbours, config.support_m)
+    near[near] = main_part(points_world[near], config.cell_m, config.part)
     points = points_world[near]
     inner = without_noise(points, noise_world[near], up_world, config.trim)
     return np.asarray(points.mean(axis=0)), box_around(inner, up_world)

@@ -14,6 +14,7 @@ from bmask_slam.semantics.objects.boxes3d import (
     box_around,
     box_iou,
     gravity_axes,
+    main_part,
     supported,
     without_noise,
 )
@@ -157,3 +158,16 @@ def test_normals_of_a_floor_point_up() -> None:
     found = upright.up_world({4: T_B_A})
     assert np.allclose(found, T_B_A[:3, :3] @ up_camera, atol=1e-4)
     assert np.allclose(upright.up_world({}), [0, -1, 0])
+
+
+def test_what_hangs_apart_is_no_part_of_a_thing() -> None:
+    rng = np.random.default_rng(4)
+    chair = rng.uniform([0, 0, 2.0], [0.5, 0.9, 2.1], (300, 3))
+    wall = rng.uniform([0.1, 0.2, 3.0], [0.4, 0.8, 3.02], (60, 3))
+    points = np.concatenate([chair, wall])
+    kept = main_part(points, 0.12, 0.35)
+    assert kept[:300].all()
+    assert not kept[300:].any()
+    halves = np.concatenate([chair, chair + np.array([1.5, 0, 0])])
+    assert main_part(halves, 0.12, 0.35).all()  # two large parts, such as a table behind a screen
+    assert main_part(points[:1], 0.12, 0.35).tolist() == [True]
