@@ -65,6 +65,17 @@ def office(rendered: Callable[[RenderConfig], Path]) -> Path:
     return rendered(RenderConfig("office", frames=15, width=160, height=120, true_depth=True))
 
 
+SLOW_OFFICE_FRAMES = 60
+
+
+@pytest.fixture(scope="session")
+def slow_office(rendered: Callable[[RenderConfig], Path]) -> Path:
+    """Seven and a half seconds of the office at 8 Hz, in images of half the width and height."""
+    from bmask_slam.rendering.sequence import RenderConfig
+
+    return rendered(RenderConfig("office", SLOW_OFFICE_FRAMES, fps=8.0, width=320, height=240))
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
     """A file system of 300 kB, too small for a run folder's map, or of another size."""

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from bmask_slam.graph.trajectory import read_tum
-from bmask_slam.rendering.sequence import RenderConfig
 
 FRAMES = 60
 COMMAND = [sys.executable, "-m", "bmask_slam"]
@@ -24,11 +23,6 @@ USUAL = (
 """Starts a command that SIGHUP ends, also where these tests themselves run under nohup."""
 
 
-@pytest.fixture(scope="module")
-def recording(rendered) -> Path:
-    return rendered(RenderConfig("office", FRAMES, fps=8.0, width=320, height=240))
-
-
 def frames_written(out: Path) -> int:
     path = out / "frames.csv"
     return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
@@ -36,11 +30,11 @@ def frames_written(out: Path) -> int:
 
 @pytest.mark.parametrize("words", [("run",), ("live", "--realtime")])
 def test_a_closed_terminal_ends_a_run_with_everything_saved(
-    recording: Path, tmp_path: Path, words: tuple[str, ...]
+    slow_office: Path, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
     """The kernel sends SIGHUP to all processes of the terminal, which can be written no more."""
     out = tmp_path / "run"
-    command = [*COMMAND, *words, str(recording), "--segmenter", "none", "--out", str(out)]
+    command = [*COMMAND, *words, str(slow_office), "--segmenter", "none", "--out", str(out)]
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
         ["setsid", "--ctty", sys.executable, "-c", USUAL, *command],
@@ -94,10 +88,10 @@ def test_a_signal_during_the_start_is_one_line(number: signal.Signals) -> None:
     assert process.returncode == 128 + number
 
 
-def test_nohup_stays_in_force(recording: Path, tmp_path: Path) -> None:
+def test_nohup_stays_in_force(slow_office: Path, tmp_path: Path) -> None:
     """A SIGHUP that is ignored when the program starts does not end it."""
     out, frames = tmp_path / "run", str(FRAMES // 2)
-    words = ["run", str(recording), "--max-frames", frames, "--segmenter", "none"]
+    words = ["run", str(slow_office), "--max-frames", frames, "--segmenter", "none"]
     command = [*COMMAND, *words, "--out", str(out)]
     process = subprocess.Popen(
         ["sh", "-c", "trap '' HUP; exec \"$@\"", "sh", *command], stderr=subprocess.DEVNULL

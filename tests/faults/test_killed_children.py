@@ -18,18 +18,12 @@ import pytest
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
-from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.sequences import open_sequence
 from bmask_slam.system_config import SystemConfig
 
 FRAMES = 60
 SEEDS = range(int(os.environ.get("BMASK_SLAM_FAULT_SEEDS", "2")))
 CONFIG = resolve(SystemConfig, None, ("semantics.segmenter.name=truth",))
-
-
-@pytest.fixture(scope="module")
-def recording(rendered) -> Path:
-    return rendered(RenderConfig("office", FRAMES, fps=8.0, width=320, height=240))
 
 
 def kills(seed: int) -> Iterator[tuple[int, str]]:
@@ -51,12 +45,12 @@ def children() -> set[int]:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_every_tracked_pose_is_saved(recording: Path, tmp_path: Path, seed: int) -> None:
+def test_every_tracked_pose_is_saved(slow_office: Path, tmp_path: Path, seed: int) -> None:
     plan, before, memory = sorted(kills(seed)), children(), set(os.listdir("/dev/shm"))
-    sequence, tracked = open_sequence(recording), []
+    sequence, tracked = open_sequence(slow_office), []
     options = LiveOptions(
         tmp_path / "run",
-        images=recording,
+        images=slow_office,
         dense=has_dense(seed),
         calibrate="report",
         interpolates=True,

@@ -17,14 +17,9 @@ from bmask_slam.cli import main
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.start import LiveOptions
-from bmask_slam.rendering.sequence import RenderConfig
 
-FRAMES = 24
-
-
-@pytest.fixture(scope="module")
-def recording(rendered) -> Path:
-    return rendered(RenderConfig("office", FRAMES, fps=8.0, width=320, height=240))
+FRAMES, ALL_FRAMES = 24, 60
+SHORT = ("--max-frames", str(FRAMES))
 
 
 def start(recording: Path, out: Path, *options: str) -> subprocess.Popen[str]:
@@ -46,8 +41,8 @@ def frames_written(out: Path) -> int:
     return len(path.read_text().splitlines()) - 1 if path.is_file() else 0
 
 
-def test_masks_from_another_process_label_the_map(recording, tmp_path) -> None:
-    live = start(recording, tmp_path / "run", "--segmenter", "truth")
+def test_masks_from_another_process_label_the_map(slow_office, tmp_path) -> None:
+    live = start(slow_office, tmp_path / "run", "--segmenter", "truth", *SHORT)
     output, errors = live.communicate(timeout=300)
     assert live.returncode == 0, errors
     assert "latency_ms_median" in output
@@ -60,15 +55,15 @@ def test_masks_from_another_process_label_the_map(recording, tmp_path) -> None:
 
 
 def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
-    recording, tmp_path, capsys
+    slow_office, tmp_path, capsys
 ) -> None:
     """After a dropped frame, keyframe numbers differ from image numbers."""
     out, offline = tmp_path / "live", tmp_path / "offline"
-    live = start(recording, out, "--realtime", "--map", "--segmenter", "none")
+    live = start(slow_office, out, "--realtime", "--map", "--segmenter", "none", *SHORT)
     output, errors = live.communicate(timeout=300)
     assert live.returncode == 0, errors
     assert "Dense map" in output
-    common = [str(recording), "--segmenter", "none", "--out", str(offline), "--quiet"]
+    common = [str(slow_office), "--segmenter", "none", "--out", str(offline), "--quiet", *SHORT]
     assert main(["run", *common]) == 0
     assert main(["map", str(offline), "--quiet"]) == 0
     clouds = [read_ply(path / "dense" / "cloud.ply") for path in (out, offline)]
@@ -87,9 +82,9 @@ def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_with_everything_saved(recording, tmp_path, number) -> None:
+def test_a_signal_ends_it_with_everything_saved(slow_office, tmp_path, number) -> None:
     out = tmp_path / "run"
-    live = start(recording, out, "--realtime", "--map", "--segmenter", "none")
+    live = start(slow_office, out, "--realtime", "--map", "--segmenter", "none")
     deadline_s = time.monotonic() + 300
     while frames_written(out) < 8 and time.monotonic() < deadline_s:
         time.sleep(0.05)
@@ -97,7 +92,7 @@ def test_a_signal_ends_it_with_everything_saved(recording, tmp_path, number) -> 
     _, errors = live.communicate(timeout=300)
     assert live.returncode == 128 + number, errors
     tracked = len(read_tum(out / "trajectory.txt"))
-    assert 8 <= tracked == frames_written(out) < FRAMES
+    assert 8 <= tracked == frames_written(out) < ALL_FRAMES
     assert {"map", "metrics.json", "landmarks.ply"} <= {path.name for path in out.iterdir()}
     assert read_ply(out / "dense" / "cloud.ply")["x"].size > 1000
 

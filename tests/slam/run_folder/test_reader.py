@@ -17,20 +17,17 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.offline import runner
 from bmask_slam.offline.options import RunOptions
-from bmask_slam.rendering.sequence import RenderConfig, render_sequence
 from bmask_slam.run_folder.covariance_file import COVARIANCES, read_covariances
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import read_labels
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def labelled(slow_office: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A short run with exact masks, covariances and a dense map."""
     folder = tmp_path_factory.mktemp("reader")
-    config = RenderConfig("office", frames=16, fps=8, width=320, height=240)
-    sequence = render_sequence(config, folder / "office")
     settings = {"covariances": True, "semantics.segmenter.min_score": 0.5}
-    found = run(sequence, folder / "run", segmenter="truth", settings=settings)
+    found = run(slow_office, folder / "run", segmenter="truth", settings=settings, max_frames=16)
     return map_run(found)
 
 
