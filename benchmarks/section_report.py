@@ -107,6 +107,10 @@ REPORTS = {
             "Labels and objects of real rooms, judged by eye",
             "semantics.real_rooms --out {sequences}/rooms",
         ),
+        "surfaces": (
+            "Surfaces of real rooms, judged by eye",
+            "semantics.room_surfaces {sequences}/rooms/redkitchen {sequences}/rooms/bonn_crowd",
+        ),
         "store": ("Time of the label store", "semantics.label_store"),
         "dynamic": (
             "People who walk, a carried box and a pulled chair",

@@ -160,10 +160,12 @@ class FloorPlan:
     def _close_walls(self, grid: NDArray[np.int16]) -> None:
         """Fill gaps of up to GAP_M in the walls, which run along the axes, of cells (H, W)."""
         wall = self._names.index(WALL)
-        mask, length = (grid == wall).astype(np.uint8), round(GAP_M / self.frame.cell_m) + 1
+        length = round(GAP_M / self.frame.cell_m) + 1
+        mask = np.pad((grid == wall).astype(np.uint8), length)  # nothing is beyond the border
+        inside = (slice(length, -length),) * 2
         for size in ((1, length), (length, 1)):
-            closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones(size, np.uint8)) > 0
-            grid[closed & (grid < 0)] = wall
+            closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones(size, np.uint8))
+            grid[(closed[inside] > 0) & (grid < 0)] = wall
 
     def picture(self, path_world: Array) -> Image:
         """The plan (H, W, 3), red first, with scale bar, legend and the camera's path (N, 3)."""

@@ -27,8 +27,8 @@ HEIGHTS_M = {
     "pillow": (0.2, 1.3),
 }
 """Heights of the surfaces of classes; of others any in the room."""
-STRAY = 0.15
-"""Share of a class's surface that is anywhere in the room, be it by errors of map or label."""
+STRAY = 0.02
+"""Likelihood of a class far from its heights, where it is 1: errors of the map, odd furniture."""
 SOFT_M = 0.08
 UP, UPRIGHT, DOWN, SLANTED = range(4)
 _FLAT = (0.9, 0.03, 0.02, 0.05)
@@ -84,20 +84,19 @@ def find_ground(floor_world: Array, cameras_world: Array, up_world: Array) -> Gr
 def log_likelihoods(
     names: LabelSet | tuple[str, ...], heights_m: Array, cosines: Array | None = None
 ) -> Array:
-    """log p (N, C) of heights (N,) above the floor, and of slopes, for the C classes.
+    """log likelihoods (N, C), at most 0, of heights (N,) above the floor and of slopes.
 
-    A height is uniform over the class's range, with soft ends, and for a share STRAY over the room.
-    ``cosines`` (N,) are those of the angles between normals and up. ``names`` are those of the
-    classes; of a label set, those after the background.
+    They rule out: within a class's heights, which end softly, they are 0, so that colour decides
+    among the classes that are possible. ``cosines`` (N,) are those of the angles between normals
+    and up. ``names`` are those of the classes; of a label set, those after the background.
     """
     classes = names.names[1:] if isinstance(names, LabelSet) else names
     low, high = np.array([HEIGHTS_M.get(name, ROOM_M) for name in classes]).T
     beyond_m = np.maximum(np.maximum(low - heights_m[:, None], heights_m[:, None] - high), 0)
-    inside = np.exp(-0.5 * (beyond_m / SOFT_M) ** 2) / (high - low + np.sqrt(2 * np.pi) * SOFT_M)
-    found = np.log((1 - STRAY) * inside + STRAY / (ROOM_M[1] - ROOM_M[0]))
+    found = np.log(STRAY + (1 - STRAY) * np.exp(-0.5 * (beyond_m / SOFT_M) ** 2))
     if cosines is not None:
-        shares = np.log(np.array([SLOPES.get(name, _ANY_SLOPE) for name in classes]))
-        found += shares.T[slope(cosines)]
+        shares = np.array([SLOPES.get(name, _ANY_SLOPE) for name in classes])
+        found += np.log(np.minimum(shares / _ANY_SLOPE, 1)).T[slope(cosines)]
     return found
 
 

@@ -10,8 +10,9 @@ from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.files.array_file import check_ids
 from bmask_slam.semantics.labels import LabelSet, label_set
 
-CORRELATION = 0.35
-"""Of the errors of one network in two views of the same place."""
+CORRELATION = 0.6
+"""Of the errors of one network in two views of a place. With 0.5 to 0.75 the landmarks of a real
+room are calibrated to 0.06 to 0.08 (benchmarks/semantics/room_surfaces.py), with less too sure."""
 FLOOR = 1e-3
 """Least probability of a class in one view."""
 MIN_PROBABILITY = 0.4

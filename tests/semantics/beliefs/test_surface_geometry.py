@@ -56,9 +56,9 @@ def test_a_table_top_that_looks_like_floor_is_a_table() -> None:
     found = with_evidence(p, log_likelihoods(NAMES, np.array([0.0, 0.75, 2.0])))
     assert found.sum(axis=1) == pytest.approx(1.0)
     assert found[0].argmax() == FLOOR
-    assert found[0, FLOOR] > 0.85
+    assert found[0, FLOOR] > 2.5 * found[0, TABLE]
     assert found[1].argmax() == TABLE
-    assert found[2, FLOOR] < 0.4  # neither: not sure
+    assert found[2, FLOOR] < 0.2  # neither: not sure
 
 
 def test_slopes_have_the_sign_of_up() -> None:
@@ -68,4 +68,4 @@ def test_slopes_have_the_sign_of_up() -> None:
     found = with_evidence(p, log_likelihoods(NAMES, np.array([0.0, 1.5, 2.4, 1.5]), cosines))
     assert found[0].argmax() == FLOOR
     assert found[1, WALL] > 2 * found[1, CEILING]
-    assert found[2].argmax() == CEILING
+    assert found[2, CEILING] > 1.5 * found[2, WALL]
