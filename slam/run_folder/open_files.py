@@ -140,9 +140,10 @@ class OpenFiles:
         return self._directory is None or os.path.samestat(found, os.fstat(self._directory))
 
     def _removed(self) -> list[str]:
-        """Names of the open files that were removed."""
-        names = [name for name, table in self.tables.items() if table.is_removed]
-        return [*names, LOG] if self.log.is_removed else names
+        """Names of the open files that were removed, and in whose place there is no other one."""
+        files: dict[str, GrowingTable | LogFile] = {**self.tables, LOG: self.log}
+        removed = (name for name, file in files.items() if file.is_removed)
+        return [name for name in removed if not os.path.lexists(self.path / name)]
 
     def _made_again(self) -> Path:
         """A new folder in the place of one that was removed, or beside what is there now."""

@@ -62,6 +62,15 @@ def test_frames_are_on_disk_at_once(tmp_path: Path) -> None:
         assert dict(zip(header.split(","), row.split(","), strict=True))["tracking_ms"] == "1.500"
 
 
+def test_a_file_that_is_replaced_is_left_as_it_is(tmp_path: Path) -> None:
+    """As by an adjusted run, which copies the frames of another one."""
+    with RunFolder(tmp_path) as folder:
+        (tmp_path / "new").write_text("replaced")
+        (tmp_path / "new").rename(folder.path / "frames.csv")
+        assert folder.path == tmp_path
+    assert (tmp_path / "frames.csv").read_text() == "replaced"
+
+
 def test_an_unknown_stage_is_a_bug(tmp_path: Path) -> None:
     result = FrameResult(3, 0.1, TrackingStatus.OK, None, stage_ms={"tea": 1.5})
     with RunFolder(tmp_path) as folder, pytest.raises(ValueError, match="tea_ms"):
