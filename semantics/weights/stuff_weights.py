@@ -15,7 +15,8 @@ from bmask_slam.semantics.network.yolox.stuff import StuffHead
 from bmask_slam.semantics.weights.checkpoints import check_state, read_state
 
 KIND = "stuff head for yolox_nano"
-"""In the file's metadata, with the classes one a line."""
+"""The first line of the file's metadata, which is one text, so that the same weights give the same
+bytes; the classes follow, one a line."""
 SHIPPED = ("weights", "stuff.safetensors")
 """The weights that come with the project, in its data folder."""
 
@@ -35,9 +36,10 @@ def load_stuff(path: Path) -> StuffNetwork:
         InputError: an unreadable file, or weights of another network.
     """
     state, about = read_state(path)
-    if about.get("network") != KIND or not about.get("classes"):
+    kind, *classes = about.get("network", "").split("\n")
+    if kind != KIND or not classes:
         raise InputError(f"{path}: not weights of the head for stuff; give a file that it was in")
-    labels = label_set(about["classes"].split("\n"))
+    labels = label_set(classes)
     with torch.device("meta"):
         head = StuffHead(len(labels) - 1)
     check_state(path, state, head, "the head for stuff")
@@ -49,6 +51,6 @@ def load_stuff(path: Path) -> StuffNetwork:
 def save_stuff(network: StuffNetwork, path: Path) -> None:
     """Write the weights in half precision."""
     state = {k: v.detach().half().contiguous() for k, v in network.head.state_dict().items()}
-    about = {"network": KIND, "classes": "\n".join(network.labels.names[1:])}
+    about = {"network": "\n".join((KIND, *network.labels.names[1:]))}
     with whole_file(path) as temporary:
         save_file(state, temporary, about)

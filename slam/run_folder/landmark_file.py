@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.ply import POINTS, check_columns, read_ply, write_ply
+from bmask_slam.graph.files.reading import read_table
 from bmask_slam.labelling.results import LandmarkCloud
 
 LANDMARKS = "landmarks.ply"
@@ -48,6 +49,9 @@ class Landmarks:
             had no segmenter.
         probabilities: (N,) of the label, or None.
         entropies: (N,) of the distribution over all labels in nats, or None.
+        surfaces: (N,) names of what the landmarks lie on (wall, floor, ...), or "unknown"; None if
+            the segmenter found instances alone.
+        surface_probabilities: (N,) of it, or None.
     """
 
     ids: Ints
@@ -57,6 +61,8 @@ class Landmarks:
     labels: NDArray[np.str_] | None = None
     probabilities: Array | None = None
     entropies: Array | None = None
+    surfaces: NDArray[np.str_] | None = None
+    surface_probabilities: Array | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -64,6 +70,8 @@ class Landmarks:
 
 def read_landmarks(path: Path, names: tuple[str, ...] | None) -> Landmarks:
     """Read what `write_landmarks` wrote; ``names`` are those of the labels, None without any.
+
+    The names of surfaces are those in labels.csv beside it.
 
     Raises:
         InputError: no such file, a column that is missing, or a label without a name.
@@ -79,7 +87,16 @@ def read_landmarks(path: Path, names: tuple[str, ...] | None) -> Landmarks:
         return found
     labels = _named(columns["label"], names, path)
     probabilities, entropies = (columns[n].astype(float) for n in ("probability", "entropy"))
-    return replace(found, labels=labels, probabilities=probabilities, entropies=entropies)
+    found = replace(found, labels=labels, probabilities=probabilities, entropies=entropies)
+    if "surface" not in columns:
+        return found
+    cure, table = "run again", path.with_name("labels.csv")
+    surfaces = np.array(read_table(table, ("surface",), cure)["surface"], np.str_)
+    if len(surfaces) != len(found):
+        raise InputError(f"{table}: {len(surfaces)} lines, but {len(found)} landmarks; {cure}")
+    check_columns(columns, ("surface_probability",), path)
+    sure = columns["surface_probability"].astype(float)
+    return replace(found, surfaces=surfaces, surface_probabilities=sure)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from repository import SHARED
 
+from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.labels import label_set
@@ -23,6 +24,7 @@ from bmask_slam.semantics.weights.light_weights import (
     new_light,
     save_light,
 )
+from bmask_slam.semantics.weights.stuff_weights import SHIPPED, load_stuff, save_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 
 PHOTOGRAPHS = SHARED / "coco_excerpt" / "images"
@@ -116,3 +118,31 @@ def test_other_files_are_not_of_this_network(tmp_path: Path, network: LightNetwo
     save_light(other, tmp_path / "other.safetensors")
     with pytest.raises(InputError, match="not the weights of the light network"):
         load_light(tmp_path / "other.safetensors")
+
+
+def test_the_classes_of_pixels_lie_where_the_pixels_are(
+    network: LightNetwork, photograph: np.ndarray, tmp_path: Path
+) -> None:
+    """A part of the image, at twice the size, has the classes of the whole at the same places."""
+    stuff = load_stuff(data_path(*SHIPPED))
+    assert len(stuff.labels) == 40
+    segmenter = LightSegmenter(network, stuff=stuff)
+    height, width = photograph.shape[:2]
+    seen = segmenter.segment(photograph, "a.jpg").surfaces
+    large = photograph.repeat(2, axis=0).repeat(2, axis=1)
+    twice = segmenter.segment(large, "a.jpg").surfaces
+    assert seen is not None
+    assert twice is not None
+    assert seen.size == (height, width)
+    assert twice.cell_px == 2 * seen.cell_px
+    grid = np.stack(np.meshgrid(np.arange(0, width, 9), np.arange(0, height, 9)), -1).reshape(-1, 2)
+    once, again = seen.at(grid.astype(float)), twice.at(2 * grid + 0.5)
+    beside = twice.at(2 * grid + 0.5 + 2 * seen.cell_px)
+    np.testing.assert_allclose(once.sum(axis=1), 1, atol=0.01)
+    assert np.abs(once - again).max(axis=1).mean() < 0.5 * np.abs(once - beside).max(axis=1).mean()
+    assert LightSegmenter(network).segment(photograph, "a.jpg").surfaces is None
+    save_stuff(stuff, tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == data_path(*SHIPPED).read_bytes()
+    save_light(network, tmp_path / "light.safetensors")
+    with pytest.raises(InputError, match="not weights of the head for stuff"):
+        load_stuff(tmp_path / "light.safetensors")

@@ -15,6 +15,7 @@ from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.instances import Instance, as_annotation, certain, mask_box
 from bmask_slam.semantics.instances.overlay import draw
+from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses, surfaces_of
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.network.box_head import ClassifiedBoxes
 from bmask_slam.semantics.network.config import DetectionConfig, ImageConfig, NetworkConfig
@@ -106,6 +107,25 @@ def test_cached_masks_are_read_back(tmp_path: Path, images: list) -> None:
         again.segment(image, "rgb/9.png")
     with pytest.raises(InputError, match="60x40 pixels there, but 30x40 here"):
         again.segment(image[:, :30], "rgb/1.25.png")
+
+
+def test_cached_classes_of_pixels_are_read_back(tmp_path: Path, images: list) -> None:
+    """A folder of masks has them if the segmenter told them."""
+
+    class Painter(Drawer):
+        def segment(self, image: Image, name: str) -> list[Instance]:
+            p = np.broadcast_to(np.array([0.7, 0.3], np.float16), (4, 6, 2))
+            seen = SurfaceClasses(label_set(("wall", "floor")), p, 10.0, (40, 60))
+            return Segmented(super().segment(image, name), seen)
+
+    out, image = tmp_path / "masks", np.zeros((40, 60, 3), np.uint8)
+    cache_masks(Painter(), images, CacheOptions(out, {"name": "x"}), quiet)
+    found = CocoSegmenter(out / ANNOTATIONS).segment(image, "rgb/1.25.png")
+    assert len(found) == 2
+    seen = surfaces_of(found)
+    assert seen is not None
+    assert seen.labels.names == ("background", "wall", "floor")
+    assert seen.at(np.array([[30.0, 20.0]])) == pytest.approx(np.array([[0.7, 0.3]]), abs=0.01)
 
 
 def test_cached_images_are_not_segmented_again(tmp_path: Path, images: list) -> None:

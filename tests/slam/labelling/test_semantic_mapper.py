@@ -12,10 +12,11 @@ from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
-from bmask_slam.run_folder.landmark_file import write_landmarks
+from bmask_slam.run_folder.landmark_file import read_landmarks, write_landmarks
 from bmask_slam.run_folder.semantic_files import read_labels, write_labels
 from bmask_slam.semantics.beliefs.label_store import LabelEstimates
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
+from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses
 from bmask_slam.semantics.labels import LabelSet, label_set
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system import SlamSystem
@@ -62,7 +63,9 @@ class Sides:
         x_world = T_first_camera[0, 3] + rays[..., 0] / rays[..., 2] * 2.0
         left = x_world < EDGE_M
         sides = ((1, left), (2, ~left))
-        return [Instance(m, mask_box(m), k, certain(k, 3, 0.9), 0.9, 0.8) for k, m in sides]
+        found = [Instance(m, mask_box(m), k, certain(k, 3, 0.9), 0.9, 0.8) for k, m in sides]
+        p = np.where(left[4::8, 4::8, None], [0.8, 0.2], [0.1, 0.9]).astype(np.float16)
+        return Segmented(found, SurfaceClasses(label_set(("wall", "door")), p, 8.0, left.shape))
 
 
 FRAMES = frames(10)
@@ -272,8 +275,27 @@ def test_files(at_once: SlamSystem, tmp_path: Path) -> None:
     assert [names[k] for k in points["label"]] == list(table.labels)
     assert np.allclose(table.probability, points["probability"], atol=1e-5)
     assert np.allclose(table.entropy, points["entropy"], atol=1e-5)
+    landmarks = read_landmarks(tmp_path / "landmarks.ply", names)
+    assert landmarks.surfaces is not None
+    assert cloud.labels is not None
+    assert cloud.labels.surfaces is not None
+    expected = cloud.labels.surfaces.names
+    given = [expected.map_name(k) for k in cloud.labels.surfaces.labels.tolist()]
+    assert landmarks.surfaces.tolist() == given
     at_once.files()["objects.png"](tmp_path / "objects.png")
     assert (tmp_path / "objects.png").stat().st_size > 10_000
     (tmp_path / "labels.csv").write_text("id,label\n")
     with pytest.raises(InputError, match="no column"):
         read_labels(tmp_path)
+
+
+def test_landmarks_lie_on_the_surfaces_that_the_pixels_show(at_once: SlamSystem) -> None:
+    cloud = at_once.landmarks()
+    assert cloud.labels is not None
+    found = cloud.labels.surfaces
+    assert found is not None
+    sure = np.abs(cloud.points_world[:, 0] - EDGE_M) > 0.05
+    left = cloud.points_world[sure, 0] < EDGE_M
+    assert 20 < left.sum() < len(left) - 20
+    assert (found.labels[sure] == np.where(left, 1, 2)).mean() > 0.98
+    assert (found.probability[sure] > 0.75).mean() > 0.9
