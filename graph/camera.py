@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,11 +26,14 @@ class DepthNoise:
 
     Attributes:
         a_m, b, c_per_m: the coefficients in metres, without unit and in 1/m.
+        in_graph: factor of the standard deviation in the graph, whose factors count as independent.
+            The errors of a sensor's own calibration are alike in all keyframes that see a point.
     """
 
     a_m: float = 0.0
     b: float = 0.0
     c_per_m: float = 0.0
+    in_graph: float = 1.0
 
     @classmethod
     def of_disparity(cls, sigma_px: float, bf_px_m: float) -> DepthNoise:
@@ -39,7 +42,8 @@ class DepthNoise:
 
     def times(self, factor: float) -> DepthNoise:
         """All standard deviations multiplied by a factor."""
-        return DepthNoise(factor * self.a_m, factor * self.b, factor * self.c_per_m)
+        a_m, b, c_per_m = (factor * value for value in (self.a_m, self.b, self.c_per_m))
+        return replace(self, a_m=a_m, b=b, c_per_m=c_per_m)
 
     def depth_sigma_m(self, depth_m: NDArray[Any]) -> NDArray[Any]:
         """Standard deviation in metres of depths (...) in metres."""
@@ -104,6 +108,11 @@ class Camera:
             return self.depth_noise
         sigma_px = KINECT_DISPARITY_SIGMA_PX if disparity_sigma_px is None else disparity_sigma_px
         return DepthNoise.of_disparity(sigma_px, self.stereo_bf_px_m)
+
+    @property
+    def graph_depth_factor(self) -> float:
+        """Factor of the depth's standard deviation in the graph, see ``DepthNoise``."""
+        return 1.0 if self.depth_noise is None else self.depth_noise.in_graph
 
     @property
     def K(self) -> Array:

@@ -35,10 +35,14 @@ class FactorSelectionConfig:
 
 
 class FactorSelector:
-    """Turns changes of the map into updates of the graph and estimates back into the map."""
+    """Turns changes of the map into updates of the graph and estimates back into the map.
 
-    def __init__(self, config: FactorSelectionConfig):
+    ``depth_factor`` is the camera's ``graph_depth_factor``.
+    """
+
+    def __init__(self, config: FactorSelectionConfig, depth_factor: float = 1.0):
         self.config = config
+        self._depth_factor = depth_factor
         self._removed: list[Ints] = []
         self._removed_keyframes: list[int] = []
 
@@ -164,7 +168,7 @@ class FactorSelector:
             ids = keyframe.landmark_ids
             rows = np.flatnonzero(in_graph[ids] & (keyframe.sent_ids != ids))
             if len(rows):
-                parts.append(observations_of(keyframe, rows, ids[rows]))
+                parts.append(observations_of(keyframe, rows, ids[rows], self._depth_factor))
                 keyframe.sent_ids[rows] = ids[rows]
         return concatenate(parts)
 
@@ -177,14 +181,14 @@ def was_sent(world: WorldMap) -> Mask:
     return sent[:-1]
 
 
-def sent_observations(world: WorldMap) -> Observations:
+def sent_observations(world: WorldMap, depth_factor: float) -> Observations:
     """Every observation that was sent to the graph, as the keyframes' features have it now."""
     parts = []
     for keyframe in world.keyframes.values():
         rows = np.flatnonzero(
             (keyframe.sent_ids >= 0) & (keyframe.sent_ids == keyframe.landmark_ids)
         )
-        parts.append(observations_of(keyframe, rows, keyframe.sent_ids[rows]))
+        parts.append(observations_of(keyframe, rows, keyframe.sent_ids[rows], depth_factor))
     return concatenate(parts)
 
 
@@ -193,14 +197,16 @@ def segment_prior(keyframe: Keyframe) -> PosePrior:
     return PosePrior(keyframe.id, keyframe.T_world_camera, np.eye(6) * 1e-8)
 
 
-def observations_of(keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints) -> Observations:
+def observations_of(
+    keyframe: Keyframe, keypoints: Ints, landmark_ids: Ints, depth_factor: float = 1.0
+) -> Observations:
     """The graph's observations of some keypoints of a keyframe."""
     features = keyframe.features
     return Observations(
         keyframe_ids=np.full(len(keypoints), keyframe.id),
         landmark_ids=landmark_ids,
         measurements=stereo_measurements(features, keypoints),
-        sigmas_px=quantised(features.sigmas_px[keypoints]),
+        sigmas_px=quantised(features.sigmas_px[keypoints] * [1.0, 1.0, depth_factor]),
     )
 
 

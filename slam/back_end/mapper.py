@@ -76,7 +76,7 @@ class Mapper:
         self.update_ms: list[float] = []
         self._tracker = tracker
         self._mapping, self._graph_config = config.mapping, config.graph
-        self._factor_selector = FactorSelector(config.factor_selection)
+        self._factor_selector = FactorSelector(config.factor_selection, camera.graph_depth_factor)
 
     @property
     def places(self) -> DescriptorIndex:

@@ -43,7 +43,8 @@ def use_camera(mapper: Mapper, camera: Camera, motions: Mapping[int, KeyframeMot
     for number in sorted(motions.keys() & keyframes.keys()):
         reinterpret(keyframes[number], motions[number], mapper.camera, camera)
     mapper.camera = camera
-    estimate = mapper.smoother.remeasure(camera, sent_observations(mapper.world))
+    observations = sent_observations(mapper.world, camera.graph_depth_factor)
+    estimate = mapper.smoother.remeasure(camera, observations)
     for note in estimate.notes():
         logger.info("graph: %s", note)
     read_back(mapper.world, estimate)

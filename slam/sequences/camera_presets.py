@@ -45,7 +45,7 @@ def _pinhole(width: int, height: int, focal_px: float, depth_scale: float = 1000
     return Camera(width, height, focal_px, focal_px, *centre, depth_scale=depth_scale)
 
 
-KINECT = DepthNoise.of_disparity(KINECT_DISPARITY_SIGMA_PX, 40.0)
+KINECT = replace(DepthNoise.of_disparity(KINECT_DISPARITY_SIGMA_PX, 40.0), in_graph=2.0)
 """2.0 mm z^2, not what laboratories find on a still wall (Khoshelham and Elberink 2012: 1.4 mm z^2;
 Nguyen, Izadi, Lovell 2012: 1.2 mm + 1.9 mm (z - 0.4)^2): the depths of one point from two keyframes
 differ by 0.9 to 1.4 times this on real recordings, and smaller values lose tracked frames."""

@@ -58,6 +58,7 @@ LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0, "rolling_shutter": 1.0}
 """Largest magnitudes in metres and seconds: a larger value is in another unit."""
 NOISE_DISTANCES_M = np.linspace(0.3, 8.0, 78)
 MAX_NOISE_SHARE = 0.2
+MAX_GRAPH_FACTOR = 10.0
 NOISE_CURE = (
     "write [a, b, c] of its standard deviation a + b z + c z^2 in metres at z metres, such as "
     "[0.0012, 0, 0.0019]"
@@ -182,7 +183,8 @@ def format_camera(camera: Camera, comment: str = "") -> str:
     values |= {"distortion": list(camera.distortion)}
     values |= {key: getattr(camera, name) for key, name in OPTIONAL.items()}
     if camera.depth_noise is not None:
-        values["depth_noise"] = list(astuple(camera.depth_noise))
+        *sigma, in_graph = astuple(camera.depth_noise)
+        values["depth_noise"] = sigma if in_graph == 1 else [*sigma, in_graph]
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines.append(format_yaml(values).rstrip())
     return "\n".join(lines) + "\n"
@@ -227,8 +229,11 @@ def _distortion(path: Path, value: object) -> tuple[float, float, float, float, 
 
 
 def _depth_noise(path: Path, value: object) -> DepthNoise:
-    """The coefficients [a, b, c] of a standard deviation that a depth sensor can have."""
-    if not isinstance(value, list) or len(value) != 3:
+    """The coefficients [a, b, c] of a standard deviation that a depth sensor can have.
+
+    And, where there is a fourth, its factor in the graph.
+    """
+    if not isinstance(value, list) or len(value) not in (3, 4):
         raise InputError(f"{path}: depth_noise is {value!r}; {NOISE_CURE}")
     noise = DepthNoise(*(_number(path, "depth_noise", v) for v in value))
     sigmas_m = noise.depth_sigma_m(NOISE_DISTANCES_M)
@@ -242,4 +247,9 @@ def _depth_noise(path: Path, value: object) -> DepthNoise:
                 f"{path}: depth_noise is {value}, {sigmas_m[at]:.3g} m at "
                 f"{NOISE_DISTANCES_M[at]:.1f} m; {said}; {NOISE_CURE}"
             )
+    if not 1 <= noise.in_graph <= MAX_GRAPH_FACTOR:
+        raise InputError(
+            f"{path}: depth_noise is {value}; its factor in the graph, {noise.in_graph:g}, must be "
+            f"from 1 to {MAX_GRAPH_FACTOR:g}"
+        )
     return noise

@@ -15,6 +15,7 @@ from bmask_slam.back_end.factor_selection import (
     stereo_measurements,
 )
 from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.camera import DepthNoise
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
 from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.geometry import inverse, se3_exp, se3_log, transform
@@ -97,6 +98,16 @@ def test_observations_belong_to_their_keypoints() -> None:
     assert observations.landmark_ids.tolist() == [9, 4]
     expected = CAMERA.project_stereo(transform(inverse(pose_of(1)), points[[9, 4]]))
     np.testing.assert_allclose(observations.measurements, expected, atol=1e-9)
+
+
+def test_only_the_depth_counts_less_by_the_cameras_factor() -> None:
+    world, _ = make_world(2)
+    rows = np.array([9, 4])
+    plain = observations_of(world.keyframes[1], rows, rows)
+    factor = replace(CAMERA, depth_noise=DepthNoise(c_per_m=0.002, in_graph=2.0)).graph_depth_factor
+    less = observations_of(world.keyframes[1], rows, rows, factor)
+    np.testing.assert_allclose(less.sigmas_px, plain.sigmas_px * [1, 1, 2])
+    assert CAMERA.graph_depth_factor == 1
 
 
 def test_a_landmark_is_added_at_its_second_observation_with_all() -> None:

@@ -82,6 +82,10 @@ def test_the_example_in_the_messages_is_valid(tmp_path):
         ({"depth_noise": "[0, 0, 2]"}, "more than a fifth of the depth; write .* in metres"),
         ({"depth_noise": "[0, 0, 0]"}, r"0 m at 0.3 m; it must be positive; write \[a, b, c\]"),
         ({"depth_noise": "[0.001, -0.001, 0.0001]"}, "positive"),
+        (
+            {"depth_noise": "[0, 0, 0.002, 0.5]"},
+            "factor in the graph, 0.5, must be from 1",
+        ),
         ({"depth_noise": "0.002"}, r"depth_noise is 0.002; write \[a, b, c\]"),
         ({"depth_noise": "[0.1, x, 0]"}, "depth_noise is 'x'"),
         ({"focal": "500"}, "unknown key 'focal'; the keys are width"),
@@ -211,7 +215,8 @@ def test_a_camera_is_read_as_it_was_written(tmp_path):
     camera = Camera(
         640, 480, 527.5, 528.5, 321.5, 237.5, depth_noise=DepthNoise(0.001, -1e-4, 2e-3)
     )
-    for written in (camera, replace(camera, depth_noise=None)):
+    in_graph = replace(camera, depth_noise=DepthNoise(c_per_m=0.002, in_graph=2.0))
+    for written in (camera, in_graph, replace(camera, depth_noise=None)):
         write_file(tmp_path / "camera.yaml", written)
         assert read_camera(tmp_path / "camera.yaml") == written
 
