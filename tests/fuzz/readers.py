@@ -75,6 +75,7 @@ from bmask_slam.semantics.instances.coco_files import read_coco
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
 from bmask_slam.semantics.labels import read_label_set
 from bmask_slam.semantics.weights.checkpoints import load_network, read_state
+from bmask_slam.semantics.weights.stuff_weights import load_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 from bmask_slam.sequences import open_sequence
 from bmask_slam.sequences.cameras import read_camera
@@ -677,6 +678,7 @@ def binary_readers(folder: Path) -> list[Reader]:
         Reader("ROS 2 metadata", "metadata.yaml", database, (recorded["metadata.yaml"],)),
         Reader("safetensors", "w.safetensors", read_state, weights(), safetensors_maker),
         Reader("network of weights", "w.safetensors", load_network, weights()[1:], network_maker),
+        Reader("head for stuff", "w.safetensors", load_stuff, weights(), safetensors_maker),
         Reader("PyTorch weights", "w.pth", read_state, pickled(folder)),
         Reader("ONNX weights", "w.onnx", load_onnx, (b"",), onnx_maker),
     ]
