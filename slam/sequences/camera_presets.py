@@ -102,9 +102,11 @@ FOLDERS = (
     (re.compile(r"(?<![a-z])(?:freiburg|fr)[12](?![0-9])"), "kinect-v1"),
     (re.compile(r"(?<![a-z])(?:freiburg|fr)3(?![0-9])"), "xtion"),
     (re.compile(r"(?<![a-z])bonn(?![a-z])"), "xtion"),
+    (re.compile(r"(?<![a-z])red_?kitchen(?![a-z])|7-?scenes(?![a-z])"), "kinect-v1"),
 )
 """Names of published recordings, and what took them: the TUM RGB-D benchmark (the third room by
-an Xtion, all others by a Kinect) and Bonn's dynamic dataset."""
+an Xtion, all others by a Kinect), Bonn's dynamic dataset, and 7-Scenes (a Kinect: Shotton et al.
+2013). Of the last one's rooms only one has a name that nobody else uses."""
 
 
 def is_preset(given: Path | None) -> bool:

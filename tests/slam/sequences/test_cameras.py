@@ -155,6 +155,8 @@ def test_no_camera(tmp_path, name):
         ("rgbd_bonn_crowd", 0.0310),
         ("bonn_moving", 0.0310),
         ("bonnet", 0.0),
+        ("redkitchen", 0.026),
+        ("7-Scenes-heads", 0.026),
         ("kitchen", 0.0),
     ],
 )
