@@ -12,12 +12,13 @@ from typing import Any
 import cv2
 from pydantic import BaseModel
 
+from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import target_below
 from bmask_slam.graph.files.json_file import STRICT, read_json
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.semantics.instances.image_files import read_colour
-from bmask_slam.semantics.instances.instances import as_annotation
+from bmask_slam.semantics.instances.instances import Instance, as_annotation
 from bmask_slam.semantics.instances.overlay import draw, draw_surfaces
 from bmask_slam.semantics.instances.surface_files import write_surfaces
 from bmask_slam.semantics.instances.surfaces import surfaces_of
@@ -94,13 +95,16 @@ def cache_masks(
             reused += 1
         else:
             try:
-                entries.append(_segmented(segmenter, name, path, options))
-                _write_json(cached, entries[-1])
+                image = read_colour(path)
+                instances = segmenter.segment(image, name)
             except InputError as error:
                 if k == 0:  # most likely all images are like that
                     raise
                 logger.warning("%s; left out", error)
                 broken += 1
+            else:
+                entries.append(_written(image, instances, name, segmenter.labels, options))
+                _write_json(cached, entries[-1])
         progress(k + 1, len(files))
     content = _as_coco(entries, segmenter.labels)
     _write_json(options.out / ANNOTATIONS, content)
@@ -125,18 +129,20 @@ def _check_settings(options: CacheOptions) -> None:
     _write_json(path, options.settings)
 
 
-def _segmented(
-    segmenter: Segmenter, name: str, path: Path, options: CacheOptions
+def _written(
+    image: Image, instances: list[Instance], name: str, labels: LabelSet, options: CacheOptions
 ) -> dict[str, Any]:
-    """The entry of one image; writes its overlay if asked."""
-    image = read_colour(path)
-    instances = segmenter.segment(image, name)
+    """The entry of one image; writes its overlay if asked.
+
+    Raises:
+        InputError: the folder holds classes of surfaces of another label set.
+    """
     seen = surfaces_of(instances)
     if seen is not None:
         write_surfaces(options.out, name, seen)
     if options.overlays:
         below = image if seen is None else draw_surfaces(image, seen)
-        picture = draw(below, instances, segmenter.labels)
+        picture = draw(below, instances, labels)
         target = target_below(options.out, f"overlays/{name}").with_suffix(".jpg")
         with whole_file(target) as temporary:
             cv2.imwrite(str(temporary), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -62,6 +63,25 @@ def test_files_keep_the_likeliest_class(tmp_path: Path) -> None:
     assert read_surfaces(tmp_path, "rgb/2.jpg", NAMES, (48, 64)) is None
     with pytest.raises(InputError, match="another shape"):
         read_surfaces(tmp_path, "rgb/1.5.jpg", NAMES, (64, 48))
+
+
+def test_more_cells_than_pixels_are_refused(tmp_path: Path) -> None:
+    """Of the image's shape, but a hundred times as large."""
+    path = tmp_path / "surfaces" / "a.png"
+    path.parent.mkdir()
+    cv2.imwrite(str(path), np.full((960, 1280), 300, np.uint16))
+    with pytest.raises(InputError, match=r"a\.png: more cells than"):
+        read_surfaces(tmp_path, "a.jpg", NAMES, (96, 128))
+    assert read_surfaces(tmp_path, "a.jpg", NAMES, (960, 1280)) is not None
+
+
+def test_a_folder_holds_classes_of_one_label_set(tmp_path: Path) -> None:
+    write_surfaces(tmp_path, "a.jpg", classes())
+    other = SurfaceClasses(label_set(("floor", "wall", "door")), classes().probabilities, 8.0,
+                           (48, 64))  # fmt: skip
+    with pytest.raises(InputError, match=r"classes\.txt: other classes .* another --out"):
+        write_surfaces(tmp_path, "b.jpg", other)
+    write_surfaces(tmp_path, "b.jpg", classes())
 
 
 def test_segmented_is_a_list_that_other_processes_get_whole() -> None:
