@@ -20,7 +20,9 @@ class SemanticsConfig:
     is lower, vote on labels only: they make no objects, and are no evidence of motion.
     """
 
-    segmenter: SegmenterOptions = field(default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER))
+    segmenter: SegmenterOptions = field(
+        default_factory=lambda: SegmenterOptions(DEFAULT_SEGMENTER, min_score=0.3)
+    )
     object_score: float = 0.5
     votes: VoteConfig = field(default_factory=VoteConfig)
     labels: LabelStoreConfig = field(default_factory=LabelStoreConfig)
