@@ -38,6 +38,8 @@ NEWER_ARRAYS = (
     "semantics.surfaces.",
 )
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
+OPTIONAL_ARRAYS = ("s.measured", "upright.points", "labels.scores", "labels.seen", "labels.judged")
+"""Ends of the names of arrays that older files lack, and whose readers do without."""
 
 
 class SlamSystem(SystemResults):
@@ -61,7 +63,7 @@ class SlamSystem(SystemResults):
         segmenter: Segmenter | None = None,
         back_end: MapBackend | None = None,
     ):
-        """A system with an empty map; the map is kept in this process unless a back end is given.
+        """An empty map, in this process unless a back end is given.
 
         Without a segmenter nothing is labelled, and moving things are found by depth alone.
         """
@@ -171,7 +173,8 @@ class SlamSystem(SystemResults):
         own = self.state()
         state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
         state = {name: a for name, a in own.items() if name.startswith(NEWER_ARRAYS)} | state
-        check_like(state, own, path)
+        present = {n: a for n, a in own.items() if n in state or not n.endswith(OPTIONAL_ARRAYS)}
+        check_like(state, present, path)
         with fitting(path):
             self.mapper.restore(part(state, "mapper"), path)
             self.camera_tracker.restore(part(state, "localiser"))

@@ -184,7 +184,7 @@ class LabelStore:
             "ids": ids,
             "log_p": self._log_p[ids].ravel(),
             "views": self._views[ids],
-            "misses": self._misses[ids],
+            "misses": self._misses[ids].ravel(),
             "scores": self._scores[ids],
             "seen": self._seen[ids],
             "judged": self._judged[ids],
@@ -198,9 +198,10 @@ class LabelStore:
         self._reserve(int(ids.max(initial=-1)) + 1)
         self._log_p[ids] = state["log_p"].reshape(len(ids), self.classes)
         self._views[ids] = state["views"]
-        misses = state["misses"].reshape(len(ids), -1)
-        fits = misses.shape[1] == self._misses.shape[1]
-        self._misses[ids] = misses if fits else misses.mean(axis=1, keepdims=True)
+        if len(ids):
+            misses = state["misses"].reshape(len(ids), -1)
+            fits = misses.shape[1] == self._misses.shape[1]
+            self._misses[ids] = misses if fits else misses.mean(axis=1, keepdims=True)
         self._scores[ids] = state.get("scores", np.zeros((len(ids), 2), np.float32))
         self._seen[ids] = state.get("seen", np.zeros(len(ids), np.uint64))
         self._judged[ids] = state.get("judged", np.zeros((len(ids), 2), np.float32))

@@ -223,7 +223,8 @@ def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSyste
     if source is None:
         return make_system(sequence.camera, options.config)
     state, camera = read_map(source)
-    if options.map and camera != sequence.camera:
+    cameras = {replace(c, depth_noise=None) for c in (camera, sequence.camera)}
+    if options.map and len(cameras) > 1:
         raise InputError(
             f"{source}: made with {camera}, but {sequence.folder} has {sequence.camera}; a map "
             "can only be continued with its own camera (--localise accepts any)"

@@ -27,7 +27,7 @@ from bmask_slam.semantics.instances.instances import Instance, PackedMask, certa
 from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.tracks.instance_track import Sighting
-from bmask_slam.system import SlamSystem
+from bmask_slam.system import OPTIONAL_ARRAYS, SlamSystem
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.world.landmark_table import PATCHES, LandmarkTable, Patches
 
@@ -199,6 +199,19 @@ def test_a_state_without_surfaces_is_restored(system: SlamSystem) -> None:
     labels = older.semantics.landmark_labels(np.array([0]), [])
     assert labels is not None
     assert labels.surfaces is None
+
+
+def test_a_state_without_objects_or_what_is_newer_is_restored(system: SlamSystem) -> None:
+    state = system.state()
+    none = SlamSystem(CAMERA, CONFIG, Halves()).state()
+    objects = {n: a for n, a in none.items() if n.startswith("semantics.objects.")}
+    assert restored({**state, **objects}).semantics.objects.state().keys()
+    older = {n: a for n, a in state.items() if not n.endswith(OPTIONAL_ARRAYS)}
+    assert len(older) == len(state) - 8
+    twin = restored(older)
+    for table in ("log_p", "views", "misses"):
+        name = f"semantics.labels.{table}"
+        np.testing.assert_array_equal(twin.state()[name], state[name])
 
 
 def test_every_attribute_is_restored(system: SlamSystem) -> None:

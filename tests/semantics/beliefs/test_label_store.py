@@ -189,6 +189,17 @@ def test_a_store_is_restored_from_its_state() -> None:
     assert np.array_equal(twin.probabilities(np.arange(6000)), store.probabilities(np.arange(6000)))
 
 
+def test_an_empty_store_and_one_of_an_older_version_are_restored() -> None:
+    twin = LabelStore(C)
+    twin.restore(LabelStore(C).state())
+    assert len(twin.known()) == 0
+    store = LabelStore(C)
+    store.update(np.array([2, 7]), *(v[:2] for v in views(3, np.random.default_rng(4))))
+    new = ("scores", "seen", "judged")
+    twin.restore({name: array for name, array in store.state().items() if name not in new})
+    assert np.array_equal(twin.probabilities(np.arange(9)), store.probabilities(np.arange(9)))
+
+
 def test_a_keyframe_takes_at_most_two_milliseconds() -> None:
     rng = np.random.default_rng(5)
     for classes in (24, 81):
