@@ -115,14 +115,12 @@ class RunFolder:
         try:
             self._files = OpenFiles(path, GROWING, "a" if self._keep else "x")
             self._tables, self._log = self._files.tables, self._files.log
-            with self._files.closed_on_error():
+            with self._files.undone_on_error():
                 self._tables[FRAMES].lock(path)
                 for name, table in self._tables.items():
                     table.begin(kept.get(name, 0))
                 remove_partial(path)
         except OSError as error:
-            if not self._keep:
-                _remove(path, (*GROWING, LOG))  # none was there
             _remove_empty(self._made)
             raise _unwritable(path, error) from error
         self._levels: dict[str, int] = {}

@@ -70,14 +70,19 @@ class OpenFiles:
         """Open tables with these columns and the log; ``mode`` "x": new, "a": to go on.
 
         Raises:
-            OSError: one of them cannot be written.
+            OSError: one of them cannot be written, or a new one is there already; none was made.
         """
         self.path = path
         self.texts: dict[str, str] = {}
-        self.tables = {name: GrowingTable(path / name, c, mode) for name, c in columns.items()}
-        self.log = LogFile(path / LOG, mode=f"{mode}+", encoding="utf-8")
-        self._directory = _descriptor(path)
-        self._is_open = True
+        self.tables: dict[str, GrowingTable] = {}
+        self._files: dict[str, GrowingTable | LogFile] = {}
+        self._directory: int | None = None
+        self._is_new, self._is_open = mode == "x", True
+        with self.undone_on_error():
+            for name, names in columns.items():
+                self._files[name] = self.tables[name] = GrowingTable(path / name, names, mode)
+            self._files[LOG] = self.log = LogFile(path / LOG, mode=f"{mode}+", encoding="utf-8")
+            self._directory = _descriptor(path)
 
     def follow(self) -> Path:
         """The folder's present path, after its tables, log and texts were written again if needed.
@@ -107,22 +112,26 @@ class OpenFiles:
             os.close(self._directory)
             self._directory = None
         error = None
-        for close in (self.log.close, *(table.close for table in self.tables.values())):
+        for file in reversed(self._files.values()):
             try:
-                close()
+                file.close()
             except OSError as unwritten:
                 error = error or unwritten
         if error is not None:
             raise error
 
     @contextmanager
-    def closed_on_error(self) -> Iterator[None]:
-        """Close all files if the block raises an error."""
+    def undone_on_error(self) -> Iterator[None]:
+        """Close all files if the block raises an error; new ones are removed, no one else's are."""
         try:
             yield
         except (OSError, InputError):
+            new = self._files.items() if self._is_new else ()
+            made = [self.path / name for name, file in new if not file.is_removed]
             with suppress(OSError):
                 self.close()
+            for path in made:
+                path.unlink(missing_ok=True)
             raise
 
     def write_missing_texts(self) -> None:
@@ -141,8 +150,7 @@ class OpenFiles:
 
     def _removed(self) -> list[str]:
         """Names of the open files that were removed, and in whose place there is no other one."""
-        files: dict[str, GrowingTable | LogFile] = {**self.tables, LOG: self.log}
-        removed = (name for name, file in files.items() if file.is_removed)
+        removed = (name for name, file in self._files.items() if file.is_removed)
         return [name for name in removed if not os.path.lexists(self.path / name)]
 
     def _made_again(self) -> Path:
@@ -156,7 +164,7 @@ class OpenFiles:
 
     def _restore(self) -> None:
         for name in self._removed():
-            (self.log if name == LOG else self.tables[name]).restore(self.path / name)
+            self._files[name].restore(self.path / name)
         self.write_missing_texts()
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.run_folder import folder as folder_module
 from bmask_slam.run_folder.folder import FILES, RunFolder
 from bmask_slam.run_folder.open_files import free_run_path
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
@@ -22,6 +23,18 @@ def test_a_folder_that_holds_a_run_is_refused_untouched(tmp_path: Path, name: st
         RunFolder(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text() == "earlier"
+
+
+@pytest.mark.parametrize("name", ["frames.csv", "events.csv", "log.txt"])
+def test_a_run_that_began_in_the_meantime_is_kept(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process makes its file after this one found the folder free."""
+    monkeypatch.setattr(folder_module, "_clear", lambda path, _: (path / name).write_text("theirs"))
+    with pytest.raises(InputError, match="File exists"):
+        RunFolder(tmp_path / "run")
+    assert [p.name for p in (tmp_path / "run").iterdir()] == [name]
+    assert (tmp_path / "run" / name).read_text() == "theirs"
 
 
 def test_overwrite_removes_only_the_run(tmp_path: Path) -> None:
