@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 
 ANNOTATIONS = "annotations.json"
 SETTINGS = "settings.json"
+SURFACES = "surfaces"
+"""The setting that masks of older versions lack; it means something for the light network alone."""
 
 
 class _Entry(BaseModel):
@@ -85,7 +87,7 @@ def cache_masks(
     Raises:
         InputError: the folder holds masks made with other settings, or no image can be read.
     """
-    _check_settings(options)
+    with_surfaces = _check_settings(options)
     entries: list[dict[str, Any]] = []
     reused = broken = 0
     for k, (name, path) in enumerate(files):
@@ -103,6 +105,7 @@ def cache_masks(
                 logger.warning("%s; left out", error)
                 broken += 1
             else:
+                instances = instances if with_surfaces else list(instances)
                 entries.append(_written(image, instances, name, segmenter.labels, options))
                 _write_json(cached, entries[-1])
         progress(k + 1, len(files))
@@ -112,21 +115,32 @@ def cache_masks(
     return CacheResult(options.out / ANNOTATIONS, len(entries), count, reused, broken)
 
 
-def _check_settings(options: CacheOptions) -> None:
+def _check_settings(options: CacheOptions) -> bool:
+    """Whether the folder may hold classes of surfaces: one of an older version has none.
+
+    Raises:
+        InputError: it holds something else, or masks made with other settings.
+    """
     path = options.out / SETTINGS
     if path.is_file():
         before = read_json(path, dict[str, str], "choose another --out or remove it")
-        different = [k for k, v in options.settings.items() if before.get(k) != v]
+        older = SURFACES in options.settings and SURFACES not in before
+        meant = options.settings.get("name") == "light"
+        skipped = SURFACES if older or not meant else None
+        different = [k for k, v in options.settings.items() if before.get(k) != v and k != skipped]
         if different:
             key = different[0]
             raise InputError(
                 f"{options.out}: holds masks made with {key} {before.get(key)}, now it is "
                 f"{options.settings[key]}; choose another --out or delete it"
             )
-        return
+        if older and meant:
+            logger.info("%s: masks of an older version, which have no surfaces", options.out)
+        return not older
     if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
         raise InputError(f"{options.out}: is no folder of masks; choose another --out")
     _write_json(path, options.settings)
+    return True
 
 
 def _written(

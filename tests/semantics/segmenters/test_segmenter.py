@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -109,15 +110,17 @@ def test_cached_masks_are_read_back(tmp_path: Path, images: list) -> None:
         again.segment(image[:, :30], "rgb/1.25.png")
 
 
+class Painter(Drawer):
+    """Tells classes of all pixels too."""
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        p = np.broadcast_to(np.array([0.7, 0.3], np.float16), (4, 6, 2))
+        seen = SurfaceClasses(label_set(("wall", "floor")), p, 10.0, (40, 60))
+        return Segmented(super().segment(image, name), seen)
+
+
 def test_cached_classes_of_pixels_are_read_back(tmp_path: Path, images: list) -> None:
     """A folder of masks has them if the segmenter told them."""
-
-    class Painter(Drawer):
-        def segment(self, image: Image, name: str) -> list[Instance]:
-            p = np.broadcast_to(np.array([0.7, 0.3], np.float16), (4, 6, 2))
-            seen = SurfaceClasses(label_set(("wall", "floor")), p, 10.0, (40, 60))
-            return Segmented(super().segment(image, name), seen)
-
     out, image = tmp_path / "masks", np.zeros((40, 60, 3), np.uint8)
     cache_masks(Painter(), images, CacheOptions(out, {"name": "x"}), quiet)
     found = CocoSegmenter(out / ANNOTATIONS).segment(image, "rgb/1.25.png")
@@ -126,6 +129,38 @@ def test_cached_classes_of_pixels_are_read_back(tmp_path: Path, images: list) ->
     assert seen is not None
     assert seen.labels.names == ("background", "wall", "floor")
     assert seen.at(np.array([[30.0, 20.0]])) == pytest.approx(np.array([[0.7, 0.3]]), abs=0.01)
+
+
+def test_masks_of_older_versions_stay_usable(
+    tmp_path: Path, images: list, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Their settings do not name surfaces, which mean something for the light network alone."""
+    options = CacheOptions(tmp_path / "light", {"name": "light"}, overlays=False)
+    cache_masks(Drawer(), images[:2], options, quiet)
+    now = replace(options, settings={"name": "light", "surfaces": "True"})
+    with caplog.at_level(logging.INFO):
+        assert cache_masks(Painter(), images, now, quiet).reused == 2
+    assert sum("no surfaces" in line for line in caplog.messages) == 1
+    assert not (options.out / "surfaces").exists()
+    fresh = replace(now, out=tmp_path / "fresh")
+    cache_masks(Painter(), images, fresh, quiet)
+    without = {"name": "light", "surfaces": "False"}
+    with pytest.raises(InputError, match="made with surfaces True, now it is False"):
+        cache_masks(Drawer(), images, replace(fresh, settings=without), quiet)
+    truth = replace(options, out=tmp_path / "truth", settings={"name": "truth"})
+    for settings in (truth.settings, {"name": "truth", "surfaces": "True"}):
+        cache_masks(Drawer(), images, replace(truth, settings=settings), quiet)
+    assert len(caplog.messages) == 1
+
+
+def test_a_folder_of_other_surface_classes_is_refused(tmp_path: Path, images: list) -> None:
+    options = CacheOptions(tmp_path / "masks", {"name": "x"}, overlays=False)
+    cache_masks(Drawer(), images[:1], options, quiet)
+    names = options.out / "surfaces" / "classes.txt"
+    names.parent.mkdir()
+    names.write_text("floor\nwall\n")
+    with pytest.raises(InputError, match=r"classes\.txt: other classes"):
+        cache_masks(Painter(), images, options, quiet)
 
 
 def test_cached_images_are_not_segmented_again(tmp_path: Path, images: list) -> None:
