@@ -6,10 +6,13 @@ import csv
 import os
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from io import TextIOWrapper
 from pathlib import Path
 from typing import IO, Any
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.whole_file import whole_file
 
 
 class GrowingTable:
@@ -22,11 +25,11 @@ class GrowingTable:
     def __init__(self, path: Path, columns: tuple[str, ...], mode: str) -> None:
         """Open a file, in mode "x" a new one, in mode "a" one that may be there; OSError if not."""
         self._columns, self._is_locked = columns, False
-        self._open(path, mode)
+        self._go_on(path.open(f"{mode}+", encoding="utf-8", newline=""))
 
-    def _open(self, path: Path, mode: str) -> None:
-        self.file = path.open(f"{mode}+", encoding="utf-8", newline="")
-        self._rows = csv.DictWriter(self.file, self._columns, lineterminator="\n")
+    def _go_on(self, file: IO[str]) -> None:
+        self.file = file
+        self._rows = csv.DictWriter(file, self._columns, lineterminator="\n")
 
     @property
     def is_removed(self) -> bool:
@@ -39,14 +42,13 @@ class GrowingTable:
         self._is_locked = True
 
     def restore(self, path: Path) -> None:
-        """Write all lines to a new file, and go on there. Raises OSError."""
+        """Write all lines to a new file, and go on there.
+
+        Raises:
+            OSError: it cannot be written whole; there is no new file, and the old one is kept open.
+        """
         old = self.file
-        text = contents(old)
-        self._open(path, "x")
-        self.file.write(text)
-        self.file.flush()
-        if self._is_locked:
-            self.lock(path.parent)
+        self._go_on(written_again(old, path, self._is_locked))
         old.close()
 
     def begin(self, size: int) -> None:
@@ -73,8 +75,30 @@ class GrowingTable:
         self.file.close()
 
 
-def contents(file: IO[str]) -> str:
-    """The whole text of an open UTF-8 file, also of one that was removed, with what is buffered."""
+def written_again(file: IO[str], path: Path, is_locked: bool = False) -> TextIOWrapper:
+    """A new file, open at its end, with all that an open UTF-8 file holds, also a removed one.
+
+    Raises:
+        OSError: it cannot be written whole; there is no new file then.
+        InputError: another process holds the lock.
+    """
+    with whole_file(path) as temporary:
+        new = temporary.open("w+", encoding="utf-8", newline="")
+        try:
+            new.write(_contents(file))
+            new.flush()
+            os.fsync(new.fileno())
+            if is_locked:
+                lock_file(new, path.parent)
+        except BaseException:
+            with suppress(OSError):
+                new.close()
+            raise
+    return new
+
+
+def _contents(file: IO[str]) -> str:
+    """The whole text of an open UTF-8 file, with what is buffered."""
     file.flush()
     size = os.fstat(file.fileno()).st_size
     return os.pread(file.fileno(), size, 0).decode(errors="replace")

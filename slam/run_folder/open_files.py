@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.growing_table import GrowingTable, contents
+from bmask_slam.graph.files.growing_table import GrowingTable, written_again
 from bmask_slam.graph.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
@@ -43,15 +43,12 @@ class LogFile(logging.FileHandler):
         return self.stream is not None and os.fstat(self.stream.fileno()).st_nlink == 0
 
     def restore(self, path: Path) -> None:
-        """Write what was logged to a new file, and go on there. Raises OSError."""
+        """Write what was logged to a new file, and go on there; OSError: there is none then."""
         self.acquire()
         try:
-            new = path.open("x+", encoding="utf-8")
-            if self.stream is not None:
-                new.write(contents(self.stream))
-                new.flush()
-                self.stream.close()
-            self.stream, self.baseFilename = new, os.path.abspath(path)
+            if (old := self.stream) is not None:
+                self.stream, self.baseFilename = written_again(old, path), os.path.abspath(path)
+                old.close()
         finally:
             self.release()
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import resource
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,11 +18,13 @@ from fake_run import FakeSystem, make_sequence
 from feeding import track_frames
 from synthetic_view import CAMERA, render_plane, sideways_path
 
+from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import read_tum
 from bmask_slam.live.live_slam import LiveOptions, LiveSlam
 from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
 from bmask_slam.run_folder.folder import CHECKPOINT, FILES, RunFolder
+from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
 FRAMES = [render_plane(T, k) for k, T in enumerate(sideways_path(0.02 * np.arange(16)))]
 
@@ -102,6 +108,38 @@ def test_no_other_process_writes_into_a_folder_that_was_made_again(tmp_path: Pat
         assert folder.path == tmp_path / "run"
         with pytest.raises(InputError, match="a process is writing a run there"):
             RunFolder(tmp_path / "run", overwrite=True)
+
+
+@contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """No file can grow beyond so many bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("name", ["frames.csv", "events.csv", "log.txt"])
+def test_what_a_full_disk_did_not_take_is_written_again_later(tmp_path: Path, name: str) -> None:
+    """No half file stands in the way, and no line is lost or cut."""
+    event = Event(3, 0.1, EventKind.LOST, "on purpose")
+    result = FrameResult(3, 0.1, TrackingStatus.OK, None, events=(event,))
+    out = tmp_path / "run"
+    with RunFolder(out) as folder:
+        for k in range(300):
+            folder.write_frame(replace(result, index=k))
+            logging.getLogger("bmask_slam").info("a line of the log")
+        before = (out / name).read_text()
+        (out / name).unlink()
+        with full_disk(2000), pytest.raises(OSError, match="too large"):
+            folder.write_frame(result)
+        names = os.listdir(out)
+        folder.write_frame(replace(result, index=300))
+    assert len(names) == 2
+    assert (out / name).read_text().startswith(before)
+    assert frames_in(out) == list(range(301))
 
 
 def test_a_checkpoint_that_cannot_be_written_does_not_end_the_run(
