@@ -15,6 +15,8 @@ from bmask_slam.semantics.labels import LabelSet
 FLOOR, SUPPORT, TOP, WALL, ANY, NEVER = "floor", "support", "top", "wall", "any", "never"
 PLACES = (FLOOR, SUPPORT, TOP, WALL, ANY, NEVER)
 _ALL_M = (0.01, 100.0)
+LONGEST_M = 1e4
+"""No class of things is as long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,17 @@ def read_sizes(labels: LabelSet) -> ClassSizes:
         raise InputError(f"{path}: needs lines 'class: [shortest, longest, place]'")
     rows = [content.get(name, (*_ALL_M, ANY)) for name in labels.names]
     for name, row in zip(labels.names, rows, strict=True):
-        if len(row) != 3 or row[2] not in PLACES or not 0 < row[0] < row[1]:
-            raise InputError(f"{path}: {name}: {row!r}; give two rising lengths and a place")
+        if not _is_row(row):
+            raise InputError(f"{path}: {name}: {row!r}; give [shortest, longest, place], metres")
     shortest_m, longest_m = (np.array([row[k] for row in rows], float) for k in (0, 1))
     return ClassSizes(shortest_m, longest_m, tuple(row[2] for row in rows))
+
+
+def _is_row(row: object) -> bool:
+    """Whether it is two rising lengths and a place."""
+    if not isinstance(row, (list, tuple)) or len(row) != 3:
+        return False
+    lengths, place = row[:2], row[2]
+    if not all(isinstance(n, (int, float)) and not isinstance(n, bool) for n in lengths):
+        return False
+    return bool(0 < lengths[0] < lengths[1] < LONGEST_M) and place in PLACES

@@ -135,7 +135,7 @@ def _check_settings(options: CacheOptions) -> bool:
                 f"{options.settings[key]}; choose another --out or delete it"
             )
         if older and meant:
-            logger.info("%s: masks of an older version, which have no surfaces", options.out)
+            logger.warning("%s: masks of an older version, which have no surfaces", options.out)
         return not older
     if options.out.exists() and (not options.out.is_dir() or any(options.out.iterdir())):
         raise InputError(f"{options.out}: is no folder of masks; choose another --out")

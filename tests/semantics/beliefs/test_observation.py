@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bmask_slam.graph.errors import InputError
+from bmask_slam.semantics.beliefs import class_sizes
 from bmask_slam.semantics.beliefs.class_sizes import NEVER, PLACES, read_sizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import (
@@ -168,3 +171,23 @@ def test_the_shipped_table_fits_the_light_networks_labels() -> None:
     assert sizes.places[names.number("person")] == NEVER
     assert observation_model("precomputed", names) is None
     assert replace(model).groups.max() == GROUPS - 1
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "5", "", "[]", "[a, b, floor]", "[0.1, 0.2, moon]", "[0.1, .inf, floor]",
+        "[.nan, 1.0, floor]", "[0.2, 0.1, floor]", "[0.1, 0.2, [floor]]", "[false, 1, any]",
+        "[0.1, 1000000000, floor]",
+    ],
+)  # fmt: skip
+def test_sizes_that_are_no_lengths_are_refused(
+    row: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "sizes.yaml"
+    monkeypatch.setattr(class_sizes, "data_path", lambda *parts: path)
+    path.write_text("chair: [0.4, 1.2, support]\n")
+    assert read_sizes(NAMES).longest_m[2] == 1.2
+    path.write_text(f"chair: {row}\n")
+    with pytest.raises(InputError, match=r"sizes\.yaml: chair: .* place"):
+        read_sizes(NAMES)
