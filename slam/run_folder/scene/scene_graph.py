@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.files.ply import POINTS, read_ply, write_ply
 from bmask_slam.graph.files.reading import read_table
 from bmask_slam.graph.whole_file import whole_file
@@ -125,10 +125,20 @@ def _within(points_world: Array, up_world: Array) -> OrientedBox | None:
 
 
 def _surfaces(run: Path, scene: SavedScene, points_world: Array) -> list[dict[str, Any]]:
-    """Label, number of landmarks, mean probability and box of all that lies on each surface."""
-    columns = read_table(run / LABELS, ("label", "probability"), "run again")
+    """Label, number of landmarks, mean probability and box of all that lies on each surface.
+
+    Raises:
+        InputError: labels.csv is not of these landmarks, or has a probability that is no number.
+    """
+    table = run / LABELS
+    columns = read_table(table, ("label", "probability"), "run again")
     names = np.array(columns.get("surface", columns["label"]))
-    sure = np.array(columns.get("surface_probability", columns["probability"]), float)
+    if len(names) != len(points_world):
+        raise InputError(
+            f"{table}: {len(names)} lines, but {len(points_world)} landmarks; run again"
+        )
+    texts = columns.get("surface_probability", columns["probability"])
+    sure = np.array([finite_number(p, f"{table}: line {n}") for n, p in enumerate(texts, 2)])
     found = []
     for name in sorted(set(names.tolist()) & set(SURFACES)):
         own = names == name

@@ -16,6 +16,7 @@ from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.labelling.results import MapObjects
 from bmask_slam.run_folder.export import export
 from bmask_slam.run_folder.scene.query import Asked, ask, format_answer, query
+from bmask_slam.run_folder.scene.scene_graph import write_scene_graph
 from bmask_slam.run_folder.semantic_files import (
     BOXES,
     OBJECTS,
@@ -166,13 +167,38 @@ def test_objects_by_relation(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ask(run, Asked(relation="on", other="sofa"))
 
 
-def test_the_scene_graph_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run, out = furnished(tmp_path), tmp_path.parent / "scene.json"
+def landmarks_of(run: Path) -> Array:
+    """Write 60 landmarks; their points (60, 3)."""
     points = np.random.default_rng(0).uniform([-1, -1, 0], [10, 1, 2], (60, 3)).astype(np.float32)
     ids = np.arange(60, dtype=np.int32)
     grey = dict.fromkeys(("red", "green", "blue"), np.zeros(60, np.uint8))
     columns = dict(zip("xyz", points.T, strict=True))
     write_ply(run / "landmarks.ply", {**columns, **grey, "observations": ids, "id": ids})
+    return points
+
+
+@pytest.mark.parametrize(
+    ("last", "problem"),
+    [
+        ([], "labels.csv: 59 lines, but 60 landmarks; run again"),
+        (["59,desk,0.9,0.5,3,wall,abc"], "labels.csv: line 61: 'abc' is not a finite number"),
+        (["59,desk,0.9,0.5,3,wall,nan"], "labels.csv: line 61: 'nan' is not a finite number"),
+    ],
+)
+def test_a_scene_graph_of_broken_labels(tmp_path: Path, last: list[str], problem: str) -> None:
+    run = furnished(tmp_path)
+    landmarks_of(run)
+    rows = [f"{k},desk,0.9,0.5,3,wall,0.5" for k in range(59)] + last
+    head = "id,label,probability,entropy,views,surface,surface_probability"
+    (run / "labels.csv").write_text("\n".join([head, *rows]) + "\n")
+    with pytest.raises(InputError, match=problem):
+        write_scene_graph(run, run / "scene.json")
+    assert not (run / "scene.json").exists()
+
+
+def test_the_scene_graph_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, out = furnished(tmp_path), tmp_path.parent / "scene.json"
+    points = landmarks_of(run)
     rows = [f"{k},{'desk' if k < 20 else 'unknown'},0.75000,0.5,3" for k in range(60)]
     text = "\n".join(["id,label,probability,entropy,views", *rows]) + "\n"
     (run / "labels.csv").write_text(text)
