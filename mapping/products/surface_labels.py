@@ -58,6 +58,12 @@ class InstanceEvidence:
     stuff: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     stuff_names: tuple[str, ...] = ()
 
+    def stuff_of(self, names: tuple[str, ...]) -> Floats:
+        """``stuff`` (R, S) of regions with these S classes; zeros if they have others."""
+        if self.stuff_names == names:
+            return self.stuff
+        return np.zeros((len(self.stuff), len(names)), np.float32)
+
     def with_landmarks(
         self,
         distributions: NDArray[np.floating],
@@ -95,6 +101,7 @@ class LabelTable:
         log_likelihoods: (I, C) float32 as in KeyframeLabels, one keyframe's rows after the other's;
             zeros for regions.
         submaps: (I,) index of each row's submap, sorted.
+        of_things: (I,) whether each row is an instance's: neither no instance's nor a region's.
         fusion: parameters of the fusion of views.
         stuff: (I, S) float32 log probabilities of the regions' classes; zeros for instances.
         stuff_fusion: how these are fused.
@@ -102,6 +109,7 @@ class LabelTable:
 
     log_likelihoods: Floats
     submaps: Ints
+    of_things: Mask
     fusion: LabelStoreConfig
     stuff: Floats
     stuff_fusion: StuffFusion
@@ -114,16 +122,23 @@ class LabelTable:
         stuff: Sequence[Floats] = (),
         stuff_fusion: StuffFusion | None = None,
     ) -> LabelTable:
-        """The table of keyframes, each with its rows (I_k + 1, C) and those of regions (R_k, S)."""
+        """The table of keyframes, each with its rows (I_k + 1, C) and those of regions (R_k, S).
+
+        Regions of a keyframe with another number of classes keep their rows, which tell nothing.
+        """
         together = stuff_fusion or StuffFusion(())
-        none = np.zeros((0, len(together.stuff)), np.float32)
-        regions = [r if r.shape[1] == none.shape[1] else none for r in stuff]
-        regions = regions or [none] * len(keyframes)
+        columns, none = len(together.stuff), np.zeros((0, 0), np.float32)
+        regions = [
+            r if r.shape[1] == columns else np.zeros((len(r), columns), np.float32)
+            for r in stuff or [none] * len(keyframes)
+        ]
         pairs = list(zip(keyframes, regions, strict=True))
         likelihoods = [np.pad(k, ((0, len(r)), (0, 0))) for k, r in pairs]
         submaps = np.repeat(np.arange(len(pairs)), [len(rows) for rows in likelihoods])
-        below = [np.pad(r, ((len(k), 0), (0, 0))) for k, r in pairs]
-        return cls(np.concatenate(likelihoods), submaps, fusion, np.concatenate(below), together)
+        below = np.concatenate([np.pad(r, ((len(k), 0), (0, 0))) for k, r in pairs])
+        of_things = [np.r_[0, np.ones(len(k) - 1), np.zeros(len(r))] > 0 for k, r in pairs]
+        rows = np.concatenate(likelihoods), submaps, np.concatenate(of_things)
+        return cls(*rows, fusion, below, together)
 
     @property
     def first(self) -> Ints:
@@ -136,8 +151,7 @@ class LabelTable:
         As the label store fuses views of a landmark: the likelihoods of the instances, and the
         probability that all views without an instance missed the object.
         """
-        none = self._is_region.astype(np.float32)
-        none[self.first] = 1
+        none = (~self.of_things).astype(np.float32)
         evidence = np.asarray(views @ self.log_likelihoods)
         evidence += np.log(self.fusion.prior(evidence.shape[1])).astype(np.float32)
         missed = self.fusion.log_missed(np.asarray(views @ none))

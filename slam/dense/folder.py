@@ -208,6 +208,11 @@ class DenseFolder:
         if len(arrays["landmark_ids"]) != len(arrays["landmark_instances"]):
             raise InputError(f"{path}: its arrays have different lengths; remove it and map again")
         names = check_json(header.get("stuff", []), list[Name], f"{path}: its classes", "map again")
+        if arrays["stuff"].shape[1] != len(names) or (len(arrays["stuff"]) and not names):
+            raise InputError(
+                f"{path}: regions of {arrays['stuff'].shape[1]} classes, but {len(names)} names; "
+                "remove it and map again"
+            )
         return InstanceEvidence(**arrays, stuff_names=tuple(names))
 
     def fused(self, keyframe_id: int) -> InverseDepthMap:

@@ -124,7 +124,7 @@ def label_table(fused: FusedMap, keyframes: list[Keyframe], sample: Sample) -> L
     up_world = up_direction(sample.normals, sample.up_guess)
     ground = find_ground(sample.points[sample.floor], cameras, up_world)
     stuff = StuffFusion.of(fused.labels.names, names, ground)
-    return LabelTable.of(rows, store_config, [e.stuff for e in evidence], stuff)
+    return LabelTable.of(rows, store_config, [e.stuff_of(names) for e in evidence], stuff)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_matrix
 
-from bmask_slam.mapping.products.surface_labels import LabelTable, keyframe_labels
+from bmask_slam.mapping.products.surface_labels import InstanceEvidence, LabelTable, keyframe_labels
 from bmask_slam.mapping.products.surface_regions import StuffFusion, find_regions
 from bmask_slam.semantics.beliefs.label_store import LabelStoreConfig
 from bmask_slam.semantics.beliefs.surface_geometry import Ground
@@ -68,6 +68,27 @@ def test_a_thing_stands_before_stuff_and_stuff_before_nothing() -> None:
         FUSION.prior_unknown + (1 - FUSION.prior_unknown) * np.exp(FUSION.log_missed(np.ones(1)))[0]
     )
     assert p[1] == pytest.approx(0.6 * alone, abs=0.02)
+
+
+@pytest.mark.parametrize("others", [("wall", "floor"), ("floor", "wall", "chair")])
+def test_regions_of_other_classes_tell_nothing(others: tuple[str, ...]) -> None:
+    """A keyframe of another label set, before one of a cup: its points keep their numbers."""
+    rows = np.log([[1, 1, 1], [0.01, 0.01, 2]]).astype(np.float32)
+    log_p = np.log(np.full((2, len(others)), 1 / len(others), np.float32))
+    nobody = np.zeros(0, np.int64)
+    parts = [
+        InstanceEvidence(rows[:1], nobody, nobody.astype(np.uint16), log_p, others),
+        InstanceEvidence(rows, nobody, nobody.astype(np.uint16)),
+    ]
+    joined = StuffFusion.of(THINGS, STUFF.names[1:])
+    stuff = [p.stuff_of(joined.stuff) for p in parts]
+    for given in (stuff, [p.stuff for p in parts]) if len(others) == 2 else (stuff,):
+        table = LabelTable.of([p.log_likelihoods for p in parts], FUSION, given, joined)
+        assert table.first.tolist() == [0, 3]
+        views = csr_matrix(np.eye(5, dtype=np.float32)[[0, 1, 2, 4]])
+        found, p = table.labels(views, *np.zeros((2, 4, 3)))
+        assert [joined.names[k] for k in found.tolist()] == ["background"] * 3 + ["cup"]
+        assert p[1:3] == pytest.approx(p[0])  # a view without an instance
 
 
 def test_what_lies_high_is_no_floor_and_what_stands_is_a_wall() -> None:

@@ -14,11 +14,11 @@ import pytest
 from true_run import FRAMES, make_run
 
 from bmask_slam.cli import main
-from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.folder import LABEL_FILE, DenseFolder
 from bmask_slam.dense.keyframe_input import load_keyframe
 from bmask_slam.dense.saved_map import MappedRun, open_run
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.files.array_file import nested
+from bmask_slam.graph.files.array_file import nested, write_arrays
 from bmask_slam.graph.files.ply import read_ply
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.rendering.sequence import RenderConfig
@@ -264,3 +264,19 @@ def test_a_folder_without_a_map_is_refused(
     caplog.set_level(logging.ERROR)
     assert main(["map", str(tmp_path)]) == 1
     assert "no saved map" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("rows", "names"), [(2, ["wall"]), (0, ["wall"]), (2, [])])
+def test_regions_without_names_for_their_classes_are_refused(
+    tmp_path: Path, rows: int, names: list[str]
+) -> None:
+    folder = DenseFolder(tmp_path, {})
+    arrays = {
+        "log_likelihoods": np.zeros((1, 3), np.float32),
+        "landmark_ids": np.zeros(0, np.int64),
+        "landmark_instances": np.zeros(0, np.uint16),
+        "stuff": np.zeros((rows, 2 if names else 0), np.float32),
+    }
+    write_arrays(folder.path / "labels" / "000007", LABEL_FILE, {"stuff": names}, arrays)
+    with pytest.raises(InputError, match=r"labels/000007: regions of . classes, but . names"):
+        folder.evidence(7)
