@@ -45,6 +45,8 @@ SLOPES = {
 _ANY_SLOPE = (0.35, 0.4, 0.05, 0.2)
 LEAST_POINTS = 20
 BIN_M = 0.08
+FAR_M = 20.0
+"""Points so far above or below the others are errors, or on another storey."""
 PEAK_SHARE = 0.25
 MIN_CAMERA_HEIGHT_M = 0.6
 
@@ -67,9 +69,11 @@ def find_ground(floor_world: Array, cameras_world: Array, up_world: Array) -> Gr
     None where there are too few, or where it is not well below the cameras (K, 3): what a low
     camera takes for the floor may be a table.
     """
-    if len(floor_world) < LEAST_POINTS or not len(cameras_world):
-        return None
     heights = floor_world @ up_world
+    if len(heights):
+        heights = heights[np.abs(heights - np.median(heights)) < FAR_M]
+    if len(heights) < LEAST_POINTS or not len(cameras_world):
+        return None
     low = float(np.quantile(heights, 0.01))
     bins = np.maximum(np.floor((heights - low) / BIN_M).astype(int), 0)
     count = np.bincount(bins)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -41,6 +43,22 @@ def test_the_ground_is_the_lowest_of_what_looks_like_it(turn: np.ndarray) -> Non
     heights = ground.heights_m(points)
     assert np.median(heights[:300]) == pytest.approx(0.0, abs=0.01)
     assert np.median(heights[300:]) == pytest.approx(0.75, abs=0.01)
+
+
+@pytest.mark.parametrize("stray_m", [1e6, -1e6, 1e30, np.inf])
+def test_stray_points_far_away_are_no_ground(stray_m: float) -> None:
+    """Heights are counted in bins, of which a point at 1000 km would need millions."""
+    points, cameras, up = room(np.eye(4))
+    strays = np.column_stack([np.zeros((20, 2)), np.full(20, stray_m)])
+    clean = find_ground(points, cameras, up)
+    tracemalloc.start()
+    ground = find_ground(np.concatenate([points, strays]), cameras, up)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 1e6
+    assert clean is not None
+    assert ground is not None
+    assert ground.floor_m == pytest.approx(clean.floor_m, abs=1e-9)
 
 
 def test_a_table_below_the_camera_is_no_ground() -> None:
