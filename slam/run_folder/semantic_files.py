@@ -30,6 +30,8 @@ OBJECTS_PICTURE = "objects.png"
 SEMANTIC_FILES = (LABELS, OBJECTS, BOXES, OBJECTS_PICTURE)
 _COLUMNS = ("id", "label", "probability", "entropy", "views")
 _SURFACE_COLUMNS = ("surface", "surface_probability")
+_SHORTEST_UP = 1e-6
+"""Its coordinates are written with so many decimals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +176,7 @@ class SavedScene:
 
     Attributes:
         names: class names of the segmenter. objects: of the run.
-        up_world: (3,) the direction of up. floor_m: the floor's height along it, NaN if unknown.
+        up_world: (3,) unit vector, up. floor_m: the floor's height along it, NaN if unknown.
     """
 
     names: tuple[str, ...]
@@ -230,15 +232,19 @@ def read_scene(run: Path) -> SavedScene:
     """The objects of a run, and where up and the floor are.
 
     Raises:
-        InputError: no such file, or a file that `write_objects` did not make.
+        InputError: no such file, a file that `write_objects` did not make, or up has no direction.
     """
     path = run / OBJECTS
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a run that had a segmenter")
     content = read_json(path, _ObjectFile, "run again")
     floor_m = np.nan if content.floor_m is None else content.floor_m
+    up_world = np.array(content.up_world)
+    length = float(np.linalg.norm(up_world))
+    if length < _SHORTEST_UP:
+        raise InputError(f"{path}: up_world: has no direction, found {up_world}; run again")
     objects = tuple(_saved(o) for o in content.objects)
-    return SavedScene(tuple(content.labels), objects, np.array(content.up_world), floor_m)
+    return SavedScene(tuple(content.labels), objects, up_world / length, floor_m)
 
 
 def _saved(o: _Object) -> SavedObject:

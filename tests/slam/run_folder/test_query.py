@@ -21,6 +21,7 @@ from bmask_slam.run_folder.semantic_files import (
     BOXES,
     OBJECTS,
     read_objects,
+    read_scene,
     write_boxes,
     write_objects,
 )
@@ -112,6 +113,16 @@ def test_runs_without_objects_or_with_broken_ones(run: Path, tmp_path: Path) -> 
         (run / OBJECTS).write_text(broken)
         with pytest.raises(InputError, match="run again"):
             query(run, "chair")
+
+
+def test_up_is_a_unit_vector(run: Path) -> None:
+    content = json.loads((run / OBJECTS).read_text())
+    (run / OBJECTS).write_text(json.dumps({**content, "up_world": [0.0, 3.0, -4.0]}))
+    assert np.allclose(read_scene(run).up_world, [0.0, 0.6, -0.8], atol=1e-12)
+    for up in ([0.0, 0.0, 0.0], [0.0, 1e-200, 0.0]):
+        (run / OBJECTS).write_text(json.dumps({**content, "up_world": up}))
+        with pytest.raises(InputError, match=r"objects.json: up_world: has no direction, .*; run"):
+            read_scene(run)
 
 
 def test_boxes_are_written_as_lines(run: Path) -> None:
