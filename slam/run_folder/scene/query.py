@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.graph.arrays import Array
-from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.errors import InputError, is_whole
 from bmask_slam.run_folder.semantic_files import SavedObject, SavedScene, read_scene
 from bmask_slam.semantics.objects.relations import RELATIONS, distance_m, relations
 
@@ -74,7 +74,7 @@ def ask(run: Path, asked: Asked) -> Answer:
     """
     scene = read_scene(run)
     counts = dict(sorted(Counter(o.label for o in scene.objects).items()))
-    for name in (asked.label, None if asked.other.isdigit() else asked.other or None):
+    for name in (asked.label, None if is_whole(asked.other) else asked.other or None):
         if name is not None and name not in scene.names:
             raise InputError(
                 f"{run}: its label set has no {name!r}; the run holds {_listed(counts)}; the set "
@@ -113,13 +113,14 @@ def _related(run: Path, scene: SavedScene, asked: Asked) -> dict[int, str]:
     if asked.relation not in RELATIONS:
         raise InputError(f"relation {asked.relation!r}: not known; give {', '.join(RELATIONS)}")
     objects = scene.objects
-    if asked.other.isdigit() and int(asked.other) not in {o.id for o in objects}:
+    number = int(asked.other) if is_whole(asked.other) else None
+    if number is not None and number not in {o.id for o in objects}:
         known = ", ".join(f"{o.id} ({o.label})" for o in objects) or "none"
         raise InputError(f"{run}: has no object {asked.other}; there are {known}")
     found: dict[int, list[str]] = {}
     for r in relations([o.box for o in objects], scene.up_world):
         other = objects[r.object]
-        if r.kind == asked.relation and asked.other in ("", other.label, str(other.id)):
+        if r.kind == asked.relation and (asked.other in ("", other.label) or other.id == number):
             found.setdefault(objects[r.subject].id, []).append(f"{other.label} {other.id}")
     return {number: f"{asked.relation} {', '.join(names)}" for number, names in found.items()}
 
