@@ -23,7 +23,7 @@ class SurfaceClasses:
     Attributes:
         labels: their label set; column k of the probabilities is of label k + 1.
         probabilities: (h, w, C) float16. Row and column 0 are at the upper left; the cells cover
-            the image, the last ones may reach beyond it.
+            the image, the last ones may reach beyond it or end a little before its edge.
         cell_px: edge of a cell.
         size: (H, W) of the image.
     """
@@ -49,9 +49,11 @@ class SurfaceClasses:
         """Probabilities (H, W, C) of all pixels, linear between the centres of cells."""
         cells = np.asarray(self.probabilities, np.float32)
         height, width = cells.shape[:2]
-        whole = np.rint(np.array([width, height]) * self.cell_px).astype(int)
+        whole = np.maximum(np.rint(np.array([width, height]) * self.cell_px), 1).astype(int)
         found = cv2.resize(cells, (int(whole[0]), int(whole[1])), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(found[: self.size[0], : self.size[1]], np.float32)
+        found = found.reshape(whole[1], whole[0], -1)[: self.size[0], : self.size[1]]
+        missing = [(0, n - m) for n, m in zip(self.size, found.shape[:2], strict=True)]
+        return np.pad(found, (*missing, (0, 0)), "edge") if np.any(missing) else found
 
     def codes(self) -> Array:
         """(h, w) uint16: the likeliest label times 256 plus its probability in 255ths."""

@@ -41,6 +41,15 @@ def test_a_pixel_lies_between_the_centres_of_cells() -> None:
     np.testing.assert_allclose(whole.reshape(-1, 3), seen.at(grid.astype(float)), atol=1e-3)
 
 
+def test_all_pixels_have_classes_where_the_cells_end_before_the_edge() -> None:
+    """The network's input has whole pixels: of an image of 986 x 1280 the last row has no cell."""
+    found = classes((50, 65)).pixels()
+    assert found.shape == (50, 65, 3)
+    np.testing.assert_array_equal(found[48:], found[[47, 47]])
+    one = SurfaceClasses(label_set(("wall",)), np.ones((6, 8, 1), np.float16), 8.0, (48, 64))
+    assert one.pixels().shape == (48, 64, 1)
+
+
 def test_the_likeliest_class_of_pixels() -> None:
     label, p = most_probable(classes((45, 60)))
     assert label.shape == p.shape == (45, 60)
