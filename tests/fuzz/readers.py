@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -70,10 +71,12 @@ from bmask_slam.run_folder.map_file import MAP_FILE, read_map
 from bmask_slam.run_folder.origin import find_sequence
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import read_labels, read_objects
+from bmask_slam.semantics.beliefs.class_sizes import read_sizes
 from bmask_slam.semantics.beliefs.movability import read_priors
 from bmask_slam.semantics.instances.coco_files import read_coco
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
-from bmask_slam.semantics.labels import read_label_set
+from bmask_slam.semantics.instances.surface_files import read_surfaces, surface_labels
+from bmask_slam.semantics.labels import label_set, read_label_set
 from bmask_slam.semantics.weights.checkpoints import load_network, read_state
 from bmask_slam.semantics.weights.stuff_weights import load_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
@@ -163,6 +166,12 @@ def images() -> tuple[bytes, ...]:
     pairs = [(suffix, colour) for suffix in (".png", ".jpg", ".bmp", ".webp", ".ppm")]
     pairs += [(suffix, depth) for suffix in (".png", ".tiff")]
     return tuple(cv2.imencode(suffix, picture)[1].tobytes() for suffix, picture in pairs)
+
+
+def surface_images() -> tuple[bytes, ...]:
+    """Of an image of 24 rows and 32 columns: a wall above a floor."""
+    codes = np.repeat(np.array([[256 + 200], [512 + 100], [512 + 255]], np.uint16), 4, axis=1)
+    return (cv2.imencode(".png", codes)[1].tobytes(),)
 
 
 def archives() -> tuple[bytes, ...]:
@@ -376,6 +385,21 @@ def network_maker(rng: random.Random) -> bytes:
     return save({"a": torch.zeros(1)}, metadata)
 
 
+def surfaces_maker(rng: random.Random) -> bytes:
+    """Sound PNGs of any shape, depth and classes."""
+    shape = tuple(rng.choice((1, 2, 3, 4, 6, 200)) for _ in range(2)) + rng.choice(((), (), (3,)))
+    kind = rng.choice((np.uint16, np.uint16, np.uint8))
+    value = rng.choice((0, 255, 256, 767, 1023, 1024, 65535))
+    return cv2.imencode(".png", np.full(shape, value & np.iinfo(kind).max, kind))[1].tobytes()
+
+
+def sizes_maker(rng: random.Random) -> bytes:
+    """A line of a class with odd lengths and places."""
+    parts = ("0.1", "2", "-1", ".inf", ".nan", "1e400", "true", "", "floor", "top", "moon", "[]")
+    row = ", ".join(rng.choice(parts) for _ in range(rng.choice((1, 2, 3, 3, 3, 4))))
+    return f"cup: {rng.choice((row, f'[{row}]', f'{{{row}}}'))}\n".encode()
+
+
 def yaml_maker(rng: random.Random) -> bytes:
     """YAML of tokens in any order."""
     parts = (*TOKENS, *NUMBERS, b"a: ", b"tracking: ", b"\n", b"\n  ", b"- ", b"fx: ", b"| ", b"> ")
@@ -393,6 +417,29 @@ def read_masks(path: Path) -> None:
     for image in read_coco(path).images:
         for found in image.objects:
             found.mask()
+
+
+STUFF = label_set(("wall", "floor", "door"))
+
+
+def read_surface_image(path: Path) -> None:
+    folder = path.parent / "surfaces"
+    folder.mkdir()
+    (folder / "a.png").write_bytes(path.read_bytes())
+    seen = read_surfaces(path.parent, "a.jpg", STUFF, (24, 32))
+    assert seen is not None and seen.pixels().shape == (24, 32, 3)
+
+
+def read_surface_names(path: Path) -> None:
+    folder = path.parent / "surfaces"
+    folder.mkdir()
+    (folder / "classes.txt").write_bytes(path.read_bytes())
+    surface_labels(path.parent)
+
+
+def read_class_sizes(path: Path) -> None:
+    with patch("bmask_slam.semantics.beliefs.class_sizes.data_path", lambda *parts: path):
+        assert np.isfinite(read_sizes(label_set(("cup",))).typical_m).all()
 
 
 def read_dense_settings(path: Path) -> None:
@@ -553,6 +600,7 @@ def text_readers(folder: Path) -> list[Reader]:
         Reader("losses.csv", "losses.csv", read_losses, (losses,)),
         Reader("precision_recall.csv", "p.csv", read_precision, (curves,)),
         Reader("label set", "labels.txt", as_text(read_label_set), (b"cup\n# no\nN/A\nchair\n",)),
+        Reader("classes of surfaces", "c.txt", read_surface_names, (b"wall\nfloor\n# no\ndoor\n",)),
         Reader("SHA256SUMS", "SHA256SUMS", read_sums, (b"ab  a.tgz\ncd  b.tgz\n",)),
         Reader("config.yaml's sequence", "config.yaml", in_folder(find_sequence),
                (b"# bmask-slam 0.1, sequence /nowhere/s, stride 1\n",)),
@@ -581,6 +629,8 @@ def document_readers(folder: Path) -> list[Reader]:
         Reader("configuration", "c.yaml", lambda p: resolve(SystemConfig, p),
                (dump(CONFIG).encode()[:1500], b"tracking: {min_inliers: 20}\n"), yaml_maker),
         Reader("movability priors", "p.yaml", as_text(read_priors), (priors,), yaml_maker),
+        Reader("sizes of classes", "s.yaml", read_class_sizes, (b"cup: [0.1, 0.2, top]\n",),
+               sizes_maker),
         Reader("catalogue", "c.yaml", read_catalogue, (sets,), yaml_maker),
         Reader("experiment", "e.yaml", read_experiment, (experiment,), yaml_maker),
         of_json("COCO", "annotations.json", read_masks, coco()),
@@ -606,6 +656,7 @@ def array_readers(folder: Path) -> list[Reader]:
     evidence = {
         "log_likelihoods": np.zeros((3, 4), np.float32),
         "landmark_ids": np.arange(3), "landmark_instances": np.ones(3, np.uint16),
+        "stuff": np.zeros((2, 2), np.float32),
     }  # fmt: skip
 
     def of_arrays(
@@ -636,7 +687,8 @@ def array_readers(folder: Path) -> list[Reader]:
         of_arrays("submap", read_submap, SUBMAP_FILE, {"anchor": 1}, submap),
         of_arrays("fused depth", read_depth_map, DEPTH_FILE, {},
                   {"rho": image, "sigma": image}),
-        of_arrays("keyframe labels", read_evidence, LABEL_FILE, {}, evidence),
+        of_arrays("keyframe labels", read_evidence, LABEL_FILE, {"stuff": ["wall", "floor"]},
+                  evidence),
         Reader("PLY", "a.ply", read_ply, (cloud,)),
         Reader("landmarks.ply", "a.ply", lambda p: read_landmarks(p, ("unknown", "cup")), (cloud,)),
         Reader("dense/cloud.ply", "a.ply", lambda p: read_dense_cloud(p, ("b", "cup")), (cloud,)),
@@ -669,6 +721,7 @@ def binary_readers(folder: Path) -> list[Reader]:
     database = bag_folder(recorded["a.db3"], recorded["db"].decode())
     return [
         Reader("image", "1.png", both_pictures, images()),
+        Reader("surfaces", "1.png", read_surface_image, surface_images(), surfaces_maker),
         Reader("archive", "a.tgz", unpacked, packed, zip_maker),
         Reader("ROS 1 bag", "a.bag", read_bag, (recorded["a.bag"],)),
         Reader("bag as a source", "a.bag", follow_bag, (recorded["a.bag"],)),
