@@ -31,7 +31,7 @@ BLOCK, EVERY, FIRST = 30, 300, 120
 
 def held_out(number: int) -> bool:
     """Whether a training image is held out to choose settings."""
-    return FIRST <= number % EVERY < FIRST + 2 * BLOCK // 2
+    return FIRST <= number % EVERY < FIRST + BLOCK
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from bmask_slam.semantics.labels import LabelSet, label_set
 CORRELATION = 0.6
 """Of the errors of one network in two views of a place. With 0.5 to 0.75 the landmarks of a real
 room are calibrated to 0.06 to 0.08 (benchmarks/semantics/room_surfaces.py), with less too sure."""
-FLOOR = 1e-3
+LEAST_PROBABILITY = 1e-3
 """Least probability of a class in one view."""
 MIN_PROBABILITY = 0.4
 """Below it a landmark is on nothing known."""
@@ -41,7 +41,7 @@ def pooled(log_sums: Array, views: Array) -> Array:
 
 def log_view(probabilities: Floats) -> Floats:
     """The logarithm of a view's distributions (N, C), from which no class is excluded."""
-    return np.log(np.maximum(probabilities, np.float32(FLOOR)))
+    return np.log(np.maximum(probabilities, np.float32(LEAST_PROBABILITY)))
 
 
 @dataclass(frozen=True)
