@@ -42,6 +42,7 @@ class Tour:
 
     name = "tour"
     waits = True
+    use = None
 
     def __init__(self, sequence: Sequence, frames: int, hz: float, watch: Callable[[int], None]):
         self.camera = sequence.camera

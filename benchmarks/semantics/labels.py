@@ -31,7 +31,7 @@ from bmask_slam.comparison.jobs.truth_figures import (
     visible,
 )
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Floats, Ints
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.rendering.annotations import OBJECTS_TRUTH
 from bmask_slam.rendering.engine.sensor import depth_sigma_m
@@ -55,8 +55,10 @@ KINDS = ("measured", "visible", "whole")
 class RecordingStore(LabelStore):
     """Also stores the single view of each id with the best mask."""
 
-    def update(self, ids, distributions, weights):  # type: ignore[no-untyped-def]
-        super().update(ids, distributions, weights)
+    def update(
+        self, ids: Ints, distributions: Floats, weights: Floats, viewpoints: Ints | None = None
+    ) -> None:
+        super().update(ids, distributions, weights, viewpoints)
         best = self.__dict__.setdefault("best", {})
         for i, p, w in zip(ids.tolist(), distributions, weights.tolist(), strict=True):
             if w > best.get(i, (-1.0, None))[0]:

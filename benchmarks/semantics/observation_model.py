@@ -150,7 +150,7 @@ def observed(photograph: Photograph, number: int, segmenter: Segmenter) -> Array
         seen, rows = np.arange(len(pixels)), first
         if view:
             part, x, y, mirrored = _part(image, rng)
-            local = pixels - [x, y]
+            local = pixels - np.array([x, y])
             size = part.shape[1], part.shape[0]
             seen = np.flatnonzero(((local >= 0) & (local < size)).all(axis=1))
             local = local[seen]

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.semantics.photographs import IMAGES, held_out
-from bmask_slam.graph.arrays import Array, Image
+from bmask_slam.graph.arrays import Array, Floats, Image
 from bmask_slam.semantics.instances.coco_files import CocoImage
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.instances.instances import Instance
@@ -71,7 +71,7 @@ def _right(found: Sequence[Instance], image: CocoImage) -> int:
     return right
 
 
-def _iou(a: Sequence[float] | Array, b: Sequence[float] | Array) -> float:
+def _iou(a: Sequence[float] | Array | Floats, b: Sequence[float] | Array) -> float:
     low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
     both = float(np.prod(np.clip(high - low, 0, None)))
     return both / (_area(a) + _area(b) - both)

@@ -20,13 +20,13 @@ from torch.nn import functional as F
 
 from benchmarks.semantics.nyuv2 import CLASSES, GROUP_OF, GROUPS, labelled, numbers
 from benchmarks.semantics.train_stuff import held_out
-from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.arrays import Array, Bytes, Ints
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.semantics.training.stuff_images import IGNORED
 from bmask_slam.semantics.weights import light_weights, stuff_weights
 
 
-def confusion(truth: Ints, found: Ints, classes: int) -> Ints:
+def confusion(truth: Bytes | Ints, found: Bytes | Ints, classes: int) -> Ints:
     """Counts (C, C) of pixels: rows are true classes, columns found ones."""
     known = truth != IGNORED
     pairs = truth[known].astype(np.int64) * classes + found[known]
@@ -73,7 +73,7 @@ def measure(weights: Path, part: str) -> None:
     print(f"detector {light_ms:.0f} ms, head {head_ms:.0f} ms: ratio {head_ms / light_ms:.2f}")
 
 
-def reliability(p: Tensor, labels: Ints, found: Ints) -> Array:
+def reliability(p: Tensor, labels: Bytes | Ints, found: Bytes | Ints) -> Array:
     """Pixels, sum of probabilities and number of right ones (10, 3) by the best probability."""
     known = labels != IGNORED
     best = p.max(dim=0).values.numpy()[known]
