@@ -77,7 +77,7 @@ def _iou(a: Sequence[float] | Array | Floats, b: Sequence[float] | Array) -> flo
     return both / (_area(a) + _area(b) - both)
 
 
-def _area(box: Sequence[float] | Array) -> float:
+def _area(box: Sequence[float] | Array | Floats) -> float:
     return float((box[2] - box[0]) * (box[3] - box[1]))
 
 
