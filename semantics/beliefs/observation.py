@@ -24,7 +24,7 @@ _FILLED = 0.6
 _SCORES = (0.05, 0.98)
 _EVIDENCE = (0.15, 5.0)
 """Within these it was measured."""
-_AZIMUTHS, _ELEVATIONS, _DISTANCE_STEP, _CELLS = 24, 12, 1.4, 64
+_AZIMUTHS, _ELEVATIONS, _DISTANCE_STEP = 24, 12, 1.4
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,10 +53,10 @@ MIN_CAMERA_HEIGHT_M = 0.6
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """The floor: ``up_world`` (3,), a unit vector, and the floor's height ``floor_m`` along it."""
+    """Gravity in the world: ``up_world`` (3,), and the floor's height along it, NaN if unknown."""
 
     up_world: Array
-    floor_m: float
+    floor_m: float = float("nan")
 
     def heights_m(self, points_world: Array) -> Array:
         """Heights (N,) above the floor of points (N, 3)."""

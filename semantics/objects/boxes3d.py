@@ -34,13 +34,16 @@ class OrientedBox:
     @property
     def corners_world(self) -> Array:
         """The corners (8, 3); EDGES says which pairs an edge joins."""
-        corners = 0.5 * _SIGNS * self.size_m
-        return corners @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3]
+        return self.in_world(0.5 * _SIGNS * self.size_m)
 
     @property
     def volume_m3(self) -> float:
         """The volume."""
         return float(np.prod(self.size_m))
+
+    def in_world(self, points_box: Array) -> Array:
+        """Points (N, 3) of the box's own frame in the world."""
+        return np.asarray(points_box @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3])
 
     def contains(self, points_world: Array) -> Mask:
         """Which of the points (N, 3) are inside."""
@@ -128,4 +131,4 @@ def box_iou(a: OrientedBox, b: OrientedBox) -> float:
 
 def _filled(box: OrientedBox) -> Array:
     """A regular grid of points (4096, 3) in a box."""
-    return ((_GRID - 0.5) * box.size_m) @ box.T_world_box[:3, :3].T + box.T_world_box[:3, 3]
+    return box.in_world((_GRID - 0.5) * box.size_m)

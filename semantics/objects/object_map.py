@@ -14,6 +14,7 @@ from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.semantics.beliefs.class_sizes import ClassSizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import viewpoint_cells
+from bmask_slam.semantics.beliefs.surface_geometry import Ground
 from bmask_slam.semantics.beliefs.votes import NO_INSTANCE, PixelAssignment
 from bmask_slam.semantics.objects.association import (
     Evidence,
@@ -25,7 +26,7 @@ from bmask_slam.semantics.objects.association import (
 from bmask_slam.semantics.objects.config import ObjectConfig
 from bmask_slam.semantics.objects.detections import Detections, detect
 from bmask_slam.semantics.objects.points import ObjectPoints, Sightings
-from bmask_slam.semantics.objects.publication import Ground, MapObject, ObjectPublisher
+from bmask_slam.semantics.objects.publication import MapObject, ObjectPublisher
 from bmask_slam.semantics.objects.revision import MergeEvidence, merges, splits
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.semantics.beliefs.class_sizes import FLOOR, NEVER, SUPPORT, TOP, WALL, ClassSizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.surface_geometry import Ground
 from bmask_slam.semantics.objects.boxes3d import (
     OrientedBox,
     box_around,
@@ -24,14 +25,6 @@ from bmask_slam.semantics.objects.points import ObjectPoints
 _SAME_MARGIN_M = 0.05
 SMALLEST_M, LARGEST_M = 0.05, 3.5
 """Longest sides of what can be seen in a room."""
-
-
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """Gravity in the world: ``up_world`` (3,), and the floor's height along it, NaN if unknown."""
-
-    up_world: Array
-    floor_m: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +79,7 @@ def size_and_place(
     found = np.log(anything / width) - 0.5 * (above**2 + below**2)
     found[sizes.longest_m > LARGEST_M] = np.minimum(found, 0)[sizes.longest_m > LARGEST_M]
     if np.isfinite(ground.floor_m):
-        heights_m = box.corners_world @ ground.up_world - ground.floor_m
+        heights_m = ground.heights_m(box.corners_world)
         bottom_m, top_m = float(heights_m.min()), float(heights_m.max())
         beyond_m = np.zeros(len(found))
         on_floor = sizes.is_in(FLOOR, SUPPORT)
@@ -164,8 +157,9 @@ class ObjectPublisher:
 
     def _whole(self, poses: dict[int, Array], up_world: Array) -> list[MapObject]:
         """All objects that enough keyframes observed, with their parts."""
-        candidates = self._candidates(poses, up_world)
-        whole, points = same_things(candidates), self._points_by_object(poses)
+        points = self._points_by_object(poses)
+        candidates = self._candidates(points, up_world)
+        whole = same_things(candidates)
         found = []
         for k in np.unique(whole).tolist():
             parts = [candidates[j] for j in np.flatnonzero(whole == k).tolist()]
@@ -179,11 +173,13 @@ class ObjectPublisher:
         rows = {i: owners == i for i in np.unique(owners).tolist()}
         return {i: (points[mine], noise[mine]) for i, mine in rows.items()}
 
-    def _candidates(self, poses: dict[int, Array], up_world: Array) -> list[MapObject]:
+    def _candidates(
+        self, by_object: dict[int, tuple[Array, Array]], up_world: Array
+    ) -> list[MapObject]:
         """All objects that enough keyframes observed."""
         box_config = self._config.box
         found = []
-        for i, (points, noise) in self._points_by_object(poses).items():
+        for i, (points, noise) in by_object.items():
             keyframe_ids, stamps_s = self._points.sightings(i)
             if len(keyframe_ids) < self._config.min_keyframes:
                 continue

@@ -95,4 +95,4 @@ def _filled(box: OrientedBox) -> Array:
     """A grid of points (N, 3) in a box, its faces included."""
     steps = np.linspace(-0.5, 0.5, _SIDE)
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.asarray((grid * box.size_m) @ box.T_world_box[:3, :3].T + box.T_world_box[:3, 3])
+    return box.in_world(grid * box.size_m)

@@ -25,6 +25,7 @@ from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.class_sizes import read_sizes
 from bmask_slam.semantics.beliefs.label_store import LabelStore
 from bmask_slam.semantics.beliefs.observation import observation_model
+from bmask_slam.semantics.beliefs.surface_geometry import Ground
 from bmask_slam.semantics.beliefs.surface_store import SurfaceStore
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, assign_pixels, check_instances, vote
 from bmask_slam.semantics.instances.instances import Instance
@@ -32,7 +33,6 @@ from bmask_slam.semantics.instances.surfaces import surfaces_of
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.objects.gravity import GravityEstimator
 from bmask_slam.semantics.objects.object_map import KeyframeView, ObjectMap, pixel_rays
-from bmask_slam.semantics.objects.publication import Ground
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter, Segmenter
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.world.map_editor import MapReader
@@ -142,7 +142,7 @@ class SemanticMapper:
         spoken, landmarks = self._label_votes.vote(keyframe_id, everything, observed, self.labels)
         vote_on_surfaces(surfaces_of(instances), landmarks, self.surfaces)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
-            self._add_objects((keyframe_id, waiting), assignment, observed)
+            self._add_objects((keyframe_id, waiting), assignment, observed, (ids, on))
         if self._on_masks is not None:
             about = (ids, on, self.labels.appearance(ids))
             view = (assignment, waiting.depth_m, observed.T_world_camera)
@@ -262,9 +262,16 @@ class SemanticMapper:
         self._waiting = {}
 
     def _add_objects(
-        self, waited: tuple[int, _Waiting], assignment: PixelAssignment, observed: Observed
+        self,
+        waited: tuple[int, _Waiting],
+        assignment: PixelAssignment,
+        observed: Observed,
+        landmarks: tuple[Ints, Ints],
     ) -> None:
-        """Fuse a keyframe's instances into objects, and place its landmarks on them."""
+        """Fuse a keyframe's instances into objects, and place its landmarks on them.
+
+        ``landmarks`` are the ids (N,) of those that are surely on instances (N,).
+        """
         keyframe_id, waiting = waited
         here = self._map.world.in_segment(observed.anchor.segment)
         T_world_camera = observed.T_world_camera
@@ -281,10 +288,8 @@ class SemanticMapper:
         if keyframe_id != observed.anchor.id:
             parent = observed.anchor.id, observed.T_anchor_camera
             self.objects.points.reanchor(keyframe_id, *parent)
-        visible = observed.located(self._map.world)
-        votes = vote(assignment, visible.pixels, visible.z_m, len(self.names), self.config.votes)
-        on = np.append(objects, -1)[votes.instances[votes.sure]]
-        ids = observed.landmark_ids[votes.rows[votes.sure]]
+        ids, instances = landmarks
+        on = np.append(objects, -1)[instances]
         self.objects.place_landmarks(ids[on >= 0], on[on >= 0])
 
 

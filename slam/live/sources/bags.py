@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bz2
-import logging
 import struct
 import sys
 from collections.abc import Callable, Iterator
@@ -16,8 +15,6 @@ from typing import Any, NamedTuple
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.reading import MAX_RATIO, SMALL_BYTES
 from bmask_slam.live.sources.checks import import_optional
-
-logger = logging.getLogger(__name__)
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _CURE = (

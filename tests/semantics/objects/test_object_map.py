@@ -11,6 +11,7 @@ from bmask_slam.graph.arrays import Array, Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import se3_exp, transform
 from bmask_slam.semantics.beliefs.label_store import LabelStore
+from bmask_slam.semantics.beliefs.surface_geometry import Ground
 from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.objects.association import AssociationConfig, Evidence, Overlap, assign
@@ -20,7 +21,7 @@ from bmask_slam.semantics.objects.object_map import (
     ObjectMap,
     pixel_rays,
 )
-from bmask_slam.semantics.objects.publication import Ground, MapObject
+from bmask_slam.semantics.objects.publication import MapObject
 
 CAMERA = Camera(320, 240, fx=260.0, fy=262.0, cx=160.5, cy=119.0)
 SIZE = (240, 320)
