@@ -75,6 +75,28 @@ class SurfaceClasses:
         return cls(labels, p.astype(np.float16), cell_px, size)
 
 
+@dataclass(frozen=True, eq=False)
+class CodedSurfaces:
+    """What is kept of ``SurfaceClasses``: ``codes`` (h, w) of its cells of ``cell_px``."""
+
+    labels: LabelSet
+    codes: Array
+    cell_px: float
+
+    def at(self, pixels: Array) -> Floats:
+        """Probabilities (N, C) at pixels (N, 2), of the cells that they are in."""
+        limits = np.array(self.codes.shape[::-1]) - 1
+        columns, rows = np.clip(((pixels + 0.5) / self.cell_px).astype(np.int64), 0, limits).T
+        codes = self.codes[rows, columns][:, None]
+        cells = SurfaceClasses.from_codes(codes, self.labels, self.cell_px, codes.shape)
+        return cells.probabilities[:, 0].astype(np.float32)
+
+
+def coded(seen: SurfaceClasses) -> CodedSurfaces:
+    """The likeliest classes and their probabilities alone."""
+    return CodedSurfaces(seen.labels, seen.codes(), seen.cell_px)
+
+
 class Segmented(list[Instance]):
     """The instances in an image, best first, and what all of it is.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,55 +16,83 @@ from bmask_slam.semantics.beliefs.surface_geometry import by_height
 from bmask_slam.semantics.beliefs.surface_store import SurfaceEstimates, SurfaceStore
 from bmask_slam.semantics.beliefs.votes import PixelAssignment, VoteConfig, vote
 from bmask_slam.semantics.instances.instances import Instance
-from bmask_slam.semantics.instances.surfaces import SurfaceClasses
+from bmask_slam.semantics.instances.surfaces import CodedSurfaces, SurfaceClasses, coded
+from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.world.map_editor import MapReader
 
-RECENT = 8
+REMEMBERED = 100
 """Number of keyframes whose masks vote on landmarks that are made later."""
+THINNED = 4
+"""Of their masks and depth images every so many pixels are kept each way."""
 _NO_MASK = np.zeros((0, 0), bool)
 
 
-class LabelVotes:
-    """Votes of masks on landmarks, for a label store.
+@dataclass(frozen=True, eq=False)
+class _Remembered:
+    """What a keyframe's masks say, and the classes of all its pixels, if it has them."""
 
-    A landmark is often made later than the keyframes that see its place best. The masks of the last
-    RECENT keyframes therefore vote on new landmarks too, at the places where they would have been.
+    assignment: PixelAssignment
+    surfaces: SurfaceClasses | CodedSurfaces | None
+
+
+class LabelVotes:
+    """Votes of masks on landmarks, for the stores of labels and of surfaces.
+
+    A landmark is often made later than the keyframes that see its place best: in a room that is
+    seen again, most are. The masks of the last REMEMBERED keyframes therefore vote on new landmarks
+    too, at the places where they would have been.
     """
 
-    _recent: dict[int, PixelAssignment]
+    _remembered: dict[int, _Remembered]
 
-    def __init__(self, camera: Camera, config: VoteConfig, map_reader: MapReader) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: VoteConfig,
+        map_reader: MapReader,
+        labels: LabelStore,
+        surfaces: SurfaceStore,
+    ) -> None:
         self._camera, self._config, self._map = camera, config, map_reader
-        self._recent = {}
+        self._labels, self._surfaces = labels, surfaces
+        self._remembered = {}
 
     def vote(
-        self, keyframe_id: int, assignment: PixelAssignment, observed: Observed, store: LabelStore
-    ) -> tuple[Ints, VisibleLandmarks]:
-        """Let a keyframe's instances vote on all visible landmarks, which are returned too.
+        self,
+        keyframe_id: int,
+        assignment: PixelAssignment,
+        observed: Observed,
+        seen: SurfaceClasses | None = None,
+    ) -> Ints:
+        """Let a keyframe's instances and classes of pixels vote on all visible landmarks.
 
-        The ids (N,) are those of the landmarks that were voted on.
+        The ids (N,) are those of the landmarks that the instances voted on.
         """
         world = self._map.world
         new = world.landmarks.in_map.copy()
-        new[store.known()] = False
-        for earlier_id, earlier in self._recent.items():
+        new[self._labels.known()] = False
+        for earlier_id, earlier in self._remembered.items() if new.any() else ():
             visible = observed_by(earlier_id, self._map)
             if visible is not None:
                 matched = visible.located(world).among(new)
-                located = matched.with_visible(earlier.depth_m, self._camera, world, new)
-                self._vote(earlier, located, store)
+                depth_m = earlier.assignment.depth_m
+                located = matched.with_visible(depth_m, self._camera, world, new)
+                self._vote(earlier, located)
         located = observed.located(world).with_visible(assignment.depth_m, self._camera, world)
-        ids = self._vote(assignment, located, store)
-        without = [replace(i, mask=_NO_MASK) for i in assignment.instances]
-        self._recent[keyframe_id] = replace(assignment, instances=tuple(without))
-        if len(self._recent) > RECENT:
-            del self._recent[min(self._recent)]
-        return ids, located
+        ids = self._vote(_Remembered(assignment, seen), located)
+        codes = None if seen is None else coded(seen)
+        self._remembered[keyframe_id] = _Remembered(_thinned(assignment), codes)
+        if len(self._remembered) > REMEMBERED:
+            del self._remembered[min(self._remembered)]
+        return ids
 
-    def _vote(
-        self, assignment: PixelAssignment, visible: VisibleLandmarks, store: LabelStore
-    ) -> Ints:
-        votes = vote(assignment, visible.pixels, visible.z_m, store.classes, self._config)
+    def _vote(self, view: _Remembered, visible: VisibleLandmarks) -> Ints:
+        if not len(visible.landmark_ids):
+            return visible.landmark_ids
+        store, scale = self._labels, self._camera.width // view.assignment.owner.shape[1]
+        config = replace(self._config, edge_px=-(-self._config.edge_px // scale))
+        pixels = visible.pixels / scale
+        votes = vote(view.assignment, pixels, visible.z_m, store.classes, config)
         ids, hit = visible.landmark_ids[votes.rows], ~votes.missed
         points_world = self._map.world.landmarks.points_world[ids]
         cells = viewpoint_cells(points_world, visible.T_world_camera[:3, 3])
@@ -75,14 +103,16 @@ class LabelVotes:
             expected = store.model.group_recall(z_m, camera.fx, camera.width)
             missed = (missed[:, None] * expected).astype(np.float32)
         store.miss(ids[~hit], missed, cells[~hit])
+        if (seen := view.surfaces) is not None:
+            self._surfaces.update(seen.labels, visible.landmark_ids, seen.at(visible.pixels))
         return ids
 
     def state(self) -> Arrays:
         """The masks of the last keyframes, as named arrays."""
-        views = list(self._recent.values())
+        views = [v.assignment for v in self._remembered.values()]
         instances = [i for c in views for i in c.instances]
         return {
-            "keyframes": np.array(list(self._recent), np.int64),
+            "keyframes": np.array(list(self._remembered), np.int64),
             "shape": np.array([v.owner.shape for v in views], np.int64).ravel(),
             "depth_shape": np.array([v.depth_m.shape for v in views], np.int64).ravel(),
             "owner": np.array([v.owner for v in views], np.int16).ravel(),
@@ -95,6 +125,7 @@ class LabelVotes:
             "labels": np.array([i.label for i in instances], np.int64),
             "distributions": np.array([i.distribution for i in instances], np.float32).ravel(),
             "scores": np.array([(i.class_score, i.mask_score) for i in instances], float).ravel(),
+            **_surface_arrays(self._surfaces.names, list(self._remembered.values())),
         }
 
     def restore(self, state: Arrays) -> None:
@@ -105,21 +136,50 @@ class LabelVotes:
         depths_m = state["depth_m"].reshape(count, *depth_shape)
         ranges_m = state["ranges_m"].reshape(-1, 2)
         instances, ends = _instances(state), np.cumsum(state["counts"])
-        self._recent = {}
+        surfaces = _restored_surfaces(self._surfaces.names, state, count)
+        self._remembered = {}
         for k, keyframe_id in enumerate(state["keyframes"].tolist()):
             rows = slice(ends[k] - state["counts"][k], ends[k])
             owner, under, inner = (images[n][k] for n in ("owner", "under", "inner"))
-            self._recent[keyframe_id] = PixelAssignment(
-                tuple(instances[rows]), owner, under, inner, depths_m[k], ranges_m[rows]
-            )
+            kept = tuple(instances[rows]), owner, under, inner, depths_m[k], ranges_m[rows]
+            self._remembered[keyframe_id] = _Remembered(PixelAssignment(*kept), surfaces[k])
 
 
-def vote_on_surfaces(
-    seen: SurfaceClasses | None, visible: VisibleLandmarks, store: SurfaceStore
-) -> None:
-    """Let the classes of a keyframe's pixels vote on the landmarks there, if it has them."""
-    if seen is not None:
-        store.update(seen.labels, visible.landmark_ids, seen.at(visible.pixels))
+def _surface_arrays(names: LabelSet, views: Sequence[_Remembered]) -> Arrays:
+    """Their codes as named arrays; keyframes without them have none."""
+    kept = [(k, v.surfaces) for k, v in enumerate(views) if isinstance(v.surfaces, CodedSurfaces)]
+    own = [(k, c) for k, c in kept if c.labels == names]
+    return {
+        "coded": np.array([k for k, _ in own], np.int64),
+        "cell_px": np.array([c.cell_px for _, c in own], float),
+        "codes_shape": np.array([c.codes.shape for _, c in own], np.int64).ravel(),
+        "codes": np.concatenate([np.zeros(0, np.uint16), *(c.codes.ravel() for _, c in own)]),
+    }
+
+
+def _restored_surfaces(names: LabelSet, state: Arrays, count: int) -> list[CodedSurfaces | None]:
+    """The inverse, of ``count`` keyframes; states of older versions have none."""
+    found: list[CodedSurfaces | None] = [None] * count
+    if "coded" not in state:
+        return found
+    shapes, start = state["codes_shape"].reshape(-1, 2).tolist(), 0
+    rows = zip(state["coded"].tolist(), shapes, state["cell_px"].tolist(), strict=True)
+    for k, (height, width), cell_px in rows:
+        codes = state["codes"][start : start + height * width].reshape(height, width)
+        found[k] = CodedSurfaces(names, codes, cell_px)
+        start += height * width
+    return found
+
+
+def _thinned(assignment: PixelAssignment) -> PixelAssignment:
+    """Every THINNED-th pixel each way of a keyframe's masks and depth, without those masks."""
+    step = THINNED * assignment.depth_m.shape[0] // assignment.owner.shape[0]
+    every = np.s_[::THINNED, ::THINNED]
+    owner, under = assignment.owner[every].copy(), assignment.under[every].copy()
+    inner = assignment.inner[every].copy()
+    depth_m = assignment.depth_m[:: max(step, 1), :: max(step, 1)].copy()
+    without = tuple(replace(i, mask=_NO_MASK) for i in assignment.instances)
+    return PixelAssignment(without, owner, under, inner, depth_m, assignment.depth_range_m)
 
 
 def estimated_surfaces(

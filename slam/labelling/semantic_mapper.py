@@ -15,11 +15,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
-from bmask_slam.labelling.landmark_votes import (
-    LabelVotes,
-    estimated_surfaces,
-    vote_on_surfaces,
-)
+from bmask_slam.labelling.landmark_votes import LabelVotes, estimated_surfaces
 from bmask_slam.labelling.results import Attachment, LandmarkLabels, MapObjects
 from bmask_slam.moving.keyframe_masks import KeyframeMasks
 from bmask_slam.semantics.beliefs.class_sizes import read_sizes
@@ -139,8 +135,8 @@ class SemanticMapper:
         ids = observed.landmark_ids[votes.rows[votes.sure]]
         on = votes.instances[votes.sure]
         everything = assign_pixels(instances, waiting.depth_m, size, self.config.votes, True)
-        spoken, landmarks = self._label_votes.vote(keyframe_id, everything, observed, self.labels)
-        vote_on_surfaces(surfaces_of(instances), landmarks, self.surfaces)
+        seen = surfaces_of(instances)
+        spoken = self._label_votes.vote(keyframe_id, everything, observed, seen)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
             self._add_objects((keyframe_id, waiting), assignment, observed, (ids, on))
         if self._on_masks is not None:
@@ -232,11 +228,11 @@ class SemanticMapper:
             return  # nothing was learned
         self._begin(names, str(state.get("measured", np.array([""]))[0]))
         self.labels.restore(part(state, "labels"))
-        if votes := part(state, "votes"):
-            self._label_votes.restore(votes)
         self.objects.restore(part(state, "objects"))
         self._gravity.restore(part(state, "upright"))
         self.surfaces.restore(part(state, "surfaces"))
+        if votes := part(state, "votes"):
+            self._label_votes.restore(votes)
         self._done = set(state["done"].tolist())
         shape = state["waiting_shape"].reshape(-1, 2)[:1].ravel().tolist() or [0, 0]
         depths_m = state["waiting_depth_m"].reshape(len(state["waiting"]), *shape)
@@ -253,7 +249,8 @@ class SemanticMapper:
         model = observation_model(measured, names)
         self.labels = LabelStore(len(names), self.config.labels, model)
         self.surfaces = SurfaceStore()
-        self._label_votes = LabelVotes(self.camera, self.config.votes, self._map)
+        stores = self.labels, self.surfaces
+        self._label_votes = LabelVotes(self.camera, self.config.votes, self._map, *stores)
         of_objects = LabelStore(len(names), self.config.labels, model, of_objects=True)
         sizes = read_sizes(names)
         self.objects = ObjectMap(self.camera, of_objects, self.config.objects, sizes)

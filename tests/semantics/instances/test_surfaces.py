@@ -16,7 +16,12 @@ from bmask_slam.semantics.instances.surface_files import (
     surface_labels,
     write_surfaces,
 )
-from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses, most_probable
+from bmask_slam.semantics.instances.surfaces import (
+    Segmented,
+    SurfaceClasses,
+    coded,
+    most_probable,
+)
 from bmask_slam.semantics.labels import label_set
 
 NAMES = label_set(("wall", "floor", "door"))
@@ -56,6 +61,17 @@ def test_the_likeliest_class_of_pixels() -> None:
     assert (label[:24] == 1).all()
     assert (label[24:] == 2).all()
     assert p[0, 0] == pytest.approx(0.9, abs=1e-3)
+
+
+def test_codes_tell_the_likeliest_class_of_the_cell_of_a_pixel() -> None:
+    seen = classes()
+    kept = coded(seen)
+    columns, rows = np.meshgrid(np.arange(8) * 8.0 + 5, np.arange(6) * 8.0 + 2)
+    p = kept.at(np.stack([columns, rows], axis=-1).reshape(-1, 2)).reshape(6, 8, -1)
+    np.testing.assert_array_equal(p.argmax(axis=2), seen.probabilities.argmax(axis=2))
+    np.testing.assert_allclose(p.max(axis=2), seen.probabilities.max(axis=2), atol=3e-3)
+    np.testing.assert_allclose(p.sum(axis=2), 1, atol=5e-3)
+    np.testing.assert_array_equal(kept.at(np.array([[-9.0, 999.0]]))[0], p[5, 0])
 
 
 def test_files_keep_the_likeliest_class(tmp_path: Path) -> None:
