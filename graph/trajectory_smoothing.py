@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
-from scipy.optimize import minimize
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import make_pose, so3_exp, so3_log
@@ -143,6 +142,8 @@ class Frames:
         simplex = np.vstack([start, start + np.eye(len(start)) * np.log(3.0)])
         ends = {"maxfev": EVALUATIONS, "xatol": 0.05, "fatol": 0.5}
         options = {**ends, "initial_simplex": simplex}
+        from scipy.optimize import minimize  # noqa: PLC0415 - loads slowly
+
         found = minimize(cost, start, method="Nelder-Mead", options=options)
         return MotionNoise.of(found.x)
 

@@ -16,13 +16,16 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.batch.iteration import Progress, iterate
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.checks import OBSERVATION_PROBABILITY, wrong_observations
+from bmask_slam.graph.factors.checks import (
+    OBSERVATION_PROBABILITY,
+    chi2_quantile,
+    wrong_observations,
+)
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.gnc import first_mu, gnc_weights
 from bmask_slam.graph.factors.graph_update import LOOP, GraphUpdate, RelativePose
@@ -184,7 +187,7 @@ class _Adjuster:
         loops = [self._loop(number) for number in numbers]
         plain = make_graph([self._maker.pose_factor(loop) for loop in loops])
         others = self._graph(sorted(set(self._tables.pose_factors) - set(numbers)))
-        limit = float(chi2.ppf(self._config.loop_probability, 6))
+        limit = float(chi2_quantile(self._config.loop_probability, 6))
 
         def chi_squares() -> Array:
             values = self._values()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student_t
+from scipy.special import ndtri, stdtrit
 
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.equations import normal_equations, root_weights, with_points
@@ -70,5 +69,5 @@ def _clustered_variance(scores: Array, clusters: Ints) -> Array:
     sums = np.zeros((int(clusters.max()) + 1, N))
     np.add.at(sums, clusters, scores)
     freedom = max(int(np.count_nonzero(sums.any(axis=1))) - 1, 1)
-    bound = float(student_t(freedom).ppf(0.975) / norm.ppf(0.975))
+    bound = float(stdtrit(freedom, 0.975) / ndtri(0.975))
     return (sums**2).sum(axis=0) * (freedom + 1) / freedom * bound**2

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.stats import chi2
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
-from bmask_slam.graph.factors.checks import mahalanobis
+from bmask_slam.graph.factors.checks import chi2_quantile, mahalanobis
 from bmask_slam.graph.geometry import adjoint, inverse, se3_log
 from bmask_slam.graph.pose_graph.pose_graph import (
     PoseGraph,
@@ -56,12 +55,12 @@ def loop_consistency(graph: PoseGraph) -> LoopConsistency:
     if len(loops) < 2 or not is_connected(odometry):
         return LoopConsistency(consistent, 1.0)
     a, b, chi_squares = _short_cycles(graph, odometry, loops)
-    expected = chi2(graph.information.shape[-1])
+    degrees = graph.information.shape[-1]
     scale = 1.0
     if len(chi_squares) >= MIN_CYCLES:
-        ratio = float(np.median(chi_squares) / expected.median())
+        ratio = float(np.median(chi_squares) / chi2_quantile(0.5, degrees))
         scale = max(min(1.0, SCALE_MARGIN * ratio), ratio / SCALE_MARGIN)
-    agree = chi_squares < scale * expected.ppf(PROBABILITY)
+    agree = chi_squares < scale * chi2_quantile(PROBABILITY, degrees)
     consistent[loops[a[agree]]] = consistent[loops[b[agree]]] = True
     return LoopConsistency(consistent, scale)
 

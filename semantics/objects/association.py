@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
@@ -109,6 +108,8 @@ def assign(overlap: Overlap, evidence: Evidence, config: AssociationConfig) -> I
     age = 1.0 - np.exp(-evidence.unseen_s / config.forget_s)
     cost = 1.0 - covered + config.class_weight * (1.0 - affinity) + config.time_weight * age
     possible = allowed(overlap, config) & (cost <= config.max_cost)
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - loads slowly
+
     rows, columns = linear_sum_assignment(np.where(possible, cost, _IMPOSSIBLE))
     good = possible[rows, columns]
     found[rows[good]] = columns[good]

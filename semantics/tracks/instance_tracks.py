@@ -6,9 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from filterpy.common import Q_discrete_white_noise
-from filterpy.kalman import predict, update
-from scipy.optimize import linear_sum_assignment
 
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints, Mask
 from bmask_slam.semantics.tracks.instance_track import Sighting, Track
@@ -122,10 +119,8 @@ class InstanceTracks:
         dt = time_s - track.time_s
         F = np.eye(6)
         F[:3, 3:] = dt * np.eye(3)
-        variance = self.config.acceleration_m_s2**2
-        Q = Q_discrete_white_noise(2, abs(dt), variance, block_size=3, order_by_dim=False)
-        mean, covariance = predict(track.mean, track.covariance, F=F, Q=Q)
-        return replace(track, mean=mean, covariance=covariance)
+        P = F @ track.covariance @ F.T + self._process_noise(abs(dt))
+        return replace(track, mean=F @ track.mean, covariance=P)
 
     def reach_m(self, track: Track) -> Array:
         """Half size (3,) m of a predicted track's box, widened by its uncertainty."""
@@ -224,6 +219,11 @@ class InstanceTracks:
         ended = {others[k].id for k in np.flatnonzero(double.any(axis=1)).tolist()}
         self.tracks = [track for track in self.tracks if track.id not in ended]
 
+    def _process_noise(self, dt: float) -> Array:
+        """What random acceleration adds to the covariance: Bar-Shalom, Estimation, 2001, p. 274."""
+        Q = np.array([[0.25 * dt**4, 0.5 * dt**3], [0.5 * dt**3, dt**2]])
+        return np.kron(Q, np.eye(3)) * self.config.acceleration_m_s2**2
+
     def _slack_m(self, sigma_m: Array) -> Array:
         """Margin of boxes whose centres have this standard deviation."""
         known = self.config.box_sigmas * sigma_m
@@ -243,6 +243,8 @@ class InstanceTracks:
             affinity = np.array([_affinity(s.distribution, track.distribution) for s in sightings])
             total = chi2 + self.config.class_cost * (1 - affinity)
             cost[:, k] = np.where(total < self.config.gate_chi2, total, _NEVER)
+        from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - loads slowly
+
         for row, column in zip(*linear_sum_assignment(cost), strict=True):
             if cost[row, column] < _NEVER:
                 chosen[row] = int(column)
@@ -265,15 +267,14 @@ class InstanceTracks:
 
     def _updated(self, ahead: Track, sighting: Sighting, time_s: float) -> Track:
         limit = self.config.max_evidence
-        noise = self.config.centroid_sigma_m**2 * np.eye(3)
-        mean, covariance = update(
-            ahead.mean, ahead.covariance, sighting.centroid_world, noise, H=_H
-        )
+        P, noise = ahead.covariance, self.config.centroid_sigma_m**2 * np.eye(3)
+        K = P @ _H.T @ np.linalg.inv(_H @ P @ _H.T + noise)
+        kept = np.eye(6) - K @ _H  # Joseph's form, which stays symmetric
         return replace(
             ahead,
             time_s=time_s,
-            mean=mean,
-            covariance=covariance,
+            mean=ahead.mean + K @ (sighting.centroid_world - ahead.mean[:3]),
+            covariance=kept @ P @ kept.T + K @ noise @ K.T,
             half_size=np.maximum(sighting.half_size, 0.8 * ahead.half_size),
             distribution=np.float32(0.5) * (ahead.distribution + sighting.distribution),
             prior=ahead.prior if ahead.stood else (ahead.prior + sighting.prior) / 2,

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.live.health import Health
-from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.viewer.scene import Scene
 from bmask_slam.world.world_map import WorldMap
+
+if TYPE_CHECKING:  # it loads torch
+    from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 
 IMAGE_EVERY = 3
 """Interval in frames of images that are shown."""

@@ -9,6 +9,7 @@ import time
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
@@ -20,8 +21,6 @@ from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.display import Display
 from bmask_slam.live.health import FrameMeter, Health, measure_health
-from bmask_slam.live.processes.dense_messages import MapWritten
-from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.recorder import Recorder, rescued
 from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.live.sources.source_clock import SourceClock
@@ -33,6 +32,9 @@ from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 from bmask_slam.viewer.scene import Scene
+
+if TYPE_CHECKING:  # it loads torch
+    from bmask_slam.live.processes.remote_dense import MapWritten, RemoteDenseMapper
 
 __all__ = ["LiveOptions", "LiveSlam", "Prepared"]
 logger = logging.getLogger(__name__)
@@ -229,10 +231,8 @@ class LiveSlam:
         """Process ids by name."""
         system = self._system
         owners = {"map": system.remote, "segmenter": system.segmenter, "dense": system.dense}
-        found = {name: owner.worker.pid for name, owner in owners.items() if owner is not None}
-        return (
-            found if system.calibration is None else found | {"calibration": system.calibration.pid}
-        )
+        last = {} if system.calibration is None else {"calibration": system.calibration.pid}
+        return {name: part.worker.pid for name, part in owners.items() if part is not None} | last
 
     def health(self) -> Health:
         """The state of the live loop."""

@@ -5,22 +5,25 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bmask_slam.calibration.adoption import CALIBRATE, SelfCalibrationConfig
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.live.processes.calibration_process import CalibrationSetup
-from bmask_slam.live.processes.dense_messages import DenseSetup
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
-from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.system import LiveSystem
 from bmask_slam.run_folder.origin import Origin
+from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import NoSegmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.viewer.scene import ViewOptions
+
+if TYPE_CHECKING:
+    from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 
 PREVIEW_POINTS = 3000
 """Largest number of points of a submap that a viewer gets."""
@@ -74,6 +77,17 @@ def start_calibration(
     return RemoteCalibration(setup, adopt)
 
 
+def start_dense(
+    out: Path, camera: Camera, options: LiveOptions, masks: SegmenterOptions, labels: LabelSet
+) -> RemoteDenseMapper:
+    """The process that makes the dense map in a run folder."""
+    from bmask_slam.live.processes import remote_dense  # noqa: PLC0415 - loads torch
+
+    points = PREVIEW_POINTS if options.view.enabled else 0
+    setup = remote_dense.DenseSetup(out, camera, masks, labels.names, points)
+    return remote_dense.RemoteDenseMapper(setup)
+
+
 def start_system(
     camera: Camera, config: SystemConfig, options: LiveOptions, scratch: Path
 ) -> LiveSystem:
@@ -92,8 +106,7 @@ def start_system(
             undo.callback(segmenter.close)
             labels = segmenter.labels
         if options.dense and options.out is not None:
-            points = PREVIEW_POINTS if options.view.enabled else 0
-            dense = RemoteDenseMapper(DenseSetup(options.out, camera, masks, labels.names, points))
+            dense = start_dense(options.out, camera, options, masks, labels)
             undo.callback(dense.close)
         calibration = None
         if options.calibrate != "off":

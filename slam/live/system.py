@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import faiss
 import numpy as np
@@ -21,7 +22,6 @@ from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.messages import STATE_FILE, ImageToSegment, TimesEstimated, UseCamera
 from bmask_slam.live.processes.map_process import LabelsOnly
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
-from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
 from bmask_slam.live.processes.segmentation import RemoteSegmenter
 from bmask_slam.live.processes.supervision import RestartPolicy
@@ -32,6 +32,9 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult, Tracked
 from bmask_slam.world.frame_history import NO_KEYFRAME
 from bmask_slam.world.world_map import Keyframe
+
+if TYPE_CHECKING:  # it loads torch
+    from bmask_slam.live.processes.remote_dense import RemoteDenseMapper
 
 FIRST_MAP_S = 5.0
 """Longest wait of the first frame of a map for its landmarks."""
