@@ -147,12 +147,9 @@ REPORTS = {
     }, markdown=frozenset({"rooms"})),
     "mapping": Report(RESULTS / "mapping.md", "Results: the dense map", {
         "dense": ("Depth, surface, labels and time", "mapping.dense {sequences}/dense"),
-        "loop": (
-            "Submaps follow a loop closure", "mapping.dense_session loop {sequences}/dense/office"
-        ),
         "session": (
             "Memory over a long session",
-            "mapping.dense_session session {sequences}/dense/office --keyframes 900",
+            "mapping.dense_session {sequences}/dense/office --keyframes 900",
         ),
         "pictures": ("What it looks like", "mapping.dense_pictures {sequences}/dense docs/images"),
     }, {

@@ -32,7 +32,7 @@ ROOMS = {
     "semantics": """[...]  instances  network  weights  segmenters  beliefs  objects  tracks
                     training""",
     "semantics/network": "config  backbone  [...]  yolox",
-    "mapping": "[...]  inverse_depth  products",
+    "mapping": "[...]  inverse_depth  surface  products",
     "slam": """events  evaluation  config  sequences  features  world  rendering  datasets
                tracking  loops  moving  runtime  back_end  labelling  system_config
                system_interface  run_folder  system_results  system  dense  calibration

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from benchmarks.mapping.open3d_tsdf import DepthView, integrated
 from bmask_slam.dense.keyframe_input import image_name
 from bmask_slam.dense.saved_map import MappedRun
 from bmask_slam.graph.arrays import Array, Floats
@@ -17,7 +18,6 @@ from bmask_slam.graph.geometry import make_pose, transform
 from bmask_slam.mapping.inverse_depth.backprojection import back_project, surface_normals
 from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
-from bmask_slam.mapping.products.mesh import DepthView, integrated
 from bmask_slam.mapping.products.submaps import surest_per_voxel
 from bmask_slam.semantics.segmenters.segmenter import CocoSegmenter
 

@@ -1,4 +1,4 @@
-"""Point clouds written block by block: PLY and PCD, whole or not at all."""
+"""Point clouds written block by block as PLY and PCD, and meshes as PLY: whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Bytes
+from bmask_slam.graph.arrays import Bytes, Ints
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.products.cloud import Cloud
 
@@ -46,7 +46,7 @@ class CloudWriter:
     def write(self, cloud: Cloud) -> None:
         """Append a block."""
         assert self._body is not None
-        self._body.write(_rows(cloud, self._palette).tobytes())
+        self._body.write(ply_rows(cloud, self._palette).tobytes())
         self.count += len(cloud)
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
@@ -76,7 +76,8 @@ _LAYOUT = np.dtype(
 )
 
 
-def _rows(cloud: Cloud, palette: Bytes | None) -> NDArray:
+def ply_rows(cloud: Cloud, palette: Bytes | None = None) -> NDArray:
+    """The points (N,) as rows of a PLY file; with a palette (C, 3) in the labels' colours."""
     rows = np.empty(len(cloud), _LAYOUT)
     colours = cloud.colours if palette is None else palette[cloud.labels]
     for names, values in (
@@ -97,10 +98,15 @@ def _columns() -> Sequence[tuple[str, np.dtype]]:
     return [(name, _LAYOUT.fields[name][0]) for name in _LAYOUT.names or ()]
 
 
+def ply_properties() -> list[str]:
+    """The lines of a PLY header for ``ply_rows``."""
+    return [f"property {_PLY_NAMES[kind.str]} {name}" for name, kind in _columns()]
+
+
 def _ply_header(count: int) -> str:
     lines = ["ply", "format binary_little_endian 1.0", "comment bmask-slam, world frame, metres"]
     lines.append(f"element vertex {count}")
-    lines += [f"property {_PLY_NAMES[kind.str]} {name}" for name, kind in _columns()]
+    lines += ply_properties()
     return "\n".join([*lines, "end_header\n"])
 
 
@@ -126,3 +132,24 @@ def _pcd_header(count: int) -> str:
         "DATA binary",
     ]
     return "\n".join(lines) + "\n"
+
+
+_FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
+
+
+def write_mesh(path: Path, vertices: Cloud, triangles: Ints) -> Path:
+    """Write a mesh of N vertices, with the columns of a cloud, and triangles (M, 3) of them."""
+    faces = np.empty(len(triangles), _FACE)
+    faces["count"], faces["vertices"] = 3, triangles
+    lines = ["ply", "format binary_little_endian 1.0", "comment bmask-slam, world frame, metres"]
+    lines += [f"element vertex {len(vertices)}", *ply_properties()]
+    lines += [
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    with whole_file(path) as temporary, temporary.open("wb") as file:
+        file.write("\n".join(lines).encode("ascii"))
+        file.write(ply_rows(vertices).tobytes())
+        file.write(faces.tobytes())
+    return path

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Arrays, Bytes, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Arrays, Bytes, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
@@ -78,17 +78,6 @@ def make_submap(result: FusedKeyframe, camera: Camera, voxel_m: float = 0.01) ->
         variances[keep],
         instances.reshape(-1)[kept],
     )
-
-
-def relabel(submap: Submap, camera: Camera, instances: NDArray[np.uint16], hidden: Mask) -> Submap:
-    """The submap with other instances (H, W) of its keyframe, without ``hidden`` pixels (H, W).
-
-    Its points are back-projected pixel centres, so that projection gives their pixels.
-    """
-    columns, rows = np.rint(camera.project(submap.points.astype(float))).astype(np.int64).T
-    keep = ~hidden[rows, columns]
-    arrays = {name: values[keep] for name, values in _arrays(submap).items()}
-    return Submap(submap.anchor, **arrays | {"instances": instances[rows, columns][keep]})
 
 
 def surest_per_voxel(points: Floats, variances: Floats, voxel_m: float) -> Ints:

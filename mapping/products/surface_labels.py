@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.mapping.products.surface_regions import Regions, StuffFusion, find_regions
 from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
 from bmask_slam.semantics.instances.instances import Instance
@@ -21,6 +23,8 @@ OTHER_SHARE = 0.1
 STRAY = 0.01
 """Probability that the landmarks on an instance belong to another object."""
 MIN_LANDMARKS = 3
+NEAREST_M, TOLERANCE_M, TOLERANCE_SHARE = 0.1, 0.02, 0.02
+"""A point is seen where it is this near to the keyframe's depth, and this share of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,7 @@ class InstanceEvidence:
         landmark_instances: (L,) uint16, the instance of each, from 1.
         stuff: (R, S) float32 log probabilities of the classes ``stuff_names`` of the regions, whose
             numbers follow those of the instances.
+        pixels: (H, W) uint16, the instance or region at each undistorted pixel, from 1; 0 for none.
     """
 
     log_likelihoods: Floats
@@ -57,6 +62,7 @@ class InstanceEvidence:
     landmark_instances: NDArray[np.uint16]
     stuff: Floats = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     stuff_names: tuple[str, ...] = ()
+    pixels: NDArray[np.uint16] = field(default_factory=lambda: np.zeros((0, 0), np.uint16))
 
     def stuff_of(self, names: tuple[str, ...]) -> Floats:
         """``stuff`` (R, S) of regions with these S classes; zeros if they have others."""
@@ -159,7 +165,10 @@ class LabelTable:
         return evidence
 
     def labels(
-        self, views: csr_matrix, points_world: Array, normals_world: Array
+        self,
+        views: csr_matrix,
+        points_world: NDArray[np.floating],
+        normals_world: NDArray[np.floating],
     ) -> tuple[NDArray[np.uint16], Floats]:
         """Label (N,) and its probability (N,) of points (N, 3) with ``views`` (N, I).
 
@@ -221,3 +230,42 @@ def dilate(mask: Mask, margin_px: int = 5) -> Mask:
     """A mask (H, W) grown by ``margin_px`` in rows and columns."""
     size = 2 * margin_px + 1
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledView:
+    """A keyframe with labels.
+
+    Attributes:
+        depth_m: (H, W), NaN where missing.
+        numbers: (H, W), the instance or region at each pixel; 0 for none.
+        T_world_camera: (4, 4).
+        first: row of its instance 0, which stands for none, in the `LabelTable`.
+    """
+
+    depth_m: Floats
+    numbers: NDArray[np.uint16]
+    T_world_camera: Array
+    first: int
+
+
+def rows_seen(
+    points_world: NDArray[np.floating], view: LabelledView, camera: Camera
+) -> tuple[Ints, Ints]:
+    """Which of the points (N, 3) a keyframe sees, (K,), and the row of the table of each (K,)."""
+    points = transform(inverse(view.T_world_camera), points_world.astype(float))
+    ahead = np.flatnonzero(points[:, 2] > NEAREST_M)
+    u, v = np.rint(camera.project(points[ahead])).T
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    rows, pixels = ahead[inside], (v[inside].astype(np.int64), u[inside].astype(np.int64))
+    z = points[rows, 2]
+    seen = np.abs(view.depth_m[pixels] - z) < TOLERANCE_M + TOLERANCE_SHARE * z
+    return rows[seen], view.numbers[pixels][seen].astype(np.int64) + view.first
+
+
+def views_of(pairs: list[tuple[Ints, Ints]], points: int, instances: int) -> csr_matrix:
+    """One in (N, I) where a point is on an instance, from what ``rows_seen`` gave of each view."""
+    rows, columns = (
+        np.concatenate([np.zeros(0, np.int64), *part]) for part in zip(*pairs, strict=True)
+    )
+    return csr_matrix((np.ones(len(rows), np.float32), (rows, columns)), (points, instances))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Floats, Ints, Mask
 from bmask_slam.semantics.beliefs.surface_geometry import Ground, log_likelihoods, with_evidence
 from bmask_slam.semantics.beliefs.surface_store import MIN_PROBABILITY, log_view, pooled
 from bmask_slam.semantics.instances.surfaces import SurfaceClasses
@@ -78,7 +78,11 @@ class StuffFusion:
         return cls(names, tuple(stuff), columns, ground)
 
     def labels(
-        self, log_sums: Floats, views: Floats, points_world: Array, normals_world: Array
+        self,
+        log_sums: Floats,
+        views: Floats,
+        points_world: NDArray[np.floating],
+        normals_world: NDArray[np.floating],
     ) -> tuple[Ints, Floats]:
         """Class (N,) and probability (N,) from sums (N, S) of the logarithms of views (N,).
 
@@ -87,8 +91,8 @@ class StuffFusion:
         """
         p = pooled(log_sums.astype(float), views.astype(float))
         if self.ground is not None:
-            heights_m = self.ground.heights_m(points_world)
-            cosines = normals_world @ self.ground.up_world
+            heights_m = self.ground.heights_m(points_world.astype(float))
+            cosines = normals_world.astype(float) @ self.ground.up_world
             p = with_evidence(p, log_likelihoods(self.stuff, heights_m, cosines))
         best = p.max(axis=1)
         known = (views > 0) & (best >= MIN_PROBABILITY)

@@ -13,9 +13,10 @@ if TYPE_CHECKING:
 
 TEXT = "make a dense map of a finished run: cloud, mesh, floor plan"
 MORE = """\
-Every keyframe's depth is fused with its neighbours' and becomes a submap in RUN/dense; keyframes
-that are finished are not done again. Points get labels if the run had a segmenter, or with
---segmenter or --masks; what became of a label in the run's map shows here when called again."""
+Every keyframe's depth is fused with its neighbours'; keyframes that are finished are not done
+again. Then all tracked frames make one surface. Points get labels if the run had a segmenter, or
+with --segmenter or --masks; what became of a label in the run's map shows here when called
+again."""
 
 
 def add_map(commands: Commands) -> None:

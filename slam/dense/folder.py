@@ -3,13 +3,14 @@
 ==================  ==============================================================================
 settings.json       how the keyframes were fused; other settings start a new map
 depth/ID            fused inverse depth and its sigma, quantised
-labels/ID           log likelihoods of the keyframe's instances, one row each, and landmarks on them
-submaps/ID          points of a keyframe; written last: a keyframe that has one is finished
+colours/ID.jpg      its undistorted colours
+labels/ID           log likelihoods of its instances, one row each, landmarks on them, and
+                    the instance of each pixel; written last: a keyframe that has it is finished
 cloud.ply, .pcd     the cloud, with normals, label, probability and sigma of each point
-semantic.ply, .pcd  the same in the colours of the labels
+semantic.ply, .pcd  the same in the colours of the labels, if there are labels
 objects/ID-CLASS    a cloud of each object of the run
 moving/ID, .ply     with --moving: excluded points of each keyframe, and the cloud of all of them
-mesh.ply            the mesh
+mesh.ply            the mesh, with the same columns
 plan.png            the map from above
 view_*.png          pictures of cloud and mesh
 legend.json         colours of the labels
@@ -26,24 +27,25 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bmask_slam.dense.options import MapOptions, fusion_config
-from bmask_slam.graph.arrays import Arrays, Mask
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.arrays import Arrays, Image, Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.files.json_file import Name, check_json, read_json
 from bmask_slam.graph.files.reading import MAX_LINE
 from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 from bmask_slam.mapping.inverse_depth.depth_map import (
     InverseDepthMap,
     read_depth_map,
     write_depth_map,
 )
-from bmask_slam.mapping.products.submaps import Submap, read_submap, relabel, write_submap
+from bmask_slam.mapping.products.pictures import write_picture
+from bmask_slam.mapping.products.submaps import Submap, read_submap, write_submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence
 from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.semantics.labels import LabelSet
@@ -54,8 +56,9 @@ LABEL_FILE = FileKind("keyframe labels", 2)
 _NO_EVIDENCE = InstanceEvidence(
     np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.uint16)
 )
-PARTS = ("depth", "labels", "moving", "submaps")
-METHOD = 3
+PARTS = ("depth", "colours", "moving", "labels")
+OLD_PARTS = ("submaps",)
+METHOD = 4
 """Version of the method; to be raised when the same settings give other submaps than before."""
 
 
@@ -144,45 +147,38 @@ class DenseFolder:
         if before is not None:
             logger.warning("%s: was made with other settings; started again", self.path)
         path.unlink(missing_ok=True)
-        for name in PARTS:
+        for name in (*PARTS, *OLD_PARTS):
             shutil.rmtree(self.path / name, ignore_errors=True)
 
     def is_done(self, keyframe_id: int) -> bool:
         """Whether the keyframe is finished."""
-        return self._file("submaps", keyframe_id).is_file()
+        return self._file("labels", keyframe_id).is_file()
 
-    def write(self, submap: Submap, fused: InverseDepthMap, evidence: InstanceEvidence) -> None:
+    def write(self, result: FusedKeyframe, evidence: InstanceEvidence) -> None:
         """Save a finished keyframe. Raises InputError, with no half-written file, if it cannot."""
-        write_depth_map(self._file("depth", submap.anchor), fused)
-        _write_evidence(self._file("labels", submap.anchor), evidence)
-        write_submap(self._file("submaps", submap.anchor), submap)
+        number = result.keyframe.id
+        write_depth_map(self._file("depth", number), result.map)
+        write_picture(self._image(number), result.keyframe.rgb)
+        _write_evidence(self._file("labels", number), evidence)
         give_back_memory()
 
-    def relabel(
-        self,
-        keyframe_id: int,
-        camera: Camera,
-        instances: NDArray[np.uint16],
-        excluded: Mask,
-        evidence: InstanceEvidence,
-    ) -> None:
-        """Replace the instances (H, W) of a finished keyframe, remove its excluded pixels (H, W).
+    def relabel(self, keyframe_id: int, excluded: Mask, evidence: InstanceEvidence) -> None:
+        """Replace the evidence of a finished keyframe, remove its excluded pixels (H, W).
 
         Raises:
             InputError: it cannot be written; the old files stay.
         """
-        submap = relabel(self.submap(keyframe_id), camera, instances, excluded)
         if excluded.any():
             write_depth_map(
                 self._file("depth", keyframe_id), self.fused(keyframe_id).without(excluded)
             )
         _write_evidence(self._file("labels", keyframe_id), evidence)
-        write_submap(self._file("submaps", keyframe_id), submap)
 
     def remove(self, keyframe_id: int) -> None:
-        """Remove all files of a keyframe, its submap first."""
+        """Remove all files of a keyframe, its labels first."""
         for kind in reversed(PARTS):
             self._file(kind, keyframe_id).unlink(missing_ok=True)
+        self._image(keyframe_id).unlink(missing_ok=True)
 
     def write_excluded(self, submap: Submap) -> None:
         """Save the excluded points of a keyframe. Raises InputError if it cannot."""
@@ -193,15 +189,20 @@ class DenseFolder:
         path = self._file("moving", keyframe_id)
         return read_submap(path) if path.is_file() else None
 
-    def submap(self, keyframe_id: int) -> Submap:
-        """The points of a finished keyframe."""
-        return read_submap(self._file("submaps", keyframe_id))
+    def colours(self, keyframe_id: int) -> Image:
+        """Colours (H, W, 3) of a finished keyframe. Raises InputError if they cannot be read."""
+        path = self._image(keyframe_id)
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+        if image is None:
+            raise InputError(f"{path}: is missing or no image; remove {self.path} and map again")
+        return np.asarray(image, np.uint8)
 
     def evidence(self, keyframe_id: int) -> InstanceEvidence:
         """The evidence of a finished keyframe about the classes of its instances."""
         path = self._file("labels", keyframe_id)
         header, arrays = read_arrays(path, LABEL_FILE)
-        arrays.setdefault("stuff", _NO_EVIDENCE.stuff)  # older files have none
+        for name in ("stuff", "pixels"):
+            arrays.setdefault(name, getattr(_NO_EVIDENCE, name))  # older files have none
         kinds = _arrays(_NO_EVIDENCE)
         arrays = {n: a.astype(kinds[n].dtype) if n in kinds else a for n, a in arrays.items()}
         check_like(arrays, kinds, path)
@@ -223,6 +224,9 @@ class DenseFolder:
         """Write a text file, or replace it."""
         with whole_file(self.path / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
+
+    def _image(self, keyframe_id: int) -> Path:
+        return self.path / "colours" / f"{keyframe_id:06d}.jpg"
 
     def _file(self, kind: str, keyframe_id: int) -> Path:
         return self.path / kind / f"{keyframe_id:06d}"

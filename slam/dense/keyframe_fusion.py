@@ -92,8 +92,10 @@ class KeyframeFusion:
         on = labels.numbers[lines.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)]
         known = (on > 0) & (on <= len(instances))
         observed, stuff = (landmark_ids[known], on[known]), labels.stuff
-        evidence = InstanceEvidence(labels.log_likelihoods, *observed, stuff.log_p, stuff.names)
         numbers = undistort_labels(labels.numbers, self._camera)
+        evidence = InstanceEvidence(
+            labels.log_likelihoods, *observed, stuff.log_p, stuff.names, numbers
+        )
         excluded = [k for k, found in enumerate(instances, 1) if found.label in self._excluded]
         return KeyframeInstances(numbers, np.isin(numbers, excluded), evidence)
 
@@ -142,7 +144,7 @@ class KeyframeFusion:
         numbers, hidden = instances.numbers, dilate(instances.excluded)
         evidence = instances.evidence
         if self._folder.is_done(keyframe_id):
-            self._folder.relabel(keyframe_id, self._mapper.camera, numbers, hidden, evidence)
+            self._folder.relabel(keyframe_id, hidden, evidence)
         elif keyframe_id in self._evidence:
             self._evidence[keyframe_id] = evidence
             self._mapper.relabel(keyframe_id, numbers, hidden)
@@ -171,7 +173,7 @@ class KeyframeFusion:
         submaps = [make_submap(r, self._camera, voxel_m) for r in finished]
         elapsed_ms = 1e3 * (time.perf_counter() - started_s)
         for result, submap in zip(finished, submaps, strict=True):
-            folder.write(submap, result.map, self._evidence.pop(submap.anchor))
+            folder.write(result, self._evidence.pop(submap.anchor))
             self.counts.fused += 1
             self.counts.fuse_ms.append(elapsed_ms / len(finished))
         return submaps

@@ -17,8 +17,9 @@ from bmask_slam.dense.folder import DenseFolder, folder_settings
 from bmask_slam.dense.keyframe_fusion import FusionCounts, KeyframeFusion
 from bmask_slam.dense.keyframe_input import image_name, load_keyframe
 from bmask_slam.dense.options import MapOptions, resolve_options
-from bmask_slam.dense.products import FusedMap, Products, write_clouds, write_dense_mesh
+from bmask_slam.dense.products import Products, write_products
 from bmask_slam.dense.saved_map import MappedRun, open_run, with_right_images
+from bmask_slam.dense.surface import FusedMap
 from bmask_slam.graph.arrays import Image, Mask
 from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
@@ -64,9 +65,7 @@ def map_run(options: MapOptions, progress: Progress = lambda done, total: None) 
     counts = fusion.fuse_all(progress)
     started_s = time.perf_counter()
     fused = FusedMap(fusion.run, fusion.segmenter.labels, fusion.folder, fusion.options)
-    products = write_clouds(fused)
-    if options.mesh:
-        products.files.extend(write_dense_mesh(fusion.run, fused))
+    products = write_products(fused, progress)
     summary = MapSummary(fusion.folder.path, counts, products, time.perf_counter() - started_s)
     write_summary(fusion.folder, summary)
     return summary

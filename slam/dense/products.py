@@ -1,44 +1,39 @@
-"""The products of a dense map: clouds, mesh, floor plan and pictures."""
+"""The products of a dense map: clouds, mesh, floor plan and pictures, all of one surface."""
 
 from __future__ import annotations
 
 import json
-import tempfile
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
-from bmask_slam.dense.folder import DenseFolder
-from bmask_slam.dense.keyframe_input import load_keyframe
-from bmask_slam.dense.options import MapOptions
-from bmask_slam.dense.saved_map import MappedRun, SavedMap
-from bmask_slam.graph.arrays import Array, Mask
+from bmask_slam.dense.surface import FusedMap, make_surface
+from bmask_slam.graph.arrays import Array, Floats, Ints
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import file_stem
 from bmask_slam.graph.geometry import make_pose
-from bmask_slam.mapping.products.cloud import Cloud, PlacedSubmap, merge_blocks, sort_into_blocks
-from bmask_slam.mapping.products.cloud_files import CloudWriter
+from bmask_slam.graph.whole_file import remove
+from bmask_slam.mapping.products.cloud import Cloud
+from bmask_slam.mapping.products.cloud_files import CloudWriter, write_mesh
 from bmask_slam.mapping.products.floor_plan import FloorPlan, plan_frame, up_direction
-from bmask_slam.mapping.products.mesh import (
-    DepthView,
-    sampled,
-    truncation_voxels,
-    tsdf_mesh,
-    write_mesh,
-)
 from bmask_slam.mapping.products.object_clouds import ObjectClouds, ObjectRegion
 from bmask_slam.mapping.products.pictures import CloudPictures, Picture, palette, write_picture
-from bmask_slam.mapping.products.surface_labels import LabelTable
+from bmask_slam.mapping.products.surface_labels import LabelledView, LabelTable, rows_seen, views_of
 from bmask_slam.mapping.products.surface_regions import StuffFusion
+from bmask_slam.mapping.surface.depth_frame import MIN_SIGMA_M
+from bmask_slam.mapping.surface.extraction import Surface
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
-from bmask_slam.semantics.beliefs.surface_geometry import FLOORS, find_ground
-from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.beliefs.surface_geometry import FLOORS, Ground, find_ground
 from bmask_slam.world.world_map import Keyframe
 
 PLAN_CELL_M, SAMPLE_STEP = 0.03, 20
+AT_ONCE = 200_000
+NO_PIXELS = np.zeros((0, 0), np.uint16)
 OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
 OVERVIEW_TILT_DEG = -20.0
 """The overview is taken from behind and above a keyframe, tilted down."""
@@ -59,145 +54,152 @@ class Products:
     label_shares: dict[str, float]
 
 
-@dataclass(frozen=True, eq=False)
-class FusedMap:
-    """A dense map whose keyframes are fused.
-
-    Attributes:
-        run: the map of the run. labels: of its instances. folder: RUN/dense. options: resolved.
-    """
-
-    run: SavedMap
-    labels: LabelSet
-    folder: DenseFolder
-    options: MapOptions
-
-    def keyframes(self) -> list[Keyframe]:
-        """The keyframes that have a submap, oldest first."""
-        return [k for k in self.run.keyframes if self.folder.is_done(k.id)]
-
-
-def write_clouds(fused: FusedMap) -> Products:
-    """Write the coloured and the semantic cloud, and the plan and pictures, in one pass a cloud."""
-    folder, voxel_m = fused.folder, fused.options.voxel_m
-    keyframes = fused.keyframes()
-    sample = sample_points(fused, keyframes)
-    with tempfile.TemporaryDirectory(dir=folder.path, prefix=".blocks-") as temporary:
-        table = label_table(fused, keyframes, sample)
-        names = table.stuff_fusion.names
-        rows = zip(keyframes, table.first.tolist(), strict=True)
-        submaps = (PlacedSubmap(folder.submap(k.id), k.T_world_camera, row) for k, row in rows)
-        files = sort_into_blocks(submaps, voxel_m, Path(temporary))
-        plan = None
-        if fused.options.plan:
-            frame = plan_frame(sample.points, sample.normals, sample.up_guess, PLAN_CELL_M)
-            plan = FloorPlan(frame, names)
-        pictures = CloudPictures(_viewpoints(fused.run.camera, keyframes), voxel_m, names)
-        written = _write_blocks(fused, merge_blocks(files, voxel_m, table), pictures, plan)
-        written += pictures.write(folder.path)
-        written += _write_excluded(fused, keyframes, table, Path(temporary))
-    if plan is not None:
-        path_world = np.stack([k.T_world_camera[:3, 3] for k in keyframes])
+def write_products(
+    fused: FusedMap, progress: Callable[[int, int], None] = lambda done, total: None
+) -> Products:
+    """Make the surface and write the clouds, mesh, plan and pictures of it."""
+    surface, evidence = make_surface(fused, progress), KeyframeEvidence(fused)
+    if not len(surface.vertices):
+        raise InputError(f"{fused.run.path}: no surface: too few keyframes have depth")
+    views = evidence.views(surface.vertices)
+    up_guess = -np.mean([k.T_world_camera[:3, 1] for k in evidence.keyframes], axis=0)
+    table = evidence.table(evidence.ground(surface, views, up_guess))
+    cloud = _labelled(surface, views, table)
+    kept = ~np.isin(cloud.labels, [fused.labels.number(n) for n in fused.options.excluded or ()])
+    surface, cloud = surface.select(kept), cloud.select(kept)
+    names, folder = table.stuff_fusion.names, fused.folder
+    written = _write_clouds(fused, cloud, names)
+    if fused.options.mesh:
+        written += _write_mesh(fused, cloud, surface.triangles)
+    if fused.options.plan:
+        points, normals = (a.astype(float) for a in (cloud.points, cloud.normals))
+        plan = FloorPlan(plan_frame(points, normals, up_guess, PLAN_CELL_M), names)
+        plan.add(cloud)
+        path_world = np.stack([k.T_world_camera[:3, 3] for k in evidence.keyframes])
         written.append(write_picture(folder.path / "plan.png", plan.picture(path_world)))
-    legend = dict(zip(names, palette(names).tolist(), strict=True))
-    folder.write_text("legend.json", json.dumps(legend, indent=1) + "\n")
-    points = int(pictures.counts.sum())
-    shares = {names[k]: float(pictures.counts[k] / max(points, 1)) for k in pictures.present}
-    return Products(written, points, shares)
+    written += _write_pictures(fused, cloud, names)
+    written += _write_excluded(fused, evidence, table)
+    counts = np.bincount(cloud.labels, minlength=len(names))
+    shares = {names[k]: float(counts[k] / len(cloud)) for k in np.flatnonzero(counts).tolist()}
+    return Products(written, len(cloud), shares)
 
 
-def label_table(fused: FusedMap, keyframes: list[Keyframe], sample: Sample) -> LabelTable:
-    """The label evidence of all keyframes' instances and regions.
-
-    It includes the current beliefs of the run's label store about the landmarks on the instances,
-    so that a label that changes there changes in the dense map.
-    """
-    store_config = run_semantics(fused.run.path).labels
-    prior = store_config.prior(len(fused.labels))
-    evidence = [fused.folder.evidence(k.id) for k in keyframes]
-    rows = []
-    for one in evidence:
-        distributions, known = fused.run.label_distributions(one.landmark_ids, fused.labels)
-        rows.append(one.with_landmarks(distributions, known, prior))
-    names: tuple[str, ...] = next(filter(None, (e.stuff_names for e in evidence)), ())
-    cameras = np.stack([k.T_world_camera[:3, 3] for k in keyframes])
-    up_world = up_direction(sample.normals, sample.up_guess)
-    ground = find_ground(sample.points[sample.floor], cameras, up_world)
-    stuff = StuffFusion.of(fused.labels.names, names, ground)
-    return LabelTable.of(rows, store_config, [e.stuff_of(names) for e in evidence], stuff)
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """Some points of all submaps in the world.
+class KeyframeEvidence:
+    """What the keyframes tell about classes.
 
     Attributes:
-        points, normals: (N, 3).
-        floor: (N,) whether each looks like floor in its keyframe.
-        up_guess: (3,) the cameras' mean upward axis.
+        keyframes: those that are fused.
     """
 
-    points: Array
-    normals: Array
-    floor: Mask
-    up_guess: Array
+    def __init__(self, fused: FusedMap) -> None:
+        self.keyframes = fused.keyframes()
+        self._fused = fused
+        read = fused.folder.evidence
+        self._all = [replace(read(k.id), pixels=NO_PIXELS) for k in self.keyframes]
+        sizes = [len(e.log_likelihoods) + len(e.stuff) for e in self._all]
+        self.first: Ints = np.cumsum([0, *sizes])
+
+    def views(self, points_world: Floats) -> csr_matrix:
+        """The instances and regions (N, I) of all keyframes on which points (N, 3) lie."""
+        camera, pairs = self._fused.run.camera, []
+        for keyframe, first in zip(self.keyframes, self.first.tolist(), strict=False):
+            depth_m = self._fused.folder.fused(keyframe.id).depth_m()
+            pixels = self._fused.folder.evidence(keyframe.id).pixels
+            view = LabelledView(depth_m, pixels, keyframe.T_world_camera, first)
+            pairs.append(rows_seen(points_world, view, camera))
+        return views_of(pairs, len(points_world), int(self.first[-1]))
+
+    def ground(self, surface: Surface, views: csr_matrix, up_guess: Array) -> Ground | None:
+        """Up and the floor, from some points of the surface that look like floor in a keyframe."""
+        best = [(e, [e.stuff_names[row.argmax()] for row in e.stuff]) for e in self._all]
+        parts = [np.r_[np.zeros(len(e.log_likelihoods)), np.isin(n, FLOORS)] for e, n in best]
+        is_floor = views @ np.concatenate(parts) > 0
+        some = slice(None, None, SAMPLE_STEP)
+        points = surface.vertices[some].astype(float)
+        cameras = np.stack([k.T_world_camera[:3, 3] for k in self.keyframes])
+        up_world = up_direction(surface.normals[some].astype(float), up_guess)
+        return find_ground(points[is_floor[some]], cameras, up_world)
+
+    def table(self, ground: Ground | None) -> LabelTable:
+        """The evidence of all instances and regions.
+
+        It includes the current beliefs of the run's label store about the landmarks on the
+        instances, so that a label that changes there changes in the dense map.
+        """
+        fused = self._fused
+        store_config = run_semantics(fused.run.path).labels
+        prior, rows = store_config.prior(len(fused.labels)), []
+        for one in self._all:
+            distributions, known = fused.run.label_distributions(one.landmark_ids, fused.labels)
+            rows.append(one.with_landmarks(distributions, known, prior))
+        names: tuple[str, ...] = next(filter(None, (e.stuff_names for e in self._all)), ())
+        stuff = StuffFusion.of(fused.labels.names, names, ground)
+        return LabelTable.of(rows, store_config, [e.stuff_of(names) for e in self._all], stuff)
 
 
-def sample_points(fused: FusedMap, keyframes: list[Keyframe]) -> Sample:
-    """Every SAMPLE_STEP-th point of the submaps."""
-    some = slice(None, None, SAMPLE_STEP)
-    parts = []
-    for keyframe in keyframes:
-        submap, evidence = fused.folder.submap(keyframe.id), fused.folder.evidence(keyframe.id)
-        points, normals = submap.placed(keyframe.T_world_camera)
-        best = [evidence.stuff_names[row.argmax()] for row in evidence.stuff]
-        numbers = np.flatnonzero(np.isin(best, FLOORS)) + len(evidence.log_likelihoods)
-        parts.append((points[some], normals[some], np.isin(submap.instances[some], numbers)))
-    points, normals, floor = (np.concatenate(part) for part in zip(*parts, strict=True))
-    up_guess = -np.mean([k.T_world_camera[:3, 1] for k in keyframes], axis=0)
-    return Sample(points.astype(float), normals.astype(float), floor, up_guess)
+def _labelled(surface: Surface, views: csr_matrix, table: LabelTable) -> Cloud:
+    """The vertices of a surface with their labels.
+
+    The distances of a vertex's frames share MIN_SIGMA_M, which their number does not make smaller.
+    """
+    labels = np.zeros(len(surface.vertices), np.uint16)
+    probabilities = np.ones(len(labels), np.float32)
+    if table.log_likelihoods.shape[1] > 1 or len(table.stuff_fusion.stuff):
+        for some in _pieces(len(labels)):
+            points, normals = surface.vertices[some], surface.normals[some]
+            labels[some], probabilities[some] = table.labels(views[some], points, normals)
+    sigmas_m = np.sqrt(1e-4 / surface.weights + MIN_SIGMA_M**2).astype(np.float32)
+    frames = np.clip(surface.views, 1, 65535).astype(np.uint16)
+    return Cloud(
+        surface.vertices, surface.normals, surface.colours, sigmas_m, labels, probabilities, frames
+    )
 
 
-def _write_blocks(
-    fused: FusedMap, blocks: Iterable[Cloud], pictures: CloudPictures, plan: FloorPlan | None
-) -> list[Path]:
-    """Write the clouds block by block, and add each block to the pictures and the plan."""
-    path = fused.folder.path
-    with (
-        CloudWriter(path / "cloud") as cloud_file,
-        CloudWriter(path / "semantic", pictures.palette) as semantic_file,
-        ObjectClouds(path / "objects", _regions(fused)) as objects,
-    ):
-        for block in blocks:
-            cloud_file.write(block)
-            semantic_file.write(block)
-            objects.write(block)
-            pictures.draw(block)
-            if plan is not None:
-                plan.add(block)
-    written = [path / f"{n}{s}" for n in ("cloud", "semantic") for s in (".ply", ".pcd")]
+def _pieces(count: int) -> Iterator[slice]:
+    """Slices of some rows of ``count``."""
+    return (slice(k, min(k + AT_ONCE, count)) for k in range(0, count, AT_ONCE))
+
+
+def _write_clouds(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list[Path]:
+    """Write the cloud, that in the colours of the labels if there are some, and the objects'."""
+    path, colours = fused.folder.path, palette(names)
+    legend = dict(zip(names, colours.tolist(), strict=True))
+    fused.folder.write_text("legend.json", json.dumps(legend, indent=1) + "\n")
+    for suffix in (".ply", ".pcd"):
+        remove((path / "semantic").with_suffix(suffix))
+    written = []
+    for name, palette_of in (("cloud", None), ("semantic", colours))[
+        : 1 + bool(cloud.labels.any())
+    ]:
+        with CloudWriter(path / name, palette_of) as file:
+            for some in _pieces(len(cloud)):
+                file.write(cloud.select(some))
+        written += [path / f"{name}.ply", path / f"{name}.pcd"]
+    with ObjectClouds(path / "objects", _regions(fused)) as objects:
+        objects.write(cloud)
     return written + objects.files
 
 
-def _write_excluded(
-    fused: FusedMap, keyframes: list[Keyframe], table: LabelTable, temporary: Path
-) -> list[Path]:
+def _write_excluded(fused: FusedMap, evidence: KeyframeEvidence, table: LabelTable) -> list[Path]:
     """Write the cloud of all keyframes' excluded points, if they were saved."""
     path = fused.folder.path / "moving"
     path.with_suffix(".ply").unlink(missing_ok=True)
-    submaps = []
-    for keyframe, row in zip(keyframes, table.first.tolist(), strict=True):
-        submap = fused.folder.excluded(keyframe.id)
-        if submap is not None:
-            submaps.append(PlacedSubmap(submap, keyframe.T_world_camera, row))
-    if not submaps:
+    saved = [(k, fused.folder.excluded(k.id)) for k in evidence.keyframes]
+    if not any(submap for _, submap in saved):
         return []
-    temporary = temporary / "moving"
-    temporary.mkdir()
-    voxel_m = fused.options.voxel_m
     with CloudWriter(path) as file:
-        for block in merge_blocks(sort_into_blocks(submaps, voxel_m, temporary), voxel_m, table):
-            file.write(block)
+        for (keyframe, submap), first in zip(saved, evidence.first, strict=False):
+            if submap is None:
+                continue
+            points, normals = submap.placed(keyframe.T_world_camera)
+            rows = np.arange(len(points)), submap.instances.astype(np.int64) + first
+            on = csr_matrix(
+                (np.ones(len(points), np.float32), rows), (len(points), len(table.submaps))
+            )
+            labels = table.labels(on, points, normals)
+            sigmas_m = np.sqrt(submap.variances)
+            one = np.ones(len(points), np.uint16)
+            file.write(Cloud(points, normals, submap.colours, sigmas_m, *labels, one))
     return [path.with_suffix(".ply")]
 
 
@@ -205,41 +207,43 @@ def _regions(fused: FusedMap) -> list[ObjectRegion]:
     """The objects that the run found, those whose labels the dense map has too."""
     if not (fused.run.path / OBJECTS).is_file():
         return []
-    number = fused.labels.number
+    number, excluded = fused.labels.number, fused.options.excluded or ()
     return [
         ObjectRegion(f"{o.id:04d}-{file_stem(o.label)}", number(o.label), o.box)
         for o in read_objects(fused.run.path)[1]
-        if number(o.label)
+        if number(o.label) and o.label not in excluded
     ]
+
+
+def _write_mesh(fused: FusedMap, cloud: Cloud, triangles: Ints) -> list[Path]:
+    """Write the mesh and a picture of its shape, lit from the camera."""
+    path, middle = fused.folder.path, _middle(fused.keyframes())
+    picture = Picture(fused.run.camera, middle, fused.options.voxel_m)
+    shade = np.abs(cloud.normals @ middle[:3, 2].astype(np.float32))[:, None] * np.full(3, 255)
+    picture.draw(cloud.points, shade.astype(np.uint8))
+    return [
+        write_mesh(path / "mesh.ply", cloud, triangles),
+        write_picture(path / "view_mesh.png", picture.image()),
+    ]
+
+
+def _write_pictures(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list[Path]:
+    views = _viewpoints(fused.run.camera, fused.keyframes())
+    pictures = CloudPictures(views, fused.options.voxel_m, names)
+    pictures.draw(cloud)
+    return pictures.write(fused.folder.path)
+
+
+def _middle(keyframes: list[Keyframe]) -> Array:
+    return keyframes[len(keyframes) // 2].T_world_camera
 
 
 def _viewpoints(camera: Camera, keyframes: list[Keyframe]) -> dict[str, tuple[Camera, Array]]:
     """Camera and T_world_camera (4, 4) of two keyframes, and of an overview, by name."""
-    first, middle = (keyframes[k].T_world_camera for k in (0, len(keyframes) // 2))
+    first, middle = keyframes[0].T_world_camera, _middle(keyframes)
     tilt = np.deg2rad(OVERVIEW_TILT_DEG)
     T_middle_overview = make_pose(np.eye(3), OVERVIEW_OFFSET_M)
     T_middle_overview[1:3, 1:3] = [[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]]
     overview = middle @ T_middle_overview
     views = (("first", first), ("middle", middle), ("overview", overview))
     return {name: (camera, T) for name, T in views}
-
-
-def write_dense_mesh(run: MappedRun, fused: FusedMap) -> list[Path]:
-    """Integrate the fused depth of every keyframe; write the mesh and a picture of its shape."""
-    keyframes, folder, voxel_m = fused.keyframes(), fused.folder, fused.options.voxel_m
-    middle = keyframes[len(keyframes) // 2]
-    truncation = truncation_voxels(folder.fused(middle.id).depth_sigma_m(), voxel_m)
-    path = folder.path / "mesh.ply"
-    mesh = tsdf_mesh(_views(run, keyframes, folder), run.camera, voxel_m, truncation)
-    write_mesh(path, mesh)
-    picture = Picture(run.camera, middle.T_world_camera, 0.6 * voxel_m)
-    points, normals = sampled(mesh)
-    shade = np.abs(normals @ middle.T_world_camera[:3, 2])[:, None] * np.full(3, 255)
-    picture.draw(points, shade.astype(np.uint8))
-    return [path, write_picture(folder.path / "view_mesh.png", picture.image())]
-
-
-def _views(run: MappedRun, keyframes: list[Keyframe], folder: DenseFolder) -> Iterator[DepthView]:
-    for keyframe in keyframes:
-        dense, _ = load_keyframe(run, keyframe, "motion")  # for its colours: no depth is needed
-        yield DepthView(folder.fused(keyframe.id).depth_m(), dense.rgb, keyframe.T_world_camera)

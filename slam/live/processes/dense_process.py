@@ -17,8 +17,9 @@ from bmask_slam.dense.keyframe_fusion import FusionCounts, KeyframeFusion
 from bmask_slam.dense.keyframe_input import dense_keyframe
 from bmask_slam.dense.map_run import MapSummary, write_summary
 from bmask_slam.dense.options import MapOptions, resolve_options
-from bmask_slam.dense.products import FusedMap, write_clouds
+from bmask_slam.dense.products import write_products
 from bmask_slam.dense.saved_map import read_saved_map
+from bmask_slam.dense.surface import FusedMap
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import Ready
@@ -35,7 +36,7 @@ from bmask_slam.live.processes.dense_messages import (
     RemoveKeyframes,
     RunMoved,
 )
-from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+from bmask_slam.mapping.inverse_depth.dense_mapper import FusedKeyframe
 from bmask_slam.mapping.products.submaps import Submap
 from bmask_slam.mapping.products.surface_labels import InstanceEvidence
 from bmask_slam.run_folder.folder import DISK_ERRORS
@@ -72,13 +73,13 @@ class RetryingFolder(DenseFolder):
         with suppress(InputError):
             self.open_in(run)
 
-    def write(self, submap: Submap, fused: InverseDepthMap, evidence: InstanceEvidence) -> None:
+    def write(self, result: FusedKeyframe, evidence: InstanceEvidence) -> None:
         """Save a finished keyframe, or record why it cannot be saved."""
         try:
-            super().write(submap, fused, evidence)
+            super().write(result, evidence)
         except InputError as error:
-            self.unwritten[submap.anchor] = str(error)
-            self.remove(submap.anchor)
+            self.unwritten[result.keyframe.id] = str(error)
+            self.remove(result.keyframe.id)
 
 
 class DenseServer:
@@ -147,7 +148,7 @@ class DenseServer:
             fused = FusedMap(run, self._labels, self._folder, self._options)
             if not fused.keyframes():
                 return MapWritten(missing=missing, failure="no keyframe has a submap")
-            products = write_clouds(fused)
+            products = write_products(fused)
             counts = self._counts(missing, message.skipped)
             products_s = time.perf_counter() - started_s
             write_summary(self._folder, MapSummary(self._folder.path, counts, products, products_s))

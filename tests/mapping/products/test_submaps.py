@@ -17,7 +17,6 @@ from bmask_slam.mapping.inverse_depth.dense_mapper import DenseKeyframe, FusedKe
 from bmask_slam.mapping.products.submaps import (
     make_submap,
     read_submap,
-    relabel,
     surest_per_voxel,
     write_submap,
 )
@@ -142,20 +141,3 @@ def test_no_depth_gives_no_points() -> None:
     result = fused_plane()
     nothing = result.map.where(torch.zeros(30, 40, dtype=torch.bool))
     assert len(make_submap(FusedKeyframe(result.keyframe, nothing, result.views), CAMERA)) == 0
-
-
-def test_new_instances_relabel_the_points_of_their_pixels() -> None:
-    result = fused_plane()
-    submap = make_submap(result, CAMERA, 0.01)
-    numbers = np.arange(1200, dtype=np.uint16).reshape(30, 40)
-    moves = np.zeros((30, 40), bool)
-    moves[:, 25:] = True
-    relabelled = relabel(submap, CAMERA, numbers, moves)
-    expected = make_submap(
-        replace(result, keyframe=replace(result.keyframe, instances=numbers)), CAMERA, 0.01
-    )
-    keep = expected.instances % 40 < 25
-    assert 0 < keep.sum() < len(keep)
-    np.testing.assert_array_equal(relabelled.instances, expected.instances[keep])
-    np.testing.assert_array_equal(relabelled.points, expected.points[keep])
-    np.testing.assert_array_equal(relabelled.colours, expected.colours[keep])

@@ -109,11 +109,9 @@ def test_a_second_call_fuses_nothing_and_writes_the_same_bytes(
 ) -> None:
     before = (mapped / "dense" / "cloud.ply").read_bytes()
     arguments = ["map", str(mapped), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]
-    stamps = [p.stat().st_mtime_ns for p in sorted((mapped / "dense" / "submaps").iterdir())]
+    stamps = [p.stat().st_mtime_ns for p in sorted((mapped / "dense" / "labels").iterdir())]
     assert main(arguments) == 0
-    assert [
-        p.stat().st_mtime_ns for p in sorted((mapped / "dense" / "submaps").iterdir())
-    ] == stamps
+    assert [p.stat().st_mtime_ns for p in sorted((mapped / "dense" / "labels").iterdir())] == stamps
     assert (mapped / "dense" / "cloud.ply").read_bytes() == before
 
 
@@ -121,16 +119,17 @@ def test_a_stopped_map_is_completed_with_the_same_bytes(mapped: Path, tmp_path: 
     run = tmp_path / "run"
     shutil.copytree(mapped, run)
     for name in ("000003", "000004", "000009"):
-        (run / "dense" / "submaps" / name).unlink()
-    assert main(["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]) == 0
-    for name in ("submaps/000003", "submaps/000009", "cloud.ply"):
+        (run / "dense" / "labels" / name).unlink()
+    arguments = ["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet", "--mesh"]
+    assert main(arguments) == 0
+    for name in ("labels/000003", "depth/000009", "mesh.ply", "cloud.ply"):
         assert (run / "dense" / name).read_bytes() == (mapped / "dense" / name).read_bytes()
 
 
 def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(mapped, run)
-    stamps = [p.stat().st_mtime_ns for p in sorted((run / "dense" / "submaps").iterdir())]
+    stamps = [p.stat().st_mtime_ns for p in sorted((run / "dense" / "labels").iterdir())]
     opened, names = open_run(run), CocoSegmenter(truth_file(open_run(run))).labels
     folder = DenseFolder.open(run)
     evidence = [folder.evidence(k.id) for k in opened.keyframes]
@@ -150,7 +149,7 @@ def test_a_label_that_changes_in_the_store_changes_in_the_map(mapped: Path, tmp_
     shares.append(shares_of(run))
     assert shares[1].get(names.names[old], 0) < 0.3 * shares[0][names.names[old]]
     assert shares[1]["cup"] > shares[0].get("cup", 0) + 0.5 * shares[0][names.names[old]]
-    assert [p.stat().st_mtime_ns for p in sorted((run / "dense" / "submaps").iterdir())] == stamps
+    assert [p.stat().st_mtime_ns for p in sorted((run / "dense" / "labels").iterdir())] == stamps
 
 
 def test_excluded_classes_are_missing_or_in_another_cloud(mapped: Path, tmp_path: Path) -> None:
@@ -196,19 +195,19 @@ def test_a_full_disk_keeps_the_keyframes_written_before(
     run = make_run(tmp_path / "run", open_sequence(room))
     import bmask_slam.dense.folder as module
 
-    write, count = module.write_submap, 0
+    write, count = module.write_depth_map, 0
 
-    def full(path: Path, submap: object) -> None:
+    def full(path: Path, fused: object) -> None:
         nonlocal count
         count += 1
         if count == 3:
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
-        write(path, submap)  # type: ignore[arg-type]
+        write(path, fused)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(module, "write_submap", full)
+    monkeypatch.setattr(module, "write_depth_map", full)
     assert main(["map", str(run), "--voxel", "0.05", "--quiet"]) == 1
     assert "No space left" in capsys.readouterr().err
-    assert len(list((run / "dense" / "submaps").iterdir())) == 2
+    assert len(list((run / "dense" / "labels").iterdir())) == 2
     monkeypatch.undo()
     assert main(["map", str(run), "--voxel", "0.05", "--quiet"]) == 0
 

@@ -74,9 +74,10 @@ def test_a_submap_is_sent_after_its_neighbours_and_is_accurate(tmp_path) -> None
     for number in POSES:
         server.handle(to_map(number, []))
     assert mapped(answers) == [0, 1]
-    submap = DenseFolder.open(tmp_path / "run").submap(1)
-    points_world, _ = submap.placed(POSES[1])
-    assert np.abs(points_world[:, 2] - PLANE_Z_M).max() < 0.003
+    depth_m = DenseFolder.open(tmp_path / "run").fused(1).depth_m()
+    v, u = np.nonzero(np.isfinite(depth_m))
+    points = CAMERA.backproject(np.stack([u, v], axis=1).astype(float), depth_m[v, u])
+    assert np.abs((points @ POSES[1][:3, :3].T + POSES[1][:3, 3])[:, 2] - PLANE_Z_M).max() < 0.003
     preview = next(m.preview for m in answers if isinstance(m, Mapped) and m.keyframe_id == 1)
     assert 300 < len(preview.points) <= 500
     shown = preview.points @ POSES[1][:3, :3].T + POSES[1][:3, 3]
@@ -93,12 +94,12 @@ def test_poses_that_move_before_fusion_are_followed(tmp_path) -> None:
         message = to_map(number, [])
         server.handle(KeyframeToMap(message.snapshot, [], {k: POSES[k] for k in range(number + 1)}))
     folder = DenseFolder.open(tmp_path / "run")
-    sigma = float(np.median(np.sqrt(folder.submap(0).variances)))
+    sigma = float(np.nanmedian(folder.fused(0).depth_sigma_m()))
     alone, _ = make_server(tmp_path / "alone")
     alone.handle(to_map(0, []))
     alone._report(alone._fusion.finish())
-    single = DenseFolder.open(tmp_path / "alone").submap(0)
-    assert sigma < 0.8 * float(np.median(np.sqrt(single.variances)))
+    single = DenseFolder.open(tmp_path / "alone").fused(0)
+    assert sigma < 0.8 * float(np.nanmedian(single.depth_sigma_m()))
 
 
 @pytest.fixture(scope="module")
@@ -129,9 +130,10 @@ def same_evidence(one: DenseFolder, other: DenseFolder) -> bool:
 
 def test_masks_before_fusion_equal_masks_in_time(tmp_path, in_time) -> None:
     late = with_late_masks(tmp_path / "run", 3)
-    for name in ("points", "colours", "variances", "instances"):
-        a, b = getattr(late.submap(0), name), getattr(in_time.submap(0), name)
+    for name in ("rho", "variance"):
+        a, b = getattr(late.fused(0), name), getattr(in_time.fused(0), name)
         np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(late.colours(0), in_time.colours(0))
     assert same_evidence(late, in_time)
     assert in_time.evidence(0).landmark_instances.tolist() == [1, 1, 2]
 
@@ -142,19 +144,13 @@ def test_a_weak_detection_excludes_no_pixels(tmp_path) -> None:
         server.handle(to_map(number, [CHAIR, replace(PERSON, class_score=0.2)]))
     folder = DenseFolder.open(tmp_path / "run")
     assert np.isfinite(folder.fused(0).depth_m()[PERSON.mask]).mean() > 0.9
-    assert set(folder.submap(0).instances.tolist()) == {0, 1}
+    assert set(np.unique(folder.evidence(0).pixels).tolist()) == {0, 1}
 
 
-def test_late_masks_relabel_the_submap(tmp_path, in_time) -> None:
+def test_late_masks_relabel_a_saved_keyframe(tmp_path, in_time) -> None:
     late = with_late_masks(tmp_path / "run", 6)
     for folder in (late, in_time):
-        submap = folder.submap(0)
-        columns, rows = np.rint(CAMERA.project(submap.points.astype(float))).astype(int).T
-        assert CHAIR.mask[rows, columns].sum() > 50
-        np.testing.assert_array_equal(submap.instances == 1, CHAIR.mask[rows, columns])
-    submap = late.submap(0)
-    columns, rows = np.rint(CAMERA.project(submap.points.astype(float))).astype(int).T
-    assert not PERSON.mask[rows, columns].any()
+        np.testing.assert_array_equal(folder.evidence(0).pixels == 1, CHAIR.mask)
     assert not np.isfinite(late.fused(0).depth_m()[PERSON.mask]).any()
     assert same_evidence(late, in_time)
 

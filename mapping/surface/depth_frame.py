@@ -1,0 +1,101 @@
+"""A frame as the volume takes it: planes, weights and truncation of its pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from bmask_slam.graph.arrays import Array, Image, Mask
+from bmask_slam.graph.camera import Camera
+from bmask_slam.mapping.inverse_depth.backprojection import MAX_STEP, back_project, surface_normals
+from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
+
+MIN_COSINE = 0.15
+"""Pixels whose surface is seen at a flatter angle are left out."""
+MIN_SIGMA_M = 0.003
+"""Error of a distance beside that of its own pixel: of the pose and of the sensor's calibration."""
+BEHIND_SIGMAS, BEHIND_VOXELS = 3.0, (3, 8)
+SILHOUETTE_PX = 3
+UNEXPLAINED = 0.25
+"""How much a frame counts as a witness of a surface that the keyframes did not see."""
+NX, NY, NZ, OFFSET, WEIGHT, Z, BEHIND, WITNESS = range(8)
+"""Columns of ``DepthFrame.pixels``."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """What a frame's pixels tell about the distance to the surface.
+
+    Attributes:
+        pixels: (H W, 8) float32. NX, NY, NZ: unit normal towards the camera, in its frame; OFFSET:
+            normal . p of the pixel's point p, in metres; WEIGHT: 1 / sigma^2 of a distance in
+            1/cm^2, 0 where the pixel tells nothing; Z: depth in metres, 0 without weight; BEHIND:
+            how far behind the surface distances still count, in metres; WITNESS: see UNEXPLAINED.
+        free_m: (H W,) float32, depth up to which all rays around the pixel are free; 0: not known.
+        rgb: (H W, 3) float32, 0 to 255.
+        T_world_camera: (4, 4).
+    """
+
+    pixels: Tensor
+    free_m: Tensor
+    rgb: Tensor
+    T_world_camera: Array
+
+
+def depth_frame(
+    measured: InverseDepthMap, rgb: Image, T_world_camera: Array, camera: Camera, voxel_m: float
+) -> DepthFrame:
+    """A frame from its inverse depth and colours (H, W, 3), for a volume of this voxel size.
+
+    A voxel's distance is that to the plane of the pixel on which it falls: normal . (q - p), which
+    unlike a difference of depths has no bias on a slope and none by rounding to a pixel. Its
+    variance is (sigma_z cos(angle))^2 + MIN_SIGMA_M^2. Rims tell nothing: there a sensor's depth is
+    of neither side.
+    """
+    points = back_project(measured, camera)
+    normals = surface_normals(measured, camera)
+    offset, z = (normals * points).sum(-1), points[..., 2]
+    cosine = -offset / torch.linalg.norm(points, dim=-1)
+    variance = (measured.variance.sqrt() * z.square() * cosine).square() + MIN_SIGMA_M**2
+    good = (cosine > MIN_COSINE) & ~_rims(measured.rho) & torch.isfinite(variance)
+    least, most = BEHIND_VOXELS
+    columns = {
+        OFFSET: offset,
+        WEIGHT: 1e-4 / variance,
+        Z: z,
+        BEHIND: (BEHIND_SIGMAS * variance.sqrt()).clamp(least * voxel_m, most * voxel_m),
+        WITNESS: torch.ones_like(z),
+    }
+    pixels = torch.zeros((*z.shape, 8))
+    pixels[..., :3] = normals
+    for column, values in columns.items():
+        pixels[..., column] = values
+    pixels = torch.where(good[..., None], pixels, 0).reshape(-1, 8)
+    colours = torch.from_numpy(rgb).reshape(-1, 3).to(torch.float32)
+    return DepthFrame(pixels, _free_depth(pixels[:, Z].reshape(z.shape)), colours, T_world_camera)
+
+
+def _free_depth(z: Tensor) -> Tensor:
+    """The least depth (H W,) around each pixel of (H, W): silhouettes are not exact to a pixel."""
+    around = np.ones((2 * SILHOUETTE_PX + 1,) * 2, np.uint8)
+    return torch.from_numpy(cv2.erode(z.numpy(), around)).reshape(-1)
+
+
+def mark_unexplained(frame: DepthFrame, unexplained: Mask) -> None:
+    """Let pixels (H, W) count less as witnesses, in place."""
+    frame.pixels[torch.from_numpy(unexplained.reshape(-1)), WITNESS] = UNEXPLAINED
+
+
+def _rims(rho: Tensor) -> Tensor:
+    """Pixels (H, W) beside a hole or a step of inverse depth (H, W)."""
+    found = torch.zeros_like(rho, dtype=torch.bool)
+    for image, at in ((rho, found), (rho.T, found.T)):
+        a, b = image[:, 1:], image[:, :-1]
+        apart = ~((a - b).abs() < MAX_STEP * torch.maximum(a, b))
+        at[:, 1:].logical_or_(apart)
+        at[:, :-1].logical_or_(apart)
+    return found

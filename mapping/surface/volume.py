@@ -1,0 +1,232 @@
+"""A truncated signed distance volume: blocks of 8^3 voxels where frames saw surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bmask_slam.graph.arrays import Ints
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.mapping.surface.depth_frame import (
+    BEHIND,
+    NX,
+    NY,
+    NZ,
+    OFFSET,
+    WEIGHT,
+    WITNESS,
+    DepthFrame,
+    Z,
+)
+
+EDGE, BRICK = 8, 4
+"""Edges in voxels of a block, the unit of memory, and of a brick, the unit of work."""
+BRICKS, BRICK_VOXELS = (EDGE // BRICK) ** 3, BRICK**3
+FRONT_VOXELS = 8
+"""Distances in front of a surface are cut off at so many voxels."""
+COLOUR_VOXELS = 2.0
+"""Voxels this near to a surface take its colour, and count the frame as a witness of it."""
+FREE_SHARE = 0.02
+"""A ray passes a voxel freely if the surface is farther by the cut-off and this share of depth."""
+AT_ONCE, MAX_RAY_STEP_PX, NEAREST_M = 1024, 4, 0.1
+TABLES = ("distance", "weight", "witnesses", "free", "colour")
+
+
+class SurfaceVolume:
+    """Weighted means of the distances to the surface that frames measured (Curless and Levoy 1996).
+
+    Voxels are those of bricks, eight to a block; the voxel at index i has its centre at
+    i * voxel_m. What lies in front of a measured surface is also counted as free, wherever there is
+    a block, so that what moved away can be found.
+
+    Attributes:
+        voxel_m: edge of a voxel.
+        distance: (8 B, 64) float32, metres, positive in front of the surface.
+        weight: (8 B, 64) float32, sum of 1 / sigma^2 in 1/cm^2; 0 where unknown.
+        witnesses, free: (8 B, 64) float16, frames that saw a surface at the voxel, and through it.
+        colour: (8 B, 64, 3) float16, 0 to 255.
+    """
+
+    def __init__(self, voxel_m: float, camera: Camera, blocks: int = 1024) -> None:
+        """``blocks``: how many the tables hold before they grow."""
+        self.voxel_m, self._camera = voxel_m, camera
+        self._number: dict[int, int] = {}
+        self._origin = torch.zeros((blocks, 3))
+        size, half = (blocks * BRICKS, BRICK_VOXELS), torch.float16
+        self.distance, self.weight = torch.zeros(size), torch.zeros(size)
+        self.witnesses, self.free = torch.zeros(size, dtype=half), torch.zeros(size, dtype=half)
+        self.colour = torch.zeros((*size, 3), dtype=half)
+        self._voxels = _lattice(BRICK, 1) * voxel_m
+        self._bricks = _lattice(EDGE, BRICK) * voxel_m
+
+    def __len__(self) -> int:
+        return len(self._number)
+
+    @property
+    def keys(self) -> Ints:
+        """Keys (B,) of the blocks in the order of the tables, see ``block_keys``."""
+        return np.fromiter(self._number, np.int64, len(self))
+
+    def integrate(self, frame: DepthFrame) -> None:
+        """Add what a frame measured."""
+        self._make_blocks(frame)
+        T_camera_world = torch.from_numpy(inverse(frame.T_world_camera)).to(torch.float32)
+        bricks = self._seen(frame, T_camera_world)
+        for start in range(0, len(bricks), AT_ONCE):
+            self._update(bricks[start : start + AT_ONCE], frame, T_camera_world)
+
+    def _make_blocks(self, frame: DepthFrame) -> None:
+        """Make the blocks around the surface that the frame saw."""
+        camera, edge_m = self._camera, EDGE * self.voxel_m
+        image = frame.pixels.reshape(camera.height, camera.width, -1)
+        farthest_m = max(float(image[..., Z].max()), NEAREST_M)
+        step = int(np.clip(0.5 * edge_m * camera.fx / farthest_m, 1, MAX_RAY_STEP_PX))
+        some = image[::step, ::step]
+        v, u = torch.nonzero(some[..., WEIGHT]).mul_(step).to(torch.float32).unbind(-1)
+        known = some[some[..., WEIGHT] > 0]
+        rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
+        rays = torch.nn.functional.pad(rays, (0, 1), value=1)
+        T = torch.from_numpy(frame.T_world_camera).to(torch.float32)
+        keys = []
+        for share in (-1.0, -0.5, 0.0, 0.5, 1.0):
+            reach = known[:, BEHIND] if share > 0 else FRONT_VOXELS * self.voxel_m
+            points = rays * (known[:, Z] + share * reach)[:, None] @ T[:3, :3].T + T[:3, 3]
+            keys.append(block_keys(torch.floor(points / edge_m).to(torch.int64)))
+        new = [k for k in torch.unique(torch.cat(keys)).tolist() if k not in self._number]
+        first = len(self)
+        self._reserve(first + len(new))
+        self._number.update(zip(new, range(first, first + len(new)), strict=True))
+        indices = block_indices(torch.tensor(new, dtype=torch.int64))
+        self._origin[first : len(self)] = indices.to(torch.float32) * edge_m
+
+    def _reserve(self, blocks: int) -> None:
+        """Let the tables hold so many blocks."""
+        if blocks <= len(self._origin):
+            return
+        blocks = max(blocks, len(self._origin) * 3 // 2)
+        for name in (*TABLES, "_origin"):
+            old = getattr(self, name)
+            rows = blocks * (len(old) // len(self._origin) if name != "_origin" else 1)
+            new = torch.zeros((rows, *old.shape[1:]), dtype=old.dtype)
+            new[: len(old)] = old
+            setattr(self, name, new)
+
+    def _seen(self, frame: DepthFrame, T_camera_world: Tensor) -> Tensor:
+        """Numbers (N,) of the bricks that are at a surface of the frame or in front of it."""
+        edge_m, brick_m = EDGE * self.voxel_m, BRICK * self.voxel_m
+        R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
+        centres = (self._origin[: len(self)] + 0.5 * edge_m) @ R.T + t
+        blocks = torch.nonzero(self._in_image(centres, edge_m)[1])[:, 0]
+        corners = (self._origin[blocks][:, None] + self._bricks).reshape(-1, 3)
+        centres = (corners + 0.5 * brick_m) @ R.T + t
+        pixel, inside = self._in_image(centres, brick_m)
+        plane = frame.pixels.index_select(0, pixel)
+        d = (plane[:, NX : NZ + 1] * centres).sum(1) - plane[:, OFFSET]
+        near = d > -plane[:, BEHIND] - brick_m - 0.01 * centres[:, 2]
+        before = centres[:, 2] < frame.free_m.index_select(0, pixel)
+        numbers = (blocks[:, None] * BRICKS + torch.arange(BRICKS)).reshape(-1)
+        return numbers[inside & (near & (plane[:, WEIGHT] > 0) | before)]
+
+    def _in_image(self, centres: Tensor, edge_m: float) -> tuple[Tensor, Tensor]:
+        """Pixels (N,) of cubes around points (N, 3) of the camera, the nearest of the image's, and
+        whether some of the cube is in the image.
+        """
+        camera, z = self._camera, centres[:, 2].clamp(min=NEAREST_M)
+        margin = 0.87 * edge_m * camera.fx / z
+        u = centres[:, 0] / z * camera.fx + camera.cx
+        v = centres[:, 1] / z * camera.fy + camera.cy
+        inside = (u > -margin) & (u < camera.width - 1 + margin) & (centres[:, 2] > NEAREST_M)
+        inside &= (v > -margin) & (v < camera.height - 1 + margin)
+        u, v = u.round_().clamp_(0, camera.width - 1), v.round_().clamp_(0, camera.height - 1)
+        return v.mul_(camera.width).add_(u).to(torch.int64), inside
+
+    def _update(self, bricks: Tensor, frame: DepthFrame, T_camera_world: Tensor) -> None:
+        """Add what the frame tells about the voxels of bricks (N,)."""
+        R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
+        corners = self._origin[bricks // BRICKS] + self._bricks[bricks % BRICKS]
+        corners, offsets = corners @ R.T + t, self._voxels @ R.T
+        x, y, z = ((corners[:, k, None] + offsets[:, k]).reshape(-1) for k in range(3))
+        camera = self._camera
+        u = (x / z).mul_(camera.fx).add_(camera.cx).round_()
+        v = (y / z).mul_(camera.fy).add_(camera.cy).round_()
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (z > NEAREST_M)
+        chosen = torch.nonzero(inside)[:, 0]
+        voxels = (bricks[:, None] * BRICK_VOXELS + torch.arange(BRICK_VOXELS)).reshape(-1)
+        x, y, z, voxels = (a.index_select(0, chosen) for a in (x, y, z, voxels))
+        pixel = v.mul_(camera.width).add_(u).index_select(0, chosen).to(torch.int64)
+        planes = frame.pixels.index_select(0, pixel)
+        d = (planes[:, NX] * x).addcmul_(planes[:, NY], y).addcmul_(planes[:, NZ], z)
+        d -= planes[:, OFFSET]
+        depth, behind, front = planes[:, Z], planes[:, BEHIND], FRONT_VOXELS * self.voxel_m
+        free_m = frame.free_m.index_select(0, pixel)
+        _add(self.free, voxels[z < free_m * (1 - FREE_SHARE) - front], 1)
+        measured = (d > -behind) & (planes[:, WEIGHT] > 0) & (z < depth + 2 * behind)
+        used = torch.nonzero(measured)[:, 0]
+        planes, d, voxels, pixel = (
+            a.index_select(0, used) for a in (planes, d.clamp_(max=front), voxels, pixel)
+        )
+        share = self._average(voxels, d, planes)
+        near = torch.nonzero(d.abs() < COLOUR_VOXELS * self.voxel_m)[:, 0]
+        voxels, pixel, share = (a.index_select(0, near) for a in (voxels, pixel, share))
+        _add(self.witnesses, voxels, planes[:, WITNESS].index_select(0, near).to(torch.float16))
+        colour = self.colour.view(-1, 3)
+        old = colour.index_select(0, voxels).to(torch.float32)
+        new = old + share[:, None] * (frame.rgb.index_select(0, pixel) - old)
+        colour.index_copy_(0, voxels, new.to(torch.float16))
+
+    def _average(self, voxels: Tensor, d: Tensor, planes: Tensor) -> Tensor:
+        """Add distances (N,) of voxels (N,) to the means; returns the share (N,) of each in it.
+
+        Up to a voxel behind the surface they count fully, then less and less: what is behind a thin
+        wall is its other side.
+        """
+        behind = planes[:, BEHIND]
+        fall = ((d + behind) / (behind - self.voxel_m)).clamp_(max=1)
+        weight, distance = self.weight.view(-1), self.distance.view(-1)
+        added = planes[:, WEIGHT] * fall
+        total = weight.index_select(0, voxels) + added
+        share = added / total
+        old = distance.index_select(0, voxels)
+        distance.index_copy_(0, voxels, old + share * (d - old))
+        weight.index_copy_(0, voxels, total)
+        return share
+
+
+def _add(table: Tensor, rows: Tensor, values: Tensor | int) -> None:
+    """Add values to rows (N,), all different, of a table, seen as one column."""
+    column = table.view(-1)
+    column.index_copy_(0, rows, column.index_select(0, rows) + values)
+
+
+def _lattice(edge: int, step: int) -> Tensor:
+    """Points (N, 3) of a cube, ``step`` apart, the last index first."""
+    axis = torch.arange(0, edge, step, dtype=torch.float32)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
+def block_keys(index: Tensor) -> Tensor:
+    """Keys (N,) of indices (N, 3), with 21 bits for each axis."""
+    shifted = index + (1 << 20)
+    return (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]
+
+
+def block_indices(keys: Tensor) -> Tensor:
+    """Indices (N, 3) of keys (N,)."""
+    mask = (1 << 21) - 1
+    return torch.stack([keys >> 42, (keys >> 21) & mask, keys & mask], dim=-1) - (1 << 20)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use one thread: two that wait for each other are slower on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

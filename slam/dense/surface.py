@@ -1,0 +1,128 @@
+"""The surface of a run: the keyframes' fused depth first, then every tracked frame."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from bmask_slam.dense.folder import DenseFolder
+from bmask_slam.dense.keyframe_input import MAX_STAMP_ERROR_S, undistort_images
+from bmask_slam.dense.options import MapOptions, fusion_config
+from bmask_slam.dense.saved_map import MappedRun, SavedMap
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
+from bmask_slam.mapping.inverse_depth.regularisation import regularise
+from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
+from bmask_slam.mapping.surface.extraction import (
+    MIN_WITNESSES,
+    Surface,
+    extract,
+    without_crumbs,
+)
+from bmask_slam.mapping.surface.gate import KeyframeSurface
+from bmask_slam.mapping.surface.volume import SurfaceVolume, one_thread
+from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.world.world_map import Keyframe
+
+logger = logging.getLogger(__name__)
+
+AHEAD = 3
+"""Frames that are prepared while another is integrated."""
+
+
+@dataclass(frozen=True, eq=False)
+class FusedMap:
+    """A dense map whose keyframes are fused.
+
+    Attributes:
+        run: the map of the run. labels: of its instances. folder: RUN/dense. options: resolved.
+    """
+
+    run: SavedMap
+    labels: LabelSet
+    folder: DenseFolder
+    options: MapOptions
+
+    def keyframes(self) -> list[Keyframe]:
+        """The keyframes that are fused, oldest first."""
+        return [k for k in self.run.keyframes if self.folder.is_done(k.id)]
+
+
+def make_surface(
+    fused: FusedMap, progress: Callable[[int, int], None] = lambda done, total: None
+) -> Surface:
+    """The surface of the keyframes and, where their images are known, of all tracked frames.
+
+    A frame is used where it is not in front of the keyframes' surface, from which people were cut
+    out. What they did not see is kept where enough frames saw it.
+    """
+    run, voxel_m = fused.run, fused.options.voxel_m
+    with one_thread():
+        volume = SurfaceVolume(voxel_m, run.camera)
+        for keyframe in fused.keyframes():
+            volume.integrate(_keyframe(fused, keyframe))
+        frames = tracked_frames(run) if isinstance(run, MappedRun) else []
+        if fused.options.source not in ("sensor", "both") or not frames:
+            return without_crumbs(extract(volume, 1), voxel_m)
+        gate = KeyframeSurface(extract(volume, 1).vertices, run.camera)
+        for number, frame in enumerate(_prepared(fused, frames, gate)):
+            if frame is not None:
+                volume.integrate(frame)
+            progress(number + 1, len(frames))
+        return without_crumbs(extract(volume, MIN_WITNESSES), voxel_m)
+
+
+def tracked_frames(run: MappedRun) -> list[tuple[int, Array]]:
+    """Index and final T_world_camera (4, 4) of every tracked frame; none without a trajectory."""
+    path = run.path / "trajectory.txt"
+    if not path.is_file():
+        return []
+    trajectory, stamps_s = read_tum(path), run.sequence.timestamps_s
+    nearest = np.abs(stamps_s[:, None] - trajectory.timestamps_s).argmin(axis=0)
+    same = np.abs(stamps_s[nearest] - trajectory.timestamps_s) <= MAX_STAMP_ERROR_S
+    poses = trajectory.poses_world_camera
+    return [(int(nearest[k]), poses[k]) for k in np.flatnonzero(same).tolist()]
+
+
+def _keyframe(fused: FusedMap, keyframe: Keyframe) -> DepthFrame:
+    depth, rgb = fused.folder.fused(keyframe.id), fused.folder.colours(keyframe.id)
+    camera, voxel_m = fused.run.camera, fused.options.voxel_m
+    return depth_frame(depth, rgb, keyframe.T_world_camera, camera, voxel_m)
+
+
+def _prepared(
+    fused: FusedMap, frames: list[tuple[int, Array]], gate: KeyframeSurface
+) -> Iterator[DepthFrame | None]:
+    """The frames in order, some prepared ahead by a second thread."""
+    with ThreadPoolExecutor(1) as thread:
+        waiting = [thread.submit(_frame, fused, *frame, gate) for frame in frames[:AHEAD]]
+        for number in range(len(frames)):
+            if number + AHEAD < len(frames):
+                waiting.append(thread.submit(_frame, fused, *frames[number + AHEAD], gate))
+            yield waiting.pop(0).result()
+
+
+def _frame(
+    fused: FusedMap, index: int, T_world_camera: Array, gate: KeyframeSurface
+) -> DepthFrame | None:
+    """A frame after Step 3 and the gate; None if its images cannot be read."""
+    run = fused.run
+    assert isinstance(run, MappedRun)
+    try:
+        rgb, depth_m = undistort_images(run.sequence.load(index), run.camera)
+    except InputError as error:
+        logger.warning("%s; not in the surface", error)
+        return None
+    measurement = fusion_config(fused.options).measurement
+    measured = regularise(from_sensor(depth_m, run.camera, measurement))
+    verdict = gate.judge(measured.depth_m(), T_world_camera)
+    measured = measured.without(verdict.in_front)
+    frame = depth_frame(measured, rgb, T_world_camera, run.camera, fused.options.voxel_m)
+    mark_unexplained(frame, verdict.unexplained)
+    return frame
