@@ -16,6 +16,8 @@ READY := $(VENV)/.ready
 DEMO := runs/demo-sequence
 TYPING := build/typing/bmask_slam
 
+# Compiled modules are kept, also where the environment says otherwise: tests start many processes.
+export PYTHONDONTWRITEBYTECODE :=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 

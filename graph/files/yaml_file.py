@@ -8,6 +8,8 @@ has plain values only, and is bounded in size, depth and in what its aliases sta
 from __future__ import annotations
 
 import io
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -117,10 +119,17 @@ def read_yaml(file: Path) -> Any:
     """
     data = read_bytes(file, _CURE, MAX_BYTES)
     try:
-        document = parse_yaml(data.decode("utf-8-sig"), str(file))
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{file}: not a text file; {_CURE}") from error
+    document = deepcopy(_parsed(text, str(file)))
     return {} if document is None else document
+
+
+@lru_cache(maxsize=8)
+def _parsed(text: str, source: str) -> Any:
+    """As `parse_yaml`; each system of a process reads the same files, and that takes long."""
+    return parse_yaml(text, source)
 
 
 def format_yaml(document: Any, flow: bool = False) -> str:

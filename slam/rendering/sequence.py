@@ -7,7 +7,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -208,18 +210,34 @@ def _prepare(config: RenderConfig, folder: Path) -> _Job:
     delay_s = config.depth_delay_ms / 1e3
     depth_poses = camera_poses(plan.path, config.fps, config.seed, delay_s, config.sweeping)
     depth_poses = depth_poses[: config.frames]
-    builder = SceneBuilder(config.seed, detail=float(np.clip(config.width / 640, 0.25, 1.0)))
-    plan.furnish(builder)
-    write_json(folder / OBJECTS_TRUTH, true_boxes(builder))
-    roles = plan.roles
-    if config.carry:
-        roles = (replace(roles[0], carries="box", pulls=True), *roles[1:])
-    cast = add_people(builder, roles[: config.people], plan.lighting, plan.path)
-    scene = build_scene(builder, plan.lighting, cast.parts, config.seed)
+    detail = float(np.clip(config.width / 640, 0.25, 1.0))
+    alike = RenderConfig(
+        config.name, None, config.seed, config.people, config.carry, rounds=config.rounds
+    )
+    boxes, cast, scene = _built(alike, detail)
+    write_json(folder / OBJECTS_TRUTH, boxes)
     camera = kinect_camera(config)
     stamps = [f"{i / config.fps:.6f}" for i in range(len(poses))]
     renderer = Renderer(camera, scene.atlas, scene.static)
     return _Job(config, folder, camera, poses, depth_poses, stamps, scene, cast, renderer)
+
+
+@lru_cache(maxsize=2)
+def _built(config: RenderConfig, detail: float) -> tuple[dict[str, Any], Cast, Scene]:
+    """The true boxes, the people and the scene; textures have ``detail`` of the full resolution.
+
+    The last two are kept, since a scene is often rendered again at another rate or length. So
+    ``config`` may hold only what they depend on.
+    """
+    plan = _plan(config)
+    builder = SceneBuilder(config.seed, detail=detail)
+    plan.furnish(builder)
+    boxes = true_boxes(builder)
+    roles = plan.roles
+    if config.carry:
+        roles = (replace(roles[0], carries="box", pulls=True), *roles[1:])
+    cast = add_people(builder, roles[: config.people], plan.lighting, plan.path)
+    return boxes, cast, build_scene(builder, plan.lighting, cast.parts, config.seed)
 
 
 def _draw_all(job: _Job) -> Iterator[list[VisibleInstance]]:

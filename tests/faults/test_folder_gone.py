@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from fake_run import FakeSystem, make_sequence
 from feeding import track_frames
-from synthetic_view import CAMERA, render_plane, sideways_path
+from synthetic_view import CAMERA, PlaneViews, sideways_path
 
 from bmask_slam.events import Event, EventKind
 from bmask_slam.graph.errors import InputError
@@ -26,7 +26,7 @@ from bmask_slam.offline.runner import RunOptions, RunSummary, resume, run
 from bmask_slam.run_folder.folder import CHECKPOINT, FILES, RunFolder
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
 
-FRAMES = [render_plane(T, k) for k, T in enumerate(sideways_path(0.02 * np.arange(16)))]
+FRAMES = PlaneViews(sideways_path(0.02 * np.arange(16)))
 
 
 @pytest.fixture

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -19,7 +23,9 @@ _TEXELS_PER_M = 250.0
 _TEXTURE_HALF_M = 3.0
 
 
-def _texture() -> Array:
+@cache
+def plane_texture() -> Array:
+    """(H, W) float32 grey levels of the plane, the same in every process."""
     rng = np.random.default_rng(11)
     side = int(2 * _TEXTURE_HALF_M * _TEXELS_PER_M)
     texture = np.zeros((side, side), np.float32)
@@ -27,9 +33,6 @@ def _texture() -> Array:
         noise = cv2.GaussianBlur(rng.normal(size=(side, side)).astype(np.float32), (0, 0), sigma)
         texture += weight * noise / noise.std()
     return np.clip(128 + 22 * texture, 0, 255)
-
-
-TEXTURE = _texture()
 
 
 def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
@@ -44,7 +47,7 @@ def render_plane(T_world_camera: Array, index: int = 0) -> Frame:
     z_m = (PLANE_Z_M - T_world_camera[..., 2, 3, None]) / rays_world[..., 2]
     hits = T_world_camera[..., None, :3, 3] + z_m[..., None] * rays_world
     texel = ((hits[..., :2] + _TEXTURE_HALF_M) * _TEXELS_PER_M).astype(np.float32)
-    image = cv2.remap(TEXTURE, texel[..., 0], texel[..., 1], cv2.INTER_LINEAR)
+    image = cv2.remap(plane_texture(), texel[..., 0], texel[..., 1], cv2.INTER_LINEAR)
     gray = np.rint(image).astype(np.uint8)
     return Frame(index, index / 30.0, np.repeat(gray[..., None], 3, axis=2), z_m.astype(np.float32))
 
@@ -55,6 +58,25 @@ def render_or_black(T_world_camera: Array | None, index: int) -> Frame:
         return render_plane(T_world_camera, index)
     black = np.zeros((480, 640, 3), np.uint8)
     return Frame(index, index / 30.0, black, np.full((480, 640), np.nan, np.float32))
+
+
+class PlaneViews(Sequence[Frame]):
+    """`render_or_black` of poses, each when it is first used: importing a test module is quick."""
+
+    def __init__(self, poses: Sequence[Array | None]) -> None:
+        self._poses = list(poses)
+        self._frames: dict[int, Frame] = {}
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def __getitem__(self, which: Any) -> Any:
+        if isinstance(which, slice):
+            return [self[k] for k in range(len(self))[which]]
+        index = range(len(self))[which]
+        if index not in self._frames:
+            self._frames[index] = render_or_black(self._poses[index], index)
+        return self._frames[index]
 
 
 def sideways_path(x_m: Array) -> list[Array]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_view import CAMERA, render_or_black
+from synthetic_view import CAMERA, PlaneViews
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.patch_alignment import PATCH_PX
@@ -67,7 +67,7 @@ class Halves:
         return Segmented(found, SurfaceClasses(names, p, image.shape[1] / 8, size))
 
 
-FRAMES = [render_or_black(pose, index) for index, pose in enumerate(poses(14))]
+FRAMES = PlaneViews(poses(14))
 CONFIG = resolve(SystemConfig, None, SETTINGS)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from faults import Clock, fill, running, wait_until
 from feeding import track_frames
-from synthetic_view import CAMERA, render_plane, sideways_path
+from synthetic_view import CAMERA, PlaneViews, sideways_path
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.dense.folder import DenseFolder
@@ -29,7 +29,7 @@ from bmask_slam.tracking.results import TrackingStatus
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=1.1"]
 SETTINGS += ["mapping.redundant_share=1.0"]  # the same plane again and again
 CONFIG = resolve(SystemConfig, None, SETTINGS)
-FRAMES = [render_plane(T, k) for k, T in enumerate(sideways_path(0.02 * np.arange(20)))]
+FRAMES = PlaneViews(sideways_path(0.02 * np.arange(20)))
 
 
 def wait_for(slam: LiveSlam, crashes: int) -> None:

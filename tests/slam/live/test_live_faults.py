@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from faults import LONG_S, Clock, fill, running, wait_until
 from feeding import track_frames
-from synthetic_view import CAMERA, render_plane, sideways_path
+from synthetic_view import CAMERA, PlaneViews, sideways_path
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.errors import InputError
@@ -35,7 +35,7 @@ from bmask_slam.tracking.results import TrackingStatus
 
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
-FRAMES = [render_plane(T, k) for k, T in enumerate(sideways_path(0.02 * np.arange(20)))]
+FRAMES = PlaneViews(sideways_path(0.02 * np.arange(20)))
 
 
 def test_tracking_continues_while_the_disk_is_full(small_disk, caplog) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from faults import wait_until
 from feeding import track_frames
-from synthetic_view import CAMERA, render_plane, sideways_path
+from synthetic_view import CAMERA, PlaneViews, sideways_path
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Array
@@ -38,7 +38,7 @@ from bmask_slam.tracking.results import TrackingStatus
 SETTINGS = ["keyframes.min_interval_frames=2", "keyframes.max_shared=0.9"]
 CONFIG = resolve(SystemConfig, None, SETTINGS)
 TRUTH = sideways_path(0.02 * np.arange(30))
-FRAMES = [render_plane(pose, index) for index, pose in enumerate(TRUTH)]
+FRAMES = PlaneViews(TRUTH)
 
 
 def error_m(poses: Array, first: int = 0) -> float:

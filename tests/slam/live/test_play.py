@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from faults import Clock, wait_until
-from synthetic_view import CAMERA, render_plane
+from synthetic_view import CAMERA, PlaneViews, render_plane
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.errors import InputError
@@ -25,7 +25,7 @@ from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
 
 POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(10)]
-FRAMES = [render_plane(pose, index) for index, pose in enumerate(POSES)]
+FRAMES = PlaneViews(POSES)
 
 
 class FakeSource:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic_view import CAMERA, TEXTURE, render_plane
+from synthetic_view import CAMERA, plane_texture, render_plane
 
 from bmask_slam.config.configuration import resolve
 from bmask_slam.features.brisk import Features
@@ -26,7 +26,6 @@ CARD_Z_M = 1.3
 FRAMES = 36
 SETTINGS = ["keyframes.min_interval_frames=6", "keyframes.max_shared=2.0"]
 NAMES = label_set(("person", "picture", "dog"))
-_PATTERN = TEXTURE[100:340, 100:340].astype(np.uint8)
 
 
 def pose(index: int) -> Array:
@@ -48,7 +47,7 @@ def view(index: int, with_card: bool = True) -> Frame:
     rgb, depth_m = frame.rgb.copy(), frame.depth_m.copy()
     rows, columns = card(index)
     width = rgb[rows, columns].shape[1]
-    rgb[rows, columns] = _PATTERN[:, :width, None]
+    rgb[rows, columns] = plane_texture()[100:340, 100 : 100 + width, None].astype(np.uint8)
     depth_m[rows, columns] = CARD_Z_M
     return replace(frame, rgb=rgb, depth_m=depth_m, name=str(index))
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from synthetic_view import CAMERA, make_features, render_plane
+from synthetic_view import CAMERA, PlaneViews, make_features
 
 from bmask_slam.cli import main
 from bmask_slam.graph.arrays import Array
@@ -23,7 +23,7 @@ from bmask_slam.world.world_map import WorldMap
 RrdReader = pytest.importorskip("rerun.chunk").RrdReader
 POSES = [se3_exp(np.array([0, 0, 0, 0.02 * k, 0, 0])) for k in range(12)]
 NO_FEATURES = make_features(np.eye(4), np.zeros((0, 3)), np.zeros((0, 8), np.uint64))
-FRAMES = [render_plane(pose, index) for index, pose in enumerate(POSES)]
+FRAMES = PlaneViews(POSES)
 
 
 @pytest.fixture(scope="module")
