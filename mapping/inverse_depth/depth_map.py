@@ -16,7 +16,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import FileKind, check_like, read_arrays, write_arrays
 from bmask_slam.mapping.inverse_depth.pixelwise import nan_where_negative, squared_gradient
 
-DEPTH_FILE = FileKind("fused depth", 1)
+DEPTH_FILE = FileKind("fused depth", 1, compressed=True)
 RHO_STEP, SIGMA_STEP = 1 / 16000, 1e-6
 """Units of the stored integers in 1/m: rho up to 4, far finer than sigma, and sigma up to 0.065."""
 

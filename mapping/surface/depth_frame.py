@@ -70,11 +70,12 @@ def depth_frame(
         BEHIND: (BEHIND_SIGMAS * variance.sqrt()).clamp(least * voxel_m, most * voxel_m),
         WITNESS: torch.ones_like(z),
     }
-    pixels = torch.zeros((*z.shape, 8))
+    pixels = torch.empty((*z.shape, 8))
     pixels[..., :3] = normals
     for column, values in columns.items():
         pixels[..., column] = values
-    pixels = torch.where(good[..., None], pixels, 0).reshape(-1, 8)
+    pixels[~good] = 0
+    pixels = pixels.reshape(-1, 8)
     colours = torch.from_numpy(rgb).reshape(-1, 3).to(torch.float32)
     return DepthFrame(pixels, _free_depth(pixels[:, Z].reshape(z.shape)), colours, T_world_camera)
 

@@ -155,40 +155,39 @@ class SurfaceVolume:
         u = (x / z).mul_(camera.fx).add_(camera.cx).round_()
         v = (y / z).mul_(camera.fy).add_(camera.cy).round_()
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (z > NEAREST_M)
-        chosen = torch.nonzero(inside)[:, 0]
-        voxels = (bricks[:, None] * BRICK_VOXELS + torch.arange(BRICK_VOXELS)).reshape(-1)
-        x, y, z, voxels = (a.index_select(0, chosen) for a in (x, y, z, voxels))
-        pixel = v.mul_(camera.width).add_(u).index_select(0, chosen).to(torch.int64)
+        pixel = v.mul_(camera.width).add_(u).nan_to_num_().clamp_(0, len(frame.free_m) - 1)
+        pixel = pixel.to(torch.int32)
         planes = frame.pixels.index_select(0, pixel)
         d = (planes[:, NX] * x).addcmul_(planes[:, NY], y).addcmul_(planes[:, NZ], z)
         d -= planes[:, OFFSET]
-        depth, behind, front = planes[:, Z], planes[:, BEHIND], FRONT_VOXELS * self.voxel_m
-        free_m = frame.free_m.index_select(0, pixel)
-        _add(self.free, voxels[z < free_m * (1 - FREE_SHARE) - front], 1)
-        measured = (d > -behind) & (planes[:, WEIGHT] > 0) & (z < depth + 2 * behind)
+        behind, front = planes[:, BEHIND], FRONT_VOXELS * self.voxel_m
+        first = (bricks * BRICK_VOXELS)[:, None] + torch.arange(BRICK_VOXELS)
+        free_m = frame.free_m.index_select(0, pixel).mul_(1 - FREE_SHARE).sub_(front)
+        _add(self.free, first.reshape(-1)[inside & (z < free_m)], 1)
+        measured = inside & (d > -behind) & (planes[:, WEIGHT] > 0)
+        measured &= z < planes[:, Z] + 2 * behind
         used = torch.nonzero(measured)[:, 0]
-        planes, d, voxels, pixel = (
-            a.index_select(0, used) for a in (planes, d.clamp_(max=front), voxels, pixel)
-        )
-        share = self._average(voxels, d, planes)
+        voxels, d = first.reshape(-1).index_select(0, used), d.index_select(0, used)
+        weight, behind = (planes[:, k].index_select(0, used) for k in (WEIGHT, BEHIND))
+        share = self._average(voxels, d.clamp_(max=front), weight, behind)
         near = torch.nonzero(d.abs() < COLOUR_VOXELS * self.voxel_m)[:, 0]
-        voxels, pixel, share = (a.index_select(0, near) for a in (voxels, pixel, share))
-        _add(self.witnesses, voxels, planes[:, WITNESS].index_select(0, near).to(torch.float16))
+        used, voxels, share = (a.index_select(0, near) for a in (used, voxels, share))
+        _add(self.witnesses, voxels, planes[:, WITNESS].index_select(0, used).to(torch.float16))
         colour = self.colour.view(-1, 3)
         old = colour.index_select(0, voxels).to(torch.float32)
-        new = old + share[:, None] * (frame.rgb.index_select(0, pixel) - old)
-        colour.index_copy_(0, voxels, new.to(torch.float16))
+        seen = frame.rgb.index_select(0, pixel.index_select(0, used))
+        colour.index_copy_(0, voxels, old.add_(share[:, None] * (seen - old)).to(torch.float16))
 
-    def _average(self, voxels: Tensor, d: Tensor, planes: Tensor) -> Tensor:
-        """Add distances (N,) of voxels (N,) to the means; returns the share (N,) of each in it.
+    def _average(self, voxels: Tensor, d: Tensor, added: Tensor, behind: Tensor) -> Tensor:
+        """Add distances (N,) with weights (N,) to the means of voxels (N,), all different ones;
+        returns the share (N,) of each in its mean.
 
         Up to a voxel behind the surface they count fully, then less and less: what is behind a thin
         wall is its other side.
         """
-        behind = planes[:, BEHIND]
         fall = ((d + behind) / (behind - self.voxel_m)).clamp_(max=1)
         weight, distance = self.weight.view(-1), self.distance.view(-1)
-        added = planes[:, WEIGHT] * fall
+        added = added * fall
         total = weight.index_select(0, voxels) + added
         share = added / total
         old = distance.index_select(0, voxels)

@@ -52,7 +52,7 @@ from bmask_slam.semantics.labels import LabelSet
 
 logger = logging.getLogger(__name__)
 
-LABEL_FILE = FileKind("keyframe labels", 2)
+LABEL_FILE = FileKind("keyframe labels", 2, compressed=True)
 _NO_EVIDENCE = InstanceEvidence(
     np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.uint16)
 )

@@ -25,6 +25,7 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.mapping.inverse_depth.dense_mapper import WINDOW
 from bmask_slam.run_folder.map_file import run_semantics
+from bmask_slam.runtime.memory import give_back_memory
 from bmask_slam.semantics.instances.instances import Instance
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import make_segmenter
@@ -61,14 +62,20 @@ def map_run(options: MapOptions, progress: Progress = lambda done, total: None) 
         InputError: the run, its sequence or the masks cannot be used, a class is not known, no
             keyframe can be used, or the disk is full.
     """
+    fused, counts = _fused(options, progress)
+    give_back_memory()
+    started_s = time.perf_counter()
+    products = write_products(fused, progress)
+    summary = MapSummary(fused.folder.path, counts, products, time.perf_counter() - started_s)
+    write_summary(fused.folder, summary)
+    return summary
+
+
+def _fused(options: MapOptions, progress: Progress) -> tuple[FusedMap, FusionCounts]:
+    """The fused keyframes; the segmenter's memory is free again."""
     fusion = open_fusion(options)
     counts = fusion.fuse_all(progress)
-    started_s = time.perf_counter()
-    fused = FusedMap(fusion.run, fusion.segmenter.labels, fusion.folder, fusion.options)
-    products = write_products(fused, progress)
-    summary = MapSummary(fusion.folder.path, counts, products, time.perf_counter() - started_s)
-    write_summary(fusion.folder, summary)
-    return summary
+    return FusedMap(fusion.run, fusion.segmenter.labels, fusion.folder, fusion.options), counts
 
 
 class RunFusion:

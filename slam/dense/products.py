@@ -32,7 +32,7 @@ from bmask_slam.semantics.beliefs.surface_geometry import FLOORS, Ground, find_g
 from bmask_slam.world.world_map import Keyframe
 
 PLAN_CELL_M, SAMPLE_STEP = 0.03, 20
-AT_ONCE = 200_000
+AT_ONCE = 50_000
 NO_PIXELS = np.zeros((0, 0), np.uint16)
 OVERVIEW_OFFSET_M = np.array([0.0, -0.6, -1.0])
 OVERVIEW_TILT_DEG = -20.0
