@@ -243,12 +243,14 @@ def truth_errors(mesh: dict[str, NDArray], true: dict[str, Any]) -> dict[str, fl
     }
 
 
-def measure(run_path: Path, out: Path, truth: bool) -> dict[str, dict[str, float]]:
+def measure(
+    run_path: Path, out: Path, methods: list[str], truth: bool
+) -> dict[str, dict[str, float]]:
     """All measures of all methods."""
     run, rows = open_run(run_path), {}
     true = surface(read_truth(run), run) if truth else None
     patches, points = flat_patches(run), None
-    for name in METHODS:
+    for name in methods:
         file = out / f"{run_path.name}-{name.replace(', ', '-')}.npz"
         used = run_method(name, run_path, file)
         mesh = dict(np.load(file))
@@ -279,11 +281,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", help="run folders; NAME=true for rendered rooms")
     parser.add_argument("--out", type=Path, default=Path("runs/bench/surfaces"))
+    parser.add_argument("--methods", default=";".join(METHODS), help="which (default: %(default)s)")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     for given in args.runs:
         path, _, true = given.partition("=")
-        rows = measure(Path(path), args.out, bool(true))
+        rows = measure(Path(path), args.out, args.methods.split(";"), bool(true))
         print("\n".join(table(Path(path).name, rows)), flush=True)
 
 

@@ -16,7 +16,7 @@ from bmask_slam.mapping.inverse_depth.depth_map import InverseDepthMap
 
 MIN_COSINE = 0.15
 """Pixels whose surface is seen at a flatter angle are left out."""
-MIN_SIGMA_M = 0.003
+MIN_SIGMA_M = 0.01
 """Error of a distance beside that of its own pixel: of the pose and of the sensor's calibration."""
 BEHIND_SIGMAS, BEHIND_VOXELS = 3.0, (3, 8)
 SILHOUETTE_PX = 3

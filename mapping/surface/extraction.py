@@ -71,7 +71,7 @@ NOTHING = Surface(_ROWS, _ROWS, _ROWS.astype(np.uint8), _NONE, _NONE, _ROWS.asty
 
 
 def extract(volume: SurfaceVolume, min_witnesses: float = MIN_WITNESSES) -> Surface:
-    """The surface of a volume, with all its components."""
+    """The surface of a volume, with all its components; every vertex is in a triangle."""
     index = block_indices(torch.from_numpy(np.sort(volume.keys))).numpy()
     places = np.argsort(volume.keys)
     if not len(places):
@@ -81,24 +81,31 @@ def extract(volume: SurfaceVolume, min_witnesses: float = MIN_WITNESSES) -> Surf
         for cells in _blocks_with_halo(volume, index, places, min_witnesses)
     ]
     rows = [np.concatenate(part) for part in zip(*parts, strict=True)]
-    order = np.argsort(rows[5])
-    points, normals, colours, weights, views, keys, crossings = (row[order] for row in rows)
+    order = np.argsort(rows[4])
+    points, colours, weights, views, keys, crossings = (row[order] for row in rows)
     triangles = _triangles(keys, crossings)
+    normals = _normals(points, triangles)
     found = Surface(points, normals, colours, weights, views, triangles)
-    return found.select(found.views >= min_witnesses)
+    found = found.select(found.views >= min_witnesses)
+    return found.select(_used(found))
 
 
 def without_crumbs(surface: Surface, voxel_m: float) -> Surface:
-    """The surface without components smaller than MIN_COMPONENT_M2 and vertices in no triangle."""
+    """The surface without components smaller than MIN_COMPONENT_M2."""
     count, (a, b, c) = len(surface.vertices), surface.triangles.T
     ends = np.concatenate([a, b]), np.concatenate([b, c])
     joined = coo_matrix((np.ones(len(ends[0]), np.int8), ends), (count, count))
     component = connected_components(joined, directed=False)[1]
     size = np.bincount(component[a], minlength=int(component.max(initial=0)) + 1)
     kept = surface.select(size[component] * 0.5 * voxel_m**2 >= MIN_COMPONENT_M2)
-    used = np.zeros(len(kept.vertices), bool)
-    used[kept.triangles] = True
-    return kept.select(used)
+    return kept.select(_used(kept))
+
+
+def _used(surface: Surface) -> Mask:
+    """Which vertices (N,) are in a triangle."""
+    used = np.zeros(len(surface.vertices), bool)
+    used[surface.triangles] = True
+    return used
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +172,8 @@ def _voxels(table: Tensor, blocks: Ints) -> NDArray[np.float32]:
 
 
 def _vertices(cells: _Cells, voxel_m: float) -> tuple[NDArray, ...]:
-    """The columns of ``Surface`` for the cells in which the distance changes its sign, their keys
-    (N,), and along which axes (N, 3) it does: 1 from outside to inside, -1 back, 0 not at all.
+    """Points, colours, weights and views of the cells in which the distance changes its sign, their
+    keys (N,), and along which axes (N, 3) it does: 1 from outside to inside, -1 back, 0 not at all.
 
     A vertex is the mean of the points where the edges of its cell are crossed.
     """
@@ -181,7 +188,6 @@ def _vertices(cells: _Cells, voxel_m: float) -> tuple[NDArray, ...]:
     place = _mean_crossing(d)
     origin = cells.index[block] * EDGE + np.stack(local, axis=1)
     share = np.prod(np.where(CORNERS, place[:, None], 1 - place[:, None]), axis=2)
-    normals = _gradient(d, place)
     weight, witnesses = (
         np.stack([table[a] for a in at], axis=1) for table in (cells.weight, cells.witnesses)
     )
@@ -192,7 +198,6 @@ def _vertices(cells: _Cells, voxel_m: float) -> tuple[NDArray, ...]:
     crossings = inside[:, (4, 2, 1)].astype(np.int8) - inside[:, :1].astype(np.int8)
     return (
         ((origin + place) * voxel_m).astype(np.float32),
-        normals.astype(np.float32),
         np.rint(colours).clip(0, 255).astype(np.uint8),
         (share * weight).sum(axis=1).astype(np.float32),
         witnesses.max(axis=1).astype(np.float32),
@@ -212,14 +217,14 @@ def _mean_crossing(d: Array) -> Array:
     return total / count
 
 
-def _gradient(d: Array, place: Array) -> Array:
-    """Directions (N, 3) in which the values (N, 8) grow, at points (N, 3) of unit cubes."""
-    sides = np.where(CORNERS, place[:, None], 1 - place[:, None])
-    found = np.empty_like(place)
-    for axis in range(3):
-        others = np.prod(np.delete(sides, axis, axis=2), axis=2)
-        found[:, axis] = (d * others * (2 * CORNERS[:, axis] - 1)).sum(axis=1)
-    return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12))
+def _normals(vertices: Floats, triangles: Ints) -> Floats:
+    """Unit normals (N, 3): means of the triangles' around a vertex, weighted by their areas."""
+    a, b, c = (vertices[triangles[:, k]].astype(float) for k in range(3))
+    areas, corners = np.tile(np.cross(b - a, c - a), (3, 1)), triangles.T.reshape(-1)
+    total = [np.bincount(corners, area, len(vertices)) for area in areas.T]
+    found = np.stack(total, axis=1).astype(float)
+    found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
+    return np.asarray(found, np.float32)
 
 
 def _triangles(keys: Ints, crossings: NDArray[np.int8]) -> Ints:

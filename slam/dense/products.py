@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from bmask_slam.dense.surface import FusedMap, make_surface
+from bmask_slam.dense.surface import FusedMap, frames_a_keyframe, make_surface
 from bmask_slam.graph.arrays import Array, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
@@ -24,7 +24,6 @@ from bmask_slam.mapping.products.object_clouds import ObjectClouds, ObjectRegion
 from bmask_slam.mapping.products.pictures import CloudPictures, Picture, palette, write_picture
 from bmask_slam.mapping.products.surface_labels import LabelledView, LabelTable, rows_seen, views_of
 from bmask_slam.mapping.products.surface_regions import StuffFusion
-from bmask_slam.mapping.surface.depth_frame import MIN_SIGMA_M
 from bmask_slam.mapping.surface.extraction import Surface
 from bmask_slam.run_folder.map_file import run_semantics
 from bmask_slam.run_folder.semantic_files import OBJECTS, read_objects
@@ -64,7 +63,7 @@ def write_products(
     views = evidence.views(surface.vertices)
     up_guess = -np.mean([k.T_world_camera[:3, 1] for k in evidence.keyframes], axis=0)
     table = evidence.table(evidence.ground(surface, views, up_guess))
-    cloud = _labelled(surface, views, table)
+    cloud = _labelled(surface, views, table, frames_a_keyframe(fused))
     kept = ~np.isin(cloud.labels, [fused.labels.number(n) for n in fused.options.excluded or ()])
     surface, cloud = surface.select(kept), cloud.select(kept)
     names, folder = table.stuff_fusion.names, fused.folder
@@ -137,10 +136,10 @@ class KeyframeEvidence:
         return LabelTable.of(rows, store_config, [e.stuff_of(names) for e in self._all], stuff)
 
 
-def _labelled(surface: Surface, views: csr_matrix, table: LabelTable) -> Cloud:
+def _labelled(surface: Surface, views: csr_matrix, table: LabelTable, alike: float) -> Cloud:
     """The vertices of a surface with their labels.
 
-    The distances of a vertex's frames share MIN_SIGMA_M, which their number does not make smaller.
+    So many frames that follow each other look ``alike``: their errors are the same, and count once.
     """
     labels = np.zeros(len(surface.vertices), np.uint16)
     probabilities = np.ones(len(labels), np.float32)
@@ -148,7 +147,7 @@ def _labelled(surface: Surface, views: csr_matrix, table: LabelTable) -> Cloud:
         for some in _pieces(len(labels)):
             points, normals = surface.vertices[some], surface.normals[some]
             labels[some], probabilities[some] = table.labels(views[some], points, normals)
-    sigmas_m = np.sqrt(1e-4 / surface.weights + MIN_SIGMA_M**2).astype(np.float32)
+    sigmas_m = np.sqrt(1e-4 * alike / surface.weights).astype(np.float32)
     frames = np.clip(surface.views, 1, 65535).astype(np.uint16)
     return Cloud(
         surface.vertices, surface.normals, surface.colours, sigmas_m, labels, probabilities, frames

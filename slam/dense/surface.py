@@ -90,6 +90,13 @@ def tracked_frames(run: MappedRun) -> list[tuple[int, Array]]:
     return [(int(nearest[k]), poses[k]) for k in np.flatnonzero(same).tolist()]
 
 
+def frames_a_keyframe(fused: FusedMap) -> float:
+    """How many tracked frames there are for each keyframe, at least 1."""
+    run = fused.run
+    frames = len(tracked_frames(run)) if isinstance(run, MappedRun) else 0
+    return max(frames / max(len(fused.keyframes()), 1), 1.0)
+
+
 def _keyframe(fused: FusedMap, keyframe: Keyframe) -> DepthFrame:
     depth, rgb = fused.folder.fused(keyframe.id), fused.folder.colours(keyframe.id)
     camera, voxel_m = fused.run.camera, fused.options.voxel_m
