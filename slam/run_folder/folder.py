@@ -168,8 +168,9 @@ class RunFolder:
             _remove(self.last_path, (*SOMETIMES, *FILES))
             _remove_empty(self._made)
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
-            cure = "free some space, what was written before is kept"
-            raise InputError(f"{self.last_path}: {error.strerror}; {cure}") from error
+            cure = "free some space" if error.errno != errno.EROFS else "make it writable again"
+            text = f"{error.strerror}; {cure}, what was written before is kept"
+            raise InputError(f"{self.last_path}: {text}") from error
 
     def write_frame(self, result: FrameResult) -> None:
         """Append a frame to frames.csv, and its events to events.csv; both are flushed.
