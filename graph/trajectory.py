@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError, finite_number
 from bmask_slam.graph.files.reading import read_lines
-from bmask_slam.graph.geometry import make_pose, quaternion_from_rotation, rotation_from_quaternion
+from bmask_slam.graph.geometry import (
+    inverse,
+    make_pose,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    se3_exp,
+    se3_log,
+)
 from bmask_slam.graph.whole_file import whole_file
 
 MAX_TIME_DIFFERENCE_S = 0.02
@@ -67,6 +74,21 @@ class Trajectory:
     def select(self, indices: NDArray) -> Trajectory:
         """The poses at these indices (or under this mask)."""
         return Trajectory(self.timestamps_s[indices], self.poses_world_camera[indices])
+
+    def at(self, times_s: Array, max_gap_s: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Poses (M, 4, 4) at times (M,), along the geodesic between neighbours.
+
+        And whether each is between two poses at most ``max_gap_s`` apart; the others mean nothing.
+        """
+        stamps_s, T = self.timestamps_s, self.poses_world_camera
+        if len(self) < 2:
+            return np.tile(np.eye(4), (len(times_s), 1, 1)), np.zeros(len(times_s), bool)
+        before = np.clip(np.searchsorted(stamps_s, times_s, side="right") - 1, 0, len(self) - 2)
+        step_s = stamps_s[before + 1] - stamps_s[before]
+        share = (times_s - stamps_s[before]) / step_s
+        inside = (share >= 0) & (share <= 1) & (step_s <= max_gap_s)
+        steps = se3_log(inverse(T[before]) @ T[before + 1])
+        return np.asarray(T[before] @ se3_exp(share[:, None] * steps)), inside
 
     def moved(self, T_new_world: Array) -> Trajectory:
         """The same motion seen from another world frame: ``T_new_camera``."""

@@ -46,6 +46,8 @@ class EventKind(Enum):
     LOOP_REFUSED = "loop refused"
     LOOP_REMOVED = "loop removed"
     """It was closed earlier, and no longer fits the graph."""
+    SENSOR = "sensor"
+    """Measurements came too late, or do not fit the graph."""
     GRAPH = "graph"
     """Something was refused, dropped, anchored or repaired."""
 
@@ -125,10 +127,14 @@ class EventLog:
         """What was found of the camera, before the run or live, and what became of it."""
         self._add(EventKind.CALIBRATION, text)
 
-    def lost(self, matches: int) -> None:
-        """The present frame has no pose; an event if it is the first one."""
+    def lost(self, matches: int, reckoned: bool = False) -> None:
+        """The image of the present frame gives no pose; an event if it is the first one.
+
+        ``reckoned``: odometry does.
+        """
         if not self._lost_frames:
-            self._add(EventKind.LOST, f"{matches} matches give no pose, nor is it recognised")
+            more = "; odometry goes on" if reckoned else ""
+            self._add(EventKind.LOST, f"{matches} matches give no pose, nor is it recognised{more}")
         self._lost_frames += 1
 
     def tracked(self, inliers: int) -> None:
@@ -171,6 +177,10 @@ class EventLog:
         self.count(estimate.counts())
         for note in estimate.notes():
             self._add(EventKind.GRAPH, note, logging.WARNING if estimate.rebuilt else logging.INFO)
+
+    def sensor(self, text: str, level: int = logging.INFO) -> None:
+        """Something about the measurements of a sensor beside the camera."""
+        self._add(EventKind.SENSOR, text, level)
 
     def count(self, counts: Mapping[str, int]) -> None:
         """Add to the counts; a name is one of TOTALS, or one with ``: reason`` behind."""

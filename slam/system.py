@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
+from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.map_backend import MapBackend
-from bmask_slam.back_end.mapper import BackEndConfig, Mapper
+from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.features.brisk import BriskExtractor, Features
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.files.array_file import check_like, fitting, nested, part
+from bmask_slam.graph.files.array_file import fitting, nested, part
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.runtime.stage_clock import stage
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
+from bmask_slam.sensor_input import SensorInput
 from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.system_results import SystemResults, largest
+from bmask_slam.system_results import SystemResults, checked_state, largest
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.keyframe_decision import KeyframeDecision
 from bmask_slam.tracking.results import FrameResult, Tracked, TrackingStatus
@@ -28,21 +32,9 @@ from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
-OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
-"""Arrays in older files that are read by nothing today."""
-NEWER_ARRAYS = (
-    "mapper.events.",
-    "mapper.history.information",
-    "mapper.loops.noise.",
-    "localiser.images.",
-    "semantics.surfaces.",
-)
-"""Beginnings of the names of arrays that older files lack; an empty system's are used then."""
-OPTIONAL_ARRAYS = ("s.measured", "upright.points", "labels.scores", "labels.seen", "labels.judged")
-"""Ends of the names of arrays that older files lack, and whose readers do without."""
 
 
-class SlamSystem(SystemResults):
+class SlamSystem(SystemResults, SensorInput):
     """RGB-D frames in, poses out; the map and the graph grow on the way.
 
     Attributes:
@@ -126,6 +118,10 @@ class SlamSystem(SystemResults):
             events=self.events.take(),
         )
 
+    def add_measurements(self, new: Measurements) -> None:
+        """Use the measurements of a sensor beside the camera."""
+        self.map.add_measurements(new)
+
     def prepare(self, frame: Frame) -> Features:
         """The frame's features; pure, so that it may run ahead in another thread."""
         return self.extractor.extract(frame)
@@ -170,11 +166,7 @@ class SlamSystem(SystemResults):
 
     def restore(self, state: Arrays, path: Path) -> None:
         """Become the system of a state that was read from a file. Raises InputError."""
-        own = self.state()
-        state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
-        state = {name: a for name, a in own.items() if name.startswith(NEWER_ARRAYS)} | state
-        present = {n: a for n, a in own.items() if n in state or not n.endswith(OPTIONAL_ARRAYS)}
-        check_like(state, present, path)
+        state = checked_state(state, self.state(), path)
         with fitting(path):
             self.mapper.restore(part(state, "mapper"), path)
             self.camera_tracker.restore(part(state, "localiser"))
@@ -223,8 +215,9 @@ class SlamSystem(SystemResults):
 
     def _reported(self, tracked: Tracked) -> Tracked:
         """A tracked frame, once it is reported that it is lost, found again or begins a segment."""
-        if tracked.status is TrackingStatus.LOST:
-            self.events.lost(tracked.matches)
+        if not tracked.status.by_image:
+            reckoned = tracked.status is TrackingStatus.DEAD_RECKONING
+            self.events.lost(tracked.matches, reckoned)
         elif self.camera_tracker.reference is None:
             self.events.new_segment(self.camera_tracker.segment)
         else:
@@ -288,8 +281,9 @@ class SlamSystem(SystemResults):
         if keyframe:
             T_world_camera, landmark_of = keyframe.T_world_camera, keyframe.landmark_ids
             _, ids = self.map.world.observed(keyframe)
-        self.camera_tracker.remember(tracked.features, landmark_of, T_world_camera)
-        self.camera_tracker.update_motion(tracked.T_world_camera, T_world_camera, ids)
+        if keyframe or tracked.status.by_image:
+            self.camera_tracker.remember(tracked.features, landmark_of, T_world_camera)
+            self.camera_tracker.update_motion(tracked.T_world_camera, T_world_camera, ids)
         poses = reference.T_world_camera, T_world_camera
         self.map.history.append(frame.timestamp_s, reference.id, *poses, tracked.information)
         return T_world_camera
@@ -297,4 +291,4 @@ class SlamSystem(SystemResults):
 
 def back_end_config(config: SystemConfig) -> BackEndConfig:
     """The settings of map and graph."""
-    return BackEndConfig(config.mapping, config.factor_selection, config.graph, config.loops)
+    return BackEndConfig(**{f.name: getattr(config, f.name) for f in fields(BackEndConfig)})

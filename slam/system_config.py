@@ -8,6 +8,7 @@ from bmask_slam.back_end.factor_selection import FactorSelectionConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.labelling.config import SemanticsConfig
 from bmask_slam.loops.closing import LoopClosingConfig
 from bmask_slam.moving.config import MovingObjectConfig
@@ -33,6 +34,7 @@ class SystemConfig:
     factor_selection: FactorSelectionConfig = field(default_factory=FactorSelectionConfig)
     graph: SmootherConfig = field(default_factory=SmootherConfig)
     loops: LoopClosingConfig = field(default_factory=LoopClosingConfig)
+    sensors: SensorsConfig = field(default_factory=SensorsConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     moving_objects: MovingObjectConfig = field(default_factory=MovingObjectConfig)
     final_adjustment: bool = True

@@ -11,9 +11,11 @@ import numpy as np
 
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
+from bmask_slam.back_end.sensor_fusion import example_state
 from bmask_slam.events import totals
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.files.array_file import check_like, nested
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
@@ -26,6 +28,21 @@ from bmask_slam.run_folder.covariance_file import (
 from bmask_slam.run_folder.map_file import MAP, SavedRun, write_map
 from bmask_slam.run_folder.semantic_files import semantic_writers
 from bmask_slam.system_config import SystemConfig
+
+OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
+"""Arrays in older files that are read by nothing today."""
+NEWER_ARRAYS = (
+    "mapper.events.",
+    "mapper.history.information",
+    "mapper.loops.noise.",
+    "localiser.images.",
+    "semantics.surfaces.",
+)
+"""Beginnings of the names of arrays that older files lack; an empty system's are used then."""
+OPTIONAL_ARRAYS = ("s.measured", "upright.points", "labels.scores", "labels.seen", "labels.judged")
+"""Ends of the names of arrays that older files lack, and whose readers do without."""
+SENSOR_ARRAYS = "mapper.sensors."
+"""The beginning of the names of arrays that are there with sensors beside the camera only."""
 
 
 class SystemResults(ABC):
@@ -133,3 +150,21 @@ class SystemResults(ABC):
 def largest(segments: dict[int, Trajectory]) -> int:
     """The segment with most frames, the older of equal ones; 0 where there is none."""
     return max(segments, key=lambda s: (len(segments[s]), -s), default=0)
+
+
+def checked_state(state: Arrays, own: Arrays, path: Path) -> Arrays:
+    """A state that was read from a file, with what older versions did not save yet.
+
+    ``own`` is the state of an empty system. Raises InputError for arrays of other names or types.
+    """
+    own = {**nested(mapper=nested(sensors=example_state())), **own}
+    state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
+    state = {name: a for name, a in own.items() if name.startswith(NEWER_ARRAYS)} | state
+    present = {n: a for n, a in own.items() if n in state or not _is_optional(n)}
+    check_like(state, present, path)
+    return state
+
+
+def _is_optional(name: str) -> bool:
+    """Whether a state may do without an array."""
+    return name.startswith(SENSOR_ARRAYS) or name.endswith(OPTIONAL_ARRAYS)

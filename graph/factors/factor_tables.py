@@ -13,7 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, Mask, no_ids
-from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import (
+    PARTIAL,
+    Observations,
+    PosePrior,
+    RelativePose,
+)
 from bmask_slam.graph.factors.marginalised_landmarks import MarginalisedLandmarks
 
 NO_SLOT = -1
@@ -192,6 +197,11 @@ class PoseFactor:
     def keyframes(self) -> tuple[int, ...]:
         """Ids of the keyframes it involves: one for a prior, else two."""
         return self.factor.keyframe_ids
+
+    @property
+    def link(self) -> tuple[int, ...]:
+        """The keyframes that it holds to each other, or to the world; none if it is partial."""
+        return () if self.factor.kind in PARTIAL else self.factor.keyframe_ids
 
     @property
     def is_prior(self) -> bool:

@@ -21,6 +21,12 @@ RelativePoseName = tuple[int, int, str]
 LOOP, MARGINAL, ANCHOR = "loop", "marginal", "bridge"
 """Kinds of relative poses: a closed loop; what stands for marginalised landmarks; a weak between
 factor that the smoother adds to hold a keyframe (called a bridge in saved graphs)."""
+ODOMETRY, GRAVITY, POSITION = "odometry", "gravity", "position"
+"""Kinds of relative poses that sensors measure."""
+PARTIAL = (GRAVITY, POSITION)
+"""Kinds that fix a part of a pose only: what they do not measure has a very large sigma."""
+FIRST_FRAME = 1 << 40
+"""Reference frames (up is z) are poses of the graph with ids from here on, one a map segment."""
 
 
 def _zeros(*shape: int) -> Array:
@@ -82,7 +88,7 @@ class RelativePose:
         T_a_b: (4, 4) measurement, ``p_a = T_a_b @ p_b``.
         covariance: (6, 6) of the tangent ``[rotation rad, translation m]`` at b (right side).
         robust: None, "huber", "cauchy" or "dcs".
-        kind: where it comes from: "odometry", "loop" (LOOP), "dense"; made by the smoother
+        kind: where it comes from: LOOP, "dense", what sensors measure; made by the smoother
             itself: MARGINAL, ANCHOR.
     """
 
@@ -102,6 +108,11 @@ class RelativePose:
     def name(self) -> RelativePoseName:
         """What ``GraphUpdate.remove_relative_poses`` names it by."""
         return self.keyframe_a, self.keyframe_b, self.kind
+
+
+def reference_frame_id(segment: int) -> int:
+    """The id of a map segment's reference frame among the poses of the graph."""
+    return FIRST_FRAME + segment
 
 
 @dataclass(frozen=True)

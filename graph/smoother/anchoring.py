@@ -59,7 +59,7 @@ def loose_in(tables: FactorTables, config: SmootherConfig) -> Ints:
 
 def anchor_components(tables: FactorTables, config: SmootherConfig) -> list[int]:
     """Add a prior to each connected component without one; returns their numbers."""
-    ids, edges = tables.keyframes.ids, [f.keyframes for f in tables.pose_factors.values()]
+    ids, edges = tables.keyframes.ids, [f.link for f in tables.pose_factors.values()]
     observations = tables.observations.select(tables.observations.used_rows())
     labels = component_labels(ids, observations, edges)
     fixed = labels[np.searchsorted(ids, [edge[0] for edge in edges if len(edge) == 1])]
@@ -138,7 +138,7 @@ def loose_among(
 ) -> Ints:
     """The keyframes that would be loose with these rows and pose factors alone."""
     observations, poses, points = rows_in_front(rows, tables, config)
-    edges = [tables.pose_factors[number].keyframes for number in sorted(numbers)]
+    edges = [tables.pose_factors[number].link for number in sorted(numbers)]
     return loose_keyframes(ids, observations, poses, points, edges, config)
 
 
@@ -177,7 +177,7 @@ class _Before:
             np.concatenate([observations.keyframe_ids, removed.keyframe_ids]),
             np.concatenate([observations.landmark_ids, removed.landmark_ids]),
         )
-        edges = [*edges, *(f.keyframes for f in tables.pose_factors.values())]
+        edges = [*edges, *(f.link for f in tables.pose_factors.values())]
         ends = np.array([k for edge in edges for k in edge], np.int64)
         ids = np.unique(np.concatenate([tables.keyframes.ids, observations.keyframe_ids, ends]))
         shared = shared_landmarks(ids, observations).toarray()

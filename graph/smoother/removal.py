@@ -67,7 +67,7 @@ def remove(update: GraphUpdate, tables: FactorTables, config: SmootherConfig) ->
     if not (len(plan.keyframes) or len(plan.landmarks) or plan.numbers or len(plan.rows)):
         return Removal()
     removed = tables.observations.select(plan.rows)
-    edges = [tables.pose_factors[number].keyframes for number in plan.numbers]
+    edges = [tables.pose_factors[number].link for number in plan.numbers]
     slots = _remove_from_tables(plan, tables)
     added = anchor_loose(plan.loose, removed, edges, tables, config)
     return Removal(slots, plan.dropped, added, keyframes_anchored_by(added, tables))
@@ -140,7 +140,7 @@ def _still_linked(
     if any(factors[number].is_prior for number in numbers):
         return False
     observers = table.select(table.rows_of_landmarks(np.unique(table.select(rows).landmark_ids)))
-    ends = [(k, -1 - n) for n in numbers for k in factors[n].keyframes]
+    ends = [(k, -1 - n) for n in numbers for k in factors[n].link]
     touched, group = np.concatenate(
         [
             np.stack([observers.keyframe_ids, observers.landmark_ids]),
@@ -151,12 +151,14 @@ def _still_linked(
     group = np.where(len(keyframes), 0, group)  # what a keyframe shared is linked through it
     left = ~np.isin(touched, keyframes)
     touched, group = touched[left], group[left]
+    if not len(touched):  # partial factors alone
+        return True
     near = np.unique(touched)
     edges = set(tables.numbers_of_keyframes(near.tolist())) - set(numbers)
     part = firm_components(
         near,
         table.select(np.setdiff1d(table.rows_of_keyframes(near.tolist()), rows)),
-        [factors[number].keyframes for number in sorted(edges)],
+        [factors[number].link for number in sorted(edges)],
         config.min_left_observations,
     )[np.searchsorted(near, touched)]
     return len(np.unique(group)) == len(np.unique(np.stack([group, part]), axis=1).T)

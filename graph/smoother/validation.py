@@ -26,7 +26,13 @@ from bmask_slam.graph.factors.graph_estimate import (
     Refusals,
     RefusedFactor,
 )
-from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import (
+    PARTIAL,
+    GraphUpdate,
+    Observations,
+    PosePrior,
+    RelativePose,
+)
 from bmask_slam.graph.factors.observability import constrained_landmarks
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 
@@ -149,7 +155,7 @@ def _connected(
 def _joins(
     keyframe: int, pose_factors: tuple[RelativePose | PosePrior, ...], inside: set[int]
 ) -> bool:
-    ends = (factor.keyframe_ids for factor in pose_factors)
+    ends = (factor.keyframe_ids for factor in pose_factors if factor.kind not in PARTIAL)
     return any(keyframe in ids and inside.issuperset(set(ids) - {keyframe}) for ids in ends)
 
 

@@ -10,10 +10,11 @@ from bmask_slam.back_end.triangulation import TriangulationConfig
 from bmask_slam.features.matching import Matches, WindowIndex
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.geometry import transform
+from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.tracking.pose_optimisation import CHI2_2DOF, CHI2_3DOF, residuals
 from bmask_slam.tracking.tracker import Tracker
+from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -58,6 +59,15 @@ def fuse_into_neighbours(
     return fuse_into(
         world, neighbours[: config.fuse_neighbours], new_ids, tracker, config.fuse_radius_px
     )
+
+
+def fuse_into_surroundings(
+    world: WorldMap, keyframe: Keyframe, tracker: Tracker, config: MappingConfig
+) -> Ints:
+    """Search the landmarks around a keyframe that it does not observe in it; the ids removed."""
+    _, observed = world.observed(keyframe)
+    known = np.setdiff1d(local_landmarks(world, observed, config.local_map), observed)
+    return fuse_into(world, [keyframe], known, tracker, config.fuse_radius_px)
 
 
 def fuse_into(
@@ -149,6 +159,16 @@ def loop_sides(
         near = world.covisible(seen, config.min_shared)[:keyframes]
         new_side.update({k.id: k for _, k in near})
     return np.unique(np.concatenate(old_ids)), [new_side[k] for k in sorted(new_side)]
+
+
+def remove_redundant(world: WorldMap, history: FrameHistory, keyframe: Keyframe) -> Ints:
+    """Remove a keyframe; its frames follow the one that shares most. The landmarks it observed."""
+    _, ids = world.observed(keyframe)
+    parent = next(k for _, k in world.covisible(ids, 0) if k is not keyframe)
+    T_parent_keyframe = inverse(parent.T_world_camera) @ keyframe.T_world_camera
+    history.hand_over(keyframe.id, parent.id, T_parent_keyframe)
+    world.remove_keyframe(keyframe, parent)
+    return ids
 
 
 def redundant_keyframe(

@@ -14,6 +14,7 @@ import numpy as np
 from bmask_slam.events import EventLog
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Ints
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import Tracked
@@ -38,6 +39,9 @@ class MapBackend(MapEditor, Protocol):
 
     def optimise(self, keyframe: Keyframe) -> None:
         """Put a keyframe into the graph and read all poses and points back."""
+
+    def add_measurements(self, new: Measurements) -> None:
+        """Keep the measurements of a sensor; they become factors with the next keyframe."""
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
         """Look for known places from a keyframe; loops that hold move the map.

@@ -3,57 +3,48 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bmask_slam.back_end.factor_selection import FactorSelectionConfig, FactorSelector, read_back
+from bmask_slam.back_end.config import BackEndConfig
+from bmask_slam.back_end.factor_selection import FactorSelector, read_back
 from bmask_slam.back_end.landmark_management import (
-    MappingConfig,
     create_landmarks,
     cull_landmarks,
-    fuse_into,
     fuse_into_neighbours,
+    fuse_into_surroundings,
     fuse_loops,
     redundant_keyframe,
+    remove_redundant,
 )
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.back_end.pruning import MapPruner
+from bmask_slam.back_end.reference_frame import SensorChanges
 from bmask_slam.back_end.segment_joining import anchors, join_segment
+from bmask_slam.back_end.sensor_fusion import SensorFusion
 from bmask_slam.back_end.triangulation import triangulate_landmarks
 from bmask_slam.events import Ends, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
-from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.files.array_file import nested, part
-from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.smoother.smoother import Smoother
-from bmask_slam.loops.closing import LoopCloser, LoopClosingConfig
+from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.landmark_table import Patches
-from bmask_slam.world.local_map import local_landmarks
 from bmask_slam.world.map_state import world_of, world_state
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class BackEndConfig:
-    """Settings of the map, of factor selection, of the graph, and of its loops."""
-
-    mapping: MappingConfig = field(default_factory=MappingConfig)
-    factor_selection: FactorSelectionConfig = field(default_factory=FactorSelectionConfig)
-    graph: SmootherConfig = field(default_factory=SmootherConfig)
-    loops: LoopClosingConfig = field(default_factory=LoopClosingConfig)
 
 
 class Mapper:
@@ -62,6 +53,7 @@ class Mapper:
     Attributes:
         world: keyframes and landmarks. history: of all tracked frames. smoother: the graph.
         loops: finds loops, and holds closed ones.
+        sensors: makes factors of the measurements of other sensors.
         events: of this system.
         update_ms: wall time of every graph update.
     """
@@ -73,6 +65,7 @@ class Mapper:
         self.smoother = Smoother(camera, config.graph)
         self.events = EventLog()
         self.loops = LoopCloser(camera, config.loops, self.events)
+        self.sensors = SensorFusion(config.sensors, self.events)
         self.update_ms: list[float] = []
         self._tracker = tracker
         self._mapping, self._graph_config = config.mapping, config.graph
@@ -104,6 +97,7 @@ class Mapper:
                 feed=self._factor_selector.state(),
                 loops=self.loops.state(),
                 events=self.events.state(),
+                sensors=self.sensors.state(),
             ),
         }
 
@@ -116,6 +110,7 @@ class Mapper:
         self._factor_selector.restore(part(state, "feed"))
         self.loops.restore(part(state, "loops"), self.world)
         self.events.restore(part(state, "events"))
+        self.sensors.restore(part(state, "sensors"))
 
     def restart(self) -> None:
         """Rebuild what a state cannot hold (ISAM2, index), as a restored mapper does."""
@@ -126,6 +121,7 @@ class Mapper:
         """Clear the frame history, the events and the times; map and graph stay."""
         self.history = FrameHistory()
         self.events.begin_session()
+        self.sensors.begin_session()
         self.update_ms = []
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:
@@ -145,9 +141,8 @@ class Mapper:
 
     def optimise(self, keyframe: Keyframe) -> None:
         """Put a keyframe into the graph, read all poses and points back, cull a redundant one."""
-        self._apply(
-            self.smoother.update(self._factor_selector.keyframe_update(self.world, keyframe))
-        )
+        update = self._factor_selector.keyframe_update(self.world, keyframe)
+        self._apply(self.smoother.update(self._measured().added_to(update)))
         self._cull_keyframe(keyframe)
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
@@ -185,7 +180,9 @@ class Mapper:
         self.smoother = Smoother(self.camera, self._graph_config)
         update = self._factor_selector.whole_update(self.world)
         loops += anchors(self.world, self._graph_config)
-        self._apply(self.smoother.update(replace(update, relative_poses=loops)))
+        self.sensors.forget_factors()
+        update = self._measured().added_to(replace(update, relative_poses=loops))
+        self._apply(self.smoother.update(update))
         return joined
 
     def pruner(self) -> MapPruner:
@@ -216,12 +213,7 @@ class Mapper:
         if keyframe is None or not len(keypoints):
             return
         world.unmask(keyframe, keypoints)
-        _, landmark_ids = world.observed(keyframe)
-        known = np.setdiff1d(
-            local_landmarks(world, landmark_ids, self._mapping.local_map), landmark_ids
-        )
-        radius_px = self._mapping.fuse_radius_px
-        fused = fuse_into(world, [keyframe], known, self._tracker, radius_px)
+        fused = fuse_into_surroundings(world, keyframe, self._tracker, self._mapping)
         self._factor_selector.remove_landmarks(fused)
         create_landmarks(world, keyframe, self.camera)
         ids = keyframe.landmark_ids[keypoints]
@@ -230,7 +222,23 @@ class Mapper:
     def finish(self) -> None:
         """Full bundle adjustment, again without outliers; the map is then final."""
         if self.world.keyframes:
+            self.add_last_measurements()
             self._apply(self.smoother.optimise_batch(drop_outliers=True), timed=False)
+            self.sensors.report(self.smoother)
+
+    def add_measurements(self, new: Measurements) -> None:
+        """Keep the measurements of a sensor; they become factors with the next update."""
+        self.sensors.add(new, self.world)
+
+    def add_last_measurements(self) -> None:
+        """Make factors of the measurements that waited for the next keyframe."""
+        changes = self._measured(last=True)
+        if changes:
+            update = changes.added_to(self._factor_selector.map_update(self.world))
+            self._apply(self.smoother.update(update), timed=False)
+
+    def _measured(self, last: bool = False) -> SensorChanges:
+        return self.sensors.changes(self.world, self.history, self.smoother.tables, last)
 
     def _apply(self, estimate: GraphEstimate, timed: bool = True) -> None:
         if timed:
@@ -284,11 +292,7 @@ class Mapper:
         redundant = redundant_keyframe(self.world, old, self._mapping)
         if redundant is None:
             return
-        _, ids = self.world.observed(redundant)
-        parent = next(k for _, k in self.world.covisible(ids, 0) if k is not redundant)
-        T_parent_keyframe = inverse(parent.T_world_camera) @ redundant.T_world_camera
-        self.history.hand_over(redundant.id, parent.id, T_parent_keyframe)
-        self.world.remove_keyframe(redundant, parent)
+        ids = remove_redundant(self.world, self.history, redundant)
         self._factor_selector.remove_keyframe(redundant.id)
         self._factor_selector.remove_landmarks(cull_landmarks(self.world, ids, self._mapping))
         self.loops.remove(redundant.id)

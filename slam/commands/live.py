@@ -93,6 +93,7 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
 
 
 def _live(arguments: argparse.Namespace) -> int:
+    from bmask_slam.graph.sensors.streams import read_folder
     from bmask_slam.live.live_slam import LiveSlam
     from bmask_slam.live.play import PlayOptions, play
     from bmask_slam.live.sources.opening import open_source
@@ -103,6 +104,8 @@ def _live(arguments: argparse.Namespace) -> int:
         options = _live_options(arguments, source)
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
+            for measured in read_folder(options.images, config.sensors.enabled):
+                slam.add_measurements(measured)
             if slam.viewer_url:
                 print(f"in a browser: {slam.viewer_url}", flush=True)
             ended_by = play(slam, source, PlayOptions(not source.waits, quiet=arguments.quiet))

@@ -42,6 +42,8 @@ def add_render(commands: Commands) -> None:
         "--depth-delay-ms", type=float, default=0.0, metavar="MS", help="depth taken so much later"
     )
     parser.add_argument("--sweeping", action="store_true", help="tilt and roll, as to calibrate")
+    text = "also of odometry,position,accelerometer: files beside the images"
+    parser.add_argument("--sensors", default="", metavar="S,S", help=text)
     parser.add_argument("--true-depth", action="store_true", help="also write noise-free depth")
     parser.add_argument("--normals", action="store_true", help="also write surface normals")
     parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
@@ -53,6 +55,7 @@ def _render(arguments: argparse.Namespace) -> int:
 
     names = (f.name for f in fields(RenderConfig) if f.name != "noise")
     given = {name: getattr(arguments, name) for name in names}
+    given["sensors"] = tuple(filter(None, arguments.sensors.split(",")))
     config = RenderConfig(noise=not arguments.no_noise, **given)
     with console_log(), counting_bar(arguments.quiet) as progress:
         folder = render_sequence(config, arguments.out, progress)

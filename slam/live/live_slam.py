@@ -7,16 +7,16 @@ import math
 import tempfile
 import time
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
-from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud
 from bmask_slam.live.display import Display
@@ -25,9 +25,11 @@ from bmask_slam.live.recorder import Recorder, rescued
 from bmask_slam.live.sources.source import SourceCounts
 from bmask_slam.live.sources.source_clock import SourceClock
 from bmask_slam.live.start import LiveOptions, start_system
+from bmask_slam.live.system import Prepared
 from bmask_slam.run_folder import metrics
 from bmask_slam.run_folder.folder import HEALTH, RunFolder
 from bmask_slam.run_folder.metrics import RunCounters, row
+from bmask_slam.sensor_input import SensorInput
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import FrameResult
@@ -45,22 +47,7 @@ DENSE_FINISH_S = 600.0
 """Longest time that the dense map may take to finish at the end."""
 
 
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A frame's features, extracted ahead of tracking.
-
-    Attributes:
-        features: as of ``SlamSystem.prepare``.
-        ms: time that they took.
-        arrived_s: ``time.monotonic()`` when the frame arrived, from which its latency counts.
-    """
-
-    features: Features
-    ms: float
-    arrived_s: float
-
-
-class LiveSlam:
+class LiveSlam(SensorInput):
     """Tracks frames as they come; map, segmentation and dense map run in processes of their own.
 
     A context manager: leaving it ends the processes and saves everything, also after an error.
@@ -169,6 +156,10 @@ class LiveSlam:
         self._meter.count(result, 1e3 * (time.monotonic() - arrived_s))
         self._show(result, rgb)
         return result
+
+    def add_measurements(self, new: Measurements) -> None:
+        """Use the measurements of a sensor with the next frame; from any thread."""
+        self._system.add_measurements(new)
 
     def _process(self, frame: Frame, prepared: Prepared | None) -> FrameResult:
         """Do a frame's step; one that is refused is counted."""

@@ -9,6 +9,7 @@ from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import FileKind
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.live.replica import WorldDelta
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
 from bmask_slam.tracking.results import Tracked
@@ -147,6 +148,13 @@ class UseCamera:
 
     camera: Camera
     motions: dict[int, KeyframeMotion]
+
+
+@dataclass(frozen=True, eq=False)
+class AddMeasurements:
+    """To the map: measurements of a sensor beside the camera."""
+
+    measurements: Measurements
 
 
 @dataclass(frozen=True)

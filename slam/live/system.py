@@ -5,8 +5,10 @@ from __future__ import annotations
 import gc
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,7 @@ from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import nested, read_arrays
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.messages import STATE_FILE, ImageToSegment, TimesEstimated, UseCamera
@@ -67,6 +70,21 @@ def settings_for_tracking() -> Iterator[None]:
         yield
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A frame's features, extracted ahead of tracking.
+
+    Attributes:
+        features: as of ``SlamSystem.prepare``.
+        ms: time that they took.
+        arrived_s: ``time.monotonic()`` when the frame arrived, from which its latency counts.
+    """
+
+    features: Features
+    ms: float
+    arrived_s: float
+
+
 class LiveSystem(SlamSystem):
     """Tracks in the caller's process; ``finish`` fetches the map from its process.
 
@@ -87,6 +105,7 @@ class LiveSystem(SlamSystem):
         calibration: RemoteCalibration | None = None,
     ) -> None:
         self.segmenter, self.dense, self.calibration = segmenter, dense, calibration
+        self._measured: deque[Measurements] = deque()
         self._names = (segmenter or NoSegmenter).labels.names
         with ExitStack() as undo:
             self.remote = RemoteMapper(camera, config, self._names, folder)
@@ -125,8 +144,14 @@ class LiveSystem(SlamSystem):
             self.camera = self.camera_tracker.tracker.camera = found.camera
             self.remote.send(UseCamera(found.camera, found.motions))
 
+    def add_measurements(self, new: Measurements) -> None:
+        """Use the measurements of a sensor with the next frame; from any thread."""
+        self._measured.append(new)
+
     def catch_up(self) -> None:
         """Update the copy of the map, pass masks on, and move tracking with the map."""
+        while self._measured:
+            self.remote.add_measurements(self._measured.popleft())
         reference, changes = self.camera_tracker.reference, self.remote.changes
         T_before = None if reference is None else reference.T_world_camera
         for masks in self.remote.catch_up():
@@ -210,6 +235,7 @@ class LiveSystem(SlamSystem):
         while calibration and calibration.busy and time.monotonic() < begin_s + CALIBRATION_S:
             time.sleep(0.02)
             self.catch_up()
+        self.catch_up()
         path = self.remote.finish(FINISH_S)
         state = read_arrays(path, STATE_FILE)[1]
         own = nested(dynamics=self.moving_objects.state())

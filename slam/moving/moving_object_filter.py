@@ -27,7 +27,7 @@ from bmask_slam.semantics.tracks.instance_track import Sighting, Track
 from bmask_slam.semantics.tracks.instance_tracks import InstanceTracks
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.camera_tracker import CameraTracker
-from bmask_slam.tracking.results import Tracked, TrackingStatus
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.map_editor import MapEditor
 from bmask_slam.world.world_map import Keyframe
 
@@ -119,7 +119,7 @@ class MovingObjectFilter:
         restored, of something that proved static: the frame was tracked without them, so that its
         number of tracked landmarks is no measure of how much of the map it shows.
         """
-        if tracked.status is TrackingStatus.LOST:
+        if not tracked.status.by_image:
             return False
         moving = self.landmarks.observe_frame(tracked, static.view)
         self._camera_tracker.exclude_landmarks(moving)

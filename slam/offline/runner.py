@@ -18,6 +18,7 @@ from bmask_slam.config.configuration import dump
 from bmask_slam.datasets.weights import find_weights
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.sensors.streams import read_folder
 from bmask_slam.graph.trajectory import MAX_TIME_DIFFERENCE_S, Trajectory, associate_stamps
 from bmask_slam.graph.trajectory_formats import read_trajectory
 from bmask_slam.offline.checkpoint import Checkpoint, read_checkpoint
@@ -74,7 +75,7 @@ def run(options: RunOptions, make_system: MakeSystem | None = None) -> RunSummar
         calibrator = _calibrator(options, inherited_calibration(options, sequence), masks)
         if calibrator.state.adopted:
             sequence = open_sequence(options.sequence, camera=calibrator.state.camera)
-        system = start_system(options, sequence, make)
+        system = with_sensors(start_system(options, sequence, make), sequence)
         active = ActiveRun(options, sequence, reference, system, folder, stop, calibrator)
         return _finished(active, make)
 
@@ -119,7 +120,7 @@ def _finished(active: ActiveRun, make_system: MakeSystem) -> RunSummary:
         active = replace(
             active,
             sequence=open_sequence(options.sequence, camera=camera),
-            system=make_system(camera, options.config),
+            system=with_sensors(make_system(camera, options.config), active.sequence),
             counters=RunCounters(wall_s=active.counters.wall_s),
         )
     return finish_run(active)
@@ -211,6 +212,15 @@ def _system_maker(
         return partial(SlamSystem, segmenter=segmenter), None
     masks = RememberingSegmenter(segmenter)
     return partial(SlamSystem, segmenter=masks), masks
+
+
+def with_sensors(system: System, sequence: Sequence) -> System:
+    """The system with the measurements that lie beside the images. Raises InputError."""
+    if isinstance(system, SlamSystem):
+        for measured in read_folder(sequence.folder, system.config.sensors.enabled):
+            logger.info("%s: %d measurements", measured.sensor, len(measured.rows))
+            system.add_measurements(measured)
+    return system
 
 
 def start_system(options: RunOptions, sequence: Sequence, make_system: MakeSystem) -> System:

@@ -31,6 +31,7 @@ from bmask_slam.rendering.engine.raycast import Renderer, View, to_image
 from bmask_slam.rendering.engine.scene import Scene, build_scene
 from bmask_slam.rendering.engine.sensor import blur, exposure_gain, measure_depth, optical_flow
 from bmask_slam.rendering.rooms.random_room import draw_room
+from bmask_slam.rendering.sensors import FORCE_HZ, check_sensors, write_sensors
 from bmask_slam.rendering.things.people import Cast, Role, add_people
 from bmask_slam.rendering.writer import (
     new_folder,
@@ -79,6 +80,8 @@ class RenderConfig:
         width, height: image size in pixels; the field of view stays the Kinect's.
         true_depth: also write the noise-free depth to ``depth_true/``.
         normals: also write camera-frame normals to ``normals/`` as round(127.5 n + 127.5).
+        sensors: "odometry", "position", "accelerometer": their files, with the noise that is
+            assumed of them by default.
     """
 
     name: str
@@ -97,6 +100,7 @@ class RenderConfig:
     true_depth: bool = False
     normals: bool = False
     rounds: int = 1
+    sensors: tuple[str, ...] = ()
 
 
 def kinect_camera(config: RenderConfig) -> Camera:
@@ -129,6 +133,11 @@ def render_sequence(
                 progress(len(visible), len(job.poses))
         write_lists(folder, job.stamps, job.poses)
         write_camera(folder / "camera.yaml", job.camera)
+        if config.sensors:
+            path, length_s = _plan(config).path, len(job.poses) / config.fps
+            fine = camera_poses(path, FORCE_HZ, config.seed, sweeping=config.sweeping)
+            fine = fine[: int(length_s * FORCE_HZ)]
+            write_sensors(folder, config.sensors, job.poses, config.fps, fine, config.seed)
         write_json(folder / "annotations.json", coco(visible, job.stamps, job.camera, job.scene))
     return Path(out)
 
@@ -171,6 +180,7 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"fps={config.fps}: must be between 0.1 and 1000")
     if not abs(config.depth_delay_ms) <= 1000:
         raise InputError(f"depth delay {config.depth_delay_ms} ms: must be at most 1000 either way")
+    check_sensors(config.sensors)
     if min(config.width, config.height) < 16:
         raise InputError(f"{config.width}x{config.height}: too small; use at least 16x16")
 

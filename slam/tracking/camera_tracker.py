@@ -7,21 +7,18 @@ import numpy as np
 from bmask_slam.features.brisk import BriskExtractor, Features
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.files.array_file import nested, part
-from bmask_slam.graph.geometry import carried_along, inverse, orthonormalised, se3_exp, se3_log
+from bmask_slam.graph.geometry import inverse, orthonormalised
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.guided_landmarks import GuidedLandmarks
+from bmask_slam.tracking.motion_model import MotionModel
 from bmask_slam.tracking.relocalisation import RelocalisationConfig, relocalise, similar_keyframes
-from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, untracked
+from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, more, reckoned, untracked
 from bmask_slam.tracking.rolling_shutter import PreviousPose
 from bmask_slam.tracking.tracker import Tracker
 from bmask_slam.world.local_map import LocalMapConfig, local_landmarks
 from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import Keyframe
 
-UNEVEN = 0.25
-"""Frames count as evenly spaced if their intervals differ by a smaller share."""
-MAX_STEPS = 4.0
-"""The motion is extrapolated over at most so many times the interval in which it was measured."""
 MAX_AGO_S = 0.2
 """The velocity for the rolling shutter is not taken from an older pose."""
 
@@ -49,10 +46,7 @@ class CameraTracker:
         self.segment = 0
         self._map = map_reader
         self._relocalisation, self._local_map = relocalisation, local_map
-        self._T_world_last = np.eye(4)
-        self._T_last_next = np.eye(4)
-        self._last_s = self._now_s = np.nan
-        self._interval_s = np.nan  # during which T_last_next happened
+        self._motion = MotionModel()
         self._recent_ids: Ints = np.zeros(0, np.int64)
         self._local_ids: Ints = np.zeros(0, np.int64)
         self._images = GuidedLandmarks(extractor, tracker.config.image_motion)
@@ -61,9 +55,7 @@ class CameraTracker:
         """The motion, and the landmarks that the next frame will be tracked against."""
         return {
             "lost_frames": np.array(self.lost_frames),
-            "T_world_last": self._T_world_last,
-            "T_last_next": self._T_last_next,
-            "stamps_s": np.array([self._last_s, self._now_s, self._interval_s]),
+            **self._motion.state(),
             "recent_ids": self._recent_ids,
             "local_ids": self._local_ids,
             **nested(images=self._images.state()),
@@ -72,15 +64,14 @@ class CameraTracker:
     def restore(self, state: Arrays) -> None:
         """Become the tracker of a state; its reference and segment are restored by the system."""
         self.lost_frames = int(state["lost_frames"])
-        self._T_world_last, self._T_last_next = state["T_world_last"], state["T_last_next"]
-        self._last_s, self._now_s, self._interval_s = state["stamps_s"].tolist()
+        self._motion.restore(state)
         self._recent_ids, self._local_ids = state["recent_ids"], state["local_ids"]
         self._images.restore(part(state, "images"))
 
     @property
     def timestamp_s(self) -> float:
         """Time of the last frame that was begun; NaN before the first."""
-        return self._now_s
+        return self._motion.now_s
 
     @property
     def local_ids(self) -> Ints:
@@ -95,7 +86,7 @@ class CameraTracker:
         world = self._map.world
         self.segment = world.largest_segment()
         self.reference = world.in_segment(self.segment)[-1]
-        self._last_s = self._now_s = np.nan
+        self._motion.last_s = self._motion.now_s = np.nan
         self.reset(self._relocalisation.patience_frames)
 
     def reset(self, lost_frames: int) -> None:
@@ -107,14 +98,14 @@ class CameraTracker:
 
     def restart(self, T_world_camera: Array) -> None:
         """Begin at a pose, without speed: a new segment, or a map that was moved."""
-        self._T_world_last, self._T_last_next = T_world_camera, np.eye(4)
+        self._motion.restart(T_world_camera)
 
     def begin_frame(self, timestamp_s: float) -> None:
         """Set the time of the frame that is tracked next.
 
         Without it the interval is taken to be the same as the last one.
         """
-        self._now_s = timestamp_s
+        self._motion.now_s = timestamp_s
         self._images.end_frame()
 
     def look(self, frame: Frame, features: Features) -> None:
@@ -138,6 +129,17 @@ class CameraTracker:
         tracked = self._tracked(features, self._map.world.landmarks.remaining(self._local_ids))
         return None if tracked.status is TrackingStatus.LOST else tracked.T_world_camera
 
+    def can_begin(self, features: Features) -> bool:
+        """Whether a frame has depth enough to begin a map, and will be worked on."""
+        enough = np.isfinite(features.depth_m).sum() >= self._relocalisation.min_new_points
+        return bool(enough) and self._map.accepts_keyframes
+
+    def goes_on(self, tracked: Tracked) -> bool:
+        """Whether a frame goes on with the map where odometry has led, after a long blackout."""
+        waited = self.lost_frames > self._relocalisation.patience_frames
+        by_odometry = tracked.status is TrackingStatus.DEAD_RECKONING
+        return by_odometry and waited and self.can_begin(tracked.features)
+
     def exclude_landmarks(self, landmark_ids: Ints) -> None:
         """Do not track against these landmarks (N,)."""
         if not len(landmark_ids):
@@ -149,15 +151,14 @@ class CameraTracker:
         """The frame's pose; where there is no map, or it is long lost, the frame begins one.
 
         A frame that begins a map segment has the pose of the segment's origin, and must become
-        its first keyframe.
+        its first keyframe. Where odometry knows the way none begins.
         """
-        rules = self._relocalisation
-        enough = np.isfinite(features.depth_m).sum() >= rules.min_new_points
-        can_begin = enough and self._map.accepts_keyframes
+        can_begin = self.can_begin(features)
         if self.reference is None:
             return untracked(np.eye(4), features) if can_begin else lost(np.eye(4), features)
         tracked = self.track_in_map(features)
-        if self.lost_frames <= rules.patience_frames or not can_begin:
+        waits = self.lost_frames <= self._relocalisation.patience_frames or not can_begin
+        if waits or tracked.status is TrackingStatus.DEAD_RECKONING:
             return tracked
         self.segment = 1 + max(k.segment for k in self._map.world.keyframes.values())
         self.reference = None
@@ -180,8 +181,8 @@ class CameraTracker:
         if tracked.status is TrackingStatus.LOST:
             self.lost_frames += 1
             self._images.end_frame()
-            self._T_last_next = np.eye(4)
-            return tracked
+            self._motion.stop()
+            return self._by_odometry(tracked)
         world.landmarks.visible[tracked.visible_ids] += 1
         world.landmarks.found[tracked.landmark_ids] += 1
         return tracked
@@ -207,10 +208,7 @@ class CameraTracker:
         T_world_tracked is the pose as tracked, T_world_camera as optimised; the landmarks (N,) are
         those that the frame observes.
         """
-        steady = self.lost_frames == 0
-        self._T_last_next = inverse(self._T_world_last) @ T_world_tracked if steady else np.eye(4)
-        self._T_world_last = T_world_camera
-        self._interval_s, self._last_s = self._now_s - self._last_s, self._now_s
+        self._motion.advance(T_world_tracked, T_world_camera, steady=self.lost_frames == 0)
         self._recent_ids = landmark_ids
         self.lost_frames = 0
 
@@ -220,7 +218,7 @@ class CameraTracker:
         ``landmark_ids`` (N,) are those that its features observe, -1 for none. To be called before
         ``update_motion``.
         """
-        poses = (self._predicted_by_velocity(), T_world_camera)
+        poses = (self._unseen(), T_world_camera)
         self._images.remember(features, landmark_ids, poses, self._map.world.landmarks)
 
     def follow_map(self, T_old: Array, T_new: Array) -> None:
@@ -230,7 +228,7 @@ class CameraTracker:
         may have restarted with fewer landmarks.
         """
         landmarks = self._map.world.landmarks
-        self._T_world_last = carried_along(self._T_world_last, T_old, T_new)
+        self._motion.follow_map(T_old, T_new)
         known = self._recent_ids[self._recent_ids < len(landmarks)]
         self._recent_ids = landmarks.remaining(landmarks.current(known))
         self._images.follow_map(landmarks)
@@ -248,8 +246,8 @@ class CameraTracker:
 
     def _follow(self, features: Features) -> None:
         """Follow the last frame's corners into this one."""
-        T_last_next = inverse(self._T_world_last) @ self._predicted_by_velocity()
-        self._images.follow(features, T_last_next, self._now_s - self._last_s)
+        T_last_next = inverse(self._motion.T_world_last) @ self._unseen()
+        self._images.follow(features, T_last_next, self._motion.ago_s)
 
     def _tracked_in_image(self, features: Features) -> Tracked:
         """The pose by the local map, with the help of the image's motion where there is need."""
@@ -276,20 +274,21 @@ class CameraTracker:
         """T_world_camera (4, 4), by the image's motion if that is known, else by velocity."""
         followed = self._images.followed
         if followed is None:
-            return self._predicted_by_velocity()
-        return orthonormalised(self._T_world_last @ followed.estimate.T_world_camera)
+            return self._unseen()
+        return orthonormalised(self._motion.T_world_last @ followed.estimate.T_world_camera)
 
-    def _predicted_by_velocity(self) -> Array:
-        """The last motion, extrapolated over the time from the last frame to this one."""
-        known = self._interval_s > 0  # False for NaN
-        steps = (self._now_s - self._last_s) / self._interval_s if known else 1.0
-        if not abs(steps - 1) >= UNEVEN:
-            return orthonormalised(self._T_world_last @ self._T_last_next)
-        motion = min(max(steps, 0.0), MAX_STEPS) * se3_log(self._T_last_next)
-        return orthonormalised(self._T_world_last @ se3_exp(motion))
+    def _unseen(self) -> Array:
+        """T_world_camera (4, 4) by the last motion; in a blackout by odometry if that knows it."""
+        moved = self._motion.by_odometry(self._map.sensors) if self.lost_frames else None
+        return self._motion.by_velocity() if moved is None else moved[0]
+
+    def _by_odometry(self, tracked: Tracked) -> Tracked:
+        """A frame that the image gives no pose, with that of odometry if there is one."""
+        moved = self._motion.by_odometry(self._map.sensors)
+        return tracked if moved is None else reckoned(tracked, moved[0], moved[1].covariance)
 
     def _previous(self) -> PreviousPose | None:
         """The last frame's pose; None where it is too old to give a velocity."""
-        ago_s = self._now_s - self._last_s
+        ago_s = self._motion.ago_s
         recent = self.lost_frames == 0 and 0 < ago_s < MAX_AGO_S  # False for NaN
-        return PreviousPose(self._T_world_last, ago_s) if recent else None
+        return PreviousPose(self._motion.T_world_last, ago_s) if recent else None

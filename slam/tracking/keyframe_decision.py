@@ -8,7 +8,7 @@ from typing import Literal
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.tracking.camera_tracker import CameraTracker
-from bmask_slam.tracking.results import Tracked, TrackingStatus
+from bmask_slam.tracking.results import Tracked
 from bmask_slam.world.map_editor import MapReader
 from bmask_slam.world.world_map import Keyframe
 
@@ -94,8 +94,8 @@ class KeyframeDecision:
     def reason(self, tracked: Tracked) -> str:
         """Why a tracked frame should become a keyframe, or "" if it should not."""
         reference = self._camera_tracker.reference
-        if tracked.status is TrackingStatus.LOST:
-            return ""
+        if not tracked.status.by_image:
+            return "dead reckoning" if self._camera_tracker.goes_on(tracked) else ""
         if reference is None:
             return "first frame" if self._camera_tracker.segment == 0 else "new segment"
         self.frames_since += 1

@@ -13,11 +13,20 @@ from bmask_slam.graph.arrays import Array, Ints, no_ids
 
 
 class TrackingStatus(Enum):
-    """OK: a pose. WEAK: an uncertain one: few or contradictory matches, far points. LOST: none."""
+    """OK: a pose. WEAK: an uncertain one: few or contradictory matches, far points. LOST: none.
+
+    DEAD_RECKONING: a pose by odometry alone, since the image gives none.
+    """
 
     OK = "OK"
     WEAK = "WEAK"
     LOST = "LOST"
+    DEAD_RECKONING = "DEAD_RECKONING"
+
+    @property
+    def by_image(self) -> bool:
+        """Whether the image gave the pose."""
+        return self in (TrackingStatus.OK, TrackingStatus.WEAK)
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,14 @@ def untracked(T_world_camera: Array, features: Features) -> Tracked:
     return Tracked(TrackingStatus.OK, T_world_camera, features, none, none, 0, none, information)
 
 
+def reckoned(tracked: Tracked, T_world_camera: Array, covariance: Array) -> Tracked:
+    """A frame that was lost, at the pose (4, 4) where odometry has led; covariance (6, 6)."""
+    begun = untracked(T_world_camera, tracked.features)
+    status = TrackingStatus.DEAD_RECKONING
+    information: Array = np.asarray(np.linalg.inv(covariance), float)
+    return replace(begun, status=status, matches=tracked.matches, information=information)
+
+
 @dataclass(frozen=True)
 class FrameResult:
     """The outcome of one frame.
@@ -101,7 +118,8 @@ class FrameResult:
         ignored: features on moving things, which were not used.
         mostly_moving: too few features would have been left, so that all were used.
         information: (6, 6) of the pose if the map is taken as exact, in the camera's tangent
-            [rotation rad, translation m]; None without a pose, and where a frame begins a map.
+            [rotation rad, translation m]; None without a pose, and where a frame begins a map. In
+            DEAD_RECKONING that of the motion since the image last gave a pose.
         keyframe_id: id of the keyframe made from this frame, or None.
         keyframe_reason: why it was made ("" when it was not).
         stage_ms: wall time of each stage in milliseconds, by name.

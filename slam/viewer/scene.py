@@ -39,7 +39,7 @@ FLUSH_S = 10.0
 """The longest wait for a viewer at the end."""
 IMAGE_STEP = 2
 JPEG_QUALITY = 70
-STATUS = {TrackingStatus.OK: 2, TrackingStatus.WEAK: 1, TrackingStatus.LOST: 0}
+STATUS = dict.fromkeys(TrackingStatus, 1) | {TrackingStatus.OK: 2, TrackingStatus.LOST: 0}
 
 
 @dataclass(frozen=True)

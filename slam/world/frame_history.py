@@ -108,6 +108,20 @@ class FrameHistory:
             poses = origins[rows] @ self._store["T_keyframe_camera"][rows]
             yield segment, rows, origins[rows], Trajectory(self._store["timestamp_s"][rows], poses)
 
+    def path(self, world: WorldMap, segment: int, begin_s: float, end_s: float) -> Trajectory:
+        """The frames of a segment from one time to another, with one on either side."""
+        stamps_s = self._store["timestamp_s"][: self._size]
+        begin = int(np.searchsorted(stamps_s, begin_s, side="right")) - 1
+        begin = max(min(begin, self._size - 2), 0)
+        end = max(int(np.searchsorted(stamps_s, end_s, side="left")) + 1, begin + 2)
+        found_s, poses = [], []
+        for entry in self._store[: self._size][begin:end]:
+            owner, T = self._resolve(int(entry["keyframe_id"]), entry["T_keyframe_camera"])
+            if owner != NO_KEYFRAME and world.keyframes[owner].segment == segment:
+                found_s.append(float(entry["timestamp_s"]))
+                poses.append(world.keyframes[owner].T_world_camera @ T)
+        return Trajectory(np.array(found_s), _stacked(poses))
+
     def without_map(self) -> list[Trajectory]:
         """The frames of each keyframe whose pose was lost, in that keyframe's frame."""
         entries = self._store[: self._size]

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Ints, Mask
+from bmask_slam.graph.sensors.odometry import MotionSensor
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.landmark_table import Patches
 from bmask_slam.world.world_map import WorldMap
@@ -28,6 +29,10 @@ class MapReader(Protocol):
     @property
     def places(self) -> DescriptorIndex:
         """Finds the keyframes that look like a frame."""
+
+    @property
+    def sensors(self) -> MotionSensor:
+        """Knows the camera's motion without images, where there is odometry."""
 
     @property
     def idle(self) -> bool:

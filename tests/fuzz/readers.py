@@ -48,6 +48,7 @@ from bmask_slam.graph.g2o.landmark_graphs import write_landmark_graph
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
 from bmask_slam.graph.g2o.pose_graphs import read_g2o
 from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.sensors.streams import read_measurements
 from bmask_slam.graph.smoother.storage import GRAPH_FILE, graph_arrays, read_graph
 from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
 from bmask_slam.graph.trajectory_formats import (
@@ -584,6 +585,9 @@ def text_readers(folder: Path) -> list[Reader]:
     curves = b"kind,ranked_by,recall,precision\nsegm,score,0.0,1.0\nsegm,score,0.5,0.7\n"
     return [
         Reader("TUM trajectory", "a.txt", read_tum, (tum,)),
+        Reader("odometry", "a.txt", lambda p: read_measurements(p, "odometry"), (tum,)),
+        Reader("position", "a.txt", lambda p: read_measurements(p, "position"),
+               (b"1.0 2 3 4 0.5\n2.0 2 3 4\n",)),
         Reader("any trajectory", "a.txt", partial(read_trajectory, stamps_s=path.timestamps_s),
                (tum, kitti, euroc)),
         Reader("stamps", "times.txt", read_times, (b"0.1\n0.2\n0.3\n", tum)),

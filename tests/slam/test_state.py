@@ -27,8 +27,9 @@ from bmask_slam.semantics.instances.instances import Instance, PackedMask, certa
 from bmask_slam.semantics.instances.surfaces import Segmented, SurfaceClasses
 from bmask_slam.semantics.labels import label_set
 from bmask_slam.semantics.tracks.instance_track import Sighting
-from bmask_slam.system import OPTIONAL_ARRAYS, SlamSystem
+from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
+from bmask_slam.system_results import OPTIONAL_ARRAYS
 from bmask_slam.world.landmark_table import PATCHES, LandmarkTable, Patches
 
 FILE = Path("run/checkpoint")

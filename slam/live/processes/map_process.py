@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.back_end.reinterpretation import use_camera
+from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import read_arrays, write_arrays
@@ -27,6 +28,7 @@ from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import (
     STATE_FILE,
+    AddMeasurements,
     Finish,
     LostKeyframe,
     MapChanged,
@@ -126,9 +128,7 @@ class MapServer:
             case Masks():
                 self.add_masks(message)
             case PruneLandmarks():
-                ids = self.system.mapper.world.landmarks.remaining(message.ids)
-                if len(ids):
-                    self.system.map.prune_landmarks(ids)
+                self.prune_landmarks(message.ids)
             case PruneMask():
                 mask = message.mask.unpacked()
                 self.system.map.prune_mask(message.keyframe_id, mask, message.widen_px)
@@ -138,6 +138,8 @@ class MapServer:
                 self.send_changes(-1, done=False)
             case UseCamera():
                 self.use_camera(message)
+            case AddMeasurements():
+                self.system.add_measurements(message.measurements)
             case SaveState():
                 self.save(number, message.path)
             case Finish():
@@ -147,6 +149,12 @@ class MapServer:
                 self._send(StateSaved(number, message.path))
             case _:
                 raise TypeError(f"not a message for the map: {message!r}")
+
+    def prune_landmarks(self, ids: Ints) -> None:
+        """Remove those of the landmarks (N,) that are still in the map."""
+        ids = self.system.mapper.world.landmarks.remaining(ids)
+        if len(ids):
+            self.system.map.prune_landmarks(ids)
 
     def use_camera(self, message: UseCamera) -> None:
         """Go on with a camera of other times, and send the map that was adjusted to it."""

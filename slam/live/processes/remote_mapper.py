@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
+from bmask_slam.back_end.sensor_fusion import SensorFusion
 from bmask_slam.events import Event, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.labelling.semantic_mapper import kept_depth
 from bmask_slam.live.messages import (
+    AddMeasurements,
     Finish,
     LostKeyframe,
     MapChanged,
@@ -52,6 +55,7 @@ class RemoteMapper:
         history: of every tracked frame.
         places: index of the keyframes' descriptors, for relocalisation.
         events: of tracking and, as they arrive, of the process.
+        sensors: measurements of sensors beside the camera, for the motion in a blackout.
         update_ms: time that the process took for each keyframe.
         changes: how often the copy was updated.
         reference: the keyframe that tracking refers to; set before ``insert``.
@@ -64,6 +68,7 @@ class RemoteMapper:
         self.world, self.history = WorldMap(), FrameHistory()
         self.places = DescriptorIndex(config.loops.index)
         self.events = EventLog()
+        self.sensors = SensorFusion(config.sensors, EventLog())  # the process reports
         self.update_ms: list[float] = []
         self.loops_closed = 0
         self.changes = 0
@@ -124,6 +129,11 @@ class RemoteMapper:
             )
         )
         return keyframe
+
+    def add_measurements(self, new: Measurements) -> None:
+        """Keep the measurements of a sensor, and send them to the process."""
+        self.sensors.add(new, self.world)
+        self.send(AddMeasurements(new))
 
     def optimise(self, keyframe: Keyframe) -> None:
         """Nothing: the process does it."""

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from synthetic_view import CAMERA, add_keyframe, make_features, points_before, random_descriptors
 
+from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
-from bmask_slam.back_end.mapper import BackEndConfig, Mapper
+from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.graph.geometry import se3_exp
 from bmask_slam.loops.closing import LoopClosingConfig
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig

@@ -12,8 +12,9 @@ from synthetic_view import (
     random_descriptors,
 )
 
+from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
-from bmask_slam.back_end.mapper import BackEndConfig, Mapper
+from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.back_end.segment_joining import join_segment
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.factors.graph_update import ANCHOR

@@ -9,8 +9,9 @@ import pytest
 from synthetic_view import CAMERA, add_keyframe, make_features, random_descriptors
 
 import bmask_slam.back_end.mapper
+from bmask_slam.back_end.config import BackEndConfig
 from bmask_slam.back_end.landmark_management import MappingConfig
-from bmask_slam.back_end.mapper import BackEndConfig, Mapper
+from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.factors.graph_estimate import RelativePoseErrors

@@ -1,0 +1,1 @@
+"""Sensors beside the camera: their measurements, and the relative poses that they become."""

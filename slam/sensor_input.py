@@ -1,0 +1,63 @@
+"""How measurements of other sensors are handed to a system, offline and live alike."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import quaternion_from_rotation
+from bmask_slam.graph.sensors.streams import Measurements, measurements
+
+
+class SensorInput(ABC):
+    """Takes measurements, at any time and in any order that ``sensors.late_s`` allows.
+
+    Stamps are in seconds of the frames' clock. Each method takes one measurement or many. All raise
+    InputError for what is no measurement: the text names the argument, the value and the cure.
+    """
+
+    @abstractmethod
+    def add_measurements(self, new: Measurements) -> None:
+        """Use the measurements of a sensor."""
+
+    def add_odometry(self, timestamps_s: ArrayLike, T_odom_base: ArrayLike) -> None:
+        """Add poses (4, 4) or (N, 4, 4) of wheel or visual odometry; only their motion counts.
+
+        ``sensors.odometry`` says how the camera is mounted on the base, and how sure a motion is.
+        """
+        poses = np.array(T_odom_base, float)
+        if poses.shape[-2:] != (4, 4) or not np.isfinite(poses).all():
+            raise InputError(
+                f"add_odometry: shape {poses.shape}; give finite poses (4, 4) or (N, 4, 4)"
+            )
+        poses = poses.reshape(-1, 4, 4)
+        quaternions = quaternion_from_rotation(poses[:, :3, :3])
+        self._add("odometry", timestamps_s, np.hstack([poses[:, :3, 3], quaternions]))
+
+    def add_accelerometer(self, timestamps_s: ArrayLike, force_m_s2: ArrayLike) -> None:
+        """Add specific forces (3,) or (N, 3) in m/s^2, which point up at rest."""
+        self._add("accelerometer", timestamps_s, force_m_s2)
+
+    def add_position(
+        self, timestamps_s: ArrayLike, position_m: ArrayLike, sigma_m: ArrayLike | None = None
+    ) -> None:
+        """Add positions (3,) or (N, 3) of the antenna in a local frame with z up.
+
+        ``sigma_m`` of each coordinate, one for all or (N,); None: ``sensors.position.sigma_m``.
+        """
+        positions = np.array(position_m, float, ndmin=2)
+        if sigma_m is not None:
+            sigmas = np.broadcast_to(np.array(sigma_m, float), (len(positions),))
+            positions = np.column_stack([positions, sigmas])
+        self._add("position", timestamps_s, positions)
+
+    def _add(self, sensor: str, timestamps_s: ArrayLike, values: ArrayLike) -> None:
+        stamps_s, rows = np.array(timestamps_s, float, ndmin=1), np.array(values, float, ndmin=2)
+        if stamps_s.shape != (len(rows),):
+            raise InputError(
+                f"add_{sensor}: {len(stamps_s)} stamps for {len(rows)} measurements; give one each"
+            )
+        self.add_measurements(measurements(sensor, np.column_stack([stamps_s, rows])))
