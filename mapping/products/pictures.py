@@ -1,9 +1,10 @@
-"""Pictures of a cloud: points drawn into an image with a z-buffer, in their colours or labels'."""
+"""Pictures of a cloud: its nearest point at each pixel, in their colours or labels'."""
 
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -15,11 +16,11 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.graph.whole_file import whole_file
-from bmask_slam.mapping.products.cloud import Cloud
 
 BACKGROUND_COLOUR, WALL_COLOUR = (150, 150, 150), (70, 70, 80)
 WALL = "wall"
 EMPTY = 255
+NEAREST_M, MAX_SIZE_PX = 0.05, 9
 
 
 def palette(names: Sequence[str]) -> Bytes:
@@ -35,52 +36,36 @@ def palette(names: Sequence[str]) -> Bytes:
     return np.array(colours, np.uint8)
 
 
-class Picture:
-    """An image into which points are drawn with a z-buffer.
+def nearest_points(
+    points_world: NDArray[np.floating], camera: Camera, T_world_camera: Array, point_m: float
+) -> Ints:
+    """The number of the nearest point (N, 3) at each pixel (H, W), -1 where there is none.
 
-    Attributes:
-        camera: its intrinsics.
-        T_world_camera: (4, 4).
+    A point is drawn as a square with the edge ``point_m``, of at most MAX_SIZE_PX.
     """
-
-    def __init__(self, camera: Camera, T_world_camera: Array, point_m: float) -> None:
-        """``point_m`` is the edge of the square that a point is drawn as."""
-        self.camera, self.T_world_camera = camera, T_world_camera
-        self._point_m = point_m
-        self._depth = np.full((camera.height, camera.width), np.inf, np.float32)
-        self._rgb = np.full((camera.height, camera.width, 3), EMPTY, np.uint8)
-
-    def draw(self, points_world: NDArray[np.floating], colours: Bytes) -> None:
-        """Draw points (N, 3) with colours (N, 3)."""
-        points = transform(inverse(self.T_world_camera), points_world.astype(float))
-        front = points[:, 2] > 0.05
-        points, colours = points[front], colours[front]
-        pixels = np.rint(self.camera.project(points)).astype(np.int64)
-        size_px = np.ceil(self._point_m * self.camera.fx / points[:, 2]).astype(np.int64)
-        for dy, dx in _offsets(int(np.clip(size_px.max(initial=1), 1, 9))):
-            reach = np.maximum(abs(dy), abs(dx)) <= size_px // 2
-            self._put(pixels[reach] + (dx, dy), points[reach, 2], colours[reach])
-
-    def _put(self, pixels: Ints, z: Array, colours: Bytes) -> None:
-        height, width = self._depth.shape
-        inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-        index = pixels[inside, 1] * width + pixels[inside, 0]
-        z32 = z[inside].astype(np.float32)
-        nearest = np.full(height * width, np.inf, np.float32)
-        np.minimum.at(nearest, index, z32)
-        depth, rgb = self._depth.reshape(-1), self._rgb.reshape(-1, 3)
-        won = (z32 == nearest[index]) & (z32 < depth[index])
-        depth[index[won]], rgb[index[won]] = z32[won], colours[inside][won]
-
-    def image(self) -> Image:
-        """(H, W, 3) uint8, red first, white where no point was drawn."""
-        return self._rgb
+    points = transform(inverse(T_world_camera), points_world.astype(float))
+    ahead = np.flatnonzero(points[:, 2] > NEAREST_M)
+    ahead = ahead[np.argsort(-points[ahead, 2], kind="stable")]  # the nearest last
+    z, pixels = points[ahead, 2], np.rint(camera.project(points[ahead])).astype(np.int64)
+    half = np.clip(np.ceil(point_m * camera.fx / z), 1, MAX_SIZE_PX).astype(np.int64) // 2
+    order = np.full(camera.height * camera.width, -1)
+    for dy, dx in product(range(-(MAX_SIZE_PX // 2), MAX_SIZE_PX // 2 + 1), repeat=2):
+        u, v = pixels[:, 0] + dx, pixels[:, 1] + dy
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        rows = np.flatnonzero(inside & (half >= max(abs(dy), abs(dx))))
+        at = v[rows] * camera.width + u[rows]
+        drawn = np.full(len(order), -1)
+        drawn[at] = rows
+        np.maximum(order, drawn, out=order)
+    found = np.where(order < 0, -1, ahead[order] if len(ahead) else -1)
+    return np.asarray(found.reshape(camera.height, camera.width))
 
 
-def _offsets(size: int) -> list[tuple[int, int]]:
-    half = size // 2
-    steps = range(-half, half + 1)
-    return [(dy, dx) for dy in steps for dx in steps]
+def painted(numbers: Ints, colours: Bytes) -> Image:
+    """An image (H, W, 3), red first, of the colours (N, 3) of points (H, W); white without one."""
+    image = np.full((*numbers.shape, 3), EMPTY, np.uint8)
+    image[numbers >= 0] = colours[numbers[numbers >= 0]]
+    return image
 
 
 def with_legend(image: Image, names: Sequence[str], labels: Sequence[int]) -> Bytes:
@@ -100,47 +85,6 @@ def with_legend(image: Image, names: Sequence[str], labels: Sequence[int]) -> By
         image, 0, missing, 0, 0, cv2.BORDER_CONSTANT, value=(EMPTY, EMPTY, EMPTY)
     )
     return np.hstack([padded, column])
-
-
-class CloudPictures:
-    """Pictures of a cloud from several viewpoints, in the points' colours and in their labels'.
-
-    Attributes:
-        names: of the labels.
-        palette: (C, 3), their colours.
-        counts: (C,), number of points drawn with each label.
-    """
-
-    def __init__(
-        self, views: Mapping[str, tuple[Camera, Array]], point_m: float, names: Sequence[str]
-    ) -> None:
-        """``views`` are cameras with their T_world_camera (4, 4), by name."""
-        self.names, self.palette = names, palette(names)
-        self.counts = np.zeros(len(names), np.int64)
-        self._coloured = {n: Picture(*view, point_m) for n, view in views.items()}
-        self._labelled = {n: Picture(*view, point_m) for n, view in views.items()}
-
-    @property
-    def present(self) -> list[int]:
-        """Labels of the points drawn."""
-        return [int(k) for k in np.flatnonzero(self.counts)]
-
-    def draw(self, cloud: Cloud) -> None:
-        """Draw the points into all pictures."""
-        self.counts += np.bincount(cloud.labels, minlength=len(self.names))
-        for picture in self._coloured.values():
-            picture.draw(cloud.points, cloud.colours)
-        for picture in self._labelled.values():
-            picture.draw(cloud.points, self.palette[cloud.labels])
-
-    def write(self, folder: Path) -> list[Path]:
-        """Save view_NAME.png, and view_NAME_semantic.png if there are several labels."""
-        images = {f"view_{n}.png": p.image() for n, p in self._coloured.items()}
-        if len(self.present) > 1:
-            for n, p in self._labelled.items():
-                image = with_legend(p.image(), self.names, self.present)
-                images[f"view_{n}_semantic.png"] = image
-        return [write_picture(folder / name, image) for name, image in images.items()]
 
 
 def write_picture(path: Path, image: Image) -> Path:

@@ -21,7 +21,13 @@ from bmask_slam.mapping.products.cloud import Cloud
 from bmask_slam.mapping.products.cloud_files import CloudWriter, write_mesh
 from bmask_slam.mapping.products.floor_plan import FloorPlan, plan_frame, up_direction
 from bmask_slam.mapping.products.object_clouds import ObjectClouds, ObjectRegion
-from bmask_slam.mapping.products.pictures import CloudPictures, Picture, palette, write_picture
+from bmask_slam.mapping.products.pictures import (
+    nearest_points,
+    painted,
+    palette,
+    with_legend,
+    write_picture,
+)
 from bmask_slam.mapping.products.surface_labels import LabelledView, LabelTable, rows_seen, views_of
 from bmask_slam.mapping.products.surface_regions import StuffFusion
 from bmask_slam.mapping.surface.extraction import Surface
@@ -216,21 +222,28 @@ def _regions(fused: FusedMap) -> list[ObjectRegion]:
 
 def _write_mesh(fused: FusedMap, cloud: Cloud, triangles: Ints) -> list[Path]:
     """Write the mesh and a picture of its shape, lit from the camera."""
-    path, middle = fused.folder.path, _middle(fused.keyframes())
-    picture = Picture(fused.run.camera, middle, fused.options.voxel_m)
-    shade = np.abs(cloud.normals @ middle[:3, 2].astype(np.float32))[:, None] * np.full(3, 255)
-    picture.draw(cloud.points, shade.astype(np.uint8))
+    path, T_world_camera = fused.folder.path, _middle(fused.keyframes())
+    seen = nearest_points(cloud.points, fused.run.camera, T_world_camera, fused.options.voxel_m)
+    lit = np.abs(cloud.normals @ T_world_camera[:3, 2].astype(np.float32))[:, None]
+    image = painted(seen, (lit * np.full(3, 255)).astype(np.uint8))
     return [
         write_mesh(path / "mesh.ply", cloud, triangles),
-        write_picture(path / "view_mesh.png", picture.image()),
+        write_picture(path / "view_mesh.png", image),
     ]
 
 
 def _write_pictures(fused: FusedMap, cloud: Cloud, names: tuple[str, ...]) -> list[Path]:
-    views = _viewpoints(fused.run.camera, fused.keyframes())
-    pictures = CloudPictures(views, fused.options.voxel_m, names)
-    pictures.draw(cloud)
-    return pictures.write(fused.folder.path)
+    """Write view_NAME.png, and view_NAME_semantic.png if there are several labels."""
+    folder, written = fused.folder.path, []
+    present, colours = np.unique(cloud.labels).tolist(), palette(names)
+    for name, (camera, T) in _viewpoints(fused.run.camera, fused.keyframes()).items():
+        seen = nearest_points(cloud.points, camera, T, fused.options.voxel_m)
+        image = painted(seen, cloud.colours)
+        written.append(write_picture(folder / f"view_{name}.png", image))
+        if len(present) > 1:
+            image = with_legend(painted(seen, colours[cloud.labels]), names, present)
+            written.append(write_picture(folder / f"view_{name}_semantic.png", image))
+    return written
 
 
 def _middle(keyframes: list[Keyframe]) -> Array:

@@ -15,7 +15,13 @@ from bmask_slam.mapping.products.floor_plan import (
     plan_frame,
     up_direction,
 )
-from bmask_slam.mapping.products.pictures import EMPTY, Picture, palette, with_legend
+from bmask_slam.mapping.products.pictures import (
+    EMPTY,
+    nearest_points,
+    painted,
+    palette,
+    with_legend,
+)
 
 RNG = np.random.default_rng(4)
 
@@ -106,11 +112,10 @@ def test_the_picture_includes_a_path_outside_the_map() -> None:
 
 def test_the_nearer_point_is_on_top() -> None:
     camera = Camera(20, 16, fx=20, fy=20, cx=10, cy=8)
-    picture = Picture(camera, make_pose(np.eye(3), np.array([0, 0, -1.0])), 0.01)
     points = np.array([[0, 0, 0.0], [0, 0, 1.0], [0.1, 0, 0.0], [0, 0, -2.0]])
     colours = np.array([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]], np.uint8)
-    picture.draw(points, colours)
-    image = picture.image()[:, :, 0]
+    seen = nearest_points(points, camera, make_pose(np.eye(3), np.array([0, 0, -1.0])), 0.01)
+    image = painted(seen, colours)[:, :, 0]
     assert image[8, 10] == 1
     assert image[8, 12] == 3
     assert (image != EMPTY).sum() == 2

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from true_run import FRAMES, make_run
 
 from bmask_slam.cli import main
@@ -20,7 +21,8 @@ from bmask_slam.dense.saved_map import MappedRun, open_run
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, write_arrays
 from bmask_slam.graph.files.ply import read_ply
-from bmask_slam.graph.geometry import inverse, transform
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.rendering.sequence import RenderConfig
 from bmask_slam.run_folder.map_file import read_map, write_map
 from bmask_slam.semantics.beliefs.label_store import LabelStore
@@ -210,6 +212,32 @@ def test_a_full_disk_keeps_the_keyframes_written_before(
     assert len(list((run / "dense" / "labels").iterdir())) == 2
     monkeypatch.undo()
     assert main(["map", str(run), "--voxel", "0.05", "--quiet"]) == 0
+
+
+def test_the_surface_follows_poses_that_moved(mapped: Path, tmp_path: Path) -> None:
+    """As after a loop that corrects 10 cm, with all tracked frames: nothing stays where it was."""
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    sequence = open_run(run).sequence
+    truth = sequence.groundtruth
+    assert truth is not None
+    poses = inverse(truth.poses_world_camera[0]) @ truth.poses_world_camera
+    move = se3_exp(np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]))
+    clouds = []
+    for T in (np.eye(4), move):
+        state, camera = read_map(run)
+        keyframes = state["mapper.world.keyframes.T_world_camera"]
+        state["mapper.world.keyframes.T_world_camera"] = T @ keyframes
+        write_map(run / "map", state, camera)
+        write_tum(run / "trajectory.txt", Trajectory(truth.timestamps_s, T @ poses))
+        arguments = ["map", str(run), "--voxel", "0.02", "--segmenter", "truth", "--quiet"]
+        assert main(arguments) == 0
+        cloud = read_ply(run / "dense" / "cloud.ply")
+        clouds.append(np.stack([cloud[c] for c in "xyz"], axis=1).astype(float))
+    apart = cKDTree(transform(move, clouds[0])).query(clouds[1])[0]
+    assert np.quantile(apart, 0.95) < 0.02
+    stayed = cKDTree(clouds[0]).query(clouds[1][clouds[1][:, 2] < 4])[0]
+    assert np.mean(stayed > 0.03) > 0.3
 
 
 def test_a_run_can_fuse_keyframes_while_tracking(
