@@ -134,7 +134,7 @@ def make_segmenter(
     """Make what finds instances in images, for ``SlamSystem(camera, segmenter=...)``.
 
     Args:
-        segmenter: "light", "none", ..., or options.
+        segmenter: "light", "none", ..., "module:Class", or options.
         sequence: folder of the images, which "truth" needs and "precomputed" names its masks by.
 
     Raises:
@@ -164,7 +164,9 @@ def _configuration(
 
 
 def _segmenter_options(given: str | SegmenterOptions, base: SegmenterOptions) -> SegmenterOptions:
-    return replace(base, name=given) if isinstance(given, str) else given
+    from bmask_slam.semantics.segmenters.segmenter_table import written  # noqa: PLC0415
+
+    return replace(base, name=written(given)) if isinstance(given, str) else given
 
 
 def _plain(given: Mapping[str, Any]) -> dict[str, Any]:

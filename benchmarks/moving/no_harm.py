@@ -1,16 +1,19 @@
 """The effect of the semantics on accuracy in static scenes, also with wrong masks.
 
     python -m benchmarks.moving.no_harm [SEQUENCE ...] [--rooms 20-31] [--repeats 8] [--hand-eye]
+        [--variants nothing network random shuffled none moments people] [--max-frames N]
 
 Each sequence is static; ``--rooms`` are those of dynamic.py without people, of these seeds. Each is
 run without semantics and without the check of what moves ("nothing"), as usual with the network's
 masks ("network"), with masks that are drawn at random ("random": up to eight ellipses a keyframe,
 half of them people), and with the network's masks with permuted classes ("shuffled": a chair may
-be labelled as a person). Any change of the keypoints moves an ATE by a tenth or more, so
-each is run several times, with keypoints spread over a grid whose cells are a few pixels wider or
-narrower, and every run has random masks and names of its own: the mean ATE, its range, and the mean
-of the logarithms of the runs' ratios to that with nothing on the same grid, as a change, with its
-standard error. Last the same over all sequences, each of which counts alike.
+be labelled as a person). If asked for, also without semantics ("none") and with what the network
+finds in other frames, a random one for each image: of the sequence ("moments") or of Bonn's crowd,
+where most masks are people ("people"). Any change of the keypoints moves an ATE by a tenth or more,
+so each is run several times, with keypoints spread over a grid whose cells are a few pixels wider
+or narrower, and every run has random masks and names of its own: the mean ATE, its range, and the
+mean of the logarithms of the runs' ratios to the first variant on the same grid, as a change, with
+its standard error. Last the same over all sequences, each of which counts alike.
 ``--hand-eye``: the reference is of another body on the camera, as the red kitchen's is.
 """
 
@@ -19,6 +22,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,20 +36,26 @@ import torch
 
 from benchmarks.moving.dynamic import rendered
 from benchmarks.pages import table
+from benchmarks.paths import SHARED
 from bmask_slam.config.configuration import resolve
 from bmask_slam.evaluation import evaluate
 from bmask_slam.features.brisk import FeatureConfig
 from bmask_slam.graph.arrays import Array, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.offline.runner import RunOptions, run
+from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.instances.instances import Instance, certain, mask_box
 from bmask_slam.semantics.labels import LabelSet
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
 from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, make_segmenter
+from bmask_slam.sequences.lists import colour_images
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 
-VARIANTS = ("nothing", "network", "random", "shuffled")
+USUAL = ("nothing", "network", "random", "shuffled")
+MOMENTS = {"moments": None, "people": SHARED / "bonn_crowd"}
+"""Of which recording's frames masks are; None: the same."""
+VARIANTS = (*USUAL, "none", *MOMENTS)
 SEED = 1000
 """The first seed of random masks and names; not used in development."""
 SCORES = (0.5, 0.95)
@@ -99,13 +109,35 @@ class ShuffledLabels:
         ]
 
 
+class OtherMoments:
+    """The masks that another segmenter finds in random images of a recording, by an image's name.
+
+    What all pixels are is that of the other image too.
+    """
+
+    def __init__(self, inner: Segmenter, folder: Path, seed: int) -> None:
+        self.inner, self.labels, self.seed = inner, inner.labels, seed
+        self.measured = getattr(inner, "measured", "")
+        self._images = colour_images(folder)
+
+    def segment(self, image: Image, name: str) -> list[Instance]:
+        """Those of one of the recording's images."""
+        rng = np.random.default_rng([self.seed, crc32(name.encode())])
+        other, path = self._images[int(rng.integers(len(self._images)))]
+        return self.inner.segment(read_colour(path), other)
+
+
 def other_keypoints(repeat: int) -> str:
     """The setting of a slightly finer or coarser keypoint grid; 0: the default."""
     return f"features.bucket_px={FeatureConfig().bucket_px + (repeat + 1) // 2 * (-1) ** repeat}"
 
 
 def ate_m(
-    sequence: Path, segmenter: Segmenter, settings: list[str], with_body: bool = False
+    sequence: Path,
+    segmenter: Segmenter,
+    settings: list[str],
+    with_body: bool = False,
+    max_frames: int | None = None,
 ) -> float:
     """The error of a run."""
     config = resolve(SystemConfig, None, settings)
@@ -115,7 +147,8 @@ def ate_m(
 
     with TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        run(RunOptions(sequence, config, out=out, quiet=True), make)
+        options = RunOptions(sequence, config, out=out, quiet=True, max_frames=max_frames)
+        run(options, make)
         return evaluate(out, sequence, with_body=with_body).value("ate_rmse")
 
 
@@ -128,6 +161,7 @@ class Job:
     repeat: int
     seed: int
     with_body: bool
+    max_frames: int | None
 
 
 def measured_mm(job: Job) -> float:
@@ -138,14 +172,18 @@ def measured_mm(job: Job) -> float:
         if job.variant == "nothing"
         else []
     )
-    kind = "none" if job.variant == "nothing" else "light"
-    segmenter = make_segmenter(SegmenterOptions(kind), job.sequence)
+    usual = SystemConfig().semantics.segmenter
+    options = SegmenterOptions("none") if job.variant in ("nothing", "none") else usual
+    segmenter = make_segmenter(options, job.sequence)
     if job.variant == "random":
         segmenter = RandomMasks(segmenter.labels, job.seed)
     elif job.variant == "shuffled":
         segmenter = ShuffledLabels(segmenter, job.seed)
+    elif job.variant in MOMENTS:
+        folder = MOMENTS[job.variant] or job.sequence
+        segmenter = OtherMoments(segmenter, folder, job.seed)
     settings = [*off, other_keypoints(job.repeat)]
-    return 1e3 * ate_m(job.sequence, segmenter, settings, job.with_body)
+    return 1e3 * ate_m(job.sequence, segmenter, settings, job.with_body, job.max_frames)
 
 
 def change(ates_mm: Array, base_mm: Array) -> str:
@@ -155,18 +193,18 @@ def change(ates_mm: Array, base_mm: Array) -> str:
     return f"{100 * np.expm1(logs.mean()):+.1f} ± {100 * error:.1f} %"
 
 
-def report(groups: dict[str, Array]) -> str:
-    """The table in Markdown, of ATEs (sequences, VARIANTS, repeats) by what they are of."""
+def report(groups: dict[str, Array], variants: Sequence[str]) -> str:
+    """The table in Markdown, of ATEs (sequences, variants, repeats) by what they are of."""
     rows = []
     for name, ates_mm in groups.items():
-        for k, variant in enumerate(VARIANTS):
+        for k, variant in enumerate(variants):
             of_one = ates_mm[:, k]
             span = f"{of_one.min():.2f} to {of_one.max():.2f}"
             by = change(of_one, ates_mm[:, 0]) if k else ""
             rows.append((name, variant, f"{of_one.mean():.2f}", span, by))
     if len(groups) > 1:
         every = np.concatenate(list(groups.values()))
-        for k, variant in enumerate(VARIANTS[1:], 1):
+        for k, variant in enumerate(variants[1:], 1):
             of_all = f"{every[:, k].size} runs"
             rows.append(("all", variant, "", of_all, change(every[:, k], every[:, 0])))
     return table(("sequence", "with", "ATE mm", "of which", "change"), rows)
@@ -180,8 +218,10 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path, default=Path("runs/bench"), help="where they lie")
     parser.add_argument("--repeats", type=int, default=8)
     parser.add_argument("--hand-eye", action="store_true")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=USUAL)
+    parser.add_argument("--max-frames", type=int)
     arguments = parser.parse_args()
-    hand_eye = arguments.hand_eye
+    variants, of_all = arguments.variants, (arguments.hand_eye, arguments.max_frames)
     groups = {path.name: [path] for path in arguments.sequences}
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         if arguments.rooms:
@@ -190,15 +230,15 @@ def main() -> None:
             into = partial(rendered, arguments.rendered, "nobody")
             groups[f"{len(seeds)} rooms"] = list(pool.map(into, seeds))
         sequences = [path for paths in groups.values() for path in paths]
-        places = itertools.product(range(len(sequences)), VARIANTS, range(arguments.repeats))
+        places = itertools.product(range(len(sequences)), variants, range(arguments.repeats))
         jobs = [
-            Job(sequences[k], variant, repeat, SEED + k + repeat * len(sequences), hand_eye)
+            Job(sequences[k], variant, repeat, SEED + k + repeat * len(sequences), *of_all)
             for k, variant, repeat in places
         ]
         errors_mm = np.array(list(pool.map(measured_mm, jobs)))
-    by_sequence = errors_mm.reshape(len(sequences), len(VARIANTS), arguments.repeats)
+    by_sequence = errors_mm.reshape(len(sequences), len(variants), arguments.repeats)
     ends = np.cumsum([len(paths) for paths in groups.values()])[:-1]
-    print(report(dict(zip(groups, np.split(by_sequence, ends), strict=True))))
+    print(report(dict(zip(groups, np.split(by_sequence, ends), strict=True)), variants))
 
 
 if __name__ == "__main__":

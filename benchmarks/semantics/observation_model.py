@@ -7,7 +7,9 @@ third of NYUv2, whose classes chair, sofa, bed, table, desk, toilet, sink, telev
 books and person are COCO's too. Landmarks are corners, so only corners count (FAST, spread over the
 image): a table's mask is a table's in its area, but its corners are those of what lies on it. Each
 photograph is looked at VIEWS times: as it is, and as parts of it, enlarged and half of them
-mirrored, in place of the views of a camera that moves.
+mirrored, in place of the views of a camera that moves. As in a run, another view from one viewpoint
+counts by `LabelStoreConfig.again`: parts that are enlarged by less than `DISTANCE_STEP` are from
+where the photograph was taken, the others from nearer.
 
 Precision: of the corners under masks of a class, the share that is on it; a logistic function of
 the mean logit of the class score and of the logarithm of the evidence, which is the sum of mask
@@ -40,6 +42,8 @@ from benchmarks.semantics.photographs import IMAGES, held_out
 from bmask_slam.graph.arrays import Array, Image, Ints
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.semantics.beliefs.class_sizes import SUPPORT, read_sizes
+from bmask_slam.semantics.beliefs.label_fusion import LabelStoreConfig
+from bmask_slam.semantics.beliefs.observation import DISTANCE_STEP
 from bmask_slam.semantics.beliefs.votes import VoteConfig, assign_pixels
 from bmask_slam.semantics.instances.image_files import read_colour
 from bmask_slam.semantics.labels import LabelSet
@@ -56,10 +60,11 @@ SAME = {
 UNSURE = (39, 9, 25, 36)
 """Codes that may hide things of COCO: unlabelled, bookshelf, paper, bag."""
 NOTHING, DOUBTFUL, CROWD = 0, -1, -2
-MIN_SCORE, BORDER_PX, CELL_PX, A_CELL, MOST = 0.3, 20, 40, 6, 850
+MIN_SCORE, BORDER_PX, CELL_PX, A_CELL, MOST = 0.15, 20, 40, 6, 850
 THRESHOLDS = (50, 35, 25, 18, 13)
 SIDE_PX, MIDDLE_PX, LARGEST_PX, INSIDE_PX = 640, 64.0, 256.0, 5.0
 VIEWS, PART, SEED = 6, (0.55, 0.95), 5
+RINGS, AGAIN = 2, LabelStoreConfig().again
 OFFSET_SIGMA, ENOUGH, MIN_CORNERS, MIN_CONFUSED, ITERATIONS = 0.7, 20, 8, 0.03, 60
 HALF = 0.5
 OUT = ROOT / "data" / "weights" / "light_observation.yaml"
@@ -145,9 +150,10 @@ def observed(photograph: Photograph, number: int, segmenter: Segmenter) -> Array
     shares = [*(_covered(true[i.mask], i.label) for i in instances), 0.0]
     classes = len(segmenter.labels)
     evidence, logits, inside_px = np.zeros((3, len(pixels), classes))
+    looked = np.zeros((len(pixels), RINGS), bool)
     rng = np.random.default_rng([SEED, photograph.kind, number])
     for view in range(VIEWS):
-        seen, rows = np.arange(len(pixels)), first
+        seen, rows, ring = np.arange(len(pixels)), first, 0
         if view:
             part, x, y, mirrored = _part(image, rng)
             local = pixels - np.array([x, y])
@@ -157,10 +163,13 @@ def observed(photograph: Photograph, number: int, segmenter: Segmenter) -> Array
             if mirrored:
                 local[:, 0] = size[0] - 1 - local[:, 0]
             rows, _ = masks_at(np.ascontiguousarray(part), local, segmenter)
+            ring = ring_of(part.shape[1] / image.shape[1])
+        new = np.where(looked[seen, ring], AGAIN, 1.0)
+        looked[seen, ring] = True
         on = rows[:, 1] > 0
-        at = seen[on], rows[on, 1].astype(int)
-        evidence[at] += rows[on, 3]
-        logits[at] += rows[on, 3] * logit(np.clip(rows[on, 2], 0.05, 0.98))
+        at, worth = (seen[on], rows[on, 1].astype(int)), new[on] * rows[on, 3]
+        evidence[at] += worth
+        logits[at] += worth * logit(np.clip(rows[on, 2], 0.05, 0.98))
         inside_px[at] = np.maximum(inside_px[at], rows[on, 4])
     label = evidence.argmax(axis=1)
     best = np.arange(len(pixels)), label
@@ -174,6 +183,11 @@ def observed(photograph: Photograph, number: int, segmenter: Segmenter) -> Array
         np.where(evidence[best] > 0, label, 0), logits[best] / np.maximum(evidence[best], 1e-9),
         evidence[best], inside_px[best],
     ])  # fmt: skip
+
+
+def ring_of(share: float) -> int:
+    """The ring of the viewpoint that a part with a share of the image's width stands for."""
+    return int(np.log(1 / share) / np.log(DISTANCE_STEP))
 
 
 def _part(image: Image, rng: np.random.Generator) -> tuple[Image, int, int, bool]:

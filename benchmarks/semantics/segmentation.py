@@ -23,6 +23,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks.semantics.photographs import IMAGES, held_out
 from bmask_slam.graph.arrays import Array, Floats, Image
@@ -36,6 +37,7 @@ from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions, ma
 SIZE = (480, 640)
 REPEATS = 15
 MATCH_IOU = 0.5
+FEW = 20
 
 
 class Watched:
@@ -81,7 +83,7 @@ def _area(box: Sequence[float] | Array | Floats) -> float:
     return float((box[2] - box[0]) * (box[3] - box[1]))
 
 
-def photographs(weights: Path | None) -> None:
+def photographs(weights: Path | None, plot: Path | None) -> None:
     """COCO's figures on the photographs held out."""
     truth = held_out()
     given = None if weights is None else str(weights)
@@ -99,6 +101,29 @@ def photographs(weights: Path | None) -> None:
         f"{result.iou_correlation_of_good:10.3f} {watched.right / result.images:6.2f} "
         f"{watched.false / result.images:6.2f}"
     )
+    rows = reliability(result.iou_pairs)
+    print(f"\n{'predicted IoU':>13} {'true':>6} {'masks':>6}")
+    for predicted, true, count in rows.tolist():
+        print(f"{predicted:13.2f} {true:6.2f} {count:6.0f}")
+    if plot:
+        draw_reliability(rows, plot)
+
+
+def reliability(pairs: Array) -> Array:
+    """Rows (B, 3) of tenths of predicted IoU: mean predicted and true IoU, number of masks."""
+    tenth = np.clip((10 * pairs[:, 0]).astype(int), 0, 9)
+    bins = [pairs[tenth == k] for k in range(10)]
+    return np.array([(*b.mean(axis=0), len(b)) for b in bins if len(b) >= FEW]).reshape(-1, 3)
+
+
+def draw_reliability(rows: Array, path: Path) -> None:
+    """True over predicted mask IoU; the areas of dots are the numbers of masks."""
+    figure = Figure(figsize=(4, 4))
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="grey", linewidth=1)
+    axes.scatter(rows[:, 0], rows[:, 1], 400 * rows[:, 2] / rows[:, 2].max())
+    axes.set(xlabel="predicted mask IoU", ylabel="true mask IoU (mean)", xlim=(0, 1), ylim=(0, 1))
+    figure.savefig(path, dpi=100, bbox_inches="tight")
 
 
 def cost() -> None:
@@ -153,10 +178,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("part", choices=("photographs", "cost", "one"))
     parser.add_argument("--weights", type=Path)
+    parser.add_argument("--plot", type=Path, help="true over predicted IoU, of the photographs")
     parser.add_argument("--network", default="light")
     arguments = parser.parse_args()
     if arguments.part == "photographs":
-        photographs(arguments.weights)
+        photographs(arguments.weights, arguments.plot)
     elif arguments.part == "cost":
         cost()
     else:

@@ -23,8 +23,10 @@ _FILLED = 0.6
 """The root of the area of a thing in the image, as a share of its longest side."""
 _SCORES = (0.05, 0.98)
 _EVIDENCE = (0.15, 5.0)
-"""Within these it was measured."""
-_AZIMUTHS, _ELEVATIONS, _DISTANCE_STEP = 24, 12, 1.4
+"""Limits of the evidence that counts; measured up to 2.3, as photographs have few viewpoints."""
+DISTANCE_STEP = 1.4
+"""Distances of a ratio below it are from one viewpoint, if their directions are."""
+_AZIMUTHS, _ELEVATIONS = 24, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +159,7 @@ def viewpoint_cells(points_world: Array, position_world: Array) -> Ints:
     distance_m = np.maximum(np.linalg.norm(ray, axis=1), 1e-6)
     azimuth = np.floor((np.arctan2(ray[:, 2], ray[:, 0]) / (2 * np.pi) + 0.5) * _AZIMUTHS)
     elevation = np.floor((np.arcsin(ray[:, 1] / distance_m) / np.pi + 0.5) * _ELEVATIONS)
-    ring = np.floor(np.log(distance_m) / np.log(_DISTANCE_STEP)) + 40
+    ring = np.floor(np.log(distance_m) / np.log(DISTANCE_STEP)) + 40
     code = (azimuth * 31 + elevation) * 37 + ring * 11
     return np.asarray(code.astype(np.int64) * 2654435761 % 2**32 // 2**26)
 

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from bmask_slam.graph.arrays import Array, Mask
+from bmask_slam.graph.arrays import Array, Ints, Mask
 
 MIN_SIZE_M = 0.01
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -59,6 +59,10 @@ def gravity_axes(up_world: Array) -> Array:
     return np.stack([first, np.cross(up_world, first), up_world], axis=1)
 
 
+NEIGHBOURS = 24
+"""So many nearest points are compared."""
+
+
 def supported(points: Array, neighbours: int, reach_m: float) -> Mask:
     """Which of the points (N, 3) of one object have that many neighbours close by.
 
@@ -71,6 +75,22 @@ def supported(points: Array, neighbours: int, reach_m: float) -> Mask:
     farthest_m = KDTree(points).query(points, neighbours + 1)[0][:, -1]
     near = np.asarray(farthest_m <= max(reach_m, 3 * float(np.median(farthest_m))))
     return near if near.any() else np.ones(len(points), bool)
+
+
+def seen_again(points: Array, views: Ints, reach_m: float) -> Mask:
+    """Which of the points (N, 3) of one object other views than their own (N,) show as well.
+
+    That is within ``reach_m`` or, where points are sparse, within three times the median distance
+    to the nearest point of another view, among the nearest NEIGHBOURS. All of fewer than three
+    views do. What one mask alone shows is mostly what it shows beside the object.
+    """
+    count = min(NEIGHBOURS, len(points))
+    if len(np.unique(views)) < 3:
+        return np.ones(len(points), bool)
+    distance_m, nearest = KDTree(points).query(points, count)
+    other_m = np.where(views[nearest] != views[:, None], distance_m, np.inf).min(axis=1)
+    near = np.asarray(other_m <= max(reach_m, 3 * float(np.median(other_m))))
+    return near & np.isfinite(other_m) if np.isfinite(other_m).any() else ~near
 
 
 def main_part(points: Array, cell_m: float, share: float) -> Mask:

@@ -9,6 +9,8 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.geometry import transform
 
+_GOLDEN = 0.6180339887
+
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
@@ -65,6 +67,10 @@ class ObjectPoints:
         turned = np.einsum("nij,nj->ni", R_world_anchor[where], points)
         return np.asarray(turned * points[:, 2:])
 
+    def views(self, poses: dict[int, Array]) -> Ints:
+        """The keyframes (N,) in whose frames the points of the same rows are kept."""
+        return self._anchors[self.rows(poses)]
+
     def rows(self, poses: dict[int, Array]) -> Ints:
         """The rows of points whose keyframe has a pose."""
         return np.flatnonzero(np.isin(self._anchors, list(poses)))
@@ -91,17 +97,25 @@ class ObjectPoints:
         self._sightings, self._seen_s = both[first], self._seen_s[first]
 
     def thin(self, most: int) -> None:
-        """Keep at most so many points an object, spread evenly over the order of their arrival."""
+        """Keep about so many points an object at most, as many of each view that it has.
+
+        Else the views of one end of a long table would fade while the camera looks at the other.
+        """
         sizes = np.bincount(self._owners, minlength=self._next_id)
         if sizes.max(initial=0) <= most:
             return
-        order = np.argsort(self._owners, kind="stable")
-        sorted_owners = self._owners[order]
-        place = np.arange(len(order)) - (np.cumsum(sizes) - sizes)[sorted_owners]
-        share = np.minimum(1.0, 0.75 * most / np.maximum(sizes, 1))
-        share[sizes <= most] = 1.0
-        share = share[sorted_owners]
-        kept = np.sort(order[np.floor((place + 1) * share) > np.floor(place * share)])
+        order = np.lexsort((self._anchors, self._owners))  # stable
+        pairs = np.stack([self._owners, self._anchors], axis=1)[order]
+        of_view, where, counts = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+        where = where.ravel()
+        place = np.arange(len(order)) - (np.cumsum(counts) - counts)[where]
+        views = np.bincount(of_view[:, 0], minlength=self._next_id)[of_view[:, 0]]
+        share = np.minimum(1.0, np.maximum(0.75 * most / views, 1.0) / counts)
+        share[sizes[of_view[:, 0]] <= most] = 1.0
+        phase = (of_view[:, 1] + views) * _GOLDEN % 1.0  # else always the same ones would go
+        share, phase = share[where], phase[where]
+        chosen = np.floor((place + 1) * share + phase) > np.floor(place * share + phase)
+        kept = np.sort(order[chosen])
         self._points, self._anchors = self._points[kept], self._anchors[kept]
         self._owners = self._owners[kept]
 

@@ -16,6 +16,7 @@ from bmask_slam.semantics.objects.boxes3d import (
     OrientedBox,
     box_around,
     main_part,
+    seen_again,
     supported,
     without_noise,
 )
@@ -51,15 +52,37 @@ class MapObject:
     last_seen_s: float
 
 
-def fitted(
-    points_world: Array, noise_world: Array, up_world: Array, config: BoxConfig
-) -> tuple[Array, OrientedBox]:
-    """The centroid (3,) of points (N, 3) and the box around them, without outliers and noise."""
-    near = supported(points_world, config.neighbours, config.support_m)
-    near[near] = main_part(points_world[near], config.cell_m, config.part)
-    points = points_world[near]
-    inner = without_noise(points, noise_world[near], up_world, config.trim)
-    return np.asarray(points.mean(axis=0)), box_around(inner, up_world)
+@dataclass(frozen=True, eq=False)
+class ObjectSurface:
+    """An object's points.
+
+    Attributes:
+        points_world: (N, 3) m. noise_world: (N, 3) their displacement by one sigma of the depth.
+        views: (N,) the keyframes that saw them.
+    """
+
+    points_world: Array
+    noise_world: Array
+    views: Ints
+
+    @classmethod
+    def joined(cls, parts: Sequence[ObjectSurface]) -> ObjectSurface:
+        """All points of some."""
+        fields = ("points_world", "noise_world", "views")
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields))
+
+
+def fitted(surface: ObjectSurface, up_world: Array, config: BoxConfig) -> tuple[Array, OrientedBox]:
+    """The centroid (3,) of the points of an object and the box around them.
+
+    Without outliers, what only one view shows, and noise.
+    """
+    points, noise = surface.points_world, surface.noise_world
+    near = supported(points, config.neighbours, config.support_m)
+    near[near] = seen_again(points[near], surface.views[near], config.support_m)
+    near[near] = main_part(points[near], config.cell_m, config.part)
+    inner = without_noise(points[near], noise[near], up_world, config.trim)
+    return np.asarray(points[near].mean(axis=0)), box_around(inner, up_world)
 
 
 def size_and_place(
@@ -166,26 +189,25 @@ class ObjectPublisher:
             found.append(self._joined(candidates[k], parts, points, up_world))
         return found
 
-    def _points_by_object(self, poses: dict[int, Array]) -> dict[int, tuple[Array, Array]]:
-        """World points (N, 3) of each object, and their displacement by one sigma of the depth."""
+    def _points_by_object(self, poses: dict[int, Array]) -> dict[int, ObjectSurface]:
+        """The points of each object."""
         owners, points = self._points.in_world(poses)
         noise = self._config.association.depth_sigma_m * self._points.rays_in_world(poses)
+        views = self._points.views(poses)
         rows = {i: owners == i for i in np.unique(owners).tolist()}
-        return {i: (points[mine], noise[mine]) for i, mine in rows.items()}
+        return {i: ObjectSurface(points[k], noise[k], views[k]) for i, k in rows.items()}
 
-    def _candidates(
-        self, by_object: dict[int, tuple[Array, Array]], up_world: Array
-    ) -> list[MapObject]:
+    def _candidates(self, by_object: dict[int, ObjectSurface], up_world: Array) -> list[MapObject]:
         """All objects that enough keyframes observed."""
         box_config = self._config.box
         found = []
-        for i, (points, noise) in by_object.items():
+        for i, surface in by_object.items():
             keyframe_ids, stamps_s = self._points.sightings(i)
             if len(keyframe_ids) < self._config.min_keyframes:
                 continue
             distribution = self._labels.probabilities(np.array([i]))[0]
             label = int(self._labels.appearance(np.array([i]))[0].argmax())
-            centroid, box = fitted(points, noise, up_world, box_config)
+            centroid, box = fitted(surface, up_world, box_config)
             landmarks = self._points.landmarks_of(i)
             first_s, last_s = float(stamps_s.min()), float(stamps_s.max())
             rest = keyframe_ids, landmarks, first_s, last_s
@@ -196,14 +218,14 @@ class ObjectPublisher:
         self,
         whole: MapObject,
         parts: list[MapObject],
-        points: dict[int, tuple[Array, Array]],
+        points: dict[int, ObjectSurface],
         up_world: Array,
     ) -> MapObject:
         """An object with those that are parts of it, itself among them."""
         if len(parts) == 1:
             return whole
-        own, noise = (np.concatenate([points[o.id][n] for o in parts]) for n in (0, 1))
-        centroid, box = fitted(own, noise, up_world, self._config.box)
+        own = ObjectSurface.joined([points[o.id] for o in parts])
+        centroid, box = fitted(own, up_world, self._config.box)
         return replace(
             whole,
             centroid_world=centroid,

@@ -6,7 +6,7 @@ import contextlib
 import csv
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,7 @@ class SegmentationResult:
             fewer than 3, or without predicted IoUs.
         iou_correlation_of_good: the same of those with a true IoU of at least 0.5.
         images, instances: their numbers.
+        iou_pairs: (N, 2) predicted and true mask IoU of matched detections.
     """
 
     curves: tuple[ApCurve, ...]
@@ -72,6 +73,7 @@ class SegmentationResult:
     iou_correlation_of_good: float
     images: int
     instances: int
+    iou_pairs: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def evaluate_segmenter(
@@ -107,7 +109,7 @@ def evaluate_segmenter(
     pairs = np.concatenate(of_images)
     good = pairs[pairs[:, 1] >= MATCH_IOU]
     correlations = _correlation(pairs), _correlation(good)
-    return SegmentationResult(curves, *correlations, len(of_images), len(found))
+    return SegmentationResult(curves, *correlations, len(of_images), len(found), pairs)
 
 
 def _entry(instance: Instance, image: int) -> _Entry:

@@ -10,6 +10,7 @@ from pathlib import Path
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.labels import read_label_set
+from bmask_slam.semantics.segmenters.own_class import OwnClass, names_class, own_segmenter
 from bmask_slam.semantics.segmenters.segmenter import (
     CocoSegmenter,
     LabelImageSegmenter,
@@ -32,7 +33,7 @@ class SegmenterOptions:
     """Which segmenter, and its files.
 
     Attributes:
-        name: one of NAMES.
+        name: one of NAMES, or ``module:Class`` of a class of the user's own: see ``named``.
         weights: of a network: a file, or a name such as ``torchvision:NAME``.
         proposals: ONNX file of a detector that finds the boxes for a network.
         masks: COCO file or folder of label PNGs, for "precomputed".
@@ -52,9 +53,19 @@ class SegmenterOptions:
     surfaces: bool = True
     ray: str = ""
 
+    @classmethod
+    def named(cls, name: str) -> SegmenterOptions:
+        """Options with a name that the user wrote; only such a ``module:Class`` is imported."""
+        return cls(written(name))
+
     def described(self) -> dict[str, str]:
         """The options as text, to compare with those of another run."""
         return {key: str(value) for key, value in asdict(self).items()}
+
+
+def written(name: str) -> str:
+    """A segmenter's name as its user wrote it, not a file."""
+    return OwnClass(name) if names_class(name) else name
 
 
 def measured_name(options: SegmenterOptions) -> str:
@@ -78,10 +89,12 @@ def make_segmenter(
     By default ``options.weights`` must be a path. ``find_weights`` must be picklable for Ray.
 
     Raises:
-        InputError: an unknown name, or a file that is missing or does not fit.
+        InputError: an unknown name, or a file or class that is missing or does not fit.
     """
-    if options.name not in NAMES:
-        raise InputError(f"segmenter {options.name!r}: not known; there are: {', '.join(NAMES)}")
+    own = names_class(options.name)
+    if not own and options.name not in NAMES:
+        known = f"{', '.join(NAMES)}, or module:Class"
+        raise InputError(f"segmenter {options.name!r}: not known; there are: {known}")
     if options.name == "none":
         return NoSegmenter()
     if options.ray:
@@ -91,6 +104,8 @@ def make_segmenter(
         remote = RaySegmenter(partial(make_segmenter, here, sequence, find_weights), options.ray)
         remote.measured = measured_name(options)
         return remote
+    if own:
+        return own_segmenter(options.name)
     if options.name == "truth":
         path = sequence / TRUTH_FILE
         if not path.is_file():

@@ -21,7 +21,7 @@ DETAILS = (
     *("isam2_update_ms_median", "isam2_update_ms_p95", "latency_ms_p95"),
 )
 """Figures of metrics.json that are not printed; nor are those of the graph."""
-SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth or none"
+SEGMENTERS = "light, mask-scoring-rcnn, precomputed, truth, none, or module:Class of your own"
 
 
 def add_camera_argument(parser: argparse.ArgumentParser) -> None:
@@ -48,8 +48,10 @@ def add_segmenter_arguments(parser: argparse.ArgumentParser, default: str) -> No
 
 def segmenter_options(arguments: argparse.Namespace, base: SegmenterOptions) -> SegmenterOptions:
     """The options with what was given on the command line; files by their absolute paths."""
+    from bmask_slam.semantics.segmenters.segmenter_table import written
+
     given = {name: getattr(arguments, name) for name in ("weights", "labels", "ray")}
-    given["name"] = arguments.segmenter
+    given["name"] = written(arguments.segmenter) if arguments.segmenter else None
     for name in ("proposals", "masks"):
         path = getattr(arguments, name)
         given[name] = path.absolute() if path else None

@@ -82,9 +82,9 @@ class KeyframeFusion:
         """The instances of an image, and the landmarks (L,) on them.
 
         ``pixels`` (L, 2) are where the landmarks were detected; like the masks they are distorted.
-        Instances with a class score below the run's ``object_score`` do not count.
+        Instances with a class score below the run's ``sure_score`` do not count.
         """
-        strong = [i for i in instances if i.class_score >= self._semantics.object_score]
+        strong = [i for i in instances if i.class_score >= self._semantics.sure_score]
         instances = Segmented(strong, surfaces_of(instances))
         shape = self._camera.height, self._camera.width
         labels = keyframe_labels(instances, shape, self._classes, self._semantics.labels)

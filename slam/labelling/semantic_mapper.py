@@ -13,7 +13,7 @@ from bmask_slam.graph.arrays import Array, Arrays, Floats, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, part
-from bmask_slam.labelling.config import SemanticsConfig
+from bmask_slam.labelling.config import SemanticsConfig, above
 from bmask_slam.labelling.landmark_visibility import Observed, observed_by
 from bmask_slam.labelling.landmark_votes import LabelVotes, estimated_surfaces
 from bmask_slam.labelling.results import Attachment, LandmarkLabels, MapObjects
@@ -108,10 +108,8 @@ class SemanticMapper:
     def attach(self, keyframe_id: int, instances: Sequence[Instance]) -> Attachment:
         """Use the masks of a keyframe, at any time after it was made, once.
 
-        What they tell about all pixels (``Segmented``) is used as well.
-
-        Landmarks that were fused since are replaced by their successors; the masks of a culled
-        keyframe still label its landmarks.
+        What they tell about all pixels (``Segmented``) is used as well. Landmarks that were fused
+        since are replaced by their successors; a culled keyframe's masks still label its landmarks.
 
         Raises:
             InputError: masks of another size or with labels that are not in the label set.
@@ -128,18 +126,17 @@ class SemanticMapper:
         self._done.add(keyframe_id)
         nothing = np.full(self._rays.shape[:2], np.nan, np.float32)
         waiting = self._waiting.pop(keyframe_id, _Waiting(np.nan, nothing))
-        strong = [i for i in instances if i.class_score >= self.config.object_score]
-        assignment = assign_pixels(strong, waiting.depth_m, size, self.config.votes)
-        visible = observed.located(self._map.world)
-        votes = vote(assignment, visible.pixels, visible.z_m, len(self.names), self.config.votes)
-        ids = observed.landmark_ids[votes.rows[votes.sure]]
-        on = votes.instances[votes.sure]
-        everything = assign_pixels(instances, waiting.depth_m, size, self.config.votes, True)
-        seen = surfaces_of(instances)
-        spoken = self._label_votes.vote(keyframe_id, everything, observed, seen)
+        least, least_of_objects = self.config.least_scores(self.labels.model is not None)
+        told, config = above(instances, least), self.config.votes
+        everything = assign_pixels(told, waiting.depth_m, size, config, in_boxes=True)
+        surfaces = surfaces_of(instances)
+        spoken = self._label_votes.vote(keyframe_id, everything, observed, surfaces)
         if self.config.objects.enabled and np.isfinite(waiting.timestamp_s):
-            self._add_objects((keyframe_id, waiting), assignment, observed, (ids, on))
+            found = self._placed(above(instances, least_of_objects), waiting.depth_m, observed)
+            self._add_objects((keyframe_id, waiting), found, observed)
         if self._on_masks is not None:
+            sure = above(instances, self.config.sure_score)
+            assignment, ids, on = self._placed(sure, waiting.depth_m, observed)
             about = (ids, on, self.labels.appearance(ids))
             view = (assignment, waiting.depth_m, observed.T_world_camera)
             self._on_masks(KeyframeMasks(keyframe_id, self.names, *view, *about))
@@ -258,17 +255,25 @@ class SemanticMapper:
         self._done = set()
         self._waiting = {}
 
+    def _placed(
+        self, instances: Sequence[Instance], depth_m: Floats, observed: Observed
+    ) -> tuple[PixelAssignment, Ints, Ints]:
+        """The instances' pixels, and the landmarks (N,) that are surely on instances (N,)."""
+        size, config = (self.camera.height, self.camera.width), self.config.votes
+        assignment = assign_pixels(instances, depth_m, size, config)
+        visible = observed.located(self._map.world)
+        votes = vote(assignment, visible.pixels, visible.z_m, len(self.names), config)
+        ids = observed.landmark_ids[votes.rows[votes.sure]]
+        return assignment, ids, votes.instances[votes.sure]
+
     def _add_objects(
         self,
         waited: tuple[int, _Waiting],
-        assignment: PixelAssignment,
+        placed: tuple[PixelAssignment, Ints, Ints],
         observed: Observed,
-        landmarks: tuple[Ints, Ints],
     ) -> None:
-        """Fuse a keyframe's instances into objects, and place its landmarks on them.
-
-        ``landmarks`` are the ids (N,) of those that are surely on instances (N,).
-        """
+        """Fuse a keyframe's ``_placed`` instances into objects, and place its landmarks on them."""
+        assignment, ids, instances = placed
         keyframe_id, waiting = waited
         here = self._map.world.in_segment(observed.anchor.segment)
         T_world_camera = observed.T_world_camera
@@ -285,7 +290,6 @@ class SemanticMapper:
         if keyframe_id != observed.anchor.id:
             parent = observed.anchor.id, observed.T_anchor_camera
             self.objects.points.reanchor(keyframe_id, *parent)
-        ids, instances = landmarks
         on = np.append(objects, -1)[instances]
         self.objects.place_landmarks(ids[on >= 0], on[on >= 0])
 

@@ -107,7 +107,8 @@ class RunOptions:
                 raise InputError(
                     f"{_flag(option)}: the run was started with {was}; omit it, or start a new run"
                 )
-        return replace(self, **{name: given[name] for name in free if name in given})
+        taken = (*free, "config")  # an equal one may name a class that only its user may name
+        return replace(self, **{name: given[name] for name in taken if name in given})
 
 
 def _absolute(path: Path) -> Path:

@@ -123,9 +123,13 @@ def safe_import_path() -> dict[str, str]:
     """Environment of a child that imports from this process's folders but the current one.
 
     The current folder may hold foreign files, such as a downloaded recording with a ``queue.py``.
+    It is kept where its user names it in PYTHONPATH.
     """
     here = os.path.realpath(os.curdir)
-    folders = [p for p in sys.path if os.path.isabs(p) and os.path.realpath(p) != here]
+    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    named = here in {os.path.realpath(p) for p in given if p}
+    folders = [p for p in sys.path if os.path.isabs(p)]
+    folders = [p for p in folders if named or os.path.realpath(p) != here]
     return {"PYTHONPATH": os.pathsep.join(folders), "PYTHONSAFEPATH": "1"}
 
 

@@ -15,6 +15,7 @@ from bmask_slam.semantics.objects.boxes3d import (
     box_iou,
     gravity_axes,
     main_part,
+    seen_again,
     supported,
     without_noise,
 )
@@ -44,6 +45,18 @@ def test_the_box_of_a_rotated_cuboid_equals_the_cuboid(yaw_deg: float) -> None:
     assert np.allclose(box.T_world_box[:3, 2], T_B_A[:3, :3] @ UP)
     assert np.linalg.det(box.T_world_box[:3, :3]) == pytest.approx(1.0)
     assert box_iou(box, OrientedBox(T, size_m)) > 0.95
+
+
+def test_what_one_view_alone_shows_is_not_seen_again() -> None:
+    """Three views of a plate; the third has a patch of the wall behind it as well."""
+    rng = np.random.default_rng(3)
+    plate = rng.uniform(0, 0.4, (600, 3)) * [1, 1, 0]
+    patch = rng.uniform(0, 0.1, (60, 3)) + np.array([0, 0, 0.5])
+    points, views = np.concatenate([plate, patch]), np.append(np.arange(600) % 3, np.full(60, 2))
+    kept = seen_again(points, views, 0.03)
+    assert kept[:600].mean() > 0.99
+    assert not kept[600:].any()
+    assert seen_again(points, np.minimum(views, 1), 0.03).all()  # of two views nobody knows
 
 
 def test_lone_points_are_not_supported() -> None:

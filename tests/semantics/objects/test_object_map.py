@@ -21,6 +21,7 @@ from bmask_slam.semantics.objects.object_map import (
     ObjectMap,
     pixel_rays,
 )
+from bmask_slam.semantics.objects.points import ObjectPoints, Sightings
 from bmask_slam.semantics.objects.publication import MapObject
 
 CAMERA = Camera(320, 240, fx=260.0, fy=262.0, cx=160.5, cy=119.0)
@@ -204,6 +205,24 @@ def test_objects_of_one_keyframe_are_not_reported() -> None:
     scene.show(0.1, [])
     scene.show(0.1, CHAIRS[:1])
     assert len(scene.objects()) == 1
+
+
+def test_early_views_keep_their_share_of_points() -> None:
+    """One end of a table was seen first, ten times; since then a hundred views show the other."""
+    points, poses = ObjectPoints(), {}
+    points.new_ids(1)
+    rng = np.random.default_rng(0)
+    for view in range(110):
+        shown = np.sort(rng.uniform(0, 1, (200, 3)), axis=0)
+        shown[:, 0] += 2.0 if view < 10 else 0.0
+        points.add(Sightings(view, float(view), np.array([0])), shown, np.zeros(200, np.int64))
+        points.thin(1000)
+        poses[view] = np.eye(4)
+    kept = points.in_world(poses)[1]
+    assert 500 <= len(kept) <= 1000
+    early = kept[:, 0] >= 2
+    assert early.mean() == pytest.approx(10 / 110, rel=0.5)
+    assert abs(np.median(kept[~early, 0]) - 0.5) < 0.1  # no end of a view's list goes first
 
 
 def test_the_number_of_points_is_bounded() -> None:
