@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from bmask_slam.events import Event, EventKind
     from bmask_slam.graph.camera import Camera
     from bmask_slam.graph.errors import InputError
+    from bmask_slam.graph.factors.keys import key_of_keyframe, key_of_landmark
     from bmask_slam.live.live_slam import LiveSlam
     from bmask_slam.live.start import LiveOptions
     from bmask_slam.run_folder.reader import Run
@@ -42,6 +43,8 @@ __all__ = [
     "TrackingStatus",
     "__version__",
     "evaluate",
+    "key_of_keyframe",
+    "key_of_landmark",
     "make_segmenter",
     "map_run",
     "open_sequence",
@@ -63,6 +66,8 @@ _MODULES = {
     "SystemConfig": "system_config",
     "TrackingStatus": "tracking.results",
     "evaluate": "evaluation",
+    "key_of_keyframe": "graph.factors.keys",
+    "key_of_landmark": "graph.factors.keys",
     "make_segmenter": "api",
     "map_run": "api",
     "open_sequence": "sequences",

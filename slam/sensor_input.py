@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import quaternion_from_rotation
 from bmask_slam.graph.sensors.streams import Measurements, measurements
+from bmask_slam.system_results import SystemResults
+from bmask_slam.tracking.camera_tracker import CameraTracker
 
 
 class SensorInput(ABC):
@@ -22,6 +25,23 @@ class SensorInput(ABC):
     @abstractmethod
     def add_measurements(self, new: Measurements) -> None:
         """Use the measurements of a sensor."""
+
+    @abstractmethod
+    def add_factor(self, factor: Any) -> int:
+        """Add a factor of GTSAM with the keys of `key_of_keyframe` and `key_of_landmark`.
+
+        Returns its number, by which ``remove_factor`` removes it. Its noise and robust kernel are
+        its own. It holds its keyframes in the map, and goes with a landmark that is removed.
+        A ``gtsam.CustomFactor`` cannot be saved, since it is code: saving raises InputError.
+
+        Raises:
+            InputError: no factor, another key, a variable that is not in the graph, or an error
+                that is not finite.
+        """
+
+    @abstractmethod
+    def remove_factor(self, number: int) -> None:
+        """Remove a factor by the number that ``add_factor`` returned; an unknown one is ignored."""
 
     def add_odometry(self, timestamps_s: ArrayLike, T_odom_base: ArrayLike) -> None:
         """Add poses (4, 4) or (N, 4, 4) of wheel or visual odometry; only their motion counts.
@@ -61,3 +81,31 @@ class SensorInput(ABC):
                 f"add_{sensor}: {len(stamps_s)} stamps for {len(rows)} measurements; give one each"
             )
         self.add_measurements(measurements(sensor, np.column_stack([stamps_s, rows])))
+
+
+class SensorSystem(SystemResults, SensorInput):
+    """A system with its map and graph in this process, which takes measurements and factors."""
+
+    camera_tracker: CameraTracker
+
+    def add_measurements(self, new: Measurements) -> None:
+        """Use the measurements of a sensor beside the camera."""
+        self.map.add_measurements(new)
+
+    def add_factor(self, factor: Any) -> int:
+        """See `SensorInput.add_factor`; the graph is optimised at once."""
+        number = 1 + max(self.mapper.smoother.tables.own_factors, default=-1)
+        self._change_factors([(number, factor)], ())
+        return number
+
+    def remove_factor(self, number: int) -> None:
+        """See `SensorInput.remove_factor`; the graph is optimised at once."""
+        self._change_factors([], (number,))
+
+    def _change_factors(self, added: list[tuple[int, Any]], removed: tuple[int, ...]) -> None:
+        """Change the graph; tracking moves with the map."""
+        reference = self.camera_tracker.reference
+        T_before = None if reference is None else reference.T_world_camera
+        self.mapper.change_own_factors(added, removed)
+        if reference is not None and T_before is not None:
+            self.camera_tracker.follow_map(T_before, reference.T_world_camera)

@@ -15,16 +15,15 @@ from bmask_slam.features.brisk import BriskExtractor, Features
 from bmask_slam.graph.arrays import Array, Arrays, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import fitting, nested, part
-from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
 from bmask_slam.moving.moving_object_filter import MovingObjectFilter
 from bmask_slam.moving.static_features import StaticFeatures
 from bmask_slam.runtime.stage_clock import stage
 from bmask_slam.semantics.segmenters.segmenter import Segmenter
-from bmask_slam.sensor_input import SensorInput
+from bmask_slam.sensor_input import SensorSystem
 from bmask_slam.sequences.frame import Frame, check_frame
 from bmask_slam.system_config import SystemConfig
-from bmask_slam.system_results import SystemResults, checked_state, largest
+from bmask_slam.system_results import checked_state, largest
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.keyframe_decision import KeyframeDecision
 from bmask_slam.tracking.results import FrameResult, Tracked, TrackingStatus
@@ -34,7 +33,7 @@ from bmask_slam.world.world_map import Keyframe
 logger = logging.getLogger(__name__)
 
 
-class SlamSystem(SystemResults, SensorInput):
+class SlamSystem(SensorSystem):
     """RGB-D frames in, poses out; the map and the graph grow on the way.
 
     Attributes:
@@ -117,10 +116,6 @@ class SlamSystem(SystemResults, SensorInput):
             stage_ms=self.stage_ms,
             events=self.events.take(),
         )
-
-    def add_measurements(self, new: Measurements) -> None:
-        """Use the measurements of a sensor beside the camera."""
-        self.map.add_measurements(new)
 
     def prepare(self, frame: Frame) -> Features:
         """The frame's features; pure, so that it may run ahead in another thread."""

@@ -41,8 +41,8 @@ NEWER_ARRAYS = (
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
 OPTIONAL_ARRAYS = ("s.measured", "upright.points", "labels.scores", "labels.seen", "labels.judged")
 """Ends of the names of arrays that older files lack, and whose readers do without."""
-SENSOR_ARRAYS = "mapper.sensors."
-"""The beginning of the names of arrays that are there with sensors beside the camera only."""
+SENSOR_ARRAYS = ("mapper.sensors.", "mapper.graph.own_")
+"""Beginnings of the names of arrays that are there with other sensors or own factors only."""
 
 
 class SystemResults(ABC):
@@ -157,7 +157,8 @@ def checked_state(state: Arrays, own: Arrays, path: Path) -> Arrays:
 
     ``own`` is the state of an empty system. Raises InputError for arrays of other names or types.
     """
-    own = {**nested(mapper=nested(sensors=example_state())), **own}
+    graph: Arrays = {"own_factors": np.zeros(0, np.str_), "own_factor_ids": np.zeros(0, np.int64)}
+    own = {**nested(mapper=nested(sensors=example_state(), graph=graph)), **own}
     state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
     state = {name: a for name, a in own.items() if name.startswith(NEWER_ARRAYS)} | state
     present = {n: a for n, a in own.items() if n in state or not _is_optional(n)}

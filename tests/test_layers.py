@@ -35,7 +35,7 @@ ROOMS = {
     "mapping": "[...]  inverse_depth  surface  products",
     "slam": """events  evaluation  config  sequences  features  world  rendering  datasets
                tracking  loops  moving  runtime  back_end  labelling  system_config
-               sensor_input  system_interface  run_folder  system_results  system  dense
+               system_interface  run_folder  system_results  sensor_input  system  dense
                calibration  refinement  viewer  offline  live  comparison  api  commands  cli
                job_process  __init__  __main__""",
     "slam/run_folder": "[...]  scene  export",

@@ -30,6 +30,7 @@ from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.gnc import first_mu, gnc_weights
 from bmask_slam.graph.factors.graph_update import LOOP, GraphUpdate, RelativePose
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
+from bmask_slam.graph.factors.own_factors import own_gtsam_factors
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.smoother.removal import remove
 
@@ -239,7 +240,8 @@ class _Adjuster:
         table = self._tables.observations
         factors = self._maker.observations(table.all())
         chosen = [self._tables.pose_factors[number].factor for number in numbers]
-        return make_graph(factors + [self._maker.pose_factor(factor) for factor in chosen])
+        factors += [self._maker.pose_factor(factor) for factor in chosen]
+        return make_graph([*factors, *own_gtsam_factors(self._tables)])
 
     def _values(self) -> gtsam.Values:
         keyframes, landmarks = self._tables.keyframes, self._tables.landmarks

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -209,8 +210,18 @@ class PoseFactor:
         return isinstance(self.factor, PosePrior)
 
 
+@dataclass
+class OwnFactor:
+    """A factor of GTSAM that a user has made, the ids of its variables, and its slot in ISAM2."""
+
+    factor: Any
+    keyframes: tuple[int, ...]
+    landmarks: tuple[int, ...]
+    slot: int = NO_SLOT
+
+
 class FactorTables:
-    """Values, observations and pose factors (relative poses and priors, by running number).
+    """Values, observations, pose factors (priors, relative poses) and own ones by number.
 
     Observations of marginalised landmarks are in ``marginalised``; pose factors replace them.
     """
@@ -222,11 +233,12 @@ class FactorTables:
         self.pose_factors: dict[int, PoseFactor] = {}
         self.pose_factors_of: dict[int, set[int]] = {}
         self.marginalised = MarginalisedLandmarks()
+        self.own_factors: dict[int, OwnFactor] = {}
         self._next_number = 0
 
     def __len__(self) -> int:
         """Number of factors."""
-        return len(self.observations) + len(self.pose_factors)
+        return len(self.observations) + len(self.pose_factors) + len(self.own_factors)
 
     def add_pose_factors(self, factors: Iterable[RelativePose | PosePrior]) -> list[int]:
         """Add relative poses and priors; returns their numbers."""
@@ -248,6 +260,17 @@ class FactorTables:
                 others.discard(number)
                 if not others:
                     del self.pose_factors_of[keyframe]
+
+    @property
+    def own_keyframes(self) -> set[int]:
+        """The keyframes of a user's factors."""
+        return {k for own in self.own_factors.values() for k in own.keyframes}
+
+    def has_variables(self, own: OwnFactor) -> bool:
+        """Whether the variables of a user's factor are in the graph."""
+        keyframes, landmarks = np.array(own.keyframes, int), np.array(own.landmarks, int)
+        has_keyframes = self.keyframes.contains(keyframes).all()
+        return bool(has_keyframes and self.landmarks.contains(landmarks).all())
 
     def numbers_of_keyframes(self, ids: Iterable[int]) -> list[int]:
         """Numbers of the pose factors that involve these keyframes, ascending."""
@@ -272,7 +295,5 @@ def _discard(index: dict[int, dict[int, int]], first: int, second: int) -> None:
 
 
 def _rows_of(index: dict[int, dict[int, int]], ids: Iterable[int]) -> Ints:
-    rows: set[int] = set()
-    for i in ids:
-        rows.update(index.get(i, {}).values())
+    rows = {row for i in ids for row in index.get(i, {}).values()}
     return np.array(sorted(rows), np.int64)

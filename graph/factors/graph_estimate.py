@@ -88,6 +88,8 @@ class GraphEstimate:
             between factor to a neighbour (kind ANCHOR, removed when enough other factors
             constrain it again), or, where a whole component of the graph lost its prior, a prior
             at its current estimate.
+        lost_own_factors: numbers of a user's factors that were removed with one of their variables,
+            or because ISAM2 could not solve with them.
         rebuilt: ISAM2 failed and was made anew from the factor tables.
         failed_variable: the variable it named last, such as "landmark 17"; "" if none.
         cost_before, cost_after: half the sum of (robust) squared whitened errors before and
@@ -105,6 +107,7 @@ class GraphEstimate:
     dropped_landmarks: Ints = field(default_factory=no_ids)
     dropped_keyframes: Ints = field(default_factory=no_ids)
     anchored_keyframes: Ints = field(default_factory=no_ids)
+    lost_own_factors: tuple[int, ...] = ()
     rebuilt: bool = False
     failed_variable: str = ""
     cost_before: float = math.nan
@@ -136,6 +139,7 @@ class GraphEstimate:
         counts = self.counts()
         rebuilt = counts.pop("rebuilds", 0)
         lines = [f"{count} {what}" for what, count in counts.items()]
+        lines += [f"own factor {n} was removed with its variable" for n in self.lost_own_factors]
         if rebuilt:
             lines.append(f"rebuilt after a failure near {self.failed_variable or 'no variable'}")
         return lines

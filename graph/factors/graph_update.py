@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,6 +152,9 @@ class GraphUpdate:
             their factors. An id in ``landmark_ids`` that was marginalised comes back at the place
             that its summary gives (`graph.marginals.landmark_marginalisation`): ``points_world``
             is not read for it, and only new observations enter.
+        own_factors: numbers and `graph.factors.factor_tables.OwnFactor` of a user's factors, whose
+            variables are in the graph.
+        remove_own_factors: numbers.
 
     Ids to remove that are not in the graph are ignored.
     """
@@ -169,3 +172,5 @@ class GraphUpdate:
     remove_relative_poses: tuple[RelativePoseName, ...] = ()
     max_iterations: int = 0
     marginalise_landmarks: Ints = field(default_factory=no_ids)
+    own_factors: tuple[tuple[int, Any], ...] = ()
+    remove_own_factors: tuple[int, ...] = ()

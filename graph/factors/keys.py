@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 import numpy as np
 
 from bmask_slam.graph.arrays import Ints
+from bmask_slam.graph.errors import InputError
 
 _INDEX_BITS = 56
 KEYFRAME_BASE = ord("x") << _INDEX_BITS
@@ -23,6 +25,30 @@ def keyframe_keys(ids: Ints) -> list[int]:
 def landmark_keys(ids: Ints) -> list[int]:
     """The keys of landmarks, as Python integers."""
     return (np.asarray(ids, np.int64) + LANDMARK_BASE).tolist()
+
+
+def key_of_keyframe(keyframe_id: int) -> int:
+    """The key of a keyframe's pose, T_world_camera, in GTSAM: ``gtsam.symbol("x", id)``."""
+    return KEYFRAME_BASE + keyframe_id
+
+
+def key_of_landmark(landmark_id: int) -> int:
+    """The key of a landmark's point in the world, in GTSAM: ``gtsam.symbol("l", id)``."""
+    return LANDMARK_BASE + landmark_id
+
+
+def variables_of_keys(keys: Iterable[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Ids of the keyframes and of the landmarks among keys. Raises InputError for other keys."""
+    found: dict[int, list[int]] = {KEYFRAME_BASE: [], LANDMARK_BASE: []}
+    for key in keys:
+        base = key >> _INDEX_BITS << _INDEX_BITS
+        if base not in found:
+            raise InputError(
+                f"add_factor: key {key} is no keyframe's and no landmark's; use "
+                "key_of_keyframe(id) or key_of_landmark(id)"
+            )
+        found[base].append(key - base)
+    return tuple(found[KEYFRAME_BASE]), tuple(found[LANDMARK_BASE])
 
 
 def variable_named_in(message: str) -> tuple[str, int] | None:

@@ -18,6 +18,7 @@ from bmask_slam.graph.factors.keys import (
     landmark_keys,
     variable_named_in,
 )
+from bmask_slam.graph.factors.own_factors import own_gtsam_factors
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
 
@@ -38,7 +39,8 @@ class Change:
     """What to pass to ISAM2.
 
     Attributes:
-        rows: of new observations in the factor tables; numbers: of new pose factors.
+        rows: of new observations in the factor tables; numbers: of new pose factors; own: of a
+            user's new factors.
         keyframe_ids, landmark_ids: new variables.
         removed_slots: of factors that were removed.
         max_iterations: how many further steps may follow.
@@ -50,6 +52,7 @@ class Change:
     landmark_ids: Ints = field(default_factory=no_ids)
     removed_slots: list[int] = field(default_factory=list)
     max_iterations: int = 0
+    own: tuple[int, ...] = ()
 
 
 class Solver:
@@ -87,6 +90,7 @@ class Solver:
             sorted(tables.pose_factors),
             tables.keyframes.ids,
             tables.landmarks.ids,
+            own=tuple(sorted(tables.own_factors)),
         )
         self._apply(tables, everything)
 
@@ -142,7 +146,8 @@ class Solver:
     def _everything(self, tables: FactorTables) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """All factors and values, in an order that depends on the tables' contents alone."""
         numbers = sorted(tables.pose_factors)
-        graph = make_graph(self._factors(tables, tables.observations.all_rows(), numbers))
+        factors = self._factors(tables, tables.observations.all_rows(), numbers)
+        graph = make_graph([*factors, *own_gtsam_factors(tables)])
         keyframes, landmarks = tables.keyframes, tables.landmarks
         return graph, make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
 
@@ -153,7 +158,9 @@ class Solver:
         ]
 
     def _apply(self, tables: FactorTables, change: Change) -> None:
-        graph = make_graph(self._factors(tables, change.rows, change.numbers))
+        own = [tables.own_factors[number] for number in change.own]
+        factors = self._factors(tables, change.rows, change.numbers)
+        graph = make_graph([*factors, *(one.factor for one in own)])
         values = make_values(
             change.keyframe_ids,
             tables.keyframes.get(change.keyframe_ids),
@@ -166,8 +173,11 @@ class Solver:
             raise SolverError("ISAM2 and the factor tables have different variables", None)
         self._check_finite(tables, poses, points)
         tables.observations.set_slots(change.rows, np.array(slots[: len(change.rows)], np.int64))
-        for number, slot in zip(change.numbers, slots[len(change.rows) :], strict=True):
-            tables.pose_factors[number].slot = slot
+        later = iter(slots[len(change.rows) :])
+        for number in change.numbers:
+            tables.pose_factors[number].slot = next(later)
+        for one in own:
+            one.slot = next(later)
         tables.keyframes.values, tables.landmarks.values = poses, points
 
     def _run(

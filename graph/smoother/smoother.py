@@ -24,6 +24,10 @@ from bmask_slam.graph.factors.graph_estimate import (
     RelativePoseErrors,
 )
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
+from bmask_slam.graph.factors.own_factors import (
+    exchange_own_factors,
+    without_own,
+)
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.marginals.covariances import Marginals
 from bmask_slam.graph.marginals.landmark_marginalisation import (
@@ -77,12 +81,15 @@ class Smoother:
         before = remove_marginalised(update, *model)
         removal = remove(update, tables, self._config)
         mark_retracted(removal.dropped_landmarks, tables.marginalised)
-        marginalised = marginalise_landmarks(update.marginalise_landmarks, *model)
+        marginalised = marginalise_landmarks(without_own(update, tables), *model)
         validated = validate(with_returning(update, tables, self._camera), *model)
         report.refused, report.refused_factors = validated.refused, validated.refused_factors
         report.add_removal(removal)
         entered = self._enter(validated, [before, removal, marginalised], report)
-        change = dataclasses.replace(entered, max_iterations=update.max_iterations)
+        report.lost_own, slots, own = exchange_own_factors(update, tables)
+        slots = sorted([*entered.removed_slots, *slots])
+        change = dataclasses.replace(entered, own=own, removed_slots=slots)
+        change = dataclasses.replace(change, max_iterations=update.max_iterations)
         try:
             self._solver.update(self._tables, change)
         except SolverError as failure:
@@ -275,6 +282,7 @@ class Smoother:
         mark_retracted(validated.landmark_ids, self._tables.marginalised)
         present = [n for n in change.numbers if n in self._tables.pose_factors]
         self._tables.remove_pose_factors(present)
+        report.lost_own += [n for n in change.own if self._tables.own_factors.pop(n, None)]
         anchor_components(self._tables, self._config)
         report.refuse_all(validated)
         try:

@@ -77,7 +77,16 @@ def graph_arrays(tables: FactorTables) -> Arrays:
         "pose_factor_kinds": np.array([factor.kind for factor in factors], np.str_),
         "pose_factor_robust": np.array([getattr(f, "robust", "") or "" for f in factors], np.str_),
         **marginalised_arrays(tables),
+        **_own_arrays(tables),
     }
+
+
+def _own_arrays(tables: FactorTables) -> Arrays:
+    if not tables.own_factors:
+        return {}
+    from bmask_slam.graph.factors.own_factors import own_arrays  # noqa: PLC0415 - loads GTSAM
+
+    return own_arrays(tables)
 
 
 def _measured(factor: RelativePose | PosePrior) -> Array:
@@ -150,6 +159,10 @@ def _tables(arrays: Arrays) -> FactorTables:
             factor = RelativePose(a, b, T, covariance, robust or None, kind)
         tables.add_pose_factors([factor])
     tables.marginalised = read_marginalised(arrays)
+    if "own_factors" in arrays:
+        from bmask_slam.graph.factors.own_factors import read_own  # noqa: PLC0415 - loads GTSAM
+
+        read_own(arrays, tables)
     return tables
 
 

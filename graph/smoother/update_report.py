@@ -30,6 +30,7 @@ class UpdateReport:
     dropped_landmarks: set[int] = field(default_factory=set)
     dropped_keyframes: set[int] = field(default_factory=set)
     anchored_keyframes: set[int] = field(default_factory=set)
+    lost_own: list[int] = field(default_factory=list)
     rebuilt: bool = False
     failed: Variable | None = None
     started_s: float = field(default_factory=time.perf_counter)
@@ -76,6 +77,7 @@ class UpdateReport:
             ids_array(self.dropped_landmarks),
             ids_array(self.dropped_keyframes),
             ids_array(self.anchored_keyframes),
+            lost_own_factors=tuple(self.lost_own),
             rebuilt=self.rebuilt,
             failed_variable=self.failed_variable,
             update_ms=1e3 * (time.perf_counter() - self.started_s),

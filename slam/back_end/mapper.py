@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from bmask_slam.back_end.landmark_management import (
 )
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.back_end.pruning import MapPruner
-from bmask_slam.back_end.reference_frame import SensorChanges
 from bmask_slam.back_end.segment_joining import anchors, join_segment
 from bmask_slam.back_end.sensor_fusion import SensorFusion
 from bmask_slam.back_end.triangulation import triangulate_landmarks
@@ -31,6 +31,7 @@ from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Arrays, Ints, Mask
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.graph_estimate import GraphEstimate
+from bmask_slam.graph.factors.own_factors import Numbered, checked_own_factors
 from bmask_slam.graph.files.array_file import nested, part
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.smoother.smoother import Smoother
@@ -142,7 +143,7 @@ class Mapper:
     def optimise(self, keyframe: Keyframe) -> None:
         """Put a keyframe into the graph, read all poses and points back, cull a redundant one."""
         update = self._factor_selector.keyframe_update(self.world, keyframe)
-        self._apply(self.smoother.update(self._measured().added_to(update)))
+        self._apply(self.smoother.update(self.sensors.changes(self).added_to(update)))
         self._cull_keyframe(keyframe)
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
@@ -176,13 +177,13 @@ class Mapper:
         inliers = len(recognised.landmark_ids)
         self.events.joined(segment, self.world.segment_of(recognised.landmark_ids), inliers)
         joined = join_segment(self.world, segment, tracked, recognised)
-        loops = self.smoother.relative_poses("loop")
+        loops = self.smoother.relative_poses("loop") + anchors(self.world, self._graph_config)
+        own = tuple(self.smoother.tables.own_factors.items())
         self.smoother = Smoother(self.camera, self._graph_config)
         update = self._factor_selector.whole_update(self.world)
-        loops += anchors(self.world, self._graph_config)
         self.sensors.forget_factors()
-        update = self._measured().added_to(replace(update, relative_poses=loops))
-        self._apply(self.smoother.update(update))
+        update = replace(update, relative_poses=loops, own_factors=own)
+        self._apply(self.smoother.update(self.sensors.changes(self).added_to(update)))
         return joined
 
     def pruner(self) -> MapPruner:
@@ -191,8 +192,7 @@ class Mapper:
 
     def prune_mask(self, keyframe_id: int, mask: Mask, widen_px: int) -> None:
         """Remove what a keyframe observes under a mask (H, W), widened by ``widen_px``."""
-        pruner = replace(self.pruner(), border_px=-widen_px)
-        report = pruner.prune_mask(keyframe_id, mask)
+        report = replace(self.pruner(), border_px=-widen_px).prune_mask(keyframe_id, mask)
         self.events.count(report.counts("mask"))
         logger.info("mask of keyframe %d: %s", keyframe_id, report)
 
@@ -230,15 +230,19 @@ class Mapper:
         """Keep the measurements of a sensor; they become factors with the next update."""
         self.sensors.add(new, self.world)
 
+    def change_own_factors(self, added: Sequence[Numbered], removed: tuple[int, ...]) -> None:
+        """Add factors that a user has made and remove others by number. Raises InputError."""
+        update = self._factor_selector.map_update(self.world)
+        own = checked_own_factors(added, self.smoother.tables)
+        update = replace(update, own_factors=own, remove_own_factors=removed)
+        self._apply(self.smoother.update(update), timed=False)
+
     def add_last_measurements(self) -> None:
         """Make factors of the measurements that waited for the next keyframe."""
-        changes = self._measured(last=True)
+        changes = self.sensors.changes(self, last=True)
         if changes:
             update = changes.added_to(self._factor_selector.map_update(self.world))
             self._apply(self.smoother.update(update), timed=False)
-
-    def _measured(self, last: bool = False) -> SensorChanges:
-        return self.sensors.changes(self.world, self.history, self.smoother.tables, last)
 
     def _apply(self, estimate: GraphEstimate, timed: bool = True) -> None:
         if timed:
@@ -248,17 +252,15 @@ class Mapper:
 
     def _change_graph(self, **changes: Any) -> None:
         """An update that moves much of the graph: ISAM2 is iterated until it converges."""
-        rounds = self.loops.config.max_iterations
-        update = replace(
-            self._factor_selector.map_update(self.world), max_iterations=rounds, **changes
+        rounds, update = (
+            self.loops.config.max_iterations,
+            self._factor_selector.map_update(self.world),
         )
+        update = replace(update, max_iterations=rounds, **changes)
         self._apply(self.smoother.update(update))
 
     def _remove_wrong_loops(self, fresh: set[Ends]) -> set[Ends]:
-        """Remove loops that do not fit the graph, older ones with what they fused; their ends.
-
-        Until all fit: a wrong one pulls at others.
-        """
+        """Remove loops until all fit the graph, older ones with what they fused; their ends."""
         removed: set[Ends] = set()
         while True:
             errors = self.smoother.relative_pose_errors("loop", self.loops.noise.bent)
@@ -286,7 +288,7 @@ class Mapper:
         would drift if newer views replaced them.
         """
         _, landmark_ids = self.world.observed(newest)
-        kept = self.loops.ends | {0}  # culling the end of a loop would remove its factor
+        kept = self.loops.ends | {0} | self.smoother.tables.own_keyframes  # they hold factors
         near = {k.id: k for _, k in self.world.covisible(landmark_ids, 15)}
         old = [near[i] for i in sorted(near.keys() - kept, reverse=True) if i < newest.id - 2]
         redundant = redundant_keyframe(self.world, old, self._mapping)

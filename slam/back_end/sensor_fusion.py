@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.checks import chi2_quantile
-from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import (
     FIRST_FRAME,
     GRAVITY,
@@ -39,6 +39,14 @@ DEGREES = {ODOMETRY: 6, GRAVITY: 2, POSITION: 3}
 """The kinds of factors, and the degrees of freedom of their errors."""
 KINDS = tuple(DEGREES)
 FIT_PROBABILITY = 0.9999
+
+
+class GraphOwner(Protocol):
+    """Has a map, the frames, and the graph."""
+
+    world: WorldMap
+    history: FrameHistory
+    smoother: Smoother
 
 
 class SensorFusion:
@@ -96,12 +104,11 @@ class SensorFusion:
         """Another recording: its measurements replace the present ones; factors stay."""
         self.streams, self.refused = SensorStreams(), {}
 
-    def changes(
-        self, world: WorldMap, history: FrameHistory, tables: FactorTables, last: bool = False
-    ) -> SensorChanges:
+    def changes(self, owner: GraphOwner, last: bool = False) -> SensorChanges:
         """The factors that can be made now; ``last``: no further keyframe will come."""
         if not self.streams:
             return SensorChanges()
+        world, history, tables = owner.world, owner.history, owner.smoother.tables
         self._forget_culled(world)
         found = SensorChanges()
         for segment in sorted({k.segment for k in world.keyframes.values()}):

@@ -9,7 +9,7 @@ import time
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bmask_slam.config.configuration import dump
 from bmask_slam.evaluation import Row
@@ -160,6 +160,14 @@ class LiveSlam(SensorInput):
     def add_measurements(self, new: Measurements) -> None:
         """Use the measurements of a sensor with the next frame; from any thread."""
         self._system.add_measurements(new)
+
+    def add_factor(self, factor: Any) -> int:
+        """See `SensorInput.add_factor`; from the thread that tracks. A refusal is an event."""
+        return self._system.add_factor(factor)
+
+    def remove_factor(self, number: int) -> None:
+        """See `SensorInput.remove_factor`."""
+        self._system.remove_factor(number)
 
     def _process(self, frame: Frame, prepared: Prepared | None) -> FrameResult:
         """Do a frame's step; one that is refused is counted."""

@@ -158,6 +158,14 @@ class AddMeasurements:
 
 
 @dataclass(frozen=True)
+class ChangeOwnFactors:
+    """To the map: add a user's factors, as number and text, and remove others by number."""
+
+    added: tuple[tuple[int, str], ...]
+    removed: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class SaveState:
     """To the map: write its state to a file."""
 

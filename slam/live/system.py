@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import faiss
 import numpy as np
@@ -18,11 +18,18 @@ import numpy as np
 from bmask_slam.features.brisk import Features
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.factors.own_factors import own_factor, text_of
 from bmask_slam.graph.files.array_file import nested, read_arrays
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.labelling.results import LandmarkLabels
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
-from bmask_slam.live.messages import STATE_FILE, ImageToSegment, TimesEstimated, UseCamera
+from bmask_slam.live.messages import (
+    STATE_FILE,
+    ChangeOwnFactors,
+    ImageToSegment,
+    TimesEstimated,
+    UseCamera,
+)
 from bmask_slam.live.processes.map_process import LabelsOnly
 from bmask_slam.live.processes.remote_calibration import RemoteCalibration
 from bmask_slam.live.processes.remote_mapper import RemoteMapper
@@ -106,6 +113,7 @@ class LiveSystem(SlamSystem):
     ) -> None:
         self.segmenter, self.dense, self.calibration = segmenter, dense, calibration
         self._measured: deque[Measurements] = deque()
+        self._own_factors = -1
         self._names = (segmenter or NoSegmenter).labels.names
         with ExitStack() as undo:
             self.remote = RemoteMapper(camera, config, self._names, folder)
@@ -147,6 +155,17 @@ class LiveSystem(SlamSystem):
     def add_measurements(self, new: Measurements) -> None:
         """Use the measurements of a sensor with the next frame; from any thread."""
         self._measured.append(new)
+
+    def add_factor(self, factor: Any) -> int:
+        """See `SensorInput.add_factor`; one that the map refuses is told as an event."""
+        self._own_factors += 1
+        text = text_of(own_factor(factor).factor)
+        self.remote.send(ChangeOwnFactors(((self._own_factors, text),), ()))
+        return self._own_factors
+
+    def remove_factor(self, number: int) -> None:
+        """See `SensorInput.remove_factor`."""
+        self.remote.send(ChangeOwnFactors((), (number,)))
 
     def catch_up(self) -> None:
         """Update the copy of the map, pass masks on, and move tracking with the map."""

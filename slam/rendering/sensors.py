@@ -6,6 +6,7 @@ The noise has the sigmas of the default `SensorsConfig`, so that an estimate can
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.odometry import OdometryConfig, step_covariances
 from bmask_slam.graph.sensors.position import PositionConfig
 from bmask_slam.graph.sensors.streams import COLUMNS, FILES
+from bmask_slam.rendering.engine.path import CameraPath, camera_poses
 
 GRAVITY_M_S2 = 9.81
 FORCE_HZ, FORCE_SIGMA_M_S2, FORCE_BIAS_M_S2 = 200.0, 0.05, 0.03
@@ -74,20 +76,33 @@ def accelerometer(
     return np.column_stack([np.arange(len(force)) / hertz, force])
 
 
-def write_sensors(
-    folder: Path, names: tuple[str, ...], poses: Array, fps: float, fine_poses: Array, seed: int
-) -> None:
-    """Write the files of sensors for poses (N, 4, 4); ``fine_poses`` are at FORCE_HZ."""
-    config, stamps_s = SensorsConfig(), np.arange(len(poses)) / fps
-    for number, name in enumerate(names):
-        rng = np.random.default_rng([seed, 23, number])
+class SensorsOf(Protocol):
+    """What is to be rendered, as `RenderConfig` says it."""
+
+    @property
+    def sensors(self) -> tuple[str, ...]: ...
+    @property
+    def fps(self) -> float: ...
+    @property
+    def seed(self) -> int: ...
+    @property
+    def sweeping(self) -> bool: ...
+
+
+def write_sensors(folder: Path, wanted: SensorsOf, poses: Array, path: CameraPath) -> None:
+    """Write the files of sensors for the poses (N, 4, 4) of a path's frames."""
+    config, stamps_s = SensorsConfig(), np.arange(len(poses)) / wanted.fps
+    for number, name in enumerate(wanted.sensors):
+        rng = np.random.default_rng([wanted.seed, 23, number])
         if name == "odometry":
             rows = odometry(poses, stamps_s, config.odometry, rng)
         elif name == "position":
             rows = positions(poses, stamps_s, config.position, rng)
         else:
             mounting = T_of(config.accelerometer.accelerometer_in_camera)
-            rows = accelerometer(fine_poses, mounting, FORCE_HZ, rng)
+            count = int(len(poses) / wanted.fps * FORCE_HZ)
+            fine = camera_poses(path, FORCE_HZ, wanted.seed, sweeping=wanted.sweeping)[:count]
+            rows = accelerometer(fine, mounting, FORCE_HZ, rng)
         lines = [f"# {name}, rendered", f"# {' '.join(COLUMNS[name])}"]
         lines += [f"{row[0]:.6f} " + " ".join(f"{x:.9f}" for x in row[1:]) for row in rows.tolist()]
         (folder / FILES[name]).write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -31,7 +31,7 @@ from bmask_slam.rendering.engine.raycast import Renderer, View, to_image
 from bmask_slam.rendering.engine.scene import Scene, build_scene
 from bmask_slam.rendering.engine.sensor import blur, exposure_gain, measure_depth, optical_flow
 from bmask_slam.rendering.rooms.random_room import draw_room
-from bmask_slam.rendering.sensors import FORCE_HZ, check_sensors, write_sensors
+from bmask_slam.rendering.sensors import check_sensors, write_sensors
 from bmask_slam.rendering.things.people import Cast, Role, add_people
 from bmask_slam.rendering.writer import (
     new_folder,
@@ -54,9 +54,7 @@ SCENES: dict[str, str] = {
 CLOSED = ("corridor",)
 """Scenes whose path ends where it began: it can be walked more than once."""
 
-_WORKERS = 2
-_SHUTTER_SHARE = 0.6
-_IMAGE_NOISE = 2.0
+_WORKERS, _SHUTTER_SHARE, _IMAGE_NOISE = 2, 0.6, 2.0
 
 
 @dataclass(frozen=True)
@@ -80,8 +78,7 @@ class RenderConfig:
         width, height: image size in pixels; the field of view stays the Kinect's.
         true_depth: also write the noise-free depth to ``depth_true/``.
         normals: also write camera-frame normals to ``normals/`` as round(127.5 n + 127.5).
-        sensors: "odometry", "position", "accelerometer": their files, with the noise that is
-            assumed of them by default.
+        sensors: also write the files of "odometry", "position", "accelerometer".
     """
 
     name: str
@@ -133,11 +130,7 @@ def render_sequence(
                 progress(len(visible), len(job.poses))
         write_lists(folder, job.stamps, job.poses)
         write_camera(folder / "camera.yaml", job.camera)
-        if config.sensors:
-            path, length_s = _plan(config).path, len(job.poses) / config.fps
-            fine = camera_poses(path, FORCE_HZ, config.seed, sweeping=config.sweeping)
-            fine = fine[: int(length_s * FORCE_HZ)]
-            write_sensors(folder, config.sensors, job.poses, config.fps, fine, config.seed)
+        write_sensors(folder, config, job.poses, _plan(config).path)
         write_json(folder / "annotations.json", coco(visible, job.stamps, job.camera, job.scene))
     return Path(out)
 

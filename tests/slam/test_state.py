@@ -255,7 +255,7 @@ def test_compared_classes_have_only_compared_attributes(system: SlamSystem) -> N
     tables, table = system.mapper.smoother._tables, system.mapper.world.landmarks
     pose_factors = {"pose_factors", "pose_factors_of", "_next_number"}
     assert vars(tables).keys() == {
-        *("keyframes", "landmarks", "observations", "marginalised"),
+        *("keyframes", "landmarks", "observations", "marginalised", "own_factors"),
         *pose_factors,
     }
     rows = {"of_keyframe", "of_landmark", "_free", "_columns", "_slots", "_used"}

@@ -29,6 +29,7 @@ from bmask_slam.live.channel import Channel
 from bmask_slam.live.messages import (
     STATE_FILE,
     AddMeasurements,
+    ChangeOwnFactors,
     Finish,
     LostKeyframe,
     MapChanged,
@@ -138,8 +139,8 @@ class MapServer:
                 self.send_changes(-1, done=False)
             case UseCamera():
                 self.use_camera(message)
-            case AddMeasurements():
-                self.system.add_measurements(message.measurements)
+            case AddMeasurements() | ChangeOwnFactors():
+                self.take_from_user(message)
             case SaveState():
                 self.save(number, message.path)
             case Finish():
@@ -149,6 +150,17 @@ class MapServer:
                 self._send(StateSaved(number, message.path))
             case _:
                 raise TypeError(f"not a message for the map: {message!r}")
+
+    def take_from_user(self, message: AddMeasurements | ChangeOwnFactors) -> None:
+        """Measurements, or changes of a user's factors; one that cannot enter is reported."""
+        if isinstance(message, AddMeasurements):
+            self.system.add_measurements(message.measurements)
+            return
+        try:
+            self.system.mapper.change_own_factors(message.added, message.removed)
+        except InputError as error:
+            self.system.events.sensor(f"own factor refused: {error}", logging.WARNING)
+        self.send_changes(-1, done=False)
 
     def prune_landmarks(self, ids: Ints) -> None:
         """Remove those of the landmarks (N,) that are still in the map."""

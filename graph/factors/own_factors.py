@@ -1,0 +1,149 @@
+"""Factors that a user has made with GTSAM: their variables, their text in files, and checks.
+
+Keys are those of `graph.factors.keys`. What enters is the user's own factor, with his noise and his
+robust kernel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from bmask_slam.graph.arrays import Arrays, Ints, no_ids
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, OwnFactor
+from bmask_slam.graph.factors.graph_update import GraphUpdate
+from bmask_slam.graph.factors.gtsam_factors import make_graph, make_values
+from bmask_slam.graph.factors.keys import variables_of_keys
+
+Numbered = tuple[int, Any]
+"""A factor of a user, or its text, with its number."""
+
+
+def own_factor(factor: Any) -> OwnFactor:
+    """A user's factor, whose variables are named by its keys.
+
+    Raises:
+        InputError: it is no GTSAM factor, or a key is neither a keyframe's nor a landmark's.
+    """
+    if not isinstance(factor, gtsam.NonlinearFactor):
+        raise InputError(f"add_factor: a {type(factor).__name__}; give a factor of GTSAM")
+    return OwnFactor(factor, *variables_of_keys(list(factor.keys())))
+
+
+def checked_own_factors(
+    given: Sequence[Numbered], tables: FactorTables
+) -> tuple[tuple[int, OwnFactor], ...]:
+    """Numbered factors, or texts of them, that can enter the graph. Raises InputError."""
+    found = []
+    for number, factor in given:
+        own = own_factor(factor_of(factor) if isinstance(factor, str) else factor)
+        check_own_factor(own, tables)
+        found.append((number, own))
+    return tuple(found)
+
+
+def check_own_factor(own: OwnFactor, tables: FactorTables) -> None:
+    """Refuse a factor that cannot enter a graph as it is now.
+
+    Raises:
+        InputError: a variable is not in the graph, or its error is not finite there.
+    """
+    for what, ids, known in (
+        ("keyframe", own.keyframes, tables.keyframes),
+        ("landmark", own.landmarks, tables.landmarks),
+    ):
+        for number in ids:
+            if not known.contains(np.array([number])).all():
+                raise InputError(
+                    f"add_factor: {what} {number} is not in the graph (culled, or not there yet); "
+                    "use one that is"
+                )
+    keyframes, landmarks = np.array(own.keyframes, int), np.array(own.landmarks, int)
+    poses, points = tables.keyframes.get(keyframes), tables.landmarks.get(landmarks)
+    try:
+        error = own.factor.error(make_values(keyframes, poses, landmarks, points))
+    except RuntimeError as reason:
+        raise InputError(f"add_factor: its error cannot be computed: {reason}") from reason
+    if not np.isfinite(error):
+        raise InputError(f"add_factor: its error is {error}; correct its measurement or its noise")
+
+
+def exchange_own_factors(
+    update: GraphUpdate, tables: FactorTables
+) -> tuple[list[int], list[int], tuple[int, ...]]:
+    """Carry out an update's changes: numbers lost with a variable, slots removed, numbers added."""
+    numbers = update.remove_own_factors
+    gone = [n for n in numbers if n in tables.own_factors]
+    own = tables.own_factors.items()
+    lost = [n for n, one in own if n not in numbers and not tables.has_variables(one)]
+    slots = [tables.own_factors.pop(n).slot for n in (*gone, *lost)]
+    added = {n: one for n, one in update.own_factors if tables.has_variables(one)}
+    lost += [n for n, _ in update.own_factors if n not in added]
+    tables.own_factors |= added
+    return lost, [slot for slot in slots if slot != NO_SLOT], tuple(added)
+
+
+def own_gtsam_factors(tables: FactorTables) -> list[Any]:
+    """The factors of a user, by number, without those that have lost a variable."""
+    own = (one for _, one in sorted(tables.own_factors.items()))
+    return [one.factor for one in own if tables.has_variables(one)]
+
+
+def text_of(factor: Any, number: int | None = None) -> str:
+    """A factor in GTSAM's own format, for a file or another process.
+
+    Raises:
+        InputError: it has none, as a ``gtsam.CustomFactor``, which is Python code.
+    """
+    try:
+        return str(make_graph([factor]).serialize())
+    except RuntimeError as reason:
+        name = "" if number is None else f" {number}"
+        raise InputError(
+            f"own factor{name}: a {type(factor).__name__} cannot be saved or sent to another "
+            "process, since it is code; remove it first (remove_factor), or use a factor of GTSAM"
+        ) from reason
+
+
+def factor_of(text: str) -> Any:
+    """The factor of ``text_of``. Raises ValueError for another text."""
+    graph = gtsam.NonlinearFactorGraph()
+    try:
+        graph.deserialize(text)
+    except RuntimeError as reason:
+        raise ValueError(f"an own factor cannot be read: {reason}") from reason
+    if graph.size() != 1:
+        raise ValueError(f"an own factor is {graph.size()} factors")
+    return graph.at(0)
+
+
+def without_own(update: GraphUpdate, tables: FactorTables) -> Ints:
+    """The landmarks to marginalise, but for those of a user's factors."""
+    held = [j for own in tables.own_factors.values() for j in own.landmarks]
+    return (
+        np.setdiff1d(update.marginalise_landmarks, held) if held else update.marginalise_landmarks
+    )
+
+
+def own_arrays(tables: FactorTables) -> Arrays:
+    """The users' factors for a file; nothing if there are none. Raises InputError for code."""
+    own = sorted(tables.own_factors.items())
+    if not own:
+        return {}
+    texts = [text_of(entry.factor, number) for number, entry in own]
+    numbers = np.array([number for number, _ in own], np.int64)
+    return {"own_factors": np.array(texts, np.str_), "own_factor_ids": numbers}
+
+
+def read_own(arrays: Arrays, tables: FactorTables) -> None:
+    """Put the users' factors of a file into a graph. Raises InputError or ValueError."""
+    texts = arrays.get("own_factors", np.zeros(0, np.str_)).tolist()
+    for number, text in zip(arrays.get("own_factor_ids", no_ids()).tolist(), texts, strict=True):
+        own = own_factor(factor_of(text))
+        if not tables.has_variables(own):
+            raise InputError(f"own factor {number}: has unknown ids; save it again")
+        tables.own_factors[number] = own

@@ -1,0 +1,45 @@
+"""The files of rendered sensors: of the motion that is rendered."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import inverse, se3_log
+from bmask_slam.graph.sensors.config import SensorsConfig
+from bmask_slam.graph.sensors.mounting import T_of
+from bmask_slam.graph.sensors.odometry import motion_between
+from bmask_slam.graph.sensors.streams import COLUMNS, SensorStreams, read_folder
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.rendering.sensors import GRAVITY_M_S2, POSITION_SIGMA_M, T_ENU_RENDERED
+from bmask_slam.rendering.sequence import RenderConfig, render_sequence
+
+CONFIG = RenderConfig("corridor", 31, fps=10.0, width=32, height=24, sensors=tuple(COLUMNS))
+
+
+def test_the_sensors_of_a_rendered_sequence_fit_its_truth(tmp_path: Path) -> None:
+    folder = render_sequence(CONFIG, tmp_path / "out")
+    truth, config, streams = read_tum(folder / "groundtruth.txt"), SensorsConfig(), SensorStreams()
+    for found in read_folder(folder, tuple(COLUMNS)):
+        streams.add(found)
+    poses = truth.poses_world_camera
+    motion = motion_between(streams, 0.0, 3.0, config.odometry)
+    assert motion is not None
+    error = se3_log(inverse(motion.T_a_b) @ inverse(poses[0]) @ poses[30])
+    assert error @ np.linalg.solve(motion.covariance, error) < 22.5  # 99.9 %
+    fixes = streams.of("position")
+    places = (T_ENU_RENDERED @ poses[::10])[:, :3, 3]
+    np.testing.assert_allclose(fixes[:, 1:4], places, atol=4 * POSITION_SIGMA_M)
+    force = streams.of("accelerometer")
+    R_world, known = truth.at(force[:, 0], 1.0)
+    sensor = T_of(config.accelerometer.accelerometer_in_camera)[:3, :3]
+    mean = np.mean((R_world[known, :3, :3] @ sensor @ force[known, 1:4, None])[:, :, 0], axis=0)
+    np.testing.assert_allclose(mean, [0, 0, GRAVITY_M_S2], atol=0.4)
+
+
+def test_an_unknown_sensor_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="sensor 'sonar' is unknown; choose of odometry"):
+        render_sequence(RenderConfig("corridor", 2, sensors=("sonar",)), tmp_path / "out")
