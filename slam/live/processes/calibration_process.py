@@ -7,7 +7,6 @@ the camera was last changed, not the same frames again.
 from __future__ import annotations
 
 import logging
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -49,7 +48,6 @@ from bmask_slam.world.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
-NICENESS = 19
 MAX_IMAGES = 120
 """Keyframes whose depth images are kept, 1.2 MB each at 640 x 480."""
 
@@ -73,7 +71,6 @@ class CalibrationSetup:
 
 def serve_calibration(channel: Channel, setup: CalibrationSetup) -> None:
     """Keep depth images and estimate until the channel ends."""
-    os.nice(NICENESS)
     server = CalibrationServer(setup)
     channel.send(Ready())
     for message in channel.messages():

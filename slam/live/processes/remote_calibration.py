@@ -8,6 +8,7 @@ tracking nor the map waits for it, and a process that dies is not started again.
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from dataclasses import dataclass
 
@@ -22,6 +23,7 @@ from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 
+NICENESS = 19
 TARGET = "bmask_slam.live.processes.calibration_process:serve_calibration"
 
 
@@ -52,6 +54,7 @@ class RemoteCalibration:
         self._tries_left = setup.config.stretches
         self.adopts = adopt
         self._worker = Worker("calibration", TARGET, setup)
+        os.setpriority(os.PRIO_PROCESS, self._worker.pid, NICENESS)  # from its start on
         self._frames = 0  # since the camera was changed, or since the last estimate
         self._first_keyframe = 0
         self._awaited_save: int | None = None
