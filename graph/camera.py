@@ -13,6 +13,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import MAX_NUMBER
 
 UNDISTORTION_STEPS = 5
+NO_DEPTH_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 MAX_SIDE_PX = 65_535
 KINECT_DISPARITY_SIGMA_PX = 0.08
 
@@ -70,6 +71,9 @@ class Camera:
     stands for the depth sensor: u_right = u_left - bf / z (ORB-SLAM2 eq. 1); for a Kinect
     about 40 px m (baseline 7.5 cm), so that one pixel of disparity noise is z^2/bf of depth noise.
     ``depth_noise`` is the depth sensor's; None: not known, see ``noise_of_depth``.
+    ``depth_distortion`` is what the sensor adds to the inverse depth, in 1/m: coefficients of
+    ``depth_distortion_terms``. Structured light bends its depth images so, by an error of the
+    disparity that varies smoothly over the image (Herrera et al., PAMI 34, 2012).
     """
 
     width: int
@@ -86,6 +90,7 @@ class Camera:
     depth_time_offset_s: float = 0.0
     rolling_shutter_s: float = 0.0
     depth_noise: DepthNoise | None = None
+    depth_distortion: tuple[float, float, float, float, float] = NO_DEPTH_DISTORTION
 
     def fault(self) -> str:
         """What no camera can be, in words; "" for a possible camera."""
@@ -136,6 +141,11 @@ class Camera:
         normalised = points_camera[:, :2] * (1 / points_camera[:, 2])[:, None]
         return self._focal * distort_normalised(normalised, self.distortion) + self._centre
 
+    def image_places(self, pixels: Array) -> Array:
+        """Pixels (..., 2) from the middle of the image, in units of half its width."""
+        middle = np.array([self.width - 1, self.height - 1]) / 2
+        return (pixels - middle) * (2 / self.width)
+
     def distort(self, pixels: Array) -> Array:
         """Pixels (..., 2) in the image as recorded of undistorted ones."""
         normalised = (pixels - self._centre) / self._focal
@@ -168,6 +178,16 @@ class Camera:
         x = (pixels[..., 0] - self.cx) / self.fx * depth_m
         y = (pixels[..., 1] - self.cy) / self.fy * depth_m
         return np.stack([x, y, np.broadcast_to(depth_m, x.shape)], axis=-1)
+
+
+def depth_distortion_terms(places: Array) -> Array:
+    """The terms (..., 5) x, y, x^2, xy, y^2 of ``Camera.depth_distortion``.
+
+    ``places`` (..., 2) are those of ``Camera.image_places``. A constant is missing: it is hardly
+    told from the depth's scale and offset.
+    """
+    x, y = np.moveaxis(places, -1, 0)
+    return np.stack([x, y, x * x, x * y, y * y], axis=-1)
 
 
 def distort_normalised(normalised: Array, distortion: Sequence[float] | Array) -> Array:

@@ -53,7 +53,7 @@ class CalibrationResult:
     """The result of the solver.
 
     Attributes:
-        calibration: (13,), and its covariance (13, 13), zero in fixed parameters.
+        calibration: (18,), and its covariance (18, 18), zero in fixed parameters.
         poses_world_camera: (K, 4, 4); points_world: (L, 3).
         noise_scales: (2,) ratio of the residuals to the nominal sigmas of pixels and of depths.
         body_arm_m: (3,) position in the camera's frame of the body that the anchors refer to.
@@ -135,7 +135,7 @@ def _descend(
 def _step(
     problem: CalibrationProblem, state: CalibrationState, scales: Array, damping: float
 ) -> tuple[Array, Array, Array] | None:
-    """Step of poses (K, 6), points (L, 3) and calibration (13,); None: not positive definite."""
+    """Step of poses (K, 6), points (L, 3) and calibration (18,); None: not positive definite."""
     reduced = normal_equations(problem, state, scales, damping)
     try:
         x = -cho_solve(cho_factor(reduced.S), reduced.b)

@@ -19,7 +19,7 @@ STRETCHES = 8
 
 
 def covariance_of(problem: CalibrationProblem, state: CalibrationState, scales: Array) -> Array:
-    """Covariance (13, 13) of the calibration, zero in what is held fixed.
+    """Covariance (18, 18) of the calibration, zero in what is held fixed.
 
     The inverse of the normal equations is right if errors are independent. They are not: a
     landmark's patch errs alike in neighbouring views, and a stretch of the path shares light, blur
@@ -61,7 +61,7 @@ def _clusters(views: CalibrationViews) -> tuple[Ints, Ints, Ints]:
 
 
 def _clustered_variance(scores: Array, clusters: Ints) -> Array:
-    """Variances (13,) from scores (M, 13) whose errors are correlated within clusters (M,).
+    """Variances (18,) from scores (M, 18) whose errors are correlated within clusters (M,).
 
     Few clusters estimate their spread badly: the variance is increased so that 1.96 standard
     deviations are the bound of Student's t with as many degrees of freedom.

@@ -33,7 +33,7 @@ class CrossValidation:
     """Two calibrations from half the keyframes each, judged by the other half.
 
     Attributes:
-        calibrations, sigmas: (2, 13) of the halves.
+        calibrations, sigmas: (2, 18) of the halves.
         gains: (K,) of every judged keyframe, the drop of its robust cost, in units of the
             estimated noise, from the calibration before to that of the half it is not in.
     """

@@ -95,9 +95,9 @@ def _product(views: CalibrationViews, left: Array, right: Array, K: int, L: int)
 
 
 def with_points(views: CalibrationViews, reduced: Reduced, x: Array) -> tuple[Array, Array, Array]:
-    """Columns (6K + 13, n) of poses and calibration, and the points that follow from them.
+    """Columns (6K + 18, n) of poses and calibration, and the points that follow from them.
 
-    Returns (K, 6, n), (L, 3, n) and (13, n).
+    Returns (K, 6, n), (L, 3, n) and (18, n).
     """
     poses, calibration = x[:-N].reshape(-1, 6, x.shape[1]), x[-N:]
     right = reduced.cross_calibration.swapaxes(1, 2) @ calibration

@@ -10,12 +10,13 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationConfig, calibrate
 from bmask_slam.graph.calibration.cross_validation import halves_of
-from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, F
+from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, F
 from bmask_slam.graph.calibration.problem import CalibrationProblem
 
 MIN_KEYFRAMES = 12
 """Of fewer, the largest error found with right cameras was 5 %, ten times its sigma."""
-FOCAL_PRIOR, SHUTTER_PRIOR_S = 0.2, 0.05
+FOCAL_PRIOR, SHUTTER_PRIOR_S, BEND_PRIOR = 0.2, 0.05, 0.02
+LENS_PRIORS = 0.1, 0.2
 SOLVER = CalibrationConfig(rounds=2, steps=4)
 
 
@@ -43,14 +44,18 @@ class FocalCheck:
 def check_focal(problem: CalibrationProblem) -> FocalCheck | None:
     """The change of focal lengths that the problem's views ask for; None: they show none.
 
-    Poses, landmarks and the readout time are estimated along: the last takes the part of a focal
-    length where it is wrong.
+    Poses, landmarks, the readout time and the distortion of depth are estimated along: the last two
+    take the part of a focal length where they are wrong. So are k1 and k2 of a lens that has no
+    distortion, as it was not calibrated then.
     """
     count = len(problem.poses_world_camera)
     if count < MIN_KEYFRAMES:
         return None
     sigmas = np.zeros(len(PARAMETERS))
     sigmas[F], sigmas[SHUTTER] = FOCAL_PRIOR * problem.calibration[F], SHUTTER_PRIOR_S
+    sigmas[BEND] = BEND_PRIOR
+    if not problem.calibration[LENS].any():
+        sigmas[LENS][:2] = LENS_PRIORS
     problem = dataclasses.replace(problem, prior_sigmas=sigmas)
     try:
         return _in_whole_and_halves(problem)

@@ -4,12 +4,12 @@ The measurements of a landmark are its raw (distorted) pixel in the colour image
 the raw depth at that pixel of the depth image:
 
     pixel          (u, v) = (fx, fy) * distort_normalised(x / z, y / z) + (cx, cy)
-    metric depth   z = factor * raw + offset
+    metric depth   z_sensor = factor * raw + offset,   1 / z_sensor = 1 / z + distortion(u, v)
 
 The depth image may have been taken tau = lag + time_offset later than the colour image, when
 another point of the surface is at the pixel. To first order
 
-    1 / raw = factor / (z - offset) + tau * rate
+    1 / raw = factor / (z_sensor - offset) + tau * rate
 
 with the rate of change of 1 / raw at the fixed pixel, which is measured from the depth images
 before and after. (The alternative, rate = -(z' + slope . flow) / z^2 from the camera's velocity and
@@ -18,6 +18,10 @@ the surface's slope, needs the slope from one noisy image, whose error biases ta
 The rows of a rolling shutter are exposed one after the other: a point with the velocity p' in the
 camera's frame is observed at p + (row / rows - 1/2) rolling_shutter p'. The depth image is assumed
 to have the same rolling shutter.
+
+The distortion of depth is a quadratic of the pixel's place in the image. Where it is not estimated
+it passes for wrong focal lengths: turned by an angle a, a camera shows a shift fx a of the pixels
+and a change u a / fx of 1 / z relative to it, whose product tells fx.
 """
 
 from __future__ import annotations
@@ -27,18 +31,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, Mask
-from bmask_slam.graph.camera import Camera, distort_normalised, distortion_terms
+from bmask_slam.graph.camera import (
+    Camera,
+    depth_distortion_terms,
+    distort_normalised,
+    distortion_terms,
+)
 from bmask_slam.graph.geometry import inverse, skew
 
 PARAMETERS = (
     *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
     *("depth_factor", "depth_offset_m", "time_offset_s", "rolling_shutter_s"),
+    *("depth_u", "depth_v", "depth_uu", "depth_uv", "depth_vv"),
 )
-"""The calibration as a vector (13,): pixels, OpenCV's distortion, metres a raw depth unit,
-metres, seconds, seconds."""
+"""The calibration as a vector (18,): pixels, OpenCV's distortion, metres a raw depth unit,
+metres, seconds, seconds, and the distortion of depth in 1/m."""
 F, C, LENS = slice(0, 2), slice(2, 4), slice(4, 9)
 FACTOR, OFFSET, TIME, SHUTTER = 9, 10, 11, 12
+BEND = slice(13, 18)
 MIN_DEPTH_M = 0.05
+MIN_INVERSE_DEPTH = 0.01
 
 
 @dataclass(frozen=True)
@@ -48,6 +60,7 @@ class CalibrationViews:
     Attributes:
         keyframes, landmarks: (M,) rows in the tables of poses and points, from 0.
         pixels: (M, 2) raw pixels, distorted as the image is.
+        places: (M, 2) the same as ``Camera.image_places``.
         inverse_depth: (M,) of the raw depth, NaN without one.
         inverse_depth_rate: (M,) its rate of change at that pixel, in 1/s; NaN where unknown.
         lag_s: (M,) stamp of the depth image less that of the colour image.
@@ -60,6 +73,7 @@ class CalibrationViews:
     keyframes: Ints
     landmarks: Ints
     pixels: Array
+    places: Array
     inverse_depth: Array
     inverse_depth_rate: Array
     lag_s: Array
@@ -73,7 +87,7 @@ class Linearised:
     """Residuals (M, 3), predicted - measured over sigma, and their derivatives.
 
     ``pose`` (M, 3, 6) is by the tangent of T_world_camera, ``point`` (M, 3, 3) by the point in
-    the world, ``calibration`` (M, 3, 13) by the vector of PARAMETERS. Rows are u, v and inverse
+    the world, ``calibration`` (M, 3, 18) by the vector of PARAMETERS. Rows are u, v and inverse
     depth; ``valid`` (M, 3) is False, and the row zero, for a missing depth or one whose rate is not
     known, and for a point behind the camera.
     """
@@ -86,13 +100,14 @@ class Linearised:
 
 
 def parameters_of(camera: Camera, raw_scale: float) -> Array:
-    """The vector (13,) of a camera whose raw depth is stored values over ``raw_scale``."""
+    """The vector (18,) of a camera whose raw depth is stored values over ``raw_scale``."""
     k1, k2, p1, p2, k3 = camera.distortion
     return np.array(
         [
             *(camera.fx, camera.fy, camera.cx, camera.cy, k1, k2, p1, p2, k3),
             *(raw_scale / camera.depth_scale, camera.depth_offset_m),
             *(camera.depth_time_offset_s, camera.rolling_shutter_s),
+            *camera.depth_distortion,
         ]
     )
 
@@ -100,7 +115,7 @@ def parameters_of(camera: Camera, raw_scale: float) -> Array:
 def linearise(
     views: CalibrationViews, poses: Array, points_world: Array, calibration: Array
 ) -> Linearised:
-    """Residuals and derivatives at poses (K, 4, 4), points (L, 3) and a calibration (13,)."""
+    """Residuals and derivatives at poses (K, 4, 4), points (L, 3) and a calibration (18,)."""
     T_camera_world = inverse(poses)[views.keyframes]
     R = T_camera_world[:, :3, :3]
     p = np.einsum("mij,mj->mi", R, points_world[views.landmarks]) + T_camera_world[:, :3, 3]
@@ -130,7 +145,7 @@ def linearise(
 
 
 def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
-    """Pixels (M, 2), and their derivatives (M, 2, 3) by p (M, 3) and (M, 2, 13)."""
+    """Pixels (M, 2), and their derivatives (M, 2, 3) by p (M, 3) and (M, 2, 18)."""
     inv_z = 1 / p[:, 2]
     normalised = p[:, :2] * inv_z[:, None]
     x, y = normalised.T
@@ -158,13 +173,16 @@ def _pixel(p: Array, calibration: Array) -> tuple[Array, Array, Array]:
 def _inverse_depth(
     views: CalibrationViews, p: Array, calibration: Array
 ) -> tuple[Array, Array, Array]:
-    """Raw inverse depth (M,) in the depth image, and its derivatives (M, 3) by p and (M, 13)."""
+    """Raw inverse depth (M,) in the depth image, and its derivatives (M, 3) by p and (M, 18)."""
     tau_s = views.lag_s + calibration[TIME]
-    factor, z = calibration[FACTOR], np.maximum(p[:, 2] - calibration[OFFSET], MIN_DEPTH_M)
+    terms = depth_distortion_terms(views.places)
+    z_sensor = 1 / np.maximum(1 / p[:, 2] + terms @ calibration[BEND], MIN_INVERSE_DEPTH)
+    factor, z = calibration[FACTOR], np.maximum(z_sensor - calibration[OFFSET], MIN_DEPTH_M)
     by_p = np.zeros_like(p)
-    by_p[:, 2] = -factor / z**2
+    by_p[:, 2] = -factor / z**2 * (z_sensor / p[:, 2]) ** 2
     by_calibration = np.zeros((len(p), len(PARAMETERS)))
     by_calibration[:, FACTOR] = 1 / z
     by_calibration[:, OFFSET] = factor / z**2
+    by_calibration[:, BEND] = (factor / z**2 * z_sensor**2)[:, None] * terms
     by_calibration[:, TIME] = np.nan_to_num(views.inverse_depth_rate)
     return factor / z + tau_s * views.inverse_depth_rate, by_p, by_calibration

@@ -43,8 +43,8 @@ class CalibrationProblem:
 
     Attributes:
         views: the measurements.
-        poses_world_camera: (K, 4, 4); points_world: (L, 3); calibration: (13,), see PARAMETERS.
-        prior_sigmas: (13,) around ``calibration``; 0 holds a parameter fixed.
+        poses_world_camera: (K, 4, 4); points_world: (L, 3); calibration: (18,), see PARAMETERS.
+        prior_sigmas: (18,) around ``calibration``; 0 holds a parameter fixed.
         pose_sigmas: (6,) of the prior on the first pose ``[rad, m]``, which fixes the frame.
         anchors: if None, only the prior determines the scale.
     """
@@ -60,7 +60,7 @@ class CalibrationProblem:
 
 @dataclass(frozen=True)
 class CalibrationState:
-    """Current values: poses (K, 4, 4), points (L, 3) and the vector (13,) of PARAMETERS."""
+    """Current values: poses (K, 4, 4), points (L, 3) and the vector (18,) of PARAMETERS."""
 
     poses: Array
     points: Array
@@ -73,7 +73,7 @@ class CalibrationState:
 
 
 def prior_residuals(problem: CalibrationProblem, state: CalibrationState) -> tuple[Array, Array]:
-    """Of the first pose (6,) and of the calibration (13,), zero for what is held fixed."""
+    """Of the first pose (6,) and of the calibration (18,), zero for what is held fixed."""
     pose = se3_log(inverse(problem.poses_world_camera[0]) @ state.poses[0]) / problem.pose_sigmas
     sigmas = problem.prior_sigmas
     moved = state.calibration - problem.calibration
@@ -81,7 +81,7 @@ def prior_residuals(problem: CalibrationProblem, state: CalibrationState) -> tup
 
 
 def prior_information(problem: CalibrationProblem, state: CalibrationState) -> Array:
-    """What priors and anchors add to the reduced normal equations, (6K + 13) square."""
+    """What priors and anchors add to the reduced normal equations, (6K + 18) square."""
     information = np.zeros((6 * len(state.poses) + N,) * 2)
     _, J = anchor_terms(problem, state)
     information[:-N, :-N] = J.T @ J

@@ -1,4 +1,7 @@
-"""Whether a run should use what was found of its camera's times: by one estimate and the next.
+"""Whether a run should use what was found of its camera: by one estimate and the next.
+
+Of a camera's parameters the readout time, the delay of depth and the distortion of depth may be
+adopted; the last, five coefficients, as a whole.
 
 What was found is adopted if it is observable, differs from what the camera has, is found in both
 halves of the observations, and fits the half that it was not estimated from better by two standard
@@ -23,18 +26,23 @@ from bmask_slam.calibration.calibrate import camera_from, with_rate_error
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
 from bmask_slam.graph.calibration.cross_validation import CrossValidation, cross_validate
-from bmask_slam.graph.calibration.model import SHUTTER, TIME, parameters_of
+from bmask_slam.graph.calibration.model import BEND, PARAMETERS, SHUTTER, TIME, parameters_of
 from bmask_slam.graph.calibration.problem import CalibrationProblem
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, depth_distortion_terms
 
 logger = logging.getLogger(__name__)
 
-FREE = (SHUTTER, TIME)
+TIMES = (SHUTTER, TIME)
+BENDS = tuple(range(len(PARAMETERS))[BEND])
+FREE = (*TIMES, *BENDS)
 """The parameters that are estimated, by their places in PARAMETERS."""
 CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
 MIN_STEP_S, MAX_SHARE = 0.002, 0.6
+PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
+BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
+"""Those of the distortion of depth at places all over an image of 4:3."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +60,7 @@ class SelfCalibrationConfig:
         min_change_s: and by so much.
         min_gain_sigmas: so many standard errors is the gain on observations kept out of the fit.
         max_s: a larger time is no readout within a frame's interval, but an error.
+        max_bend_sigma, min_bend, max_bend: the same limits of the distortion of depth, in 1/m.
     """
 
     frames: int = 210
@@ -63,6 +72,15 @@ class SelfCalibrationConfig:
     min_change_s: float = 0.002
     min_gain_sigmas: float = 2.0
     max_s: float = 0.035
+    max_bend_sigma: float = 0.004
+    min_bend: float = 0.003
+    max_bend: float = 0.1
+
+    def limits(self, i: int) -> tuple[float, float, float]:
+        """Largest sigma, smallest change and largest value of a parameter."""
+        if i in BENDS:
+            return self.max_bend_sigma, self.min_bend, self.max_bend
+        return self.max_sigma_s, self.min_change_s, self.max_s
 
 
 @dataclass(frozen=True)
@@ -91,7 +109,7 @@ class SelfCalibration:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Of one stretch: the vector (13,) before and after, standard deviations, and the problem."""
+    """Of one stretch: the vector (18,) before and after, standard deviations, and the problem."""
 
     before: Array
     found: Array
@@ -100,12 +118,18 @@ class Estimate:
 
     def differs(self, i: int, config: SelfCalibrationConfig) -> bool:
         """Whether a parameter is observable, possible, and not what the camera has."""
-        change_s = abs(self.found[i] - self.before[i])
+        _, min_change, largest = config.limits(i)
+        change = abs(self.found[i] - self.before[i])
         return bool(
-            self.sigmas[i] < config.max_sigma_s
-            and change_s > max(config.min_change_sigmas * self.sigmas[i], config.min_change_s)
-            and abs(self.found[i]) < config.max_s
+            self.shows(i, config)
+            and change > max(config.min_change_sigmas * self.sigmas[i], min_change)
+            and abs(self.found[i]) < largest
         )
+
+    def shows(self, i: int, config: SelfCalibrationConfig) -> bool:
+        """Whether a parameter is observable; the distortion of depth is so over the whole image."""
+        sigma = _rms_sigma(self.sigmas[BEND]) if i in BENDS else self.sigmas[i]
+        return bool(sigma < config.limits(i)[0])
 
     def settled(self, chosen: list[int]) -> bool:
         """Whether the run found what its camera had, within 95 % bounds of two rounds."""
@@ -114,12 +138,33 @@ class Estimate:
 
     def agrees(self, i: int, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
         """Whether both halves alone find a parameter: within their bounds, or nearer to what was
-        found than to what the camera has.
+        found than to what the camera has. The distortion of depth is compared over the image.
         """
+        if i in BENDS:
+            return self._bend_agrees(halves, config)
         bounds = config.min_change_sigmas * np.hypot(halves.sigmas[:, i], self.sigmas[i])
         nearer = abs(self.found[i] - self.before[i]) / 2
         off = np.abs(halves.calibrations[:, i] - self.found[i])
         return bool((off <= np.maximum(bounds, nearer)).all())
+
+    def _bend_agrees(self, halves: CrossValidation, config: SelfCalibrationConfig) -> bool:
+        found, sigma = self.found[BEND], _rms_sigma(self.sigmas[BEND])
+        nearer = _rms(found - self.before[BEND]) / 2
+        return all(
+            _rms(half[BEND] - found)
+            <= max(nearer, config.min_change_sigmas * np.hypot(_rms_sigma(sigmas[BEND]), sigma))
+            for half, sigmas in zip(halves.calibrations, halves.sigmas, strict=True)
+        )
+
+
+def _rms(bend: Array) -> float:
+    """Of a distortion of depth (5,) over the image, in 1/m."""
+    return float(np.sqrt(np.mean((BEND_TERMS @ bend) ** 2)))
+
+
+def _rms_sigma(sigmas: Array) -> float:
+    """Standard deviation of a distortion with those (5,) of its coefficients, in 1/m."""
+    return float(np.sqrt(np.mean(BEND_TERMS**2 @ sigmas**2)))
 
 
 def estimate_times(problem: CalibrationProblem) -> Estimate:
@@ -145,7 +190,7 @@ class CalibrationRounds:
         self,
         given: Camera,
         config: SelfCalibrationConfig | None = None,
-        free: tuple[int, ...] = FREE,
+        free: tuple[int, ...] = TIMES,
     ) -> None:
         self._given, self._config, self._free = given, config or SelfCalibrationConfig(), free
         self._sure: list[int] = []
@@ -153,7 +198,7 @@ class CalibrationRounds:
 
     def shows(self, estimate: Estimate) -> bool:
         """Whether the motion of a stretch shows any of the parameters."""
-        return bool(min(estimate.sigmas[i] for i in FREE) < self._config.max_sigma_s)
+        return any(estimate.shows(i, self._config) for i in TIMES)
 
     def add(self, estimate: Estimate) -> Camera | None:
         """Add the estimate of a round; the camera to track the next one with, None at the end."""
@@ -173,13 +218,13 @@ class CalibrationRounds:
         final = dataclasses.replace(self._rounds[-1], before=start)
         kept = [i for i in self._sure if final.differs(i, config)]
         if not kept:
-            return SelfCalibration(given, given, format_times(final, FREE, self._refused(final)))
+            return SelfCalibration(given, given, format_found(final, TIMES, self._refused(final)))
         camera = camera_with(given, final.found, kept)
-        return SelfCalibration(given, camera, format_times(final, kept, "found and applied"))
+        return SelfCalibration(given, camera, format_found(final, kept, "found and applied"))
 
     def _refused(self, estimate: Estimate) -> str:
         """Why nothing is adopted."""
-        differs = any(estimate.differs(i, self._config) for i in FREE)
+        differs = any(estimate.differs(i, self._config) for i in TIMES)
         return "not sure enough to be applied" if differs else "the camera keeps its values"
 
 
@@ -197,11 +242,14 @@ def newly_sure(
     )
     if halves.gain_sigmas < config.min_gain_sigmas:
         return []
-    return [i for i in sure if estimate.agrees(i, halves, config)]
+    agreed = {i for i in sure if estimate.agrees(i, halves, config)}
+    if agreed & set(BENDS):  # one surface, of which no part is right alone
+        agreed |= set(BENDS)
+    return sorted(agreed)
 
 
 def next_start(rounds: list[Estimate]) -> Array:
-    """The vector (13,) to track with after some rounds.
+    """The vector (18,) to track with after some rounds.
 
     A run with a camera that is off by d finds one that is off by a share r of d, which two rounds
     show; what it tends to is x + (found - x) / (1 - r) (Aitken's extrapolation).
@@ -215,21 +263,33 @@ def next_start(rounds: list[Estimate]) -> Array:
 
 
 def camera_with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
-    """The camera with some of the parameters of a vector (13,), rounded as in camera.yaml."""
+    """The camera with some of the parameters of a vector (18,), rounded as in camera.yaml."""
     calibration = parameters_of(camera, camera.depth_scale)
     calibration[chosen] = values[chosen]
     found = camera_from(camera, calibration)
     return dataclasses.replace(
         camera,
-        rolling_shutter_s=round(found.rolling_shutter_s, 6),
-        depth_time_offset_s=round(found.depth_time_offset_s, 6),
+        rolling_shutter_s=found.rolling_shutter_s,
+        depth_time_offset_s=found.depth_time_offset_s,
+        depth_distortion=found.depth_distortion,
     )
 
 
-def format_times(estimate: Estimate, parameters: tuple[int, ...] | list[int], verdict: str) -> str:
-    """Parameters in milliseconds with 95 % bounds, and what became of them."""
+def format_found(estimate: Estimate, parameters: tuple[int, ...] | list[int], verdict: str) -> str:
+    """Parameters in milliseconds and millimetres with 95 % bounds, and what became of them."""
     parts = [
         f"{NAMES[i]} {1e3 * estimate.found[i]:.1f} ± {1.96e3 * estimate.sigmas[i]:.1f} ms"
         for i in parameters
+        if i in TIMES
     ]
+    if set(BENDS) <= set(parameters):
+        parts.append(_format_bend(estimate))
     return f"{', '.join(parts)}: {verdict}"
+
+
+def _format_bend(estimate: Estimate) -> str:
+    """The distortion of depth where it is largest."""
+    bend = BEND_TERMS @ estimate.found[BEND]
+    at = int(np.abs(bend).argmax())
+    bound = 1.96 * float(np.linalg.norm(BEND_TERMS[at] * estimate.sigmas[BEND]))
+    return f"depth bent by up to {1e3 * abs(bend[at]):.0f} ± {1e3 * bound:.0f} mm at 1 m"

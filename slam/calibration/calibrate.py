@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.calibration.motion import landmark_motion
-from bmask_slam.calibration.report import Calibrated, format_calibration, parameter_named
+from bmask_slam.calibration.report import Calibrated, format_calibration, parameters_named
 from bmask_slam.calibration.views import connected_views, make_views
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.calibration.calibration import CalibrationResult, calibrate
 from bmask_slam.graph.calibration.model import (
+    BEND,
     FACTOR,
     OFFSET,
     PARAMETERS,
@@ -50,10 +51,12 @@ class CalibrationPriors:
     Attributes:
         focal_share: of the focal lengths, as a share of them.
         centre_share: of the principal point, as a share of the image's width.
-        k1, k2, p1, p2, k3: of the distortion; 0 fixes a parameter.
+        k1, k2, p1, p2, k3: of the distortion, a tenth of that where the camera has one, as it was
+            calibrated then; 0 fixes a parameter.
         depth_share: of the depth scale, as a share of it.
         depth_offset_m, depth_time_offset_s: of the offsets.
         rolling_shutter_s: of the time from the first to the last row.
+        depth_distortion: of each of its coefficients, in 1/m.
     """
 
     focal_share: float = 0.05
@@ -67,16 +70,20 @@ class CalibrationPriors:
     depth_offset_m: float = 0.02
     depth_time_offset_s: float = 0.02
     rolling_shutter_s: float = 0.02
+    depth_distortion: float = 0.02
 
     def sigmas(self, camera: Camera) -> Array:
-        """The vector (13,) of PARAMETERS."""
+        """The vector (18,) of PARAMETERS."""
+        known = 0.1 if any(camera.distortion) else 1.0
+        lens = (known * sigma for sigma in (self.k1, self.k2, self.p1, self.p2, self.k3))
         return np.array(
             [
                 *(self.focal_share * camera.fx, self.focal_share * camera.fy),
                 *(self.centre_share * camera.width,) * 2,
-                *(self.k1, self.k2, self.p1, self.p2, self.k3),
+                *lens,
                 *(self.depth_share, self.depth_offset_m, self.depth_time_offset_s),
                 self.rolling_shutter_s,
+                *(self.depth_distortion,) * 5,
             ]
         )
 
@@ -164,7 +171,7 @@ def check_options(options: CalibrateOptions) -> Path:
     if not out.parent.is_dir():
         raise InputError(f"{out}: the folder {out.parent} is not there; make it first")
     for name in options.fixed:
-        if parameter_named(name) is None:
+        if not parameters_named(name):
             raise InputError(f"--fix {name}: is no parameter; they are {', '.join(PARAMETERS)}")
     if options.on_body and options.reference is None:
         raise InputError("--hand-eye: finds where the reference sits; give it as --reference")
@@ -211,7 +218,8 @@ def make_problem(
     has_anchor = options.reference is not None or options.known_distance is not None
     if not has_anchor:  # a scale that nothing fixes and an offset take each other's part
         sigmas[OFFSET] = 0.0
-    sigmas[[PARAMETERS.index(parameter_named(name) or name) for name in options.fixed]] = 0.0
+    fixed = {parameter for name in options.fixed for parameter in parameters_named(name)}
+    sigmas[np.isin(PARAMETERS, list(fixed))] = 0.0
     start = parameters_of(run.camera, run.camera.depth_scale)
     problem = CalibrationProblem(
         views, poses, points, start, sigmas, gauge, anchors if has_anchor else None
@@ -271,9 +279,10 @@ def _with_distance(
 
 
 def camera_from(before: Camera, calibration: Array) -> Camera:
-    """The camera of a vector (13,) of PARAMETERS, rounded to meaningful digits."""
+    """The camera of a vector (18,) of PARAMETERS, rounded to meaningful digits."""
     fx, fy, cx, cy = (round(float(x), 4) for x in calibration[:4])
     k1, k2, p1, p2, k3 = (round(float(x), 6) for x in calibration[4:9])
+    u, v, uu, uv, vv = (round(float(x), 6) for x in calibration[BEND])
     return dataclasses.replace(
         before,
         fx=fx, fy=fy, cx=cx, cy=cy,
@@ -282,4 +291,5 @@ def camera_from(before: Camera, calibration: Array) -> Camera:
         depth_offset_m=round(float(calibration[OFFSET]), 6),
         depth_time_offset_s=round(float(calibration[TIME]), 6),
         rolling_shutter_s=round(float(calibration[SHUTTER]), 6),
+        depth_distortion=(u, v, uu, uv, vv),
     )  # fmt: skip

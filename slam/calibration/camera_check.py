@@ -17,7 +17,13 @@ from bmask_slam.calibration.motion import as_exposed, landmark_motion
 from bmask_slam.calibration.views import connected_views
 from bmask_slam.evaluation import Row
 from bmask_slam.graph.calibration.focal_check import FocalCheck, check_focal
-from bmask_slam.graph.calibration.model import OFFSET, PARAMETERS, CalibrationViews, parameters_of
+from bmask_slam.graph.calibration.model import (
+    BEND,
+    OFFSET,
+    PARAMETERS,
+    CalibrationViews,
+    parameters_of,
+)
 from bmask_slam.graph.calibration.problem import CalibrationProblem
 from bmask_slam.graph.calibration.registration import Registration, register
 from bmask_slam.graph.camera import Camera
@@ -108,6 +114,7 @@ def stored_problem(run: SavedRun) -> CalibrationProblem | None:
         keyframes=keyframes,
         landmarks=landmarks,
         pixels=pixels,
+        places=camera.image_places(pixels),
         inverse_depth=(measured[:, 0] - measured[:, 2]) / bf,  # u_left - u_right
         inverse_depth_rate=none,
         lag_s=none,
@@ -116,7 +123,7 @@ def stored_problem(run: SavedRun) -> CalibrationProblem | None:
         shutter_velocity=share_of_rows(pixels[:, 1], camera)[:, None] * motion.velocities,
     )
     start = parameters_of(camera, camera.depth_scale)
-    start[OFFSET] = 0.0  # it is in the depths already
+    start[OFFSET], start[BEND] = 0.0, 0.0  # they are in the depths already
     poses, points = tables.keyframes.get(keyframe_ids), tables.landmarks.get(landmark_ids)
     return CalibrationProblem(views, poses, points, start, np.zeros(len(PARAMETERS)), GAUGE_SIGMAS)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.calibration.adoption import FREE
+from bmask_slam.calibration.adoption import TIMES
 from bmask_slam.calibration.calibrate import (
     GAUGE_SIGMAS,
     MIN_KEYFRAMES,
@@ -25,13 +25,21 @@ from bmask_slam.calibration.views import (
     smooth_value,
 )
 from bmask_slam.graph.arrays import Array, Floats, Ints
-from bmask_slam.graph.calibration.model import PARAMETERS, CalibrationViews, parameters_of
+from bmask_slam.graph.calibration.model import (
+    BEND,
+    OFFSET,
+    PARAMETERS,
+    CalibrationViews,
+    parameters_of,
+)
 from bmask_slam.graph.calibration.problem import CalibrationProblem
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.run_folder.map_file import SavedRun
 from bmask_slam.sequences.images import SURFACE_STEP
 from bmask_slam.tracking.rolling_shutter import share_of_rows
+
+IS_TIME = np.isin(np.arange(len(PARAMETERS)), TIMES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +153,7 @@ def keyframe_problem(
         keyframes=keyframes,
         landmarks=landmarks,
         pixels=pixels,
+        places=camera.image_places(pixels),
         inverse_depth=samples.inverse_depth,
         inverse_depth_rate=samples.rate,
         lag_s=samples.lag_s,
@@ -152,12 +161,13 @@ def keyframe_problem(
         sigma_inverse=np.hypot(samples.sigmas, samples.rms),
         shutter_velocity=share_of_rows(pixels[:, 1], camera)[:, None] * velocities,
     )
-    free = np.isin(np.arange(len(PARAMETERS)), FREE)
+    start = parameters_of(camera, camera.depth_scale)
+    start[OFFSET], start[BEND] = 0.0, 0.0  # they are in the depths already
     return CalibrationProblem(
         views,
         run.tables.keyframes.get(keyframe_ids),
         run.tables.landmarks.get(landmark_ids),
-        parameters_of(camera, camera.depth_scale),
-        np.where(free, CalibrationPriors().sigmas(camera), 0.0),
+        start,
+        np.where(IS_TIME, CalibrationPriors().sigmas(camera), 0.0),
         GAUGE_SIGMAS,
     )

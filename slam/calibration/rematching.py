@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.calibration.adoption import FREE, Estimate, estimate_of
+from bmask_slam.calibration.adoption import FREE, TIMES, Estimate, estimate_of
 from bmask_slam.calibration.calibrate import (
     GAUGE_SIGMAS,
     MIN_KEYFRAMES,
@@ -229,6 +229,7 @@ class RunProblem:
             keyframes=keyframes,
             landmarks=landmarks,
             pixels=found.pixels,
+            places=camera.image_places(found.pixels),
             inverse_depth=depths.inverse_depth,
             inverse_depth_rate=depths.rate,
             lag_s=depths.lag_s,
@@ -284,6 +285,6 @@ def estimate_again(
         problems.move_to(result)
         estimate = estimate_of(problem, result)
         shutter_s = float(estimate.found[SHUTTER])
-        if max(abs(estimate.found[i] - estimate.before[i]) for i in FREE) < worth_s:
+        if max(abs(estimate.found[i] - estimate.before[i]) for i in TIMES) < worth_s:
             break
     return estimate

@@ -9,7 +9,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import CalibrationResult
-from bmask_slam.graph.calibration.model import FACTOR, PARAMETERS
+from bmask_slam.graph.calibration.model import BEND, FACTOR, PARAMETERS
 from bmask_slam.graph.camera import Camera
 
 NORMAL_95 = 1.96
@@ -19,6 +19,7 @@ UNITS = {
     "depth_offset_m": ("depth offset", "mm", 1e3),
     "time_offset_s": ("time offset", "ms", 1e3),
     "rolling_shutter_s": ("rolling shutter", "ms", 1e3),
+    **{name: (f"depth bend {name[6:]}", "mm at 1 m", 1e3) for name in PARAMETERS[BEND]},
 }
 CURES = {
     **dict.fromkeys(("fx", "fy"), "turn the camera, over things near and far"),
@@ -30,28 +31,30 @@ CURES = {
     "depth_offset_m": "look at the same things from near and far",
     "time_offset_s": "move faster, and toward and away from things",
     "rolling_shutter_s": "turn the camera faster",
+    **dict.fromkeys(PARAMETERS[BEND], "let flat things fill the image, and turn the camera"),
 }
 
 
 ALSO = {
     "depth_factor": ("depth scale",),
     "time_offset_s": ("depth time offset", "colour-depth delay"),
+    **dict.fromkeys(PARAMETERS[BEND], ("depth distortion",)),
 }
 """Further names, of the table and of camera.yaml."""
 
 
-def parameter_named(name: str) -> str | None:
-    """The parameter of PARAMETERS that a name of the table or of camera.yaml stands for.
+def parameters_named(name: str) -> list[str]:
+    """Those of PARAMETERS that a name of the table or of camera.yaml stands for, [] if none.
 
     Units, and whether words are joined by spaces, hyphens or underscores, do not matter.
     """
-    text = _plain(name)
-    for parameter in PARAMETERS:
-        label, unit, _ = UNITS.get(parameter, (parameter, "", 1.0))
-        names = (parameter, label, f"{label} {unit}", *ALSO.get(parameter, ()))
-        if text in map(_plain, names):
-            return parameter
-    return None
+    return [parameter for parameter in PARAMETERS if _plain(name) in _names_of(parameter)]
+
+
+def _names_of(parameter: str) -> set[str]:
+    label, unit, _ = UNITS.get(parameter, (parameter, "", 1.0))
+    names = parameter, label, f"{label} {unit}", *ALSO.get(parameter, ())
+    return {_plain(name) for name in names}
 
 
 def _plain(name: str) -> str:
@@ -64,7 +67,7 @@ class Calibrated:
 
     Attributes:
         path: the camera.yaml; camera: the camera in it; before: the run's camera.
-        result: of the solver; prior_sigmas: (13,), 0 for a fixed parameter.
+        result: of the solver; prior_sigmas: (18,), 0 for a fixed parameter.
         has_anchor: whether a reference or a distance was given.
         keyframes, landmarks, observations: numbers of those used.
         noise_before: (2,) ratio of residuals to nominal sigmas, of pixels and of depths, when poses
@@ -98,7 +101,7 @@ class Calibrated:
 
     @property
     def sigmas(self) -> Array:
-        """Standard deviations (13,) of PARAMETERS."""
+        """Standard deviations (18,) of PARAMETERS."""
         return np.sqrt(np.diag(self.result.covariance))
 
 
@@ -152,12 +155,13 @@ def _row(done: Calibrated, i: int) -> tuple[str, ...]:
 
 
 def _of(camera: Camera) -> Array:
-    """The vector (13,) of PARAMETERS as shown: the depth scale in place of the factor."""
+    """The vector (18,) of PARAMETERS as shown: the depth scale in place of the factor."""
     return np.array(
         [
             *(camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion),
             *(camera.depth_scale, camera.depth_offset_m),
             *(camera.depth_time_offset_s, camera.rolling_shutter_s),
+            *camera.depth_distortion,
         ]
     )
 

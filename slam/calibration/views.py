@@ -12,7 +12,7 @@ import numpy as np
 from bmask_slam.calibration.motion import LandmarkMotion, as_exposed
 from bmask_slam.graph.arrays import Array, Ints, Mask
 from bmask_slam.graph.calibration.model import CalibrationViews
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.sequences import Sequence
@@ -106,6 +106,7 @@ def make_views(
         keyframes=keyframes,
         landmarks=landmarks,
         pixels=pixels,
+        places=camera.image_places(pixels),
         inverse_depth=depths.inverse_depth,
         inverse_depth_rate=depths.rate,
         lag_s=depths.lag_s,
@@ -178,8 +179,10 @@ class Depths:
 
 
 def _raw_inverse_depth(sequence: Sequence, index: int) -> Array:
-    """Inverse depth (H, W) of a frame without the camera's depth offset, NaN where missing."""
-    camera = dataclasses.replace(sequence.camera, depth_offset_m=0.0)
+    """Inverse depth (H, W) of a frame as the sensor has it, only scaled; NaN where missing."""
+    camera = dataclasses.replace(
+        sequence.camera, depth_offset_m=0.0, depth_distortion=NO_DEPTH_DISTORTION
+    )
     return 1.0 / read_depth(sequence.pairs.depth_files[index], camera).astype(float)
 
 

@@ -152,12 +152,13 @@ def inherited_calibration(options: RunOptions, sequence: Sequence) -> SelfCalibr
 
 
 def _calibration_of_map(options: RunOptions, source: Path, given: Camera) -> SelfCalibration:
-    """The camera that the run of a map has found, if it is the given one but for its times."""
+    """The camera that the run of a map has found, if only what runs adopt differs in it."""
     camera = read_map(source)[1]
-    times = {name: getattr(camera, name) for name in ("rolling_shutter_s", "depth_time_offset_s")}
+    found = ("rolling_shutter_s", "depth_time_offset_s", "depth_distortion")
+    times = {name: getattr(camera, name) for name in found}
     if options.camera is not None or replace(given, **times) != camera or camera == given:
         return SelfCalibration(given, given)
-    return SelfCalibration(given, camera, f"readout time and depth delay of {source}")
+    return SelfCalibration(given, camera, f"camera as found by {source}")
 
 
 def find_reference(path: Path | None, sequence: Sequence) -> Trajectory | None:

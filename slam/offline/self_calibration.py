@@ -1,12 +1,12 @@
 """Self-calibration in a run: what its first frames show of the camera, found and adopted.
 
-The run itself is the first stretch. After some frames the readout time of the rolling shutter and
-the delay of the depth images are estimated from its map (`calibration.rematching`). The focal
-lengths are estimated along with them but keep their values: those of a published calibration are
-better than what a short stretch shows, and an error of the depth scale, which images and depths
-alone do not show, would be taken for one of theirs. Whether a time is adopted is decided in
-`calibration.adoption`. If none is, the run goes on; else it begins anew, once, with the camera that
-was found.
+The run itself is the first stretch. After some frames the readout time of the rolling shutter, and
+the delay and the distortion of the depth images, are estimated from its map
+(`calibration.rematching`). The focal lengths are estimated along with them but keep their values:
+those of a published calibration are better than what a short stretch shows, and an error of the
+depth scale, which images and depths alone do not show, would be taken for one of theirs. Whether
+they are adopted is decided in `calibration.adoption`. If none is, the run goes on; else it begins
+anew, once, with the camera that was found.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bmask_slam.calibration.adoption import (
     SelfCalibration,
     SelfCalibrationConfig,
     camera_with,
-    format_times,
+    format_found,
     newly_sure,
 )
 from bmask_slam.calibration.rematching import estimate_again
@@ -36,7 +36,7 @@ from bmask_slam.system_interface import System
 logger = logging.getLogger(__name__)
 
 _Packed = tuple[list[tuple[Instance, PackedMask]], SurfaceClasses | None]
-UNOBSERVABLE = "readout and delay not observable in the motion"
+UNOBSERVABLE = "readout, delay and bend of depth not observable in the motion"
 
 
 class RememberingSegmenter:
@@ -134,7 +134,7 @@ class SelfCalibrator:
             logger.info("calibration: %s", error)
             return None
         if estimate is not None:
-            logger.info("calibration: %s", format_times(estimate, FREE, "estimated"))
+            logger.info("calibration: %s", format_found(estimate, FREE, "estimated"))
         return estimate
 
     def _judged(self, estimate: Estimate) -> SelfCalibration:
@@ -146,14 +146,14 @@ class SelfCalibrator:
         sure = newly_sure(estimate, FREE, config)
         if sure:
             verdict = "found and applied" if self._mode == "auto" else "found, not applied"
-            text = format_times(estimate, sure, verdict)
+            text = format_found(estimate, sure, verdict)
             if self._mode != "auto":
                 return replace(state, text=text, settled=True)
             camera = camera_with(state.given, estimate.found, sure)
             return replace(state, camera=camera, text=text, settled=True)
-        seen = [i for i in FREE if estimate.sigmas[i] < config.max_sigma_s]
+        seen = [i for i in FREE if estimate.shows(i, config)]
         differs = any(estimate.differs(i, config) for i in FREE)
         verdict = "not sure enough to be applied" if differs else "the camera keeps it"
-        text = format_times(estimate, seen, verdict) if seen else UNOBSERVABLE
+        text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
         settled = len(seen) == len(FREE) and not differs
         return replace(state, text=text, looks=state.looks + 1, settled=settled)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bmask_slam.graph.camera import MAX_SIDE_PX, Camera, DepthNoise
+from bmask_slam.graph.camera import MAX_SIDE_PX, NO_DEPTH_DISTORTION, Camera, DepthNoise
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import format_yaml, read_yaml
 from bmask_slam.graph.whole_file import whole_file
@@ -53,7 +53,9 @@ OPTIONAL = {
     "rolling_shutter": "rolling_shutter_s",
 }
 """Optional numbers by the name of Camera's attribute."""
-KEYS = (*REQUIRED, "distortion", "depth_noise", *OPTIONAL)
+KEYS = (*REQUIRED, "distortion", "depth_noise", "depth_distortion", *OPTIONAL)
+MAX_DEPTH_DISTORTION = 0.2
+"""In 1/m: an error of 20 cm at 1 m."""
 LIMITS = {"depth_offset": 1.0, "depth_time_offset": 1.0, "rolling_shutter": 1.0}
 """Largest magnitudes in metres and seconds: a larger value is in another unit."""
 NOISE_DISTANCES_M = np.linspace(0.3, 8.0, 78)
@@ -117,7 +119,7 @@ def given_camera(given: Path, own: Camera | None = None) -> Camera:
 
 
 def read_camera(path: Path) -> Camera:
-    """Read camera.yaml: the keys are REQUIRED, ``distortion``, ``depth_noise`` and OPTIONAL.
+    """Read camera.yaml; its keys are KEYS.
 
     Raises:
         InputError: naming the key, its value and the cure.
@@ -128,7 +130,7 @@ def read_camera(path: Path) -> Camera:
 def _read(path: Path) -> tuple[Camera, set[str]]:
     """The camera of a file, and the keys that the file has."""
     values = _values(path)
-    lists = ("distortion", "depth_noise")
+    lists = ("distortion", "depth_noise", "depth_distortion")
     numbers = {k: _number(path, k, v) for k, v in values.items() if k not in lists}
     _check_range(path, numbers)
     optional = {name: numbers[key] for key, name in OPTIONAL.items() if key in numbers}
@@ -138,6 +140,7 @@ def _read(path: Path) -> tuple[Camera, set[str]]:
         **{key: numbers[key] for key in ("fx", "fy", "cx", "cy", "depth_scale")},
         distortion=_distortion(path, values.get("distortion", [0, 0, 0, 0, 0])),
         depth_noise=_depth_noise(path, values["depth_noise"]) if "depth_noise" in values else None,
+        depth_distortion=_depth_distortion(path, values.get("depth_distortion", [0, 0, 0, 0, 0])),
         **optional,
     )
     return camera, set(values)
@@ -185,6 +188,8 @@ def format_camera(camera: Camera, comment: str = "") -> str:
     if camera.depth_noise is not None:
         *sigma, in_graph = astuple(camera.depth_noise)
         values["depth_noise"] = sigma if in_graph == 1 else [*sigma, in_graph]
+    if any(camera.depth_distortion):
+        values["depth_distortion"] = list(camera.depth_distortion)
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines.append(format_yaml(values).rstrip())
     return "\n".join(lines) + "\n"
@@ -226,6 +231,22 @@ def _distortion(path: Path, value: object) -> tuple[float, float, float, float, 
         raise InputError(f"{path}: distortion is {value!r}; write [k1, k2, p1, p2, k3]")
     k1, k2, p1, p2, k3 = [_number(path, "distortion", v) for v in [*value, 0][:5]]
     return k1, k2, p1, p2, k3
+
+
+def _depth_distortion(path: Path, value: object) -> tuple[float, float, float, float, float]:
+    """Coefficients [u, v, uu, uv, vv] in 1/m of an error that a depth sensor can have."""
+    if not isinstance(value, list) or len(value) != len(NO_DEPTH_DISTORTION):
+        raise InputError(
+            f"{path}: depth_distortion is {value!r}; write [u, v, uu, uv, vv] in 1/m, or leave it "
+            "out: bmask-slam calibrate RUN finds it"
+        )
+    u, v, uu, uv, vv = [_number(path, "depth_distortion", number) for number in value]
+    if max(map(abs, (u, v, uu, uv, vv))) > MAX_DEPTH_DISTORTION:
+        raise InputError(
+            f"{path}: depth_distortion is {value}, more than {MAX_DEPTH_DISTORTION:g} either way; "
+            "it is in 1/m, 0.01 is 1 cm at 1 m"
+        )
+    return u, v, uu, uv, vv
 
 
 def _depth_noise(path: Path, value: object) -> DepthNoise:

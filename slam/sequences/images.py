@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Floats, Image
-from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.camera import Camera, depth_distortion_terms
 from bmask_slam.graph.errors import InputError
 from bmask_slam.semantics.instances.image_files import decode_image, read_colour
 
@@ -51,15 +52,27 @@ def read_depth(path: Path, camera: Camera) -> Floats:
 
 
 def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
-    """Depth (H, W) in metres from stored values, integers or floats (paper eq. 9, and an offset).
+    """Depth (H, W) in metres from stored values, integers or floats.
 
-    NaN where they are 0, negative or not finite.
+    Paper eq. 9 and an offset, 1/z less the camera's ``depth_distortion``; NaN where the values are
+    0, negative or not finite.
     """
     depth_m = np.divide(stored, np.float32(camera.depth_scale), dtype=np.float32)
     if camera.depth_offset_m:
         depth_m += np.float32(camera.depth_offset_m)
+    if any(camera.depth_distortion):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            depth_m /= 1 - depth_m * _depth_distortion(camera)
     depth_m[~((stored > 0) & (depth_m > 0) & (depth_m < np.inf))] = np.nan
     return depth_m
+
+
+@lru_cache(2)
+def _depth_distortion(camera: Camera) -> Floats:
+    """What the sensor adds to the inverse depth of each pixel (H, W), in 1/m."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    terms = depth_distortion_terms(camera.image_places(np.stack([u, v], axis=-1)))
+    return (terms @ np.array(camera.depth_distortion)).astype(np.float32)
 
 
 def depth_between(near_m: Floats, other_m: Floats, share: float) -> Floats:

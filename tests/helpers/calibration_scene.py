@@ -9,13 +9,20 @@ from synthetic_room import make_room
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.model import CalibrationViews
 from bmask_slam.graph.calibration.problem import CalibrationProblem
+from bmask_slam.graph.camera import Camera, depth_distortion_terms
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, so3_exp, transform
 
 TRUTH = np.array(
-    [525.0, 520.0, 318.5, 241.5, 0.05, -0.08, 0.001, -0.002, 0.0, 0.97, 0.012, 0.010, 0.0]
+    [
+        *(525.0, 520.0, 318.5, 241.5, 0.05, -0.08, 0.001, -0.002, 0.0, 0.97, 0.012, 0.010, 0.0),
+        *(0.004, -0.006, 0.010, 0.014, -0.005),
+    ]
 )
-PRIORS = np.array([30.0, 30, 10, 10, 0.2, 0.4, 0.01, 0.01, 0.0, 0.05, 0.05, 0.02, 0.02])
+PRIORS = np.array(
+    [30.0, 30, 10, 10, 0.2, 0.4, 0.01, 0.01, 0.0, 0.05, 0.05, 0.02, 0.02, *(0.02,) * 5]
+)
 SIZE = (640, 480)
+PLACES = Camera(*SIZE, 525.0, 520.0, 318.5, 241.5).image_places
 
 
 def project(points: Array, truth: Array) -> Array:
@@ -37,7 +44,9 @@ def rays_of(pixels: Array, truth: Array) -> Array:
 def inverse_depth_of(pixels: Array, n: Array, d: Array, truth: Array) -> Array:
     """The depth image's 1 / raw (M,) at raw pixels of planes n . p = d, n (M, 3)."""
     z = d / (n * rays_of(pixels, truth)).sum(axis=1)
-    return truth[9] / (z - truth[10])
+    z_sensor = 1 / (1 / z + depth_distortion_terms(PLACES(pixels)) @ truth[13:])
+    inverse_depth: Array = truth[9] / (z_sensor - truth[10])
+    return inverse_depth
 
 
 def rolled(points: Array, pixels: Array, twists: Array, truth: Array) -> tuple[Array, Array, Array]:
@@ -59,7 +68,7 @@ def make_problem(
     keyframes: int = 14,
     points: int = 150,
 ) -> tuple[CalibrationProblem, Array, Array]:
-    """A problem that starts at ``start`` (13,), and its true poses and points.
+    """A problem that starts at ``start`` (18,), and its true poses and points.
 
     ``noise`` is a factor on sigmas of 0.3 px and 0.002 / m, which the problem states. Poses and
     points start a little beside the truth, the first pose at it.
@@ -106,6 +115,7 @@ def make_problem(
         keyframes=k,
         landmarks=point_ids,
         pixels=pixels,
+        places=PLACES(pixels),
         inverse_depth=w[1] + noise * 0.002 * rng.standard_normal(len(k)),
         inverse_depth_rate=15 * (w[2] - w[0]),
         lag_s=np.zeros(len(k)),

@@ -14,11 +14,11 @@ import numpy as np
 
 from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.calibration.adoption import (
-    FREE,
+    TIMES,
     CalibrationRounds,
     SelfCalibrationConfig,
     estimate_times,
-    format_times,
+    format_found,
 )
 from bmask_slam.calibration.calibrate import MAX_KEYFRAMES
 from bmask_slam.calibration.keyframe_depth import (
@@ -92,7 +92,7 @@ class CalibrationServer:
         self._given = parameters_of(setup.camera, setup.camera.depth_scale)
 
     def _new_rounds(self) -> CalibrationRounds:
-        free = FREE if self._setup.interpolates else (SHUTTER,)
+        free = TIMES if self._setup.interpolates else (SHUTTER,)
         return CalibrationRounds(self._setup.camera, self._setup.config, free)
 
     def add(self, images: KeyframeImages) -> None:
@@ -112,18 +112,18 @@ class CalibrationServer:
         except InputError as error:
             logger.info("calibration: %s", error)
             return TimesEstimated(None, {}, "", False)
-        text = format_times(estimate, FREE, "estimated")
+        text = format_found(estimate, TIMES, "estimated")
         logger.info("calibration: %d keyframes: %s", len(np.unique(seen.keyframe_ids)), text)
         if not self._begun and not self._rounds.shows(estimate):
             return TimesEstimated(None, {}, "not observable in the motion so far", False)
         camera = self._rounds.add(estimate)
         result, done = self._rounds.result(), camera is None
-        used = [i for i in FREE if estimate.before[i] != self._given[i]]
+        used = [i for i in TIMES if estimate.before[i] != self._given[i]]
         if self._begun and done and result.adopted and estimate.settled(used):
             return TimesEstimated(None, {}, "", True)  # what is in use was found again
         if camera is None and not self._begun:
             self._rounds = self._new_rounds()
-            differs = any(estimate.differs(i, self._setup.config) for i in FREE)
+            differs = any(estimate.differs(i, self._setup.config) for i in TIMES)
             return TimesEstimated(None, {}, result.text, done=not differs)
         self._begun = True
         camera = camera or result.camera

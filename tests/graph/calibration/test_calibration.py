@@ -12,7 +12,15 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.calibration.calibration import calibrate
 from bmask_slam.graph.calibration.covariance import _clustered_variance
 from bmask_slam.graph.calibration.equations import normal_equations
-from bmask_slam.graph.calibration.model import FACTOR, OFFSET, PARAMETERS, SHUTTER, TIME, linearise
+from bmask_slam.graph.calibration.model import (
+    BEND,
+    FACTOR,
+    OFFSET,
+    PARAMETERS,
+    SHUTTER,
+    TIME,
+    linearise,
+)
 from bmask_slam.graph.calibration.problem import (
     Anchors,
     CalibrationProblem,
@@ -22,7 +30,7 @@ from bmask_slam.graph.calibration.problem import (
 from bmask_slam.graph.geometry import se3_exp
 
 START = TRUTH + np.array(
-    [15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010, 0.005]
+    [15, -12, 6, -6, -0.05, 0.08, -0.001, 0.002, 0, 0.03, -0.012, -0.010, 0.005, *-TRUTH[13:]]
 )
 FREE_GAUGE = np.array([1.0] * 3 + [10.0] * 3)
 
@@ -40,7 +48,7 @@ def test_model_fits_exact_views() -> None:
     assert len(residuals) > 500
     assert np.abs(residuals[:, :2]).max() < 1e-6
     assert np.abs(residuals[:, 2]).max() < 0.05  # second order in the 10 ms, a twentieth of sigma
-    on_time = np.where(np.arange(13) == TIME, 0.0, TRUTH)
+    on_time = np.where(np.arange(18) == TIME, 0.0, TRUTH)
     assert np.abs(linearise(problem.views, poses, points, on_time).residuals[:, 2]).max() > 1
 
 
@@ -57,13 +65,13 @@ def test_derivatives_equal_finite_differences() -> None:
     for derivative, sizes in (
         ("pose", (6, 0, 0)),
         ("point", (0, 3, 0)),
-        ("calibration", (0, 0, 13)),
+        ("calibration", (0, 0, 18)),
     ):
         for i in range(sum(sizes)):
             step = h * (PRIORS[i] or 1.0) if derivative == "calibration" else h
             one = [
                 np.eye(n)[i] * step if n else np.zeros(k)
-                for n, k in zip(sizes, (6, 3, 13), strict=True)
+                for n, k in zip(sizes, (6, 3, 18), strict=True)
             ]
             two = residuals(*one) - residuals(*(-x for x in one))
             got = getattr(at, derivative)[..., i]
@@ -80,10 +88,11 @@ def test_all_parameters_are_found_with_an_anchor() -> None:
     assert (error[:4] < 0.02).all(), error
     assert (error[4:9] < [3e-4, 6e-4, 2e-5, 2e-5, 1e-9]).all(), error
     assert error[FACTOR] < 3e-4 and error[OFFSET] < 3e-4 and error[TIME] < 1e-4
+    assert (error[BEND] < 1e-4).all(), error
 
 
 def test_a_rolling_shutter_is_found_with_its_sign() -> None:
-    rolling = np.where(np.arange(13) == SHUTTER, 0.020, TRUTH)
+    rolling = np.where(np.arange(18) == SHUTTER, 0.020, TRUTH)
     problem, poses, points = make_problem(truth=rolling, start=START)
     residuals = linearise(problem.views, poses, points, rolling).residuals
     assert np.abs(residuals).max() < 0.15  # of second order in the 10 ms from the middle
@@ -101,7 +110,7 @@ def test_without_an_anchor_only_the_scale_stays_at_its_prior() -> None:
     result = calibrate(problem)
     sigma = np.sqrt(np.diag(result.covariance))
     assert sigma[FACTOR] > 0.9 * PRIORS[FACTOR]
-    others = (PRIORS > 0) & (np.arange(13) != FACTOR)
+    others = (PRIORS > 0) & (np.arange(18) != FACTOR)
     assert (sigma[others] < 0.2 * PRIORS[others]).all()
     # A world 3 % too large, with its depths, fits as well: only offset / factor is told.
     assert result.calibration[FACTOR] == pytest.approx(START[FACTOR], abs=0.01)
@@ -209,7 +218,7 @@ def test_sigmas_agree_with_the_errors() -> None:
     for seed in range(10):
         problem, poses, _ = make_problem(seed=seed, noise=1.0, keyframes=10, points=90)
         rng = np.random.default_rng(100 + seed)
-        start = TRUTH + PRIORS * rng.standard_normal(13)
+        start = TRUTH + PRIORS * rng.standard_normal(18)
         problem = dataclasses.replace(anchored(problem, poses, 0.01), calibration=start)
         result = calibrate(problem)
         error = (result.calibration - TRUTH)[free]
@@ -235,7 +244,7 @@ def test_errors_correlated_along_the_path_widen_the_bounds() -> None:
         result = calibrate(problem)
         state = CalibrationState(result.poses_world_camera, result.points_world, result.calibration)
         S = normal_equations(problem, state, result.noise_scales, 0.0).S
-        independent = np.sqrt(np.diag(np.linalg.inv(S))[-13:-11])
+        independent = np.sqrt(np.diag(np.linalg.inv(S))[-18:-16])
         return np.sqrt(np.diag(result.covariance)[:2]) / independent
 
     assert (ratio(0.0) < 1.5).all()
@@ -243,7 +252,7 @@ def test_errors_correlated_along_the_path_widen_the_bounds() -> None:
 
 
 def test_clustered_variances_are_sums_of_squares_raised_to_students_bound() -> None:
-    scores = np.random.default_rng(0).standard_normal((40, 13))
+    scores = np.random.default_rng(0).standard_normal((40, 18))
     clusters = np.repeat(np.arange(5), 8)
     total = sum(scores[clusters == c].sum(axis=0) ** 2 for c in range(5))
     bound = 2.776445 / 1.959964  # Student's t, 4 degrees of freedom

@@ -10,8 +10,8 @@ from calibration_scene import PRIORS, TRUTH, make_problem
 from bmask_slam.graph.calibration.cross_validation import cross_validate
 from bmask_slam.graph.calibration.model import OFFSET, SHUTTER, TIME
 
-TIMES_ONLY = np.where(np.isin(np.arange(13), (TIME, SHUTTER)), PRIORS, 0.0)
-ROLLING = np.where(np.arange(13) == SHUTTER, 0.020, TRUTH)
+TIMES_ONLY = np.where(np.isin(np.arange(18), (TIME, SHUTTER)), PRIORS, 0.0)
+ROLLING = np.where(np.arange(18) == SHUTTER, 0.020, TRUTH)
 
 
 def _problem(truth, start, keyframes=20):
@@ -20,7 +20,7 @@ def _problem(truth, start, keyframes=20):
 
 
 def test_both_halves_confirm_a_rolling_shutter() -> None:
-    found = cross_validate(_problem(ROLLING, np.where(np.arange(13) == SHUTTER, 0.0, ROLLING)))
+    found = cross_validate(_problem(ROLLING, np.where(np.arange(18) == SHUTTER, 0.0, ROLLING)))
     assert found is not None
     error = found.calibrations - ROLLING
     assert (np.abs(error)[:, SHUTTER] < 4 * found.sigmas[:, SHUTTER]).all()
@@ -38,7 +38,7 @@ def test_a_correct_camera_is_not_improved() -> None:
 
 def test_a_delay_is_confirmed_although_it_hides_in_the_noise_of_depth() -> None:
     """With the wrong delay the noise that depths seem to have is larger."""
-    on_time = np.where(np.arange(13) == TIME, TRUTH[TIME] - 0.004, TRUTH)
+    on_time = np.where(np.arange(18) == TIME, TRUTH[TIME] - 0.004, TRUTH)
     found = cross_validate(_problem(TRUTH, on_time))
     assert found is not None
     error = np.abs(found.calibrations - TRUTH)[:, TIME]
@@ -49,9 +49,9 @@ def test_a_delay_is_confirmed_although_it_hides_in_the_noise_of_depth() -> None:
 
 def test_what_is_fitted_along_is_no_gain() -> None:
     """Focal lengths 2 % off, the times right: only the focal lengths are to be changed."""
-    off = np.where(np.arange(13) < 2, 1.02 * ROLLING, ROLLING)
+    off = np.where(np.arange(18) < 2, 1.02 * ROLLING, ROLLING)
     problem, _, _ = make_problem(truth=ROLLING, start=off, noise=1.0, keyframes=20)
-    along = np.where(np.arange(13) < 2, 0.02 * ROLLING, TIMES_ONLY)
+    along = np.where(np.arange(18) < 2, 0.02 * ROLLING, TIMES_ONLY)
     problem = dataclasses.replace(problem, prior_sigmas=along)
     whole, times = cross_validate(problem), cross_validate(problem, (TIME, SHUTTER))
     assert whole is not None and times is not None

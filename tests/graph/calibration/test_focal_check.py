@@ -10,7 +10,7 @@ from calibration_scene import TRUTH, make_problem
 
 from bmask_slam.graph.calibration.focal_check import FocalCheck, check_focal
 
-EXACT = np.where(np.isin(np.arange(13), (10, 11)), 0.0, TRUTH)
+EXACT = np.where(np.isin(np.arange(18), (10, 11)), 0.0, TRUTH)
 """Without offset and delay, which the check does not estimate."""
 
 

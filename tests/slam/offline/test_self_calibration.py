@@ -11,16 +11,20 @@ import numpy as np
 import pytest
 
 from bmask_slam.calibration.adoption import (
+    BENDS,
+    FREE,
     Estimate,
     SelfCalibration,
     SelfCalibrationConfig,
+    camera_with,
+    format_found,
     next_start,
 )
-from bmask_slam.calibration.report import parameter_named
+from bmask_slam.calibration.report import parameters_named
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.calibration.cross_validation import CrossValidation
-from bmask_slam.graph.calibration.model import PARAMETERS, SHUTTER, TIME
+from bmask_slam.graph.calibration.model import BEND, PARAMETERS, SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline import checkpoint, runner
@@ -125,11 +129,11 @@ def test_report_and_off_change_nothing(late_sweep: Path, tmp_path: Path) -> None
 def test_only_observable_parameters_are_changed(
     change_ms: float, sigma_ms: float, differs: bool
 ) -> None:
-    found = np.where(np.arange(13) == TIME, 1e-3 * change_ms, 0.0)
+    found = np.where(np.arange(18) == TIME, 1e-3 * change_ms, 0.0)
     estimate = Estimate(
-        np.zeros(13),
+        np.zeros(18),
         found,
-        np.full(13, 1e-3 * sigma_ms),
+        np.full(18, 1e-3 * sigma_ms),
         None,  # type: ignore[arg-type]
     )
     config = SelfCalibrationConfig()
@@ -145,17 +149,53 @@ def test_both_halves_have_to_find_what_is_adopted(
     halves_ms: tuple[float, float], agrees: bool
 ) -> None:
     """Of -20 +- 1 ms found for a camera without delay, halves with sigmas of 1 ms."""
-    found = np.where(np.arange(13) == TIME, -0.020, 0.0)
+    found = np.where(np.arange(18) == TIME, -0.020, 0.0)
     estimate = Estimate(
-        np.zeros(13),
+        np.zeros(18),
         found,
-        np.full(13, 0.001),
+        np.full(18, 0.001),
         None,  # type: ignore[arg-type]
     )
-    calibrations = np.zeros((2, 13))
+    calibrations = np.zeros((2, 18))
     calibrations[:, TIME] = 1e-3 * np.array(halves_ms)
-    halves = CrossValidation(calibrations, np.full((2, 13), 0.001), np.zeros(4))
+    halves = CrossValidation(calibrations, np.full((2, 18), 0.001), np.zeros(4))
     assert estimate.agrees(TIME, halves, SelfCalibrationConfig()) is agrees
+
+
+@pytest.mark.parametrize(
+    ("halves", "agrees"),
+    [((0.012, 0.018), True), ((0.006, 0.015), False), ((0.015, -0.015), False)],
+)
+def test_a_bend_of_depth_is_compared_over_the_image(
+    halves: tuple[float, float], agrees: bool
+) -> None:
+    """Of 0.015 / m in xx found for a camera without, by halves of which one has it in yy."""
+    xx, yy = BENDS[2], BENDS[4]
+    before, found = np.zeros(18), np.zeros(18)
+    found[xx] = 0.015
+    estimate = Estimate(before, found, np.full(18, 0.0005), None)  # type: ignore[arg-type]
+    config = SelfCalibrationConfig()
+    assert estimate.differs(xx, config) and not estimate.differs(yy, config)
+    calibrations = np.zeros((2, 18))
+    calibrations[:, xx] = halves
+    sides = CrossValidation(calibrations, np.full((2, 18), 0.0005), np.zeros(4))
+    assert estimate.agrees(xx, sides, config) is agrees
+    assert "depth bent by up to 15 ± 2 mm at 1 m: said" in format_found(estimate, FREE, "said")
+
+
+def test_an_unsure_bend_is_not_observable() -> None:
+    """Coefficients may be less sure than the surface that they make together, but not much."""
+    found = np.where(np.isin(np.arange(18), BENDS), 0.05, 0.0)
+    for sigma, shows in ((0.003, True), (0.006, False)):
+        estimate = Estimate(np.zeros(18), found, np.full(18, sigma), None)  # type: ignore[arg-type]
+        assert estimate.shows(BENDS[0], SelfCalibrationConfig()) is shows
+
+
+def test_a_camera_takes_over_the_whole_bend() -> None:
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, rolling_shutter_s=0.01)
+    values = np.arange(18) / 1000.0
+    adopted = camera_with(camera, values, list(BENDS))
+    assert adopted == replace(camera, depth_distortion=(0.013, 0.014, 0.015, 0.016, 0.017))
 
 
 @pytest.mark.parametrize(
@@ -207,14 +247,20 @@ def test_masks_are_kept_while_the_run_may_begin_anew() -> None:
         ("Time offset ms", "time_offset_s"),
         ("depth_time_offset", "time_offset_s"),
         ("focal", None),
+        ("depth_uv", "depth_uv"),
+        ("depth bend uv", "depth_uv"),
     ],
 )
 def test_parameters_have_the_names_of_table_and_file(name: str, parameter: str | None) -> None:
-    assert parameter_named(name) == parameter
+    assert parameters_named(name) == ([parameter] if parameter else [])
+
+
+def test_the_distortion_of_depth_is_named_as_a_whole() -> None:
+    assert parameters_named("depth_distortion") == list(PARAMETERS[BEND])
 
 
 def test_every_parameter_has_its_own_name() -> None:
-    assert [parameter_named(name) for name in PARAMETERS] == list(PARAMETERS)
+    assert [parameters_named(name) for name in PARAMETERS] == [[name] for name in PARAMETERS]
 
 
 def test_a_found_camera_is_adopted() -> None:
@@ -229,9 +275,9 @@ def test_two_rounds_are_extrapolated() -> None:
     truth, share = 0.026, 0.4
 
     def estimate(start: float) -> Estimate:
-        before, found = np.zeros(13), np.zeros(13)
+        before, found = np.zeros(18), np.zeros(18)
         before[SHUTTER], found[SHUTTER] = start, truth + share * (start - truth)
-        return Estimate(before, found, np.full(13, 1e-4), None)  # type: ignore[arg-type]
+        return Estimate(before, found, np.full(18, 1e-4), None)  # type: ignore[arg-type]
 
     first = estimate(0.0)
     second = estimate(next_start([first])[SHUTTER])

@@ -86,6 +86,9 @@ def test_the_example_in_the_messages_is_valid(tmp_path):
             {"depth_noise": "[0, 0, 0.002, 0.5]"},
             "factor in the graph, 0.5, must be from 1",
         ),
+        ({"depth_distortion": "[0.01, 0]"}, r"depth_distortion is \[0.01, 0\]; write \[u, v, uu"),
+        ({"depth_distortion": "[0, 0, 15, 0, 0]"}, "more than 0.2 either way; it is in 1/m"),
+        ({"depth_distortion": "[0, 0, x, 0, 0]"}, "depth_distortion is 'x'; it must be a number"),
         ({"depth_noise": "0.002"}, r"depth_noise is 0.002; write \[a, b, c\]"),
         ({"depth_noise": "[0.1, x, 0]"}, "depth_noise is 'x'"),
         ({"focal": "500"}, "unknown key 'focal'; the keys are width"),
@@ -218,7 +221,8 @@ def test_a_camera_is_read_as_it_was_written(tmp_path):
         640, 480, 527.5, 528.5, 321.5, 237.5, depth_noise=DepthNoise(0.001, -1e-4, 2e-3)
     )
     in_graph = replace(camera, depth_noise=DepthNoise(c_per_m=0.002, in_graph=2.0))
-    for written in (camera, in_graph, replace(camera, depth_noise=None)):
+    bent = replace(camera, depth_distortion=(0.001, -0.002, 0.0105, 0.02, -0.004))
+    for written in (camera, in_graph, bent, replace(camera, depth_noise=None)):
         write_file(tmp_path / "camera.yaml", written)
         assert read_camera(tmp_path / "camera.yaml") == written
 

@@ -1,10 +1,31 @@
-"""Depth between two depth images."""
+"""Depth from stored values, and between two depth images."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from bmask_slam.sequences.images import depth_between
+from bmask_slam.graph.camera import Camera
+from bmask_slam.sequences.images import depth_between, depth_in_metres
+
+
+def test_the_distortion_of_depth_is_taken_from_the_inverse_depth() -> None:
+    """At the right edge x = 1 - 1/640 and y = 0 but for half a pixel."""
+    camera = Camera(
+        640, 480, 525.0, 525.0, 319.5, 239.5, depth_scale=1000.0, depth_offset_m=0.5,
+        depth_distortion=(0.02, 0.5, 0.03, 0.0, 0.0),
+    )  # fmt: skip
+    stored = np.full((480, 640), 1500, np.uint16)
+    stored[0, 0] = 0
+    depth_m = depth_in_metres(stored, camera)
+    x, y = 639 / 640, 1 / 640
+    expected_m = 1 / (1 / 2.0 - (0.02 * x + 0.5 * y + 0.03 * x * x))
+    assert depth_m.dtype == np.float32
+    np.testing.assert_allclose(depth_m[240, 639], expected_m, rtol=1e-6)
+    assert np.isnan(depth_m[0, 0])
+    far = replace(camera, depth_distortion=(0.0, 0.0, 0.6, 0.0, 0.0))  # behind infinity
+    assert np.isnan(depth_in_metres(stored, far)[240, 639])
 
 
 def test_a_plane_that_moves_is_between_its_depths() -> None:
