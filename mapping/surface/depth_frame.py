@@ -20,6 +20,9 @@ MIN_SIGMA_M = 0.01
 """Error of a distance beside that of its own pixel: of the pose and of the sensor's calibration."""
 BEHIND_SIGMAS, BEHIND_VOXELS = 3.0, (3, 8)
 SILHOUETTE_PX = 3
+"""Silhouettes of depth are not exact to a pixel."""
+PAINT_PX, FAINT = 8, 0.01
+"""Colours so near to a rim or hole, which may be those of what is in front, hardly count."""
 UNEXPLAINED = 0.25
 """How much a frame counts as a witness of a surface that the keyframes did not see."""
 NX, NY, NZ, OFFSET, WEIGHT, Z, BEHIND, WITNESS = range(8)
@@ -36,13 +39,13 @@ class DepthFrame:
             1/cm^2, 0 where the pixel tells nothing; Z: depth in metres, 0 without weight; BEHIND:
             how far behind the surface distances still count, in metres; WITNESS: see UNEXPLAINED.
         free_m: (H W,) float32, depth up to which all rays around the pixel are free; 0: not known.
-        rgb: (H W, 3) float32, 0 to 255.
+        paint: (H W, 4) float32, colours from 0 to 255 and the weight that they have.
         T_world_camera: (4, 4).
     """
 
     pixels: Tensor
     free_m: Tensor
-    rgb: Tensor
+    paint: Tensor
     T_world_camera: Array
 
 
@@ -76,14 +79,17 @@ def depth_frame(
         pixels[..., column] = values
     pixels[~good] = 0
     pixels = pixels.reshape(-1, 8)
-    colours = torch.from_numpy(rgb).reshape(-1, 3).to(torch.float32)
-    return DepthFrame(pixels, _free_depth(pixels[:, Z].reshape(z.shape)), colours, T_world_camera)
+    paint = torch.empty((len(pixels), 4))
+    paint[:, :3] = torch.from_numpy(rgb).reshape(-1, 3)
+    paint[:, 3] = torch.where(_least_around(pixels[:, Z], z.shape, PAINT_PX) > 0, 1, FAINT)
+    free_m = _least_around(pixels[:, Z], z.shape, SILHOUETTE_PX)
+    return DepthFrame(pixels, free_m, paint, T_world_camera)
 
 
-def _free_depth(z: Tensor) -> Tensor:
-    """The least depth (H W,) around each pixel of (H, W): silhouettes are not exact to a pixel."""
-    around = np.ones((2 * SILHOUETTE_PX + 1,) * 2, np.uint8)
-    return torch.from_numpy(cv2.erode(z.numpy(), around)).reshape(-1)
+def _least_around(values: Tensor, shape: torch.Size, radius: int) -> Tensor:
+    """The least value (H W,) in the square around each pixel of an image of this shape."""
+    square = np.ones((2 * radius + 1,) * 2, np.uint8)
+    return torch.from_numpy(cv2.erode(values.reshape(shape).numpy(), square)).reshape(-1)
 
 
 def mark_unexplained(frame: DepthFrame, unexplained: Mask) -> None:

@@ -134,7 +134,7 @@ def _blocks_with_halo(
         shape = (len(some), *(EDGE + 1,) * 3)
         unknown = np.full(shape, np.nan, np.float32)
         weight, witnesses = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        cells = _Cells(some, unknown, weight, witnesses, np.zeros((*shape, 3), np.float32))
+        cells = _Cells(some, unknown, weight, witnesses, np.zeros((*shape, 4), np.float32))
         for corner in CORNERS:
             wanted = block_keys(torch.from_numpy(some + corner)).numpy()
             at = np.searchsorted(keys, wanted).clip(max=len(keys) - 1)
@@ -191,9 +191,10 @@ def _vertices(cells: _Cells, voxel_m: float) -> tuple[NDArray, ...]:
     weight, witnesses = (
         np.stack([table[a] for a in at], axis=1) for table in (cells.weight, cells.witnesses)
     )
-    painted = share * weight * (witnesses > 0)
+    paint = np.stack([cells.colour[a] for a in at], axis=1)
+    painted = share * paint[..., 3]
     painted /= np.maximum(painted.sum(axis=1, keepdims=True), 1e-12)
-    colours = sum(painted[:, m, None] * cells.colour[a] for m, a in enumerate(at))
+    colours = (painted[..., None] * paint[..., :3]).sum(axis=1)
     inside = d < 0
     crossings = inside[:, (4, 2, 1)].astype(np.int8) - inside[:, :1].astype(np.int8)
     return (

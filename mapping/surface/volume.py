@@ -49,7 +49,7 @@ class SurfaceVolume:
         distance: (8 B, 64) float32, metres, positive in front of the surface.
         weight: (8 B, 64) float32, sum of 1 / sigma^2 in 1/cm^2; 0 where unknown.
         witnesses, free: (8 B, 64) float16, frames that saw a surface at the voxel, and through it.
-        colour: (8 B, 64, 3) float16, 0 to 255.
+        colour: (8 B, 64, 4) float16, 0 to 255, and the sum of its weights.
     """
 
     def __init__(self, voxel_m: float, camera: Camera, blocks: int = 1024) -> None:
@@ -60,7 +60,7 @@ class SurfaceVolume:
         size, half = (blocks * BRICKS, BRICK_VOXELS), torch.float16
         self.distance, self.weight = torch.zeros(size), torch.zeros(size)
         self.witnesses, self.free = torch.zeros(size, dtype=half), torch.zeros(size, dtype=half)
-        self.colour = torch.zeros((*size, 3), dtype=half)
+        self.colour = torch.zeros((*size, 4), dtype=half)
         self._voxels = _lattice(BRICK, 1) * voxel_m
         self._bricks = _lattice(EDGE, BRICK) * voxel_m
 
@@ -169,18 +169,24 @@ class SurfaceVolume:
         used = torch.nonzero(measured)[:, 0]
         voxels, d = first.reshape(-1).index_select(0, used), d.index_select(0, used)
         weight, behind = (planes[:, k].index_select(0, used) for k in (WEIGHT, BEHIND))
-        share = self._average(voxels, d.clamp_(max=front), weight, behind)
+        self._average(voxels, d.clamp_(max=front), weight, behind)
         near = torch.nonzero(d.abs() < COLOUR_VOXELS * self.voxel_m)[:, 0]
-        used, voxels, share = (a.index_select(0, near) for a in (used, voxels, share))
+        used, voxels, weight = (a.index_select(0, near) for a in (used, voxels, weight))
         _add(self.witnesses, voxels, planes[:, WITNESS].index_select(0, used).to(torch.float16))
-        colour = self.colour.view(-1, 3)
-        old = colour.index_select(0, voxels).to(torch.float32)
-        seen = frame.rgb.index_select(0, pixel.index_select(0, used))
-        colour.index_copy_(0, voxels, old.add_(share[:, None] * (seen - old)).to(torch.float16))
+        self._paint(voxels, frame.paint.index_select(0, pixel.index_select(0, used)), weight)
 
-    def _average(self, voxels: Tensor, d: Tensor, added: Tensor, behind: Tensor) -> Tensor:
-        """Add distances (N,) with weights (N,) to the means of voxels (N,), all different ones;
-        returns the share (N,) of each in its mean.
+    def _paint(self, voxels: Tensor, paint: Tensor, weight: Tensor) -> None:
+        """Add colours (N, 4) with weights (N,) to the means of voxels (N,), all different ones."""
+        colour = self.colour.view(-1, 4)
+        old = colour.index_select(0, voxels).to(torch.float32)
+        added = weight * paint[:, 3]
+        total = old[:, 3] + added
+        new = old + (added / total)[:, None] * (paint - old)
+        new[:, 3] = total
+        colour.index_copy_(0, voxels, new.to(torch.float16))
+
+    def _average(self, voxels: Tensor, d: Tensor, added: Tensor, behind: Tensor) -> None:
+        """Add distances (N,) with weights (N,) to the means of voxels (N,), all different ones.
 
         Up to a voxel behind the surface they count fully, then less and less: what is behind a thin
         wall is its other side.
@@ -189,11 +195,9 @@ class SurfaceVolume:
         weight, distance = self.weight.view(-1), self.distance.view(-1)
         added = added * fall
         total = weight.index_select(0, voxels) + added
-        share = added / total
         old = distance.index_select(0, voxels)
-        distance.index_copy_(0, voxels, old + share * (d - old))
+        distance.index_copy_(0, voxels, old + added / total * (d - old))
         weight.index_copy_(0, voxels, total)
-        return share
 
 
 def _add(table: Tensor, rows: Tensor, values: Tensor | int) -> None:
