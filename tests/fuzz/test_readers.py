@@ -52,7 +52,6 @@ ELSEWHERE = {
     "slam/runtime/machine.py": "/proc",
     "slam/runtime/memory.py": "/proc",
     "slam/comparison/report/report.py": "the project's own style",
-    "mapping/products/cloud.py": "temporary files of its own",
 }
 """Modules that read without graph/files, and what."""
 
