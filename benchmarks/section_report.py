@@ -160,6 +160,15 @@ REPORTS = {
             "dense_office.jpg": "A rendered office: cloud and labels",
         },
     }),
+    "dense": Report(RESULTS / "dense.md", "Results: the surface beside Open3D's", {
+        "rooms": (
+            "Real rooms, and a rendered one",
+            "mapping.surface_compare {sequences}/dense/kitchen-run {sequences}/dense/bonn-run "
+            "{sequences}/dense/office-run=true",
+        ),
+        "reading": ("What the figures say", ""),
+        "goals": ("Goals reached and missed", ""),
+    }, markdown=frozenset({"rooms"})),
     "real-cameras": Report(RESULTS / "real-cameras.md", "Results: real cameras", {
         "table": ("Real sequences", "cameras.real_sequences --work {sequences}"),
         "reading": ("What the figures say", ""),

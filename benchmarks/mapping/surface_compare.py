@@ -44,6 +44,7 @@ from bmask_slam.graph.geometry import inverse, transform
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.mapping.products.submaps import surest_per_voxel
 from bmask_slam.mapping.products.surface_labels import dilate
+from bmask_slam.runtime.memory import peak_rss_mb
 
 TRUNCATION_VOXELS, MIN_FRAMES = 8.0, 3.0
 PATCHES, PATCH_M, FLAT = 400, 0.1, (0.002, 0.004)
@@ -105,7 +106,7 @@ def _measured(method: str, run: Path, out: Path, send: Any) -> None:
     METHODS[method](run, out)
     used = resource.getrusage(resource.RUSAGE_SELF)
     processor_s = used.ru_utime + used.ru_stime
-    send.send((time.perf_counter() - started_s, processor_s, used.ru_maxrss / 1e3))
+    send.send((time.perf_counter() - started_s, processor_s, peak_rss_mb()))
 
 
 def run_method(method: str, run: Path, out: Path) -> dict[str, float]:
