@@ -214,6 +214,8 @@ class DenseFolder:
                 f"{path}: regions of {arrays['stuff'].shape[1]} classes, but {len(names)} names; "
                 "remove it and map again"
             )
+        if arrays["pixels"].max(initial=0) >= len(arrays["log_likelihoods"]) + len(arrays["stuff"]):
+            raise InputError(f"{path}: a pixel of an instance that is not there; map again")
         return InstanceEvidence(**arrays, stuff_names=tuple(names))
 
     def fused(self, keyframe_id: int) -> InverseDepthMap:

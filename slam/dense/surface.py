@@ -98,8 +98,14 @@ def frames_a_keyframe(fused: FusedMap) -> float:
 
 
 def _keyframe(fused: FusedMap, keyframe: Keyframe) -> DepthFrame:
-    depth, rgb = fused.folder.fused(keyframe.id), fused.folder.colours(keyframe.id)
-    camera, voxel_m = fused.run.camera, fused.options.voxel_m
+    folder, camera, voxel_m = fused.folder, fused.run.camera, fused.options.voxel_m
+    depth, rgb = folder.fused(keyframe.id), folder.colours(keyframe.id)
+    pixels = folder.evidence(keyframe.id).pixels
+    if {depth.rho.shape, rgb.shape[:2], pixels.shape} != {(camera.height, camera.width)}:
+        raise InputError(
+            f"{folder.path}: the images of keyframe {keyframe.id} are not of the camera's size; "
+            "remove the folder and map again"
+        )
     return depth_frame(depth, rgb, keyframe.T_world_camera, camera, voxel_m)
 
 

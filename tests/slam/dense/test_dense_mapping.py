@@ -307,3 +307,16 @@ def test_regions_without_names_for_their_classes_are_refused(
     write_arrays(folder.path / "labels" / "000007", LABEL_FILE, {"stuff": names}, arrays)
     with pytest.raises(InputError, match=r"labels/000007: regions of . classes, but . names"):
         folder.evidence(7)
+
+
+def test_a_pixel_of_an_instance_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    folder = DenseFolder(tmp_path, {})
+    arrays = {
+        "log_likelihoods": np.zeros((2, 3), np.float32),
+        "landmark_ids": np.zeros(0, np.int64),
+        "landmark_instances": np.zeros(0, np.uint16),
+        "pixels": np.full((4, 5), 2, np.uint16),
+    }
+    write_arrays(folder.path / "labels" / "000007", LABEL_FILE, {}, arrays)
+    with pytest.raises(InputError, match="labels/000007: a pixel of an instance"):
+        folder.evidence(7)
