@@ -116,11 +116,16 @@ class InstanceTracks:
 
     def predicted(self, track: Track, time_s: float) -> Track:
         """A track at another time, by constant velocity; ``time_s`` stays that of its sighting."""
+        from filterpy.common import Q_discrete_white_noise  # noqa: PLC0415 - loads slowly
+        from filterpy.kalman import predict  # noqa: PLC0415
+
         dt = time_s - track.time_s
         F = np.eye(6)
         F[:3, 3:] = dt * np.eye(3)
-        P = F @ track.covariance @ F.T + self._process_noise(abs(dt))
-        return replace(track, mean=F @ track.mean, covariance=P)
+        variance = self.config.acceleration_m_s2**2
+        Q = Q_discrete_white_noise(2, abs(dt), variance, block_size=3, order_by_dim=False)
+        mean, covariance = predict(track.mean, track.covariance, F=F, Q=Q)
+        return replace(track, mean=mean, covariance=covariance)
 
     def reach_m(self, track: Track) -> Array:
         """Half size (3,) m of a predicted track's box, widened by its uncertainty."""
@@ -219,11 +224,6 @@ class InstanceTracks:
         ended = {others[k].id for k in np.flatnonzero(double.any(axis=1)).tolist()}
         self.tracks = [track for track in self.tracks if track.id not in ended]
 
-    def _process_noise(self, dt: float) -> Array:
-        """What random acceleration adds to the covariance: Bar-Shalom, Estimation, 2001, p. 274."""
-        Q = np.array([[0.25 * dt**4, 0.5 * dt**3], [0.5 * dt**3, dt**2]])
-        return np.kron(Q, np.eye(3)) * self.config.acceleration_m_s2**2
-
     def _slack_m(self, sigma_m: Array) -> Array:
         """Margin of boxes whose centres have this standard deviation."""
         known = self.config.box_sigmas * sigma_m
@@ -266,15 +266,18 @@ class InstanceTracks:
         )
 
     def _updated(self, ahead: Track, sighting: Sighting, time_s: float) -> Track:
+        from filterpy.kalman import update  # noqa: PLC0415 - loads slowly
+
         limit = self.config.max_evidence
-        P, noise = ahead.covariance, self.config.centroid_sigma_m**2 * np.eye(3)
-        K = P @ _H.T @ np.linalg.inv(_H @ P @ _H.T + noise)
-        kept = np.eye(6) - K @ _H  # Joseph's form, which stays symmetric
+        noise = self.config.centroid_sigma_m**2 * np.eye(3)
+        mean, covariance = update(
+            ahead.mean, ahead.covariance, sighting.centroid_world, noise, H=_H
+        )
         return replace(
             ahead,
             time_s=time_s,
-            mean=ahead.mean + K @ (sighting.centroid_world - ahead.mean[:3]),
-            covariance=kept @ P @ kept.T + K @ noise @ K.T,
+            mean=mean,
+            covariance=covariance,
             half_size=np.maximum(sighting.half_size, 0.8 * ahead.half_size),
             distribution=np.float32(0.5) * (ahead.distribution + sighting.distribution),
             prior=ahead.prior if ahead.stood else (ahead.prior + sighting.prior) / 2,
