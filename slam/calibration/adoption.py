@@ -129,7 +129,7 @@ class Estimate:
     def shows(self, i: int, config: SelfCalibrationConfig) -> bool:
         """Whether a parameter is observable; the distortion of depth is so over the whole image."""
         sigma = _rms_sigma(self.sigmas[BEND]) if i in BENDS else self.sigmas[i]
-        return bool(sigma < config.limits(i)[0])
+        return bool(0 < sigma < config.limits(i)[0])
 
     def settled(self, chosen: list[int]) -> bool:
         """Whether the run found what its camera had, within 95 % bounds of two rounds."""

@@ -4,7 +4,8 @@ The run itself is the first stretch. After some frames the readout time of the r
 the delay and the distortion of the depth images, are estimated from its map
 (`calibration.rematching`). The focal lengths are estimated along with them but keep their values:
 those of a published calibration are better than what a short stretch shows, and an error of the
-depth scale, which images and depths alone do not show, would be taken for one of theirs. Whether
+depth scale, which images and depths alone do not show, would be taken for one of theirs. A readout
+time that the camera has is kept. Whether
 they are adopted is decided in `calibration.adoption`. If none is, the run goes on; else it begins
 anew, once, with the camera that was found.
 """
@@ -13,6 +14,8 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+
+import numpy as np
 
 from bmask_slam.calibration.adoption import (
     FREE,
@@ -155,5 +158,5 @@ class SelfCalibrator:
         differs = any(estimate.differs(i, config) for i in FREE)
         verdict = "not sure enough to be applied" if differs else "the camera keeps it"
         text = format_found(estimate, seen, verdict) if seen else UNOBSERVABLE
-        settled = len(seen) == len(FREE) and not differs
+        settled = len(seen) == np.count_nonzero(estimate.sigmas[list(FREE)]) and not differs
         return replace(state, text=text, looks=state.looks + 1, settled=settled)
