@@ -86,8 +86,7 @@ class InstanceTracks:
                 self.tracks[row] = self._updated(ahead[row], sightings[k], time_s)
             ids[k] = self.tracks[row].id
         self._end_doubles(time_s, R)
-        found: list[int] = ids[whole].tolist()
-        return found
+        return [int(i) for i in ids[whole]]
 
     def miss(self, time_s: float, shown: Sequence[Track]) -> None:
         """Count a miss for those of the tracks in a keyframe's view without a sighting in it.
@@ -119,10 +118,8 @@ class InstanceTracks:
         from filterpy.common import Q_discrete_white_noise  # noqa: PLC0415 - loads slowly
         from filterpy.kalman import predict  # noqa: PLC0415
 
-        dt = time_s - track.time_s
-        F = np.eye(6)
-        F[:3, 3:] = dt * np.eye(3)
-        variance = self.config.acceleration_m_s2**2
+        dt, variance = time_s - track.time_s, self.config.acceleration_m_s2**2
+        F = np.eye(6) + dt * np.eye(6, k=3)
         Q = Q_discrete_white_noise(2, abs(dt), variance, block_size=3, order_by_dim=False)
         mean, covariance = predict(track.mean, track.covariance, F=F, Q=Q)
         return replace(track, mean=mean, covariance=covariance)

@@ -280,7 +280,7 @@ def format_found(estimate: Estimate, parameters: tuple[int, ...] | list[int], ve
     parts = [
         f"{NAMES[i]} {1e3 * estimate.found[i]:.1f} ± {1.96e3 * estimate.sigmas[i]:.1f} ms"
         for i in parameters
-        if i in TIMES
+        if i in TIMES and estimate.sigmas[i] > 0
     ]
     if set(BENDS) <= set(parameters):
         parts.append(_format_bend(estimate))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bmask_slam.calibration.motion import landmark_motion
+from bmask_slam.calibration.priors import CalibrationPriors
 from bmask_slam.calibration.report import Calibrated, format_calibration, parameters_named
 from bmask_slam.calibration.views import connected_views, make_views
 from bmask_slam.graph.arrays import Array, Ints
@@ -42,50 +43,6 @@ MAX_KEYFRAMES = 400
 GAUGE_SIGMAS = np.full(6, 1e-4)
 FREE_SIGMAS = np.array([1.0] * 3 + [10.0] * 3)
 """Of the first pose [rad, m]: the first without a reference, the second with one."""
-
-
-@dataclass(frozen=True)
-class CalibrationPriors:
-    """Standard deviations of the parameters around the run's own camera.
-
-    Attributes:
-        focal_share: of the focal lengths, as a share of them.
-        centre_share: of the principal point, as a share of the image's width.
-        k1, k2, p1, p2, k3: of the distortion, a tenth of that where the camera has one, as it was
-            calibrated then; 0 fixes a parameter.
-        depth_share: of the depth scale, as a share of it.
-        depth_offset_m, depth_time_offset_s: of the offsets.
-        rolling_shutter_s: of the time from the first to the last row.
-        depth_distortion: of each of its coefficients, in 1/m.
-    """
-
-    focal_share: float = 0.05
-    centre_share: float = 0.016
-    k1: float = 0.1
-    k2: float = 0.2
-    p1: float = 0.002
-    p2: float = 0.002
-    k3: float = 0.0
-    depth_share: float = 0.05
-    depth_offset_m: float = 0.02
-    depth_time_offset_s: float = 0.02
-    rolling_shutter_s: float = 0.02
-    depth_distortion: float = 0.02
-
-    def sigmas(self, camera: Camera) -> Array:
-        """The vector (18,) of PARAMETERS."""
-        known = 0.1 if any(camera.distortion) else 1.0
-        lens = (known * sigma for sigma in (self.k1, self.k2, self.p1, self.p2, self.k3))
-        return np.array(
-            [
-                *(self.focal_share * camera.fx, self.focal_share * camera.fy),
-                *(self.centre_share * camera.width,) * 2,
-                *lens,
-                *(self.depth_share, self.depth_offset_m, self.depth_time_offset_s),
-                self.rolling_shutter_s,
-                *(self.depth_distortion,) * 5,
-            ]
-        )
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from bmask_slam.calibration.adoption import TIMES
 from bmask_slam.calibration.calibrate import (
     GAUGE_SIGMAS,
     MIN_KEYFRAMES,
-    CalibrationPriors,
 )
 from bmask_slam.calibration.motion import landmark_motion
+from bmask_slam.calibration.priors import CalibrationPriors
 from bmask_slam.calibration.views import (
     MAX_RATE_STEP_S,
     MAX_STEP_SIGMAS,

@@ -17,10 +17,10 @@ from bmask_slam.calibration.adoption import FREE, TIMES, Estimate, estimate_of
 from bmask_slam.calibration.calibrate import (
     GAUGE_SIGMAS,
     MIN_KEYFRAMES,
-    CalibrationPriors,
     frames_of,
 )
 from bmask_slam.calibration.motion import MIN_DEPTH_M, twists_at
+from bmask_slam.calibration.priors import estimated_priors
 from bmask_slam.calibration.views import (
     MAX_STEP_SIGMAS,
     Depths,
@@ -36,11 +36,8 @@ from bmask_slam.graph.calibration.calibration import (
     calibrate,
 )
 from bmask_slam.graph.calibration.model import (
-    LENS,
-    PARAMETERS,
     SHUTTER,
     CalibrationViews,
-    F,
     parameters_of,
 )
 from bmask_slam.graph.calibration.problem import CalibrationProblem
@@ -54,9 +51,6 @@ from bmask_slam.world.world_map import Keyframe, WorldMap
 MAX_KEYFRAMES, MAX_OBSERVATIONS = 40, 8000
 """Those with most observations are used of more, and the landmarks that are seen most often."""
 QUICK = CalibrationConfig(rounds=2, steps=4, tolerance=1e-3)
-FOCAL_SHARE = 0.01
-"""Standard deviation of the focal lengths, which are estimated along but not adopted: published
-ones are up to 2 % from what the motion shows, which would pass for a readout time."""
 RADII_PX = (24.0, 8.0)
 """Of the windows around predicted pixels: by the run's camera, then by the one found so far."""
 
@@ -240,7 +234,9 @@ class RunProblem:
         )
         start = parameters_of(camera, camera.depth_scale)
         poses, points_world = self._poses[keyframe_rows], self._points[landmark_rows]
-        return CalibrationProblem(views, poses, points_world, start, _priors(camera), GAUGE_SIGMAS)
+        return CalibrationProblem(
+            views, poses, points_world, start, estimated_priors(camera, FREE), GAUGE_SIGMAS
+        )
 
     def move_to(self, result: CalibrationResult) -> None:
         """Go on from the poses and points that were found for the last problem."""
@@ -262,23 +258,6 @@ class RunProblem:
         order = np.argsort(keys, kind="stable")
         rows = order[np.minimum(np.searchsorted(keys[order], found.keys), len(keys) - 1)]
         return measured.select(rows, keys[rows] == found.keys)
-
-
-def _priors(camera: Camera) -> Array:
-    """Standard deviations (18,) of what a run estimates of its camera, 0 where it does not.
-
-    A readout time that the camera has is the sensor's, and kept: landmarks matched in a slow
-    stretch have shown up to 42 ms of a Kinect's 26 ms. A lens without distortion was not
-    calibrated: what it has is estimated along, but not adopted, else depth would seem bent.
-    """
-    usual, sigmas = CalibrationPriors().sigmas(camera), np.zeros(len(PARAMETERS))
-    sigmas[list(FREE)] = usual[list(FREE)]
-    sigmas[F] = FOCAL_SHARE * np.array([camera.fx, camera.fy])
-    if camera.rolling_shutter_s:
-        sigmas[SHUTTER] = 0.0
-    if not any(camera.distortion):
-        sigmas[LENS][:2] = usual[LENS][:2]
-    return sigmas
 
 
 def estimate_again(

@@ -20,11 +20,12 @@ from bmask_slam.calibration.adoption import (
     format_found,
     next_start,
 )
+from bmask_slam.calibration.priors import estimated_priors
 from bmask_slam.calibration.report import parameters_named
 from bmask_slam.config.configuration import resolve
 from bmask_slam.graph.arrays import Image
 from bmask_slam.graph.calibration.cross_validation import CrossValidation
-from bmask_slam.graph.calibration.model import BEND, PARAMETERS, SHUTTER, TIME
+from bmask_slam.graph.calibration.model import BEND, LENS, PARAMETERS, SHUTTER, TIME
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.offline import checkpoint, runner
@@ -189,6 +190,31 @@ def test_an_unsure_bend_is_not_observable() -> None:
     for sigma, shows in ((0.003, True), (0.006, False)):
         estimate = Estimate(np.zeros(18), found, np.full(18, sigma), None)  # type: ignore[arg-type]
         assert estimate.shows(BENDS[0], SelfCalibrationConfig()) is shows
+
+
+def test_what_is_held_is_neither_changed_nor_told() -> None:
+    sigmas = np.where(np.isin(np.arange(18), FREE), 0.0005, 0.0)
+    sigmas[SHUTTER] = 0.0
+    estimate = Estimate(np.zeros(18), np.zeros(18), sigmas, None)  # type: ignore[arg-type]
+    config = SelfCalibrationConfig()
+    assert not estimate.shows(SHUTTER, config) and not estimate.differs(SHUTTER, config)
+    assert format_found(estimate, FREE, "said").startswith("colour-depth delay")
+
+
+@pytest.mark.parametrize(
+    ("readout_s", "k1", "held", "lens"), [(0.0, 0.1, False, False), (0.026, 0.0, True, True)]
+)
+def test_a_known_readout_is_held_and_an_unknown_lens_estimated_along(
+    readout_s: float, k1: float, held: bool, lens: bool
+) -> None:
+    distortion = (k1, 0.0, 0.0, 0.0, 0.0)
+    camera = Camera(
+        640, 480, 500.0, 500.0, 320.0, 240.0, distortion=distortion, rolling_shutter_s=readout_s
+    )
+    sigmas = estimated_priors(camera, FREE)
+    assert bool(sigmas[SHUTTER] == 0) is held
+    assert (sigmas[LENS] > 0).tolist() == [lens, lens, False, False, False]
+    assert (sigmas[list(BENDS)] > 0).all() and sigmas[TIME] > 0
 
 
 def test_a_camera_takes_over_the_whole_bend() -> None:
