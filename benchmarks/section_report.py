@@ -174,7 +174,7 @@ REPORTS = {
         "reading": ("What the figures say", ""),
         "hard": ("Hard inputs: never lost", ""),
         "loops": ("Loop closures", "loops.loop_edges --work {sequences}"),
-        "wrong": ("Wrong cameras", ""),
+        "wrong": ("Wrong cameras", "suite.wrong_cameras"),
     }, markdown=frozenset({"table", "hard", "loops", "wrong"})),
 }  # fmt: skip
 

@@ -10,6 +10,7 @@ camera.yaml are run; faults of depth images and stamps are compared with the run
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -66,11 +67,11 @@ def _moved(baseline_m: float, scale: float, shift_px: tuple[float, float] = (0, 
     """Depth as of a camera beside the colour camera, with ``scale`` times its focal lengths."""
 
     def fault(folder: Path, camera: Camera) -> Camera:
-        files = sorted((folder / "depth").iterdir())
+        files = sorted((folder / "depth").resolve().iterdir())
         (folder / "depth").unlink()
         (folder / "depth").mkdir()
         for path in files:
-            stored = cv2.imread(str(path.resolve()), cv2.IMREAD_UNCHANGED)
+            stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
             v, u = np.nonzero(stored)
             beside_px = camera.fx * baseline_m * camera.depth_scale / stored[v, u]
             to_u = scale * (u - camera.cx + beside_px) + camera.cx + shift_px[0]
@@ -168,7 +169,7 @@ def main() -> None:
                     render_sequence(RenderConfig(name, MAX_FRAMES), source)
             for line in rows_of(source, arguments.faults, into):
                 lines.append(line)
-                print(" | ".join(line), flush=True)
+                print(" | ".join(line), file=sys.stderr, flush=True)
     print(table(("fault", "sequence", "said"), lines))
 
 

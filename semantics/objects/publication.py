@@ -26,6 +26,7 @@ from bmask_slam.semantics.objects.points import ObjectPoints
 _SAME_MARGIN_M = 0.05
 SMALLEST_M, LARGEST_M = 0.05, 3.5
 """Longest sides of what can be seen in a room."""
+LANDMARK_MARGIN_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,16 @@ class MapObject:
     landmark_ids: Ints
     first_seen_s: float
     last_seen_s: float
+
+    def with_landmarks_at(self, points_world: Array) -> MapObject:
+        """Without landmarks that are elsewhere, seen past its edge; points (N, 3) by landmark id.
+
+        Depth at a rim is now and then that of the background, and where the box ends is not exact:
+        they may be LANDMARK_MARGIN_M outside.
+        """
+        around = replace(self.box, size_m=self.box.size_m + 2 * LANDMARK_MARGIN_M)
+        inside = around.contains(points_world[self.landmark_ids])
+        return replace(self, landmark_ids=self.landmark_ids[inside])
 
 
 @dataclass(frozen=True, eq=False)

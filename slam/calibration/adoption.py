@@ -39,7 +39,7 @@ FREE = (*TIMES, *BENDS)
 CALIBRATE = ("auto", "report", "off")
 """Whether what is found is used, only told, or not looked for."""
 NAMES = {SHUTTER: "rolling shutter", TIME: "colour-depth delay"}
-MIN_STEP_S, MAX_SHARE = 0.002, 0.6
+MIN_STEP_S, MAX_SHARE, MAX_S = 0.002, 0.6, 0.035
 PLACES = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-0.75, 0.75, 7)), axis=-1)
 BEND_TERMS = depth_distortion_terms(PLACES).reshape(-1, len(BENDS))
 """Those of the distortion of depth at places all over an image of 4:3."""
@@ -59,7 +59,8 @@ class SelfCalibrationConfig:
         min_change_sigmas: what is adopted differs by so many standard deviations,
         min_change_s: and by so much.
         min_gain_sigmas: so many standard errors is the gain on observations kept out of the fit.
-        max_s: a larger time is no readout within a frame's interval, but an error.
+        max_s: a time that is surely larger is no readout within a frame's interval, but an error;
+            of one that may be, so much is adopted.
         max_bend_sigma, min_bend, max_bend: the same limits of the distortion of depth, in 1/m.
     """
 
@@ -71,7 +72,7 @@ class SelfCalibrationConfig:
     min_change_sigmas: float = 3.0
     min_change_s: float = 0.002
     min_gain_sigmas: float = 2.0
-    max_s: float = 0.035
+    max_s: float = MAX_S
     max_bend_sigma: float = 0.004
     min_bend: float = 0.003
     max_bend: float = 0.1
@@ -123,7 +124,7 @@ class Estimate:
         return bool(
             self.shows(i, config)
             and change > max(config.min_change_sigmas * self.sigmas[i], min_change)
-            and abs(self.found[i]) < largest
+            and abs(self.found[i]) - 1.96 * self.sigmas[i] < largest
         )
 
     def shows(self, i: int, config: SelfCalibrationConfig) -> bool:
@@ -266,6 +267,8 @@ def camera_with(camera: Camera, values: Array, chosen: list[int]) -> Camera:
     """The camera with some of the parameters of a vector (18,), rounded as in camera.yaml."""
     calibration = parameters_of(camera, camera.depth_scale)
     calibration[chosen] = values[chosen]
+    times = list(TIMES)
+    calibration[times] = np.clip(calibration[times], -MAX_S, MAX_S)
     found = camera_from(camera, calibration)
     return dataclasses.replace(
         camera,

@@ -180,7 +180,8 @@ class SemanticMapper:
     def map_objects(self, keyframes: Sequence[Keyframe]) -> MapObjects:
         """The objects that these keyframes, all of one map segment, saw."""
         poses, ground = self._posed(keyframes)
-        found = self.objects.objects(poses, ground)
+        points = self._map.world.landmarks.points_world
+        found = [o.with_landmarks_at(points) for o in self.objects.objects(poses, ground)]
         return MapObjects(self.names, found, ground.up_world, ground.floor_m)
 
     def _posed(self, keyframes: Sequence[Keyframe]) -> tuple[dict[int, Array], Ground]:

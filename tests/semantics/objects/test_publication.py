@@ -133,3 +133,13 @@ def test_a_table_below_the_camera_is_no_floor() -> None:
     del state["points"]  # as older versions wrote it
     found.restore(state)
     assert np.isnan(found.floor_m(poses, UP_ROOM))
+
+
+def test_landmarks_behind_a_thing_are_not_on_it() -> None:
+    chair = box((0.5, 0.5, 0.8), 0.0)
+    room = np.array([[0.2, 1.0, 0.4], [0.34, 1.0, 0.4], [0.0, 3.0, 0.4], [np.nan] * 3])
+    ids = np.arange(4)
+    none = np.zeros(0, np.int64)
+    found = MapObject(7, 2, np.eye(6)[2], np.zeros(3), chair, none, ids, 0.0, 1.0)
+    kept = found.with_landmarks_at(transform(T_WORLD_ROOM, room)).landmark_ids
+    assert kept.tolist() == [0, 1]  # the second is 9 cm outside, the third 1.75 m behind

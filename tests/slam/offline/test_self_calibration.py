@@ -125,8 +125,15 @@ def test_report_and_off_change_nothing(late_sweep: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("change_ms", "sigma_ms", "differs"),
-    [(20.0, 1.0, True), (-14.0, 2.0, True), (2.0, 1.0, False), (20.0, 6.0, False), (60, 1, False)],
-)
+    [
+        (20.0, 1.0, True),
+        (-14.0, 2.0, True),
+        (2.0, 1.0, False),
+        (20.0, 6.0, False),
+        (60, 1, False),
+        (36.5, 1.5, True),
+    ],
+)  # fmt: skip
 def test_only_observable_parameters_are_changed(
     change_ms: float, sigma_ms: float, differs: bool
 ) -> None:
@@ -222,6 +229,12 @@ def test_a_camera_takes_over_the_whole_bend() -> None:
     values = np.arange(18) / 1000.0
     adopted = camera_with(camera, values, list(BENDS))
     assert adopted == replace(camera, depth_distortion=(0.013, 0.014, 0.015, 0.016, 0.017))
+
+
+def test_no_readout_is_longer_than_a_frame() -> None:
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    values = np.where(np.arange(18) == SHUTTER, 0.0365, 0.0)
+    assert camera_with(camera, values, [SHUTTER]).rolling_shutter_s == 0.035
 
 
 @pytest.mark.parametrize(
