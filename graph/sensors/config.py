@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.sensors.accelerometer import AccelerometerConfig
 from bmask_slam.graph.sensors.odometry import OdometryConfig
 from bmask_slam.graph.sensors.position import PositionConfig
@@ -27,3 +28,11 @@ class SensorsConfig:
         """Names of the sensors that are used."""
         sensors = ("odometry", "accelerometer", "position")
         return tuple(name for name in sensors if getattr(self, name).enabled)
+
+    def check_enabled(self, sensor: str) -> None:
+        """Raise InputError for a sensor that is not used."""
+        if sensor not in self.enabled:
+            raise InputError(
+                f"{sensor}: not enabled; set sensors.{sensor}.enabled to true, and how it is "
+                "mounted"
+            )

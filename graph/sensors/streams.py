@@ -95,16 +95,24 @@ def read_measurements(path: Path, sensor: str) -> Measurements:
     return Measurements(sensor, table[first])
 
 
-def read_folder(folder: Path, sensors: tuple[str, ...]) -> list[Measurements]:
+def read_folder(folder: Path | None, sensors: tuple[str, ...]) -> list[Measurements]:
     """Those of the sensors whose file is in a folder, in their order; none for no folder.
 
     Raises:
-        InputError: a file of them cannot be read.
+        InputError: a file of them cannot be read; it names the setting that leaves the file out.
     """
-    if folder == Path():
+    if folder is None:
         return []
     files = {sensor: folder / FILES[sensor] for sensor in sensors}
-    return [read_measurements(file, s) for s, file in files.items() if file.is_file()]
+    found = []
+    for sensor, file in files.items():
+        if file.is_file():
+            try:
+                found.append(read_measurements(file, sensor))
+            except InputError as error:
+                way_out = f"sensors.{sensor}.enabled=false"
+                raise InputError(f"{error} (--set {way_out} leaves the file out)") from error
+    return found
 
 
 def _check_row(sensor: str, row: list[float], where: str) -> None:

@@ -16,7 +16,6 @@ import numpy as np
 from bmask_slam.back_end.reference_frame import Made, ReferenceFrame, SensorChanges
 from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import Arrays
-from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.checks import chi2_quantile
 from bmask_slam.graph.factors.graph_update import (
     FIRST_FRAME,
@@ -71,11 +70,7 @@ class SensorFusion:
 
         Raises InputError for those of a sensor that is not enabled.
         """
-        if new.sensor not in self.config.enabled:
-            raise InputError(
-                f"{new.sensor}: not enabled; set sensors.{new.sensor}.enabled to true, and how it "
-                "is mounted"
-            )
+        self.config.check_enabled(new.sensor)
         newest_s = max((k.timestamp_s for k in world.keyframes.values()), default=-np.inf)
         late = new.rows[:, 0] < newest_s - self.config.late_s
         if late.any():

@@ -128,7 +128,7 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
         overwrite=arguments.overwrite,
         reference=source.groundtruth,
         view=view_options(arguments, arguments.view),
-        images=folder if folder.is_dir() and not is_bag(folder) else Path(),
+        images=folder if folder.is_dir() and not is_bag(folder) else None,
         title=source.name,
         dense=arguments.map,
         calibrate=arguments.calibrate,

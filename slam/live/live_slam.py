@@ -294,6 +294,6 @@ class LiveSlam(SensorInput):
         self.dense = dense.finish(world, DENSE_FINISH_S)
         if self._display is not None:
             self._display.submaps(dense, world, True, len(world.keyframes))
-        self.dense.log_missing(folder.path, self.options.images != Path())
+        self.dense.log_missing(folder.path, self.options.images is not None)
         ended = replace(health, submaps=len(dense.submaps), submaps_waiting=0)
         folder.write_text(HEALTH, ended.as_json())

@@ -52,7 +52,7 @@ class LiveOptions:
     overwrite: bool = False
     reference: Trajectory | None = None
     view: ViewOptions = field(default_factory=ViewOptions)
-    images: Path = Path()
+    images: Path | None = None
     title: str = "live"
     dense: bool = False
     calibrate: str = "off"
@@ -65,7 +65,7 @@ class LiveOptions:
     @property
     def origin(self) -> Origin:
         """The sequence folder that the frames come from, if any, for config.yaml."""
-        return Origin(None if self.images == Path() else self.images)
+        return Origin(self.images)
 
 
 def start_calibration(
@@ -102,7 +102,7 @@ def start_system(
     with ExitStack() as undo:
         segmenter, dense, labels = None, None, NoSegmenter.labels
         if masks.name != "none":
-            segmenter = RemoteSegmenter(masks, options.images)
+            segmenter = RemoteSegmenter(masks, options.images or Path())
             undo.callback(segmenter.close)
             labels = segmenter.labels
         if options.dense and options.out is not None:

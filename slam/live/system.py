@@ -154,6 +154,7 @@ class LiveSystem(SlamSystem):
 
     def add_measurements(self, new: Measurements) -> None:
         """Use the measurements of a sensor with the next frame; from any thread."""
+        self.config.sensors.check_enabled(new.sensor)
         self._measured.append(new)
 
     def add_factor(self, factor: Any) -> int:

@@ -31,6 +31,7 @@ from bmask_slam.graph.sensors.streams import (
     Measurements,
     SensorStreams,
     measurements,
+    read_folder,
     read_measurements,
 )
 from bmask_slam.rendering.sensors import odometry
@@ -240,3 +241,16 @@ def test_lines_are_sorted_and_a_missing_sigma_is_unknown(tmp_path: Path) -> None
 def test_what_is_no_measurement_is_refused(sensor: str, rows: list[float], reason: str) -> None:
     with pytest.raises(InputError, match=reason):
         measurements(sensor, np.array(rows, float))
+
+
+def test_the_files_of_the_present_folder_are_read_and_a_strange_one_names_the_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("position.txt").write_text("1.5 1 2 3\n")
+    Path("odometry.txt").write_text("a file of another program\n")
+    assert not read_folder(None, ("position",))
+    (found,) = read_folder(Path(), ("position",))
+    np.testing.assert_array_equal(found.rows[:, :4], [[1.5, 1, 2, 3]])
+    with pytest.raises(InputError, match=r"--set sensors\.odometry\.enabled=false"):
+        read_folder(Path(), ("odometry", "position"))

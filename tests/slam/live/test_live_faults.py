@@ -101,6 +101,8 @@ def test_five_seconds_without_a_frame_are_tolerated() -> None:
             stamp_s = FRAMES[9].timestamp_s + 5.0 + 0.03 * k
             result = slam.track(stamp_s, frame.rgb, frame.depth_m)
             assert result.status is TrackingStatus.OK
+            with pytest.raises(InputError, match=r"set sensors.accelerometer.enabled to true"):
+                slam.add_accelerometer(stamp_s, [0.0, 0.0, 9.81])  # and the next frame is tracked
         assert slam.health().map_deaths == 0
 
 
