@@ -122,7 +122,7 @@ class Mapper:
         """Clear the frame history, the events and the times; map and graph stay."""
         self.history = FrameHistory()
         self.events.begin_session()
-        self.sensors.begin_session()
+        self.sensors.begin_session(self.world.next_keyframe_id)
         self.update_ms = []
 
     def insert(self, frame: Frame, tracked: Tracked, segment: int, local_ids: Ints) -> Keyframe:

@@ -96,8 +96,9 @@ class ReferenceFrame:
     """One segment, the measurements, and what was made of them so far.
 
     Attributes:
-        last: no further keyframe will come.
         made, plumbs: are extended; plumbs by keyframe.
+        first_keyframe: those before are of another recording than the measurements.
+        last: no further keyframe will come.
     """
 
     segment: int
@@ -108,6 +109,7 @@ class ReferenceFrame:
     config: SensorsConfig
     made: Made
     plumbs: dict[int, Plumb]
+    first_keyframe: int
     last: bool
 
     def changes(self) -> SensorChanges:
@@ -185,7 +187,7 @@ class ReferenceFrame:
         if not config.enabled or not len(self.streams.of("accelerometer")):
             return None
         for keyframe in self._keyframes:
-            if keyframe.id not in self.plumbs:
+            if keyframe.id >= self.first_keyframe and keyframe.id not in self.plumbs:
                 self._hang_plumb(keyframe)
         places = [k for k, i in enumerate(self._ids) if i in self.plumbs]
         measured = [self.plumbs[self._ids[k]] for k in places]
@@ -232,6 +234,7 @@ class ReferenceFrame:
             return _Fixes()
         used_s = [t for name, t in self.made.items() if name[2] == POSITION]
         rows, places = rows[~np.isin(rows[:, 0], used_s)], self._without(POSITION)
+        places = places[np.array(self._ids, int)[places] >= self.first_keyframe]
         near, of = associate_stamps(self._stamps_s[places], rows[:, 0], config.max_apart_s)
         found: list[tuple[int, Array, Array, Array]] = []
         for k, row in zip(places[near].tolist(), rows[of], strict=True):

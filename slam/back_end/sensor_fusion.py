@@ -64,6 +64,7 @@ class SensorFusion:
         self._events = events
         self._made: Made = {}
         self._plumbs: dict[int, Plumb] = {}
+        self._first_keyframe = 0  # of this session
 
     def add(self, new: Measurements, world: WorldMap) -> None:
         """Add measurements; those that are too late for the newest keyframe are refused.
@@ -71,7 +72,8 @@ class SensorFusion:
         Raises InputError for those of a sensor that is not enabled.
         """
         self.config.check_enabled(new.sensor)
-        newest_s = max((k.timestamp_s for k in world.keyframes.values()), default=-np.inf)
+        present = (k for k in world.keyframes.values() if k.id >= self._first_keyframe)
+        newest_s = max((k.timestamp_s for k in present), default=-np.inf)
         late = new.rows[:, 0] < newest_s - self.config.late_s
         if late.any():
             count, until_s = int(late.sum()), new.rows[late, 0][-1]
@@ -95,9 +97,14 @@ class SensorFusion:
         """The graph was emptied: all factors are to be made anew."""
         self._made = {}
 
-    def begin_session(self) -> None:
-        """Another recording: its measurements replace the present ones; factors stay."""
+    def begin_session(self, first_keyframe: int) -> None:
+        """Another recording, whose keyframes have ids from ``first_keyframe`` on.
+
+        Its measurements replace the present ones and are of its keyframes only; factors stay.
+        """
         self.streams, self.refused = SensorStreams(), {}
+        self._first_keyframe = first_keyframe
+        self._made = dict.fromkeys(self._made, np.nan)  # stamps are of the other recording
 
     def changes(self, owner: GraphOwner, last: bool = False) -> SensorChanges:
         """The factors that can be made now; ``last``: no further keyframe will come."""
@@ -107,9 +114,10 @@ class SensorFusion:
         self._forget_culled(world)
         found = SensorChanges()
         for segment in sorted({k.segment for k in world.keyframes.values()}):
-            given = self.streams, self.config, self._made, self._plumbs
+            given = self.streams, self.config, self._made, self._plumbs, self._first_keyframe
             frame = ReferenceFrame(segment, world, history, tables, *given, last)
-            moved = SensorChanges(relative_poses=tuple(self._odometry(world.in_segment(segment))))
+            present = [k for k in world.in_segment(segment) if k.id >= self._first_keyframe]
+            moved = SensorChanges(relative_poses=tuple(self._odometry(present)))
             found = found.with_more(moved).with_more(frame.changes())
         return found
 
@@ -152,6 +160,7 @@ class SensorFusion:
         ids = [(KINDS.index(kind), a, b) for a, b, kind in self._made]
         return {
             **nested(streams=self.streams.state()),
+            "first_keyframe": np.array(self._first_keyframe),
             "made": np.array(ids, np.int64).reshape(-1, 3),
             "made_s": np.array(list(self._made.values()), float),
             "plumb_ids": np.array(list(self._plumbs), np.int64),
@@ -165,6 +174,7 @@ class SensorFusion:
         self.streams = SensorStreams()
         state = {**{n: a for n, a in example_state().items() if "." not in n}, **state}
         self.streams.restore(part(state, "streams"))
+        self._first_keyframe = int(state["first_keyframe"])
         made = zip(state["made"].tolist(), state["made_s"].tolist(), strict=True)
         self._made = {(a, b, KINDS[kind]): t for (kind, a, b), t in made}
         plumbs = zip(state["plumb_ids"].tolist(), state["plumbs"], strict=True)
@@ -178,7 +188,7 @@ def example_state() -> Arrays:
     rows = {sensor: np.zeros((0, len(names))) for sensor, names in COLUMNS.items()}
     made: Arrays = {"made": np.zeros((0, 3), np.int64), "made_s": np.zeros(0)}
     plumbs: Arrays = {"plumb_ids": np.zeros(0, np.int64), "plumbs": np.zeros((0, 13))}
-    return {**nested(streams=rows), **made, **plumbs}
+    return {**nested(streams=rows), "first_keyframe": np.array(0), **made, **plumbs}
 
 
 def _is_known(name: RelativePoseName, world: WorldMap) -> bool:

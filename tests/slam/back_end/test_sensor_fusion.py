@@ -161,6 +161,32 @@ def test_measurements_may_come_late_but_not_too_late() -> None:
     assert not events  # they were told with the frame before
 
 
+def test_a_second_recordings_measurements_are_of_its_own_keyframes() -> None:
+    """Its clock is behind the first one's, whose keyframes have other poses at those stamps."""
+    system = SlamSystem(CAMERA, replace(CONFIG, sensors=replace(CONFIG.sensors, late_s=0.1)))
+    for frame in FRAMES[:8]:
+        system.process(replace(frame, timestamp_s=frame.timestamp_s + 0.2))
+    first = system.mapper.world.next_keyframe_id
+    system.begin_session()
+    for add, measured in ((system.add_odometry, odometry), (system.add_position, positions)):
+        stamps_s, values = measured()
+        add(stamps_s[:8] + 0.1, values[:8])
+    system.add_accelerometer(STAMPS_S[:8] + 0.1, forces()[1][:8])
+    for frame in FRAMES[:8]:
+        system.process(replace(frame, timestamp_s=frame.timestamp_s + 0.1))
+    system.finish()
+    assert not system.mapper.sensors.refused
+    tables = system.mapper.smoother.tables
+    for kind in ("odometry", "gravity", "position"):
+        ends = [k for f in tables.relative_poses(kind) for k in f.keyframe_ids]
+        assert len(ends) > 4, kind
+        assert min(ends) >= first, kind
+    again = SlamSystem(CAMERA, system.config)
+    again.restore(system.state(), Path("run/checkpoint"))
+    again.add_odometry(0.25, np.eye(4))  # newest keyframe: 0.33 s, of the other recording 0.43 s
+    assert not again.mapper.sensors.refused
+
+
 def test_a_sensor_that_is_not_enabled_is_refused() -> None:
     system = SlamSystem(CAMERA)
     with pytest.raises(InputError, match=r"set sensors.accelerometer.enabled to true"):
