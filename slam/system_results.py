@@ -39,7 +39,10 @@ NEWER_ARRAYS = (
     "semantics.surfaces.",
 )
 """Beginnings of the names of arrays that older files lack; an empty system's are used then."""
-OPTIONAL_ARRAYS = ("s.measured", "upright.points", "labels.scores", "labels.seen", "labels.judged")
+OPTIONAL_ARRAYS = (
+    *("s.measured", "upright.points", "labels.scores", "labels.seen", "labels.judged"),
+    *("votes.coded", "votes.cell_px", "votes.codes_shape", "votes.codes"),
+)
 """Ends of the names of arrays that older files lack, and whose readers do without."""
 SENSOR_ARRAYS = ("mapper.sensors.", "mapper.graph.own_")
 """Beginnings of the names of arrays that are there with other sensors or own factors only."""

@@ -245,7 +245,8 @@ def newly_sure(
         return []
     agreed = {i for i in sure if estimate.agrees(i, halves, config)}
     if agreed & set(BENDS):  # one surface, of which no part is right alone
-        agreed |= set(BENDS)
+        possible = np.abs(estimate.found[BEND]).max() < config.max_bend
+        agreed = agreed | set(BENDS) if possible else agreed - set(BENDS)
     return sorted(agreed)
 
 

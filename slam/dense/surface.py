@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -13,9 +14,9 @@ from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.keyframe_input import MAX_STAMP_ERROR_S, undistort_images
 from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.dense.saved_map import MappedRun, SavedMap
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.graph.trajectory import nearest_indices, read_tum
 from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
@@ -27,7 +28,9 @@ from bmask_slam.mapping.surface.extraction import (
 )
 from bmask_slam.mapping.surface.gate import KeyframeSurface
 from bmask_slam.mapping.surface.volume import SurfaceVolume, one_thread
+from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
@@ -79,15 +82,27 @@ def make_surface(
 
 
 def tracked_frames(run: MappedRun) -> list[tuple[int, Array]]:
-    """Index and final T_world_camera (4, 4) of every tracked frame; none without a trajectory."""
+    """Index and final T_world_camera (4, 4) of the frames that images gave a pose.
+
+    None without a trajectory; those reckoned by odometry alone are left out.
+    """
     path = run.path / "trajectory.txt"
     if not path.is_file():
         return []
     trajectory, stamps_s = read_tum(path), run.sequence.timestamps_s
-    nearest = np.abs(stamps_s[:, None] - trajectory.timestamps_s).argmin(axis=0)
+    nearest = nearest_indices(stamps_s, trajectory.timestamps_s)
     same = np.abs(stamps_s[nearest] - trajectory.timestamps_s) <= MAX_STAMP_ERROR_S
+    same &= ~np.isin(nearest, _reckoned(run.path / FRAMES))
     poses = trajectory.poses_world_camera
     return [(int(nearest[k]), poses[k]) for k in np.flatnonzero(same).tolist()]
+
+
+def _reckoned(path: Path) -> Ints:
+    """Indices of the frames whose poses are by odometry alone."""
+    if not path.is_file():
+        return np.zeros(0, np.int64)
+    frames = read_frames(path)
+    return frames.index[np.array(frames.status) == TrackingStatus.DEAD_RECKONING.value]
 
 
 def frames_a_keyframe(fused: FusedMap) -> float:

@@ -142,7 +142,10 @@ class LabelVotes:
             rows = slice(ends[k] - state["counts"][k], ends[k])
             owner, under, inner = (images[n][k] for n in ("owner", "under", "inner"))
             kept = tuple(instances[rows]), owner, under, inner, depths_m[k], ranges_m[rows]
-            self._remembered[keyframe_id] = _Remembered(PixelAssignment(*kept), surfaces[k])
+            assignment = PixelAssignment(*kept)
+            if len(owner) == self._camera.height:  # older versions kept them whole
+                assignment = _thinned(assignment)
+            self._remembered[keyframe_id] = _Remembered(assignment, surfaces[k])
 
 
 def _surface_arrays(names: LabelSet, views: Sequence[_Remembered]) -> Arrays:

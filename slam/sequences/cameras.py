@@ -100,9 +100,10 @@ def find_camera(folder: Path, given: Path | None = None) -> tuple[Camera, str]:
     source = ", ".join(filter(None, (source, added)))
     logger.info(
         "camera: %s; fx %.3f fy %.3f cx %.3f cy %.3f, depth scale %g to the metre, offsets %g m "
-        "and %g s, rolling shutter %g s",
+        "and %g s, rolling shutter %g s, distortion of depth %s /m",
         source, camera.fx, camera.fy, camera.cx, camera.cy, camera.depth_scale,
         camera.depth_offset_m, camera.depth_time_offset_s, camera.rolling_shutter_s,
+        list(camera.depth_distortion),
     )  # fmt: skip
     return camera, source
 

@@ -99,6 +99,7 @@ def format_info(info: SequenceInfo) -> str:
         ("camera from", info.camera_source),
         ("rolling shutter", f"{1e3 * c.rolling_shutter_s:g} ms"),
         ("depth delay", f"{1e3 * c.depth_time_offset_s:g} ms"),
+        ("depth distortion", " ".join(f"{k:g}" for k in c.depth_distortion)),
         ("depth scale", f"{c.depth_scale:g} to the metre"),
         ("valid depth", f"{100 * info.depth_valid_share:.1f} % of the pixels"),
         ("depth (m)", f"5 % {low_m:.2f}, median {middle_m:.2f}, 95 % {high_m:.2f}"),

@@ -90,6 +90,8 @@ def _render_arguments(config: RenderConfig) -> Iterator[str]:
         flag, value = f"--{name.replace('_', '-')}", getattr(config, name)
         if value is True:
             yield flag
+        elif isinstance(value, tuple):
+            yield from (flag, ",".join(value)) if value else ()
         elif value is not None and value is not False:
             yield from (flag, str(value))
     if not config.noise:

@@ -92,8 +92,10 @@ class CalibrationServer:
         self._given = parameters_of(setup.camera, setup.camera.depth_scale)
 
     def _new_rounds(self) -> CalibrationRounds:
-        free = TIMES if self._setup.interpolates else (SHUTTER,)
-        return CalibrationRounds(self._setup.camera, self._setup.config, free)
+        free = set(TIMES if self._setup.interpolates else (SHUTTER,))
+        if self._setup.camera.rolling_shutter_s:  # the sensor's, as for a run that is not live
+            free.discard(SHUTTER)
+        return CalibrationRounds(self._setup.camera, self._setup.config, tuple(free))
 
     def add(self, images: KeyframeImages) -> None:
         """Keep what is needed of a keyframe's depth images."""

@@ -4,9 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_semantic_mapper import FRAMES, MANY_KEYFRAMES, Sides, estimates, right_share, run
+from test_semantic_mapper import (
+    CAMERA,
+    FILE,
+    FRAMES,
+    MANY_KEYFRAMES,
+    Sides,
+    estimates,
+    right_share,
+    run,
+)
 
 from bmask_slam.labelling import landmark_votes as label_votes
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
 
 
 def test_keyframes_vote_on_landmarks_made_later(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,3 +53,27 @@ def test_what_is_remembered_outlives_a_state_and_older_states_lack_surfaces() ->
     votes.restore(older)
     assert not len(votes.state()["coded"])
     np.testing.assert_array_equal(votes.state()["owner"], state["owner"])
+
+
+def test_masks_that_an_older_version_kept_whole_are_thinned() -> None:
+    """A state of both sizes could not be saved."""
+    system = run(Sides(FRAMES), MANY_KEYFRAMES)
+    votes, height, width = system.semantics._label_votes, CAMERA.height, CAMERA.width
+    state = votes.state()
+    count, (h, w) = len(state["keyframes"]), state["shape"][:2]
+    older = {n: a for n, a in state.items() if not n.startswith(("cod", "cell"))}
+    for name in ("owner", "under", "inner"):
+        whole = state[name].reshape(count, h, w).repeat(height // h, 1).repeat(width // w, 2)
+        older[name] = whole.ravel()
+    older["shape"] = np.tile([height, width], count)
+    votes.restore(older)
+    np.testing.assert_array_equal(votes.state()["owner"], state["owner"])
+
+
+def test_a_map_of_an_older_version_lacks_the_surfaces_of_masks() -> None:
+    system = run(Sides(FRAMES), MANY_KEYFRAMES)
+    state = {n: a for n, a in system.state().items() if "semantics.votes.code" not in n}
+    del state["semantics.votes.cell_px"]
+    again = SlamSystem(CAMERA, SystemConfig())
+    again.restore(state, FILE)
+    assert len(again.semantics._label_votes.state()["keyframes"]) > 1

@@ -73,12 +73,12 @@ def test_a_live_dense_map_equals_the_offline_one_and_can_be_continued(
         distances_m = cKDTree(other).query(found[::5])[0]
         assert (distances_m < 0.03).mean() > 0.9
         assert distances_m[distances_m < 0.05].mean() < 0.01
-    submaps = sorted((out / "dense" / "submaps").iterdir())
-    submaps[0].unlink()
+    fused = sorted((out / "dense" / "depth").iterdir())
+    fused[0].unlink()
     capsys.readouterr()
     assert main(["map", str(out)]) == 0
     summary = capsys.readouterr().out
-    assert f"1 fused, {len(submaps) - 1} were finished" in summary
+    assert f"1 fused, {len(fused) - 1} were finished" in summary
     assert "left out" not in summary
 
 
