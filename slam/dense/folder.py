@@ -151,8 +151,8 @@ class DenseFolder:
             shutil.rmtree(self.path / name, ignore_errors=True)
 
     def is_done(self, keyframe_id: int) -> bool:
-        """Whether the keyframe is finished."""
-        return self._file("labels", keyframe_id).is_file()
+        """Whether the keyframe is finished, and its depth still there."""
+        return all(self._file(kind, keyframe_id).is_file() for kind in ("labels", "depth"))
 
     def write(self, result: FusedKeyframe, evidence: InstanceEvidence) -> None:
         """Save a finished keyframe. Raises InputError, with no half-written file, if it cannot."""
