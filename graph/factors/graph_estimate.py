@@ -88,8 +88,8 @@ class GraphEstimate:
             between factor to a neighbour (kind ANCHOR, removed when enough other factors
             constrain it again), or, where a whole component of the graph lost its prior, a prior
             at its current estimate.
-        lost_own_factors: numbers of a user's factors that were removed with one of their variables,
-            or because ISAM2 could not solve with them.
+        lost_own_factors: numbers of a user's factors that were removed with one of their variables.
+        failed_own_factors: the same of those that were removed after a failure of the solver.
         rebuilt: ISAM2 failed and was made anew from the factor tables.
         failed_variable: the variable it named last, such as "landmark 17"; "" if none.
         cost_before, cost_after: half the sum of (robust) squared whitened errors before and
@@ -108,6 +108,7 @@ class GraphEstimate:
     dropped_keyframes: Ints = field(default_factory=no_ids)
     anchored_keyframes: Ints = field(default_factory=no_ids)
     lost_own_factors: tuple[int, ...] = ()
+    failed_own_factors: tuple[int, ...] = ()
     rebuilt: bool = False
     failed_variable: str = ""
     cost_before: float = math.nan
@@ -140,6 +141,8 @@ class GraphEstimate:
         rebuilt = counts.pop("rebuilds", 0)
         lines = [f"{count} {what}" for what, count in counts.items()]
         lines += [f"own factor {n} was removed with its variable" for n in self.lost_own_factors]
+        failed = self.failed_own_factors
+        lines += [f"own factor {n} was removed: the graph could not be solved" for n in failed]
         if rebuilt:
             lines.append(f"rebuilt after a failure near {self.failed_variable or 'no variable'}")
         return lines

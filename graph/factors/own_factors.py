@@ -21,6 +21,8 @@ from bmask_slam.graph.factors.keys import variables_of_keys
 
 Numbered = tuple[int, Any]
 """A factor of a user, or its text, with its number."""
+Variable = tuple[str, int]
+"""("keyframe" or "landmark", id)."""
 
 
 def own_factor(factor: Any) -> OwnFactor:
@@ -46,11 +48,15 @@ def checked_own_factors(
     return tuple(found)
 
 
-def check_own_factor(own: OwnFactor, tables: FactorTables) -> None:
+def check_own_factor(own: OwnFactor, tables: FactorTables, where: str = "add_factor") -> None:
     """Refuse a factor that cannot enter a graph as it is now.
 
+    What cannot be checked: a ``gtsam.CustomFactor`` with Jacobians of a wrong shape, or without
+    some, ends the process in GTSAM; and what a factor does at other values.
+
     Raises:
-        InputError: a variable is not in the graph, or its error is not finite there.
+        InputError: a variable is not in the graph or of another type than the factor's, or its
+            error or its Jacobians are not finite there.
     """
     for what, ids, known in (
         ("keyframe", own.keyframes, tables.keyframes),
@@ -59,17 +65,46 @@ def check_own_factor(own: OwnFactor, tables: FactorTables) -> None:
         for number in ids:
             if not known.contains(np.array([number])).all():
                 raise InputError(
-                    f"add_factor: {what} {number} is not in the graph (culled, or not there yet); "
+                    f"{where}: {what} {number} is not in the graph (culled, or not there yet); "
                     "use one that is"
                 )
     keyframes, landmarks = np.array(own.keyframes, int), np.array(own.landmarks, int)
     poses, points = tables.keyframes.get(keyframes), tables.landmarks.get(landmarks)
+    values = make_values(keyframes, poses, landmarks, points)
     try:
-        error = own.factor.error(make_values(keyframes, poses, landmarks, points))
-    except RuntimeError as reason:
-        raise InputError(f"add_factor: its error cannot be computed: {reason}") from reason
+        error, linear = own.factor.error(values), own.factor.linearize(values)
+    except Exception as reason:  # it may be a user's code
+        raise InputError(f"{where}: its error cannot be computed: {reason}") from reason
     if not np.isfinite(error):
-        raise InputError(f"add_factor: its error is {error}; correct its measurement or its noise")
+        raise InputError(f"{where}: its error is {error}; correct its measurement or its noise")
+    if linear is not None and not np.isfinite(linear.augmentedInformation()).all():
+        raise InputError(f"{where}: its Jacobians are not finite; correct them or its noise")
+
+
+def suspects(named: Variable | None, new: Sequence[int], tables: FactorTables) -> list[int]:
+    """The users' factors that may have made the solver fail near a variable, if it named one.
+
+    Those that cannot be evaluated; if all can, the new ones; else those of the variable.
+    """
+    found = [n for n, own in sorted(tables.own_factors.items()) if _fails(own, tables)]
+    found = found or [n for n in new if n in tables.own_factors]
+    if found:
+        return found
+    return [n for n, own in sorted(tables.own_factors.items()) if _concerns(own, named)]
+
+
+def _fails(own: OwnFactor, tables: FactorTables) -> bool:
+    try:
+        check_own_factor(own, tables)
+    except InputError:
+        return True
+    return False
+
+
+def _concerns(own: OwnFactor, named: Variable | None) -> bool:
+    if named is None:
+        return True
+    return named[1] in (own.keyframes if named[0] == "keyframe" else own.landmarks)
 
 
 def exchange_own_factors(
@@ -131,7 +166,7 @@ def without_own(update: GraphUpdate, tables: FactorTables) -> Ints:
 
 def own_arrays(tables: FactorTables) -> Arrays:
     """The users' factors for a file; nothing if there are none. Raises InputError for code."""
-    own = sorted(tables.own_factors.items())
+    own = [(n, one) for n, one in sorted(tables.own_factors.items()) if tables.has_variables(one)]
     if not own:
         return {}
     texts = [text_of(entry.factor, number) for number, entry in own]
@@ -144,6 +179,5 @@ def read_own(arrays: Arrays, tables: FactorTables) -> None:
     texts = arrays.get("own_factors", np.zeros(0, np.str_)).tolist()
     for number, text in zip(arrays.get("own_factor_ids", no_ids()).tolist(), texts, strict=True):
         own = own_factor(factor_of(text))
-        if not tables.has_variables(own):
-            raise InputError(f"own factor {number}: has unknown ids; save it again")
+        check_own_factor(own, tables, f"own factor {number}")
         tables.own_factors[number] = own

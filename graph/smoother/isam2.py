@@ -10,7 +10,7 @@ import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
-from bmask_slam.graph.factors.factor_tables import FactorTables
+from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
 from bmask_slam.graph.factors.keys import (
     KEYFRAME_BASE,
@@ -18,12 +18,9 @@ from bmask_slam.graph.factors.keys import (
     landmark_keys,
     variable_named_in,
 )
-from bmask_slam.graph.factors.own_factors import own_gtsam_factors
+from bmask_slam.graph.factors.own_factors import Variable, own_gtsam_factors
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
-
-Variable = tuple[str, int]
-"""("keyframe" or "landmark", id)."""
 
 
 class SolverError(Exception):
@@ -85,12 +82,15 @@ class Solver:
         if not len(tables.keyframes.ids):
             return
         self._isam = gtsam.ISAM2(_parameters(self._config))
+        own = sorted(tables.own_factors.items())
+        for _, one in own:
+            one.slot = NO_SLOT
         everything = Change(
             tables.observations.all_rows(),
             sorted(tables.pose_factors),
             tables.keyframes.ids,
             tables.landmarks.ids,
-            own=tuple(sorted(tables.own_factors)),
+            own=tuple(number for number, one in own if tables.has_variables(one)),
         )
         self._apply(tables, everything)
 
@@ -109,7 +109,7 @@ class Solver:
             before = graph.error(values)
             values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
             after = graph.error(values)
-        except RuntimeError as error:
+        except Exception as error:  # a user's factor may raise any
             raise self._failure(error) from error
         if not np.isfinite(after):
             raise SolverError(f"the cost is {after}", None)
@@ -198,12 +198,12 @@ class Solver:
                 if self._isam.update().getVariablesRelinearized() == 0:
                     break
             return slots, *read_values(self._isam.calculateEstimate())
-        except RuntimeError as error:
+        except Exception as error:  # a user's factor may raise any
             raise self._failure(error) from error
         finally:
             self.elapsed_s += time.perf_counter() - started_s
 
-    def _failure(self, error: RuntimeError) -> SolverError:
+    def _failure(self, error: Exception) -> SolverError:
         self._isam = None
         first_line = str(error).strip().split("\n\n")[0].replace("\n", " ")
         return SolverError(first_line, variable_named_in(str(error)))

@@ -7,6 +7,7 @@ searched first, and the named variable is removed only if there is none.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from bmask_slam.graph.factors.checks import observation_errors, reprojection
 from bmask_slam.graph.factors.factor_tables import FactorTables, ids_array
 from bmask_slam.graph.factors.graph_update import ANCHOR, GraphUpdate
 from bmask_slam.graph.factors.observability import constrained_landmarks
+from bmask_slam.graph.factors.own_factors import Variable, suspects
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.smoother.anchoring import (
     anchor_components,
@@ -24,7 +26,7 @@ from bmask_slam.graph.smoother.anchoring import (
     loose_in,
     weak_between,
 )
-from bmask_slam.graph.smoother.isam2 import Variable
+from bmask_slam.graph.smoother.isam2 import SolverError
 from bmask_slam.graph.smoother.removal import remove
 
 
@@ -46,6 +48,29 @@ class Repair:
         )
 
 
+def solve_without_own(
+    failure: SolverError,
+    new: Sequence[int],
+    tables: FactorTables,
+    solve: Callable[[FactorTables], None],
+) -> tuple[list[int], SolverError | None]:
+    """Remove users' factors that may be the cause until it works, first the ``new`` ones.
+
+    Returns their numbers, and the failure that is left, if any.
+    """
+    removed: list[int] = []
+    while found := suspects(failure.variable, new, tables):
+        removed += found
+        for number in found:
+            del tables.own_factors[number]
+        try:
+            solve(tables)
+            return removed, None
+        except SolverError as again:
+            failure = again
+    return removed, failure
+
+
 def repair(
     named: Variable | None,
     new_keyframes: Ints,
@@ -61,8 +86,11 @@ def repair(
     landmarks = _loose_landmarks(tables, camera, config)
     keyframes = loose_in(tables, config)
     if named is not None and not (len(constrained) or broken or len(landmarks) or len(keyframes)):
-        landmarks = ids_array([named[1]] if named[0] == "landmark" else [])
-        keyframes = ids_array([named[1]] if named[0] == "keyframe" else [])
+        one = ids_array([named[1]])
+        if named[0] == "landmark":
+            landmarks = np.intersect1d(one, tables.landmarks.ids)
+        else:
+            keyframes = np.intersect1d(one, tables.keyframes.ids)
     leaving = ids_array(
         k for k in keyframes.tolist() if k in new_keyframes or _is_anchored(k, tables)
     )

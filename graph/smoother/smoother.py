@@ -24,10 +24,7 @@ from bmask_slam.graph.factors.graph_estimate import (
     RelativePoseErrors,
 )
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
-from bmask_slam.graph.factors.own_factors import (
-    exchange_own_factors,
-    without_own,
-)
+from bmask_slam.graph.factors.own_factors import exchange_own_factors, without_own
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.marginals.covariances import Marginals
 from bmask_slam.graph.marginals.landmark_marginalisation import (
@@ -40,7 +37,7 @@ from bmask_slam.graph.marginals.summaries import mark_retracted, mark_returned, 
 from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors, with_first_prior
 from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError
 from bmask_slam.graph.smoother.removal import Removal, remove
-from bmask_slam.graph.smoother.repair import repair
+from bmask_slam.graph.smoother.repair import repair, solve_without_own
 from bmask_slam.graph.smoother.storage import (
     factor_tables_of,
     graph_arrays,
@@ -86,9 +83,9 @@ class Smoother:
         report.refused, report.refused_factors = validated.refused, validated.refused_factors
         report.add_removal(removal)
         entered = self._enter(validated, [before, removal, marginalised], report)
-        report.lost_own, slots, own = exchange_own_factors(update, tables)
+        report.lost_own, slots, report.new_own = exchange_own_factors(update, tables)
         slots = sorted([*entered.removed_slots, *slots])
-        change = dataclasses.replace(entered, own=own, removed_slots=slots)
+        change = dataclasses.replace(entered, own=report.new_own, removed_slots=slots)
         change = dataclasses.replace(change, max_iterations=update.max_iterations)
         try:
             self._solver.update(self._tables, change)
@@ -252,9 +249,15 @@ class Smoother:
     ) -> bool:
         """Repair the factor tables and solve again until it works; returns whether it did.
 
-        The first attempt removes only what is visibly loose, later ones the named variable too.
+        Users' factors go before anything else. The first attempt then removes only what is visibly
+        loose, later ones the named variable too.
         """
         report.rebuilt = True
+        found = solve_without_own(failure, report.new_own, self._tables, solve)
+        report.failed_own, left = found
+        if left is None:
+            return True
+        failure = left
         for attempt in range(self._config.max_repairs):
             report.failed = failure.variable or report.failed
             logger.warning("GTSAM failed near %s (%s)", report.failed_variable or "?", failure)

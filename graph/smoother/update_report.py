@@ -15,7 +15,7 @@ from bmask_slam.graph.factors.graph_estimate import (
     Refusals,
     RefusedFactor,
 )
-from bmask_slam.graph.smoother.isam2 import Variable
+from bmask_slam.graph.factors.own_factors import Variable
 from bmask_slam.graph.smoother.removal import Removal
 from bmask_slam.graph.smoother.repair import Repair
 from bmask_slam.graph.smoother.validation import Validated
@@ -31,6 +31,8 @@ class UpdateReport:
     dropped_keyframes: set[int] = field(default_factory=set)
     anchored_keyframes: set[int] = field(default_factory=set)
     lost_own: list[int] = field(default_factory=list)
+    new_own: tuple[int, ...] = ()
+    failed_own: list[int] = field(default_factory=list)
     rebuilt: bool = False
     failed: Variable | None = None
     started_s: float = field(default_factory=time.perf_counter)
@@ -78,6 +80,7 @@ class UpdateReport:
             ids_array(self.dropped_keyframes),
             ids_array(self.anchored_keyframes),
             lost_own_factors=tuple(self.lost_own),
+            failed_own_factors=tuple(self.failed_own),
             rebuilt=self.rebuilt,
             failed_variable=self.failed_variable,
             update_ms=1e3 * (time.perf_counter() - self.started_s),

@@ -12,9 +12,11 @@ from synthetic_view import CAMERA, render_plane, sideways_path
 
 from bmask_slam import key_of_keyframe, key_of_landmark
 from bmask_slam.config.configuration import resolve
-from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.arrays import Array, no_ids
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.factors.own_factors import factor_of, text_of
+from bmask_slam.graph.factors.graph_update import GraphUpdate
+from bmask_slam.graph.factors.own_factors import factor_of, own_factor, text_of
+from bmask_slam.graph.smoother.repair import repair
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.live.messages import ChangeOwnFactors
 from bmask_slam.live.processes.map_process import MapServer
@@ -109,10 +111,64 @@ def test_a_factor_that_cannot_enter_is_refused() -> None:
         (position(99, before), "keyframe 99 is not in the graph"),
         (gtsam.GPSFactor(7, before, FIRM), "key 7 is no keyframe's and no landmark's"),
         (position(keyframe, before * np.nan), "its error is nan"),
+        (spoilt(keyframe, ["nan"]), "its Jacobians are not finite"),
         ("a text", "give a factor of GTSAM|cannot be read"),
     ):
         with pytest.raises((InputError, ValueError), match=reason):
             made.add_factor(factor)
+
+
+def spoilt(keyframe: int, fails: list[str]) -> gtsam.CustomFactor:
+    """A factor of which the Jacobian is NaN, or which raises, once ``fails`` says so."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: Any) -> Array:
+        if fails[0] == "raises":
+            raise ValueError("no measurement there")
+        if H is not None:
+            H[0] = np.full((3, 6), np.nan) if fails[0] else np.eye(3, 6)
+        return np.zeros(3)
+
+    return gtsam.CustomFactor(FIRM, [key_of_keyframe(keyframe)], error)
+
+
+@pytest.mark.parametrize(("how", "batch"), [("nan", False), ("raises", False), ("raises", True)])
+def test_a_factor_that_fails_later_goes_alone(how: str, batch: bool) -> None:
+    """Not the keyframe that it spoils; and the graph can be solved again."""
+    made, fails = system(), [""]
+    keyframe, _ = newest(made)
+    smoother = made.mapper.smoother
+    before = smoother.tables.keyframes.ids.tolist()
+    own = own_factor(spoilt(keyframe, fails))
+    number = made.add_factor(own.factor)
+    fails[0] = how
+    smoother.restart()
+    estimate = smoother.optimise_batch() if batch else smoother.update(GraphUpdate())
+    assert estimate.failed_own_factors == (number,)
+    assert f"own factor {number} was removed: the graph could not be solved" in estimate.notes()
+    assert not smoother.tables.own_factors
+    assert not len(estimate.dropped_keyframes)
+    assert smoother.tables.keyframes.ids.tolist() == before
+    assert smoother.update(GraphUpdate(own_factors=((7, own),))).failed_own_factors == (7,)
+    assert not smoother.update(GraphUpdate()).rebuilt
+
+
+def test_repair_passes_over_a_keyframe_that_is_not_there() -> None:
+    smoother = system().mapper.smoother
+    model = smoother.tables, CAMERA, CONFIG.graph
+    assert not repair(("keyframe", 99), no_ids(), *model).dropped_keyframes.size
+
+
+def test_a_saved_factor_of_the_wrong_type_is_refused(tmp_path: Path) -> None:
+    """A point's prior with the key of a keyframe, as only a file can have it."""
+    made = system()
+    keyframe, before = newest(made)
+    wrong = gtsam.PriorFactorPoint3(key_of_keyframe(keyframe), before, FIRM)
+    with pytest.raises(InputError, match="its error cannot be computed"):
+        made.add_factor(wrong)
+    made.mapper.smoother.tables.own_factors[3] = own_factor(wrong)
+    made.mapper.smoother.save(tmp_path / "graph")
+    with pytest.raises(InputError, match="own factor 3: its error cannot be computed"):
+        Smoother.load(tmp_path / "graph")
 
 
 def test_the_maps_process_takes_texts_and_reports_refusals() -> None:
