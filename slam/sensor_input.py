@@ -94,7 +94,7 @@ class SensorSystem(SystemResults, SensorInput):
 
     def add_factor(self, factor: Any) -> int:
         """See `SensorInput.add_factor`; the graph is optimised at once."""
-        number = 1 + max(self.mapper.smoother.tables.own_factors, default=-1)
+        number = self.mapper.smoother.tables.next_own
         self._change_factors([(number, factor)], ())
         return number
 

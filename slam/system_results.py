@@ -161,6 +161,7 @@ def checked_state(state: Arrays, own: Arrays, path: Path) -> Arrays:
     ``own`` is the state of an empty system. Raises InputError for arrays of other names or types.
     """
     graph: Arrays = {"own_factors": np.zeros(0, np.str_), "own_factor_ids": np.zeros(0, np.int64)}
+    graph["own_next"] = np.array(0)
     own = {**nested(mapper=nested(sensors=example_state(), graph=graph)), **own}
     state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
     state = {name: a for name, a in own.items() if name.startswith(NEWER_ARRAYS)} | state

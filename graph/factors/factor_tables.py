@@ -234,6 +234,7 @@ class FactorTables:
         self.pose_factors_of: dict[int, set[int]] = {}
         self.marginalised = MarginalisedLandmarks()
         self.own_factors: dict[int, OwnFactor] = {}
+        self.next_own = 0  # number that no own factor has had
         self._next_number = 0
 
     def __len__(self) -> int:

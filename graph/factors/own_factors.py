@@ -17,12 +17,14 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables, OwnFactor
 from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.factors.gtsam_factors import make_graph, make_values
-from bmask_slam.graph.factors.keys import variables_of_keys
+from bmask_slam.graph.factors.keys import LANDMARK_BASE, variables_of_keys
 
 Numbered = tuple[int, Any]
 """A factor of a user, or its text, with its number."""
 Variable = tuple[str, int]
 """("keyframe" or "landmark", id)."""
+MAX_TEXT = 1_000_000
+"""Characters of a factor's text; a prior's has 500."""
 
 
 def own_factor(factor: Any) -> OwnFactor:
@@ -119,6 +121,7 @@ def exchange_own_factors(
     added = {n: one for n, one in update.own_factors if tables.has_variables(one)}
     lost += [n for n, _ in update.own_factors if n not in added]
     tables.own_factors |= added
+    tables.next_own = max([tables.next_own, *(n + 1 for n in added)])
     return lost, [slot for slot in slots if slot != NO_SLOT], tuple(added)
 
 
@@ -134,22 +137,31 @@ def text_of(factor: Any, number: int | None = None) -> str:
     Raises:
         InputError: it has none, as a ``gtsam.CustomFactor``, which is Python code.
     """
+    name = "" if number is None else f" {number}"
     try:
-        return str(make_graph([factor]).serialize())
+        text = str(make_graph([factor]).serialize())
     except RuntimeError as reason:
-        name = "" if number is None else f" {number}"
         raise InputError(
             f"own factor{name}: a {type(factor).__name__} cannot be saved or sent to another "
             "process, since it is code; remove it first (remove_factor), or use a factor of GTSAM"
         ) from reason
+    if len(text) > MAX_TEXT:
+        raise InputError(f"own factor{name}: more than {MAX_TEXT} characters; divide it")
+    return text
 
 
 def factor_of(text: str) -> Any:
-    """The factor of ``text_of``. Raises ValueError for another text."""
+    """The factor of ``text_of``. Raises ValueError for another text.
+
+    The reader is boost's, which believes the lengths in a text: here none may exceed the text's.
+    """
+    counts = (int(word) for word in text[:MAX_TEXT].split() if word.isdecimal())
+    if len(text) > MAX_TEXT or any(len(text) < n < LANDMARK_BASE for n in counts):
+        raise ValueError("an own factor cannot be read: it is, or says that it is, too long")
     graph = gtsam.NonlinearFactorGraph()
     try:
         graph.deserialize(text)
-    except RuntimeError as reason:
+    except (RuntimeError, MemoryError) as reason:
         raise ValueError(f"an own factor cannot be read: {reason}") from reason
     if graph.size() != 1:
         raise ValueError(f"an own factor is {graph.size()} factors")
@@ -165,13 +177,14 @@ def without_own(update: GraphUpdate, tables: FactorTables) -> Ints:
 
 
 def own_arrays(tables: FactorTables) -> Arrays:
-    """The users' factors for a file; nothing if there are none. Raises InputError for code."""
+    """The users' factors for a file, if there ever were any. Raises InputError for code."""
     own = [(n, one) for n, one in sorted(tables.own_factors.items()) if tables.has_variables(one)]
+    following = {"own_next": np.array(tables.next_own)} if tables.next_own else {}
     if not own:
-        return {}
+        return following
     texts = [text_of(entry.factor, number) for number, entry in own]
     numbers = np.array([number for number, _ in own], np.int64)
-    return {"own_factors": np.array(texts, np.str_), "own_factor_ids": numbers}
+    return {"own_factors": np.array(texts, np.str_), "own_factor_ids": numbers, **following}
 
 
 def read_own(arrays: Arrays, tables: FactorTables) -> None:
@@ -181,3 +194,5 @@ def read_own(arrays: Arrays, tables: FactorTables) -> None:
         own = own_factor(factor_of(text))
         check_own_factor(own, tables, f"own factor {number}")
         tables.own_factors[number] = own
+    following = max(tables.own_factors, default=-1) + 1  # older files do not say it
+    tables.next_own = max(following, int(arrays.get("own_next", np.array(0))))

@@ -82,7 +82,7 @@ def graph_arrays(tables: FactorTables) -> Arrays:
 
 
 def _own_arrays(tables: FactorTables) -> Arrays:
-    if not tables.own_factors:
+    if not (tables.own_factors or tables.next_own):
         return {}
     from bmask_slam.graph.factors.own_factors import own_arrays  # noqa: PLC0415 - loads GTSAM
 
@@ -159,7 +159,7 @@ def _tables(arrays: Arrays) -> FactorTables:
             factor = RelativePose(a, b, T, covariance, robust or None, kind)
         tables.add_pose_factors([factor])
     tables.marginalised = read_marginalised(arrays)
-    if "own_factors" in arrays:
+    if "own_factors" in arrays or "own_next" in arrays:
         from bmask_slam.graph.factors.own_factors import read_own  # noqa: PLC0415 - loads GTSAM
 
         read_own(arrays, tables)

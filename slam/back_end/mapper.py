@@ -178,8 +178,9 @@ class Mapper:
         self.events.joined(segment, self.world.segment_of(recognised.landmark_ids), inliers)
         joined = join_segment(self.world, segment, tracked, recognised)
         loops = self.smoother.relative_poses("loop") + anchors(self.world, self._graph_config)
-        own = tuple(self.smoother.tables.own_factors.items())
+        old = self.smoother.tables
         self.smoother = Smoother(self.camera, self._graph_config)
+        self.smoother.tables.next_own, own = old.next_own, tuple(old.own_factors.items())
         update = self._factor_selector.whole_update(self.world)
         self.sensors.forget_factors()
         update = replace(update, relative_poses=loops, own_factors=own)
@@ -252,10 +253,8 @@ class Mapper:
 
     def _change_graph(self, **changes: Any) -> None:
         """An update that moves much of the graph: ISAM2 is iterated until it converges."""
-        rounds, update = (
-            self.loops.config.max_iterations,
-            self._factor_selector.map_update(self.world),
-        )
+        rounds = self.loops.config.max_iterations
+        update = self._factor_selector.map_update(self.world)
         update = replace(update, max_iterations=rounds, **changes)
         self._apply(self.smoother.update(update))
 

@@ -102,6 +102,21 @@ def test_code_cannot_be_saved_and_says_so() -> None:
         made.state()
     made.remove_factor(number)
     assert not [name for name in made.state() if "own_factor" in name]
+    again = SlamSystem(CAMERA, CONFIG)
+    again.restore(made.state(), Path("run/checkpoint"))
+    for one in (made, again):  # a number is given once
+        assert one.add_factor(position(*newest(made))) == number + 1
+
+
+def test_a_text_that_claims_more_than_it_has_is_refused() -> None:
+    text = text_of(gtsam.GPSFactor(key_of_keyframe(0), np.ones(3), gtsam.noiseModel.Unit.Create(3)))
+    assert factor_of(text).keys() == [key_of_keyframe(0)]
+    at = text.index(" 3 1.00")
+    for count in ("9999999999", str(2**60)):
+        with pytest.raises(ValueError, match="cannot be read"):
+            factor_of(f"{text[:at]} {count}{text[at + 2 :]}")
+    with pytest.raises(ValueError, match="too long"):
+        factor_of(text + " " * 1_000_000)
 
 
 def test_a_factor_that_cannot_enter_is_refused() -> None:
