@@ -23,12 +23,14 @@ is the same edge without information on 1/z: the two equations of a monocular ob
 both axes.) Poses and information: as in ``graph.g2o.lines``.
 
 **In comments**, since g2o has no tags for it: image size, bf and distortion; which ids are
-landmarks' (g2o's vertices share one range); kind and kernel of the next relative pose. Kernels of
-observations are not written.
+landmarks' (g2o's vertices share one range), which poses reference frames' (they follow the
+keyframes, also when read back); kind and kernel of the next relative pose. Kernels of
+observations and a user's own factors are not written.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +38,12 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import (
+    FIRST_FRAME,
+    Observations,
+    PosePrior,
+    RelativePose,
+)
 from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.g2o.lines import (
     Tag,
@@ -79,22 +86,24 @@ def has_landmarks(path: Path) -> bool:
 
 def write_landmark_graph(path: Path, tables: FactorTables, camera: Camera) -> None:
     """Write a graph as ``read_landmark_graph`` reads it; it appears whole or not at all."""
-    offset = 1 + int(tables.keyframes.ids.max(initial=-1))
+    ids = _Numbers.of(tables.keyframes.ids)
+    offset = ids.begin + len(ids.frames)
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
     rest = [camera.width, camera.height, camera.stereo_bf_px_m, camera.depth_scale, camera.fps]
     lines = [
         _ABOUT,
         f"{MARK} camera {numbers_text(np.array([*rest, *camera.distortion]))}",
         f"{MARK} landmarks {offset}",
+        *(f"# {ids.of_pose(frame)}: reference frame (z up) of a map" for frame in ids.frames),
         f"{CAMERA} 0 {numbers_text(np.array([*_NO_OFFSET, *intrinsics]))}",
         f"{STEREO} 1 {numbers_text(np.array([*_NO_OFFSET, *intrinsics, camera.baseline_m]))}",
         f"{OFFSET} 2 {numbers_text(_NO_OFFSET)}",
     ]
     keyframes, landmarks = tables.keyframes, tables.landmarks
-    lines += _lines(POSE, keyframes.ids, pose_columns(keyframes.values))
+    lines += _lines(POSE, ids.of_poses(keyframes.ids), pose_columns(keyframes.values))
     lines += _lines(POINT, offset + landmarks.ids, landmarks.values)
     for number in sorted(tables.pose_factors):
-        lines += _pose_factor_lines(tables.pose_factors[number].factor)
+        lines += _pose_factor_lines(tables.pose_factors[number].factor, ids)
     observations = tables.observations.all()
     names = np.stack(
         [
@@ -114,14 +123,40 @@ def _lines(tag: str, names: Ints, numbers: Array) -> list[str]:
     return [f"{tag} {' '.join(map(str, ids))} {numbers_text(row)}" for ids, row in rows]
 
 
-def _pose_factor_lines(factor: RelativePose | PosePrior) -> list[str]:
+@dataclass(frozen=True)
+class _Numbers:
+    """Numbers of poses: keyframes keep theirs, reference frames follow, since g2o's have 32 bits.
+
+    Attributes:
+        begin: number of the first of the reference frames. frames: their ids.
+    """
+
+    begin: int
+    frames: list[int]
+
+    @classmethod
+    def of(cls, ids: Ints) -> _Numbers:
+        """Of sorted ids (N,)."""
+        are_frames = ids >= FIRST_FRAME
+        return cls(1 + int(ids[~are_frames].max(initial=-1)), ids[are_frames].tolist())
+
+    def of_pose(self, pose_id: int) -> int:
+        """The number of a pose."""
+        return pose_id if pose_id < FIRST_FRAME else self.begin + self.frames.index(pose_id)
+
+    def of_poses(self, ids: Ints) -> Ints:
+        """The numbers (N,) of poses (N,)."""
+        return np.array([self.of_pose(i) for i in ids.tolist()], np.int64)
+
+
+def _pose_factor_lines(factor: RelativePose | PosePrior, ids: _Numbers) -> list[str]:
     inverse: Array = np.asarray(np.linalg.inv(factor.covariance), float)
     information = information_columns(inverse[None])
     if isinstance(factor, PosePrior):
         numbers = np.hstack([pose_columns(factor.T_world_camera[None]), information])
-        return _lines(PRIOR, np.array([[factor.keyframe_id, 2]]), numbers)
+        return _lines(PRIOR, np.array([[ids.of_pose(factor.keyframe_id), 2]]), numbers)
     numbers = np.hstack([pose_columns(factor.T_a_b[None]), information])
-    edge = np.array([[factor.keyframe_a, factor.keyframe_b]])
+    edge = ids.of_poses(np.array(factor.keyframe_ids))[None]
     note = f"{MARK} edge {factor.kind} {factor.robust or 'none'}"
     return [note, *_lines(RELATIVE, edge, numbers)]
 

@@ -78,13 +78,14 @@ def _graph(source: Path, out: Path) -> Exported:
     write_landmark_graph(out, tables, camera)
     seen = tables.observations.select(tables.observations.all_rows())
     flat = int(np.isnan(seen.measurements[:, 2]).sum())
-    edges = len(tables.pose_factors)
+    edges, own = len(tables.pose_factors), len(tables.own_factors)
+    lacking = f", {own} factors of your own (add_factor)" if own else ""
     return Exported(
         (out,),
         f"{len(tables.keyframes.ids)} keyframes (VERTEX_SE3:QUAT), {len(tables.landmarks.ids)} "
         f"landmarks (VERTEX_TRACKXYZ), {len(seen)} observations (EDGE_PROJECT_DISPARITY; {flat} "
         f"without depth: no information on 1/z), {edges} relative poses and priors.\n"
-        "Not in the format: the robust kernels of observations, and what is in comments.",
+        f"Not in the format: the robust kernels of observations{lacking}, and what is in comments.",
     )
 
 

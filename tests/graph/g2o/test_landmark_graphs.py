@@ -11,7 +11,7 @@ from bmask_slam.graph.batch.bundle_adjustment import adjust
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.factors.checks import reprojection
 from bmask_slam.graph.factors.factor_tables import FactorTables
-from bmask_slam.graph.factors.graph_update import PosePrior, RelativePose
+from bmask_slam.graph.factors.graph_update import PosePrior, RelativePose, reference_frame_id
 from bmask_slam.graph.g2o.landmark_graphs import has_landmarks, write_landmark_graph
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
 from bmask_slam.graph.geometry import inverse, rotation_from_quaternion, se3_exp
@@ -81,6 +81,27 @@ def test_everything_is_read_back(file: Path) -> None:
                 np.testing.assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-14)
             else:
                 assert getattr(found, name) == value
+
+
+def test_reference_frames_are_numbered_behind_the_keyframes(tmp_path: Path) -> None:
+    """Their ids do not fit into g2o's 32 bits."""
+    tables, path = room_graph(), tmp_path / "b.g2o"
+    frame, (*_, last) = reference_frame_id(2), tables.keyframes.ids.tolist()
+    T_world_reference, T_a_b = se3_exp(np.arange(6) / 10), se3_exp(np.arange(6) / 7)
+    tables.keyframes.insert(np.array([frame]), T_world_reference[None])
+    tables.add_pose_factors([RelativePose(frame, 5, T_a_b, np.eye(6), "cauchy", "position")])
+    write_landmark_graph(path, tables, CAMERA)
+    words = [line.split() for line in path.read_text().splitlines() if line[0] != "#"]
+    vertices = [int(w[1]) for w in words if w[0].startswith("VERTEX")]
+    assert len(vertices) == len(set(vertices))
+    assert max(vertices) < 1 << 31
+    found, _ = read_landmark_graph(path)
+    assert found.keyframes.ids[-1] == last + 1
+    np.testing.assert_allclose(found.keyframes.values[-1], T_world_reference, atol=1e-12)
+    np.testing.assert_array_equal(found.landmarks.ids, tables.landmarks.ids)
+    (factor,) = found.relative_poses("position")
+    assert (factor.keyframe_a, factor.keyframe_b) == (last + 1, 5)
+    np.testing.assert_allclose(factor.T_a_b, T_a_b, atol=1e-12)
 
 
 def test_the_cost_equals_g2os(file: Path) -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -9,10 +10,12 @@ from bmask_slam import cli
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
+from bmask_slam.graph.factors.keys import key_of_keyframe
+from bmask_slam.graph.factors.own_factors import own_factor
 from bmask_slam.graph.files.ply import read_ply, write_ply
 from bmask_slam.graph.g2o.landmark_reader import read_landmark_graph
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
-from bmask_slam.graph.smoother.storage import write_graph
+from bmask_slam.graph.smoother.storage import read_graph, write_graph
 from bmask_slam.graph.trajectory import Trajectory, write_tum
 from bmask_slam.graph.trajectory_formats import read_times, read_trajectory
 
@@ -74,7 +77,15 @@ def test_the_graph_is_read_back(capsys, run: Path, tmp_path: Path) -> None:
     assert export(run, "--format", "g2o", "--out", out) == 0
     printed = capsys.readouterr().out
     assert "2 keyframes (VERTEX_SE3:QUAT), 3 landmarks (VERTEX_TRACKXYZ), 6 observations" in printed
-    assert "Not in the format: the robust kernels" in printed
+    assert "Not in the format: the robust kernels of observations, and" in printed
+    tables, camera = read_graph(run / "graph")
+    own = gtsam.GPSFactor(key_of_keyframe(0), np.zeros(3), gtsam.noiseModel.Unit.Create(3))
+    tables.own_factors[0] = own_factor(own)
+    write_graph(run / "graph", tables, camera)
+    assert export(run, "--format", "g2o", "--out", out) == 0
+    assert "kernels of observations, 1 factors of your own (add_factor), and" in (
+        capsys.readouterr().out
+    )
     tables, camera = read_landmark_graph(out)
     assert camera == CAMERA
     np.testing.assert_allclose(tables.landmarks.values, POINTS, atol=1e-12)
