@@ -88,11 +88,16 @@ def suspects(named: Variable | None, new: Sequence[int], tables: FactorTables) -
 
     Those that cannot be evaluated; if all can, the new ones; else those of the variable.
     """
-    found = [n for n, own in sorted(tables.own_factors.items()) if _fails(own, tables)]
-    found = found or [n for n in new if n in tables.own_factors]
+    found = failing(tables) or [n for n in new if n in tables.own_factors]
     if found:
         return found
     return [n for n, own in sorted(tables.own_factors.items()) if _concerns(own, named)]
+
+
+def failing(tables: FactorTables) -> list[int]:
+    """The users' factors that cannot be evaluated now, though their variables are there."""
+    present = [(n, o) for n, o in sorted(tables.own_factors.items()) if tables.has_variables(o)]
+    return [n for n, own in present if _fails(own, tables)]
 
 
 def _fails(own: OwnFactor, tables: FactorTables) -> bool:

@@ -18,7 +18,7 @@ from bmask_slam.graph.factors.keys import (
     landmark_keys,
     variable_named_in,
 )
-from bmask_slam.graph.factors.own_factors import Variable, own_gtsam_factors
+from bmask_slam.graph.factors.own_factors import Variable, failing, own_gtsam_factors
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
 from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
 
@@ -100,6 +100,8 @@ class Solver:
         Raises SolverError; the values are then those of before.
         """
         self._isam = None
+        if failing(tables):  # GTSAM would end without a step, and not say so
+            raise SolverError("a user's factor cannot be evaluated", None)
         graph, values = self._everything(tables)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(max_iterations)
