@@ -97,7 +97,7 @@ def _views(run: MappedRun, masked: Path | None) -> Iterator[DepthView]:
 def _save(path: Path, out: Path) -> None:
     mesh = load_open3d().io.read_triangle_mesh(str(path))
     columns = {"v": mesh.vertices, "n": mesh.vertex_normals, "c": mesh.vertex_colors}
-    arrays = {name: np.asarray(values, np.float32) for name, values in columns.items()}
+    arrays: dict[str, Any] = {n: np.asarray(values, np.float32) for n, values in columns.items()}
     np.savez(out, t=np.asarray(mesh.triangles), **arrays)
 
 
