@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -222,14 +219,3 @@ def block_indices(keys: Tensor) -> Tensor:
     """Indices (N, 3) of keys (N,)."""
     mask = (1 << 21) - 1
     return torch.stack([keys >> 42, (keys >> 21) & mask, keys & mask], dim=-1) - (1 << 20)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch use one thread: two that wait for each other are slower on a busy machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -21,6 +19,7 @@ from bmask_slam.semantics.network.yolox.stuff import STUFF_STRIDE
 from bmask_slam.semantics.segmenters.network_segmenter import as_instances
 from bmask_slam.semantics.segmenters.segmenter import check_image
 from bmask_slam.semantics.segmenters.yolox import YoloxDetector
+from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.semantics.weights.light_weights import LightNetwork
 from bmask_slam.semantics.weights.stuff_weights import StuffNetwork
 
@@ -99,14 +98,3 @@ class LightSegmenter:
         logits = self._stuff.head(features, output)[0, :, :rows, :columns]
         p = logits.softmax(dim=0).permute(1, 2, 0).half().cpu().numpy()
         return SurfaceClasses(self._stuff.labels, np.ascontiguousarray(p), cell_px, size)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Within it torch runs in the calling thread alone."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -27,9 +27,10 @@ from bmask_slam.mapping.surface.extraction import (
     without_crumbs,
 )
 from bmask_slam.mapping.surface.gate import KeyframeSurface
-from bmask_slam.mapping.surface.volume import SurfaceVolume, one_thread
+from bmask_slam.mapping.surface.volume import SurfaceVolume
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
 from bmask_slam.semantics.labels import LabelSet
+from bmask_slam.semantics.torch_threads import one_thread
 from bmask_slam.tracking.results import TrackingStatus
 from bmask_slam.world.world_map import Keyframe
 

@@ -5,9 +5,8 @@ the delay and the distortion of the depth images, are estimated from its map
 (`calibration.rematching`). The focal lengths are estimated along with them but keep their values:
 those of a published calibration are better than what a short stretch shows, and an error of the
 depth scale, which images and depths alone do not show, would be taken for one of theirs. A readout
-time that the camera has is kept. Whether
-they are adopted is decided in `calibration.adoption`. If none is, the run goes on; else it begins
-anew, once, with the camera that was found.
+time that the camera has is kept. Whether they are adopted is decided in `calibration.adoption`. If
+none is, the run goes on; else it begins anew, once, with the camera that was found.
 """
 
 from __future__ import annotations
