@@ -91,11 +91,14 @@ def parse_yaml(text: str, source: str) -> Any:
     """One YAML document; ``source`` names it in the message.
 
     Raises:
-        InputError: not YAML, a key given twice, other values than plain ones, or a document that is
-            too large; names the line if there is one.
+        InputError: not a text (where it stands in a file of another kind), not YAML, a key given
+            twice, other values than plain ones, or a document that is too large; names the line if
+            there is one.
     """
     reader = YAML(typ="safe", pure=True)
     reader.Constructor = _Constructor
+    if not isinstance(text, str):
+        raise InputError(f"{source}: a YAML text was expected, not {type(text).__name__}")
     if len(text) > MAX_BYTES:
         raise InputError(f"{source}: {len(text)} characters, more than {MAX_BYTES}")
     try:
