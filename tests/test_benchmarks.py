@@ -18,9 +18,11 @@ from benchmarks.pages import table, written_sections
 from benchmarks.paths import RESULTS
 from benchmarks.section_report import REPORTS
 from benchmarks.semantics.real_rooms import ROOMS, score_objects
+from benchmarks.semantics.room_truth import centre_in, moved
 from benchmarks.suite import never_lost
+from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.geometry import inverse, se3_exp
+from bmask_slam.graph.geometry import inverse, se3_exp, transform
 from bmask_slam.run_folder.semantic_files import SavedObject
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 
@@ -137,3 +139,19 @@ def test_every_point_of_a_room_is_of_a_known_kind(room: str) -> None:
         assert -0.1 < height_m < 3, kind  # metres above the floor
         assert kind != "floor" or height_m < 0.1
         assert not kind.startswith("table") or 0.6 < height_m < 0.8
+
+
+def test_a_truth_moves_with_the_depth_that_a_run_straightens() -> None:
+    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+    T_world_camera = se3_exp(np.array([0.3, -1.2, 0.5, 2.0, -1.0, 0.7]))
+    pixel, z_m = np.array([500.0, 100.0]), 4.0
+    ray = camera.backproject(pixel, np.array(1.0))
+    place = transform(T_world_camera, z_m * ray[None])[0]
+    bend = np.array([0.01, 0.0, 0.02, 0.0, 0.0])
+    x = (500 - 319.5) / 320
+    straight_m = 1 / (1 / z_m - 0.01 * x - 0.02 * x**2)
+    expected = transform(T_world_camera, straight_m * ray[None])[0]
+    assert moved(place, pixel, T_world_camera, camera, bend) == pytest.approx(expected)
+    assert centre_in(place, T_world_camera, camera, bend) == pytest.approx(expected.tolist())
+    away = T_world_camera @ np.diag([-1, 1, -1, 1.0])  # turned by half a turn
+    assert centre_in(place, away, camera, bend) == []

@@ -12,17 +12,18 @@ counts by `LabelStoreConfig.again`: parts that are enlarged by less than `DISTAN
 where the photograph was taken, the others from nearer.
 
 Precision: of the corners under masks of a class, the share that is on it; a logistic function of
-the mean logit of the class score and of the logarithm of the evidence, which is the sum of mask
-scores over views, with an offset for each class. Evidence does not count for what things lie on
+the mean logit of the class score, of the evidence, which is the sum of mask scores over views, and
+of its logarithm, with an offset for each class. Evidence does not count for what things lie on
 (tables, beds): these are there in every view. Corners within 5 px of the mask's edge do not
-count: of those depth and other views decide. Objects: the same of whole masks, which are right if
-half of their pixels are on their class. Recall: of a thing's corners, the share that a mask of its
-class covers in the photograph itself; a logistic function of log2(size / 64 px), size the root of
-the area in an image of 640 px, with an offset for each class. All by iterated weighted least
-squares; offsets have a normal prior of standard deviation 0.7, so that a class of which little was
-seen stays near the mean. Of what is "otherprop or unlabelled" in NYUv2 nothing is known, nor of
-masks most of which is on that (a screen that is no television); but under masks of tables and beds
-it is mostly what lies on them, and counts half as that.
+count: of those depth and other views decide. Corners: of those under masks that are right, the
+share that is on the class, of all and of those 20 px or more inside. Objects: the same of whole
+masks, which are right if half of their pixels are on their class. Recall: of a thing's corners, the
+share that a mask of its class covers in the photograph itself; a logistic function of
+log2(size / 64 px), size the root of the area in an image of 640 px, with an offset for each class.
+All by iterated weighted least squares; offsets have a normal prior of standard deviation 0.7, so
+that a class of which little was seen stays near the mean. Of what is "otherprop or unlabelled" in
+NYUv2 nothing is known, nor of masks most of which is on that (a screen that is no television); but
+under masks of tables and beds it is mostly what lies on them, and counts half as that.
 """
 
 from __future__ import annotations
@@ -63,9 +64,10 @@ NOTHING, DOUBTFUL, CROWD = 0, -1, -2
 MIN_SCORE, BORDER_PX, CELL_PX, A_CELL, MOST = 0.15, 20, 40, 6, 850
 THRESHOLDS = (50, 35, 25, 18, 13)
 SIDE_PX, MIDDLE_PX, LARGEST_PX, INSIDE_PX = 640, 64.0, 256.0, 5.0
+WELL_INSIDE_PX = 20.0
 VIEWS, PART, SEED = 6, (0.55, 0.95), 5
 RINGS, AGAIN = 2, LabelStoreConfig().again
-OFFSET_SIGMA, ENOUGH, MIN_CORNERS, MIN_CONFUSED, ITERATIONS = 0.7, 20, 8, 0.03, 60
+OFFSET_SIGMA, ENOUGH, MIN_CORNERS, MIN_CONFUSED, ITERATIONS = 0.7, 20, 8, 0.03, 20
 HALF = 0.5
 OUT = ROOT / "data" / "weights" / "light_observation.yaml"
 
@@ -248,15 +250,20 @@ def fit(classes: Ints, features: Array, share: Array, weights: Array) -> tuple[A
     """
     names, where = np.unique(classes.astype(int), return_inverse=True)
     common = np.column_stack([np.ones(len(share)), features])
-    design = np.column_stack([common, np.eye(len(names))[where]])
-    prior = np.diag([*[1e-6] * common.shape[1], *[OFFSET_SIGMA**-2] * len(names)])
-    x = np.zeros(design.shape[1])
+    f, count = common.shape[1], len(names)
+    prior = np.append(np.full(f, 1e-6), np.full(count, OFFSET_SIGMA**-2))
+    x = np.zeros(f + count)
     for _ in range(ITERATIONS):
-        p = 1 / (1 + np.exp(-design @ x))
-        information = (design * (weights * p * (1 - p))[:, None]).T @ design + prior
-        x = x + np.linalg.solve(information, design.T @ (weights * (share - p)) - prior @ x)
-    offsets = x[common.shape[1] :].tolist()
-    return x[: common.shape[1]], dict(zip(names.tolist(), offsets, strict=True))
+        p = 1 / (1 + np.exp(-(common @ x[:f] + x[f:][where])))
+        worth, error = weights * p * (1 - p), weights * (share - p)
+        information = np.diag(np.append(np.zeros(f), np.bincount(where, worth, count)) + prior)
+        information[:f, :f] += (common * worth[:, None]).T @ common
+        for k in range(f):
+            information[k, f:] = np.bincount(where, worth * common[:, k], count)
+            information[f:, k] = information[k, f:]
+        gradient = np.append(common.T @ error, np.bincount(where, error, count)) - prior * x
+        x = x + np.linalg.solve(information, gradient)
+    return x[:f], dict(zip(names.tolist(), x[f:].tolist(), strict=True))
 
 
 def logit(p: Array) -> Array:
@@ -287,8 +294,8 @@ def precision(c: Corner, names: tuple[str, ...]) -> tuple[Array, dict, dict[int,
     weights = np.minimum(1.0, ENOUGH / sizes)[group] / ENOUGH
     weights = weights * np.where(c.true[on] == DOUBTFUL, HALF, 1.0)
     supports = of_supports[c.label[on].astype(int)]
-    evidence = np.where(supports, 0.0, np.log(c.evidence[on]))
-    features = np.column_stack([c.logit[on], evidence])
+    evidence = np.where(supports, 1.0, c.evidence[on])
+    features = np.column_stack([c.logit[on], np.log(evidence), np.where(supports, 0.0, evidence)])
     right = c.true[on] == c.label[on]
     x, offsets = fit(c.label[on], features, right.astype(float), weights)
     wrong: dict[int, dict[int, float]] = {}
@@ -300,6 +307,24 @@ def precision(c: Corner, names: tuple[str, ...]) -> tuple[Array, dict, dict[int,
             if j > 0 and j != k and part >= MIN_CONFUSED:
                 wrong.setdefault(k, {})[j] = float(part)
     return x, offsets, wrong
+
+
+def on_thing(c: Corner, names: tuple[str, ...]) -> tuple[Array, dict]:
+    """Log odds that corners under a right mask are on its thing, of all and of those inside.
+
+    And offsets of classes.
+    """
+    on = known_rows(c, names)
+    on = on[(c.label0[on] == c.label[on]) & (c.covered[on] >= HALF)]
+    of_supports = read_sizes(LabelSet(names)).is_in(SUPPORT)
+    on = on[(c.true[on] != DOUBTFUL) | of_supports[c.label[on].astype(int)]]
+    group, sizes = grouped(c.kind[on], c.image[on], c.label[on])
+    weights = np.minimum(1.0, ENOUGH / sizes)[group] / ENOUGH
+    weights = weights * np.where(c.true[on] == DOUBTFUL, HALF, 1.0)
+    inside = (c.inside_px[on] >= WELL_INSIDE_PX).astype(float)
+    right = (c.true[on] == c.label[on]).astype(float)
+    (a, b), offsets = fit(c.label[on], inside[:, None], right, weights)
+    return a + b * np.array([np.average(inside, weights=weights), 1.0]), offsets
 
 
 def objects(c: Corner, names: tuple[str, ...]) -> tuple[Array, dict]:
@@ -333,21 +358,24 @@ def table(rows: Array, names: tuple[str, ...]) -> list[str]:
     """The lines of the table."""
     c = Corner(*rows.T)
     (x, p, wrong), (y, o), (z, r) = precision(c, names), objects(c, names), recall(c)
+    inside, q = on_thing(c, names)
     lines = [
         "# What masks of light.safetensors are worth at corners of the image, measured on COCO",
         "# val2017 and NYUv2 by python -m benchmarks.semantics.observation_model, which says how;",
         f"# commit {describe_commit(WRITTEN).split()[0]}, {now()}.",
-        "# precision = sigmoid(a + b logit(score) + c log(evidence) + offset), of masks' corners",
-        "# objects: the same of whole masks",
+        "# precision = sigmoid(a + b logit(score) + c log(evidence) + d evidence + offset), of",
+        "# corners under masks; objects: the same of whole masks, without d",
         "# recall = sigmoid(a + b log2(size / 64 px) + offset), size at most 256 px of 640",
-        "# Of a class: offsets of precision, objects, recall; share of corners on another class.",
+        "# corners = sigmoid(a + offset), on the thing under a right mask: all, and well inside",
+        "# Of a class: offsets of precision, objects, recall, corners; corners on other classes.",
     ]
-    for name, coefficients in (("precision", x), ("objects", y), ("recall", z)):
+    curves = (("precision", x), ("objects", y), ("recall", z), ("corners", inside))
+    for name, coefficients in curves:
         lines.append(f"{name}: [{', '.join(f'{value:.3f}' for value in coefficients)}]")
     lines.append("classes:")
     for k, name in enumerate(names):
         if k in p or k in r:
-            offsets = ", ".join(f"{t.get(k, 0.0):.2f}" for t in (p, o, r))
+            offsets = ", ".join(f"{t.get(k, 0.0):.2f}" for t in (p, o, r, q))
             others = ", ".join(f"{names[j]}: {n:.2f}" for j, n in wrong.get(k, {}).items())
             lines.append(f"  {name}: [{offsets}, {{{others}}}]")
     return lines

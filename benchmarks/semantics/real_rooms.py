@@ -16,7 +16,6 @@ gives every pixel a class says that landmarks lie on.
 from __future__ import annotations
 
 import argparse
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,8 +27,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from benchmarks.pages import table
-from benchmarks.paths import ROOT, SHARED
+from benchmarks.paths import SHARED
 from benchmarks.semantics.labels import calibration_error
+from benchmarks.semantics.room_truth import read_truth
 from benchmarks.suite.measure import call
 from bmask_slam.comparison.jobs.truth_figures import truth_from_world
 from bmask_slam.graph.arrays import Array
@@ -38,8 +38,9 @@ from bmask_slam.graph.geometry import transform
 from bmask_slam.graph.trajectory import associate, read_tum
 from bmask_slam.run_folder.reader import Run
 from bmask_slam.run_folder.semantic_files import LABELS, SavedObject
+from bmask_slam.sequences.cameras import read_camera
 
-ROOMS = ("redkitchen", "bonn_crowd")
+ROOMS = ("redkitchen", "bonn_crowd", "tum_fr1_rpy")
 UNKNOWN = ("unknown", "background")
 CENTRE_M, EXTENT_FACTOR = (0.1, 0.5), 3.0
 PEOPLE = "person"
@@ -99,7 +100,7 @@ def main() -> None:
         run = Run(path)
         assert run.sequence is not None
         name = run.sequence.name
-        truth = json.loads((ROOT / "tests" / "data" / f"{name}_truth.json").read_text())
+        truth = read_truth(name, read_camera(run.path / "camera.yaml"))
         T_truth_world = aligned(run, SHARED / name)
         labels = score_labels(run, truth, T_truth_world)
         objects = score_objects(run.objects, truth, T_truth_world)

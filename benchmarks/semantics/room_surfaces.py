@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,14 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from benchmarks.pages import table
-from benchmarks.paths import ROOT, SHARED
+from benchmarks.paths import SHARED
 from benchmarks.semantics.labels import calibration_error
 from benchmarks.semantics.real_rooms import UNKNOWN, aligned, share
+from benchmarks.semantics.room_truth import read_truth
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import transform
 from bmask_slam.run_folder.reader import Run
+from bmask_slam.sequences.cameras import read_camera
 
 HEADER = ("room", "of", "at points", "known", "of them right", "ECE")
 
@@ -81,7 +82,7 @@ def main() -> None:
         run = Run(path)
         assert run.sequence is not None
         name = run.sequence.name
-        truth = json.loads((ROOT / "tests" / "data" / f"{name}_truth.json").read_text())
+        truth = read_truth(name, read_camera(run.path / "camera.yaml"))
         T_truth_world = aligned(run, SHARED / name)
         landmarks = transform(T_truth_world, run.landmarks.points_world)
         parts = [("landmarks", *score(landmarks, *surfaces_of_landmarks(run), truth, False))]

@@ -134,15 +134,14 @@ class LabelStore:
         inside, scores = ids < len(self._views), np.zeros((len(ids), 2))
         scores[inside] = self._scores[ids[inside]]
         scores[:, 0] /= np.maximum(scores[:, 1], 1e-9)
-        right = self.model.object_precision(scores)
         if self._of_objects:
-            return self.model.truth(p, scores, right)
-        of_corner = np.minimum(self.model.corner_precision(scores) / right, 1.0)
+            return self.model.truth(p, scores, self.model.object_precision(scores))
+        right = self.model.thing_precision(scores)
         rows, judged = np.flatnonzero(inside), self._judged[ids[inside]]
         at = rows, judged[:, 0].astype(int)
         odds = right[at] / (1 - right[at]) * np.exp(judged[:, 1])
         right[at] = odds / (1 + odds)
-        return self.model.truth(p, scores, right * of_corner)
+        return self.model.truth(p, scores, right * self.model.on_thing)
 
     def evidence(self, ids: Ints) -> Array:
         """Number of views (N,) of any ids (N,) by their weights and whether they were new."""

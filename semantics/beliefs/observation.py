@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bmask_slam.graph.arrays import Array, Floats, Ints, Mask
+from bmask_slam.graph.arrays import Array, Floats, Ints
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import read_yaml
@@ -22,8 +23,12 @@ _MIDDLE_PX, _LARGEST_PX, _SIDE_PX = 64.0, 256.0, 640.0
 _FILLED = 0.6
 """The root of the area of a thing in the image, as a share of its longest side."""
 _SCORES = (0.05, 0.98)
+_CURVES = ("precision", "objects", "recall", "corners")
 _EVIDENCE = (0.15, 5.0)
-"""Limits of the evidence that counts; measured up to 2.3, as photographs have few viewpoints."""
+"""Limits of the evidence that counts for objects; measured up to 2.3."""
+_EVIDENCE_OF_CORNERS = (0.15, 2.3)
+"""The same for corners: no more counts than was measured, as photographs have few viewpoints."""
+_MOST_RIGHT = 0.98
 DISTANCE_STEP = 1.4
 """Distances of a ratio below it are from one viewpoint, if their directions are."""
 _AZIMUTHS, _ELEVATIONS = 24, 12
@@ -33,17 +38,21 @@ _AZIMUTHS, _ELEVATIONS = 24, 12
 class ObservationModel:
     """Measured properties of a network's masks, by class (C,); class 0 is "unknown".
 
-    precision = sigmoid(a + b l + c ln(e) + offset), with l the mean logit of the class score and e
-    the evidence, which is the sum of mask scores over independent views: the probability that a
-    corner under masks of the class is on such a thing, or, of objects, that the thing under them is
-    one. Errors of a network repeat themselves from view to view, so that this grows much slower
-    than by Bayes' rule for independent views.
+    precision = sigmoid(a + b l + c ln(e) + d e + offset), with l the mean logit of the class score
+    and e the evidence, which is the sum of mask scores over independent views: the probability that
+    a corner under masks of the class is on such a thing, or, of objects (without d), that the thing
+    under them is one. Errors of a network repeat themselves from view to view, so that this grows
+    slower than by Bayes' rule for independent views; but what is found in every view of a
+    photograph is right more often than the logarithm alone lets expect.
+    on_thing = sigmoid(a + offset): the share of corners under a mask that are on the thing, where
+    the mask's thing is of the class: of all, which the precision is of, and of those well inside.
+    Near a mask's edge depth decides in a run, so that landmarks are as those inside.
     recall = sigmoid(a + b log2(size / 64 px) + offset), size the root of a thing's area in an image
     of 640 pixels.
 
     Attributes:
-        precision, objects: a, b, c. recall: a, b.
-        precision_offsets, object_offsets, recall_offsets: (C,).
+        precision: a, b, c, d. objects: a, b, c. recall: a, b. corners: a of all, a inside.
+        precision_offsets, object_offsets, recall_offsets, corner_offsets: (C,).
         confused: (C, C) share of the corners under masks of a class (row) on other classes.
         sizes: of the classes.
     """
@@ -51,9 +60,11 @@ class ObservationModel:
     precision: Array
     objects: Array
     recall: Array
+    corners: Array
     precision_offsets: Array
     object_offsets: Array
     recall_offsets: Array
+    corner_offsets: Array
     confused: Array
     sizes: ClassSizes
 
@@ -80,7 +91,24 @@ class ObservationModel:
 
     def object_precision(self, seen: Array) -> Array:
         """P(the thing under masks of a class is one) (N, C); ``seen`` as in ``truth``."""
-        return self._curve(self.objects, seen, self.object_offsets)
+        return self._curve((*self.objects, 0.0), seen, self.object_offsets, _EVIDENCE)
+
+    def thing_precision(self, seen: Array) -> Array:
+        """P(the thing that a landmark is on is of a class) (N, C), by what corners are worth.
+
+        That of a corner divided by the share of corners that are on the thing.
+        """
+        of_corner = _sigmoid(self.corners[0] + self.corner_offsets)
+        return np.minimum(self.corner_precision(seen) / of_corner, _MOST_RIGHT)
+
+    @property
+    def on_thing(self) -> Array:
+        """P(a landmark is on the thing under its masks) (C,), where that is of the class.
+
+        On what things lie on (tables) they are in the middle of the mask, too.
+        """
+        supports = self.sizes.is_in(SUPPORT)
+        return _sigmoid(np.where(supports, *self.corners) + self.corner_offsets)
 
     def truth(self, appearance: Array, seen: Array, right: Array | None = None) -> Array:
         """P(true class) (N, C), given P(class by its appearance) (N, C).
@@ -103,12 +131,19 @@ class ObservationModel:
 
         Evidence does not count for what things lie on: these are there in every view.
         """
-        grows = ~self.sizes.is_in(SUPPORT)
-        return self._curve(self.precision, seen, self.precision_offsets, grows)
+        supports = self.sizes.is_in(SUPPORT)
+        offsets = self.precision_offsets
+        growing = self._curve(self.precision, seen, offsets, _EVIDENCE_OF_CORNERS)
+        a, b = self.precision[:2]
+        return np.where(supports, _sigmoid(a + b * seen[:, :1] + offsets), growing)
 
-    def _curve(self, curve: Array, seen: Array, offsets: Array, grows: Mask | bool = True) -> Array:
-        evidence = np.log(np.clip(seen[:, 1:], *_EVIDENCE)) * grows
-        return _sigmoid(curve[0] + curve[1] * seen[:, :1] + curve[2] * evidence + offsets)
+    @staticmethod
+    def _curve(
+        curve: Sequence[float] | Array, seen: Array, offsets: Array, limits: tuple[float, float]
+    ) -> Array:
+        a, b, c, d = curve
+        evidence = np.clip(seen[:, 1:], *limits)
+        return _sigmoid(a + b * seen[:, :1] + c * np.log(evidence) + d * evidence + offsets)
 
     def _recall_logit(self, size_px: Array) -> Array:
         c, d = self.recall
@@ -127,8 +162,8 @@ def observation_model(segmenter: str, labels: LabelSet) -> ObservationModel | No
     path = data_path(*MEASURED[segmenter])
     content = read_yaml(path)
     try:
-        curves = {key: np.array(content[key], float) for key in ("precision", "objects", "recall")}
-        offsets, confused = np.zeros((3, len(labels))), np.zeros((len(labels), len(labels)))
+        curves = {key: np.array(content[key], float) for key in _CURVES}
+        offsets, confused = np.zeros((4, len(labels))), np.zeros((len(labels), len(labels)))
         for name, (*row, others) in content["classes"].items():
             offsets[:, labels.number(name)] = row
             for other, share in others.items():
@@ -136,7 +171,7 @@ def observation_model(segmenter: str, labels: LabelSet) -> ObservationModel | No
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: not a table of an observation model ({error})") from error
     offsets[:, 0] = confused[0] = confused[:, 0] = 0.0
-    names = ("precision_offsets", "object_offsets", "recall_offsets")
+    names = ("precision_offsets", "object_offsets", "recall_offsets", "corner_offsets")
     by_class = dict(zip(names, offsets, strict=True))
     return ObservationModel(**curves, **by_class, confused=confused, sizes=read_sizes(labels))
 

@@ -24,12 +24,14 @@ NAMES = label_set(("cup", "chair", "couch"))
 CONFUSED = np.zeros((4, 4))
 CONFUSED[3, 2] = 0.2
 MODEL = ObservationModel(
-    precision=np.array([-0.5, 1.0, 0.4]),
+    precision=np.array([-0.8, 1.0, 0.4, 0.3]),
     objects=np.array([1.0, 1.0, 0.0]),
     recall=np.array([0.0, 0.5]),
+    corners=np.array([1.5, 2.0]),
     precision_offsets=np.array([0.0, 0.0, 0.5, 0.0]),
     object_offsets=np.zeros(4),
     recall_offsets=np.zeros(4),
+    corner_offsets=np.array([0.0, 0.0, 0.5, 0.0]),
     confused=CONFUSED,
     sizes=read_sizes(NAMES),
 )
@@ -45,7 +47,7 @@ def test_what_a_thing_is_follows_from_what_it_looks_like() -> None:
     p = MODEL.truth(looks, seen)
     assert np.allclose(p.sum(axis=1), 1)
     assert p[0].tolist() == [1, 0, 0, 0]
-    right = [sigmoid(-0.5 + 0.7 + offset) for offset in (0.0, 0.5, 0.0)]
+    right = [sigmoid(0.2), sigmoid(0.7), sigmoid(-0.1)]  # a couch's evidence does not count
     assert np.diag(p)[1:] == pytest.approx(right)
     assert p[1, 0] == pytest.approx(1 - right[0])  # no cup: nothing that has a name
     assert p[3, 2] == pytest.approx(0.2)  # no couch: a chair, in one of five cases
@@ -53,10 +55,31 @@ def test_what_a_thing_is_follows_from_what_it_looks_like() -> None:
     assert whole[1, 1] == pytest.approx(sigmoid(1.7))
     mixed = MODEL.truth(looks.mean(axis=0)[None], seen[:1])
     assert np.allclose(mixed, p.mean(axis=0))
-    more = MODEL.truth(looks, np.tile([0.7, 3.0], (4, 1)))
-    assert more[1, 1] == pytest.approx(sigmoid(-0.5 + 0.7 + 0.4 * np.log(3)))
+    more = MODEL.truth(looks, np.tile([0.7, 2.0], (4, 1)))
+    assert more[1, 1] == pytest.approx(sigmoid(-0.8 + 0.7 + 0.4 * np.log(2) + 0.3 * 2))
     most = MODEL.truth(looks, np.tile([0.7, 1e9], (4, 1)))
-    assert most[1, 1] < sigmoid(-0.5 + 0.7 + 0.4 * np.log(6))  # no more than was measured
+    assert most[1, 1] < sigmoid(-0.8 + 0.7 + 0.4 * np.log(3) + 0.3 * 3)  # as much as was measured
+
+
+def test_a_landmark_is_right_as_its_thing_is_and_as_corners_well_inside_are() -> None:
+    seen = np.array([[0.7, 1.0]])
+    corner = MODEL.corner_precision(seen)[0]
+    assert corner[1:] == pytest.approx([sigmoid(0.2), sigmoid(0.7), sigmoid(-0.1)])
+    thing = MODEL.thing_precision(seen)[0]
+    assert thing[1:] == pytest.approx(corner[1:] / [sigmoid(1.5), sigmoid(2.0), sigmoid(1.5)])
+    assert MODEL.thing_precision(np.array([[4.0, 1.0]])).max() == pytest.approx(0.98)
+    assert MODEL.on_thing[1:] == pytest.approx([sigmoid(2.0), sigmoid(2.5), sigmoid(1.5)])
+    store, one = LabelStore(4, model=MODEL), np.array([0])
+    cup = np.array([[0.0, 1, 0, 0]], np.float32)
+    for place in range(8):  # there is no doubt of what it looks like
+        store.update(one, cup, np.array([0.9], np.float32), np.array([place]))
+    scores = store._scores[:1] / [store._scores[0, 1], 1]
+    right = MODEL.thing_precision(scores)[0, 1]
+    assert store.probabilities(one)[0, 1] == pytest.approx(right * sigmoid(2.0), abs=2e-3)
+    store.judge(one, np.array([1]), np.array([1.5]))  # of a cup's size, and on a table
+    odds = right / (1 - right) * np.exp(1.5)
+    expected = odds / (1 + odds) * sigmoid(2.0)
+    assert store.probabilities(one)[0, 1] == pytest.approx(expected, abs=2e-3)
 
 
 def test_small_and_far_things_are_missed_more_often() -> None:
@@ -104,8 +127,10 @@ def test_a_miss_of_what_is_too_far_says_little() -> None:
 def test_a_table_seen_often_does_not_hide_the_book_on_it() -> None:
     names = label_set(("book", "dining table", *(f"other {k}" for k in range(60))))
     count = len(names)
-    nothing = {f"{name}_offsets": np.zeros(count) for name in ("precision", "object", "recall")}
-    curves = {"precision": np.array([3.0, 0, 0]), "objects": np.array([4.0, 0, 0])}
+    curved = ("precision", "object", "recall", "corner")
+    nothing = {f"{name}_offsets": np.zeros(count) for name in curved}
+    curves = {"precision": np.array([3.0, 0, 0, 0]), "objects": np.array([4.0, 0, 0])}
+    curves["corners"] = np.array([4.0, 4.0])
     confused, sizes = np.zeros((count, count)), read_sizes(names)
     model = replace(MODEL, **curves, **nothing, confused=confused, sizes=sizes)
     table, book = np.zeros((2, 1, count), np.float32)
