@@ -54,6 +54,8 @@ RENAMED = {
 
 In the path the groups have their present names.
 """
+REMOVED = {"features.octaves": 0}
+"""Settings that are no more, and the value that is still read: what is done now."""
 
 
 def find_config(name: str) -> Path:
@@ -132,6 +134,8 @@ def _with_present_names(tree: Any, prefix: str = "") -> Any:
         return tree
     found: dict[str, Any] = {}
     for key, value in tree.items():
+        if REMOVED.get(f"{prefix}{key}", ...) == value:
+            continue
         name = RENAMED.get(f"{prefix}{key}", key)
         name = key if name in tree else name
         group, _, within = str(name).rpartition(".")

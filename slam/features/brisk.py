@@ -20,18 +20,20 @@ FINEST_SIZE_PX = 12.0  # OpenCV's size of a BRISK keypoint in the finest layer
 class FeatureConfig:
     """The front end's parameters; pixels are those of the full image.
 
-    The corner threshold is the highest of ``thresholds`` at which FAST (a fortieth of the cost of
-    BRISK) finds ``max_keypoints`` in the finest layer, so that a blurred frame still has enough
-    keypoints and a frame with much texture takes no longer. ``octaves`` is BRISK's: each adds a
-    half-scale layer and an intra-octave. Keypoints nearer to the image border than ``border_px``
-    have no descriptor. ``pixel_sigma`` is the standard deviation of a BRISK keypoint at scale 1.
+    Keypoints are found in the image and in images of half the size of the one before, as many
+    layers as ``layer_shares`` has entries: shares of ``max_keypoints``. In the larger layers' place
+    a smaller one has corners where the image is blurred, and for landmarks that come nearer. The
+    corner threshold of a layer is the highest of ``thresholds`` at which FAST finds its share, so
+    that a blurred frame still has enough keypoints and a frame with much texture takes no longer.
+    Keypoints nearer to the border of their layer than ``border_px`` have no descriptor.
+    ``pixel_sigma`` is the standard deviation of a BRISK keypoint at scale 1.
     ``disparity_sigma_px`` is a constant error of the depth's disparity, sigma_z = z^2 / bf *
     sigma_d, in place of what the camera says of its depth; None: the camera's own noise model.
     ``depth_window_px`` and ``depth_edge_ratio``: see sample_depth.
     """
 
-    thresholds: tuple[int, ...] = (50, 35, 25, 18, 13)
-    octaves: int = 0
+    thresholds: tuple[int, ...] = (50, 35, 25, 18, 13, 9)
+    layer_shares: tuple[float, ...] = (0.75, 0.25)
     max_keypoints: int = 850
     bucket_px: int = 40
     border_px: int = 20
@@ -94,28 +96,35 @@ class BriskExtractor:
     def extract(self, frame: Frame) -> Features:
         """The features of a frame. Pure: the same frame gives the same arrays."""
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        pixels, response, threshold = self._corners(gray, self.config.max_keypoints)
-        if self.config.octaves > 0:
-            return self._with_scales(frame, gray, threshold)
-        order = self._spread(pixels, response, gray.shape[1])[: self.config.max_keypoints]
-        pixels = pixels[np.sort(order)]
-        descriptors, angles_rad = self._describer.describe(gray, pixels)
-        raw, scales = pixels.astype(float), np.ones(len(pixels))
-        return self._assemble(frame, gray, (raw, scales, angles_rad), descriptors)
+        layer, scale, found = gray, 1.0, []
+        for number, share in enumerate(self.config.layer_shares):
+            if number:
+                layer, scale = cv2.pyrDown(layer), 2 * scale
+            enough = round(share * self.config.max_keypoints)
+            pixels, response = self._corners(layer, enough)
+            order = self._spread(pixels, response, layer.shape[1])[:enough]
+            pixels = pixels[np.sort(order)]
+            bits, angles_rad = self._describer.describe(layer, pixels)
+            found.append(
+                (scale * pixels.astype(float), np.full(len(bits), scale), angles_rad, bits)
+            )
+        *columns, descriptors = (np.concatenate(column) for column in zip(*found, strict=True))
+        return self._assemble(frame, gray, (columns[0], columns[1], columns[2]), descriptors)
 
     def reserve(self, frame: Frame, features: Features, share: float) -> Features:
         """Further keypoints of a frame, best first, for a share of its features that is not used.
 
-        They and the features together are what a search for that many more keypoints finds. Their
-        descriptors are 0 until ``described``. With octaves there are none.
+        They and the features of the full image are together what a search for so many more
+        keypoints finds in it. Their descriptors are 0 until ``described``.
         """
         gray, width = features.gray, features.gray.shape[1]
-        enough = math.ceil(self.config.max_keypoints / (1 - share))
-        pixels, response, _ = self._corners(gray, enough)
-        if self.config.octaves > 0:
-            pixels, response = pixels[:0], response[:0]
+        count = self.config.max_keypoints
+        others = count - round(self.config.layer_shares[0] * count)
+        enough = math.ceil(count / (1 - share)) - others
+        pixels, response = self._corners(gray, enough)
         pixels = pixels[self._spread(pixels, response, width)[:enough]]
-        places, known = ((p @ [1, width]).astype(np.int64) for p in (pixels, features.image_pixels))
+        own = features.image_pixels[features.scales == 1]
+        places, known = ((p @ [1, width]).astype(np.int64) for p in (pixels, own))
         raw = pixels[~np.isin(places, known)].astype(float)
         descriptors = np.zeros((len(raw), features.descriptors.shape[1]), np.uint64)
         return self._assemble(
@@ -135,11 +144,11 @@ class BriskExtractor:
         found = self._describer.describe(features.gray, features.image_pixels.astype(np.float32))
         return replace(features, descriptors=found[0], angles_rad=found[1])
 
-    def _corners(self, gray: Image, enough: int) -> tuple[Floats, Array, int]:
-        """Pixels (N, 2) and responses (N,) at the highest threshold that gives enough, and it.
+    def _corners(self, gray: Image, enough: int) -> tuple[Floats, Array]:
+        """Pixels (N, 2) and responses (N,) at the highest threshold that gives enough.
 
         A corner's response is the highest threshold at which it is still found, so that one
-        detection serves all thresholds above its own. Without octaves BRISK's detector is FAST
+        detection serves all thresholds above its own. Within a layer BRISK's detector is FAST
         with non-maximum suppression, and its sub-pixel step is not needed, since matches are
         registered to patches later.
         """
@@ -154,7 +163,7 @@ class BriskExtractor:
         threshold = next(usable, lowest)
         strong = response >= threshold
         pixels = np.reshape(cv2.KeyPoint_convert(found), (-1, 2)).astype(np.float32, copy=False)
-        return pixels[strong], response[strong], threshold
+        return pixels[strong], response[strong]
 
     def _inside(self, gray: Image) -> Bytes:
         """Mask (H, W): 255 where a descriptor can be computed, else 0."""
@@ -162,25 +171,6 @@ class BriskExtractor:
         inside = np.zeros_like(gray)
         inside[border : height - border, border : width - border] = 255
         return inside
-
-    def _with_scales(self, frame: Frame, gray: Image, threshold: int) -> Features:
-        """Features of several sizes, by OpenCV's BRISK."""
-        brisk = cv2.BRISK_create(threshold, self.config.octaves)
-        found = brisk.detect(gray, self._inside(gray))
-        pixels = np.reshape(cv2.KeyPoint_convert(found), (-1, 2))
-        response = np.array([keypoint.response for keypoint in found])
-        order = self._spread(pixels, response, gray.shape[1])
-        kept = np.sort(order[: self.config.max_keypoints])
-        keypoints, descriptors = brisk.compute(gray, [found[i] for i in kept])
-        table = np.array([(*k.pt, k.size, k.angle) for k in keypoints], float).reshape(-1, 4)
-        bits = np.zeros((0, 64), np.uint8) if descriptors is None else descriptors
-        columns = table[:, :2], np.maximum(table[:, 2] / FINEST_SIZE_PX, 1.0)
-        return self._assemble(
-            frame,
-            gray,
-            (*columns, np.deg2rad(table[:, 3])),
-            np.ascontiguousarray(bits).view(np.uint64),
-        )
 
     def _spread(self, pixels: Floats, response: Array, width: int) -> Ints:
         """The order of keypoints (N, 2): every bucket's strongest, then the second, and so on."""

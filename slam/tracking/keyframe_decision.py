@@ -28,10 +28,12 @@ class KeyframeConfig:
     here all points of the reference keyframe count, of which BRISK finds about 60 % again in the
     next frame, so that 0.5 is the equivalent. In front of a flat wall a slow camera keeps half of
     its points for seconds, and only new points show the motion along the wall; hence
-    ``late_shared``. The reference keyframe is the last one. If another keyframe shares more with a
-    frame that is to become a keyframe, that one becomes the reference, and the next frame is
-    decided against it: a known view needs no new keyframe. With ``max_shared`` of 1 or more this
-    rule is off.
+    ``late_shared``. In a fast turn a view is gone within three frames: below ``urgent_shared``
+    neither ``min_interval_frames`` nor mapping is waited for, so that there are landmarks enough to
+    place the keyframe. The reference keyframe is the last one. If another keyframe shares more with
+    a frame that is to become a keyframe, and at least ``known_shared`` of its points, that one
+    becomes the reference, and the next frame is decided against it: a known view needs no new
+    keyframe. With ``max_shared`` of 1 or more this rule is off.
     "paper" (Algorithm 2 as printed): at least ``paper_interval_frames`` since the last keyframe AND
     mapping idle AND less than ``paper_shared`` shared AND at least ``paper_min_matches`` matches.
     """
@@ -43,6 +45,8 @@ class KeyframeConfig:
     max_shared: float = 0.5
     late_frames: int = 10
     late_shared: float = 0.6
+    urgent_shared: float = 0.25
+    known_shared: float = 0.25
     min_close_tracked: int = 100
     min_close_new: int = 70
     paper_interval_frames: int = 30
@@ -124,7 +128,11 @@ class KeyframeDecision:
         strong = self._map.world.covisible(landmark_ids, 1)
         if not strong or strong[0][1] is reference:
             return False
-        self._camera_tracker.refer_to(strong[0][1])
+        shared, other = strong[0]
+        _, points = self._map.world.observed(other)
+        if shared < self.config.known_shared * len(points):
+            return False
+        self._camera_tracker.refer_to(other)
         return True
 
 
@@ -132,7 +140,8 @@ def keyframe_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:
     """Why this frame should become a keyframe, or "" if it should not."""
     if config.rule == "paper":
         return _paper_reason(evidence, config)
-    if evidence.frames_since < config.min_interval_frames:
+    urgent = evidence.shared < config.urgent_shared
+    if evidence.frames_since < config.min_interval_frames and not urgent:
         return ""
     starving = (
         evidence.close_tracked < config.min_close_tracked
@@ -140,7 +149,8 @@ def keyframe_reason(evidence: KeyframeEvidence, config: KeyframeConfig) -> str:
     )
     if starving:
         return "close points run out"
-    ready = evidence.mapping_idle or evidence.frames_since > config.max_interval_frames
+    overdue = evidence.frames_since > config.max_interval_frames
+    ready = evidence.mapping_idle or overdue or urgent
     late = evidence.frames_since >= config.late_frames
     most = max(config.late_shared, config.max_shared) if late else config.max_shared
     if ready and evidence.tracked >= config.min_tracked and evidence.shared < most:

@@ -79,10 +79,7 @@ def more(first: Tracked, second: Tracked, enough: int) -> Tracked:
 
     Landmarks that rest on the flow alone count at most as many as the others.
     """
-    found = [
-        (r.firm >= enough, min(len(r.landmark_ids), 2 * r.firm), len(r.landmark_ids))
-        for r in (first, second)
-    ]
+    found = [(r.firm >= enough, len(r.landmark_ids), len(r.landmark_ids)) for r in (first, second)]
     return second if found[1] > found[0] else first
 
 

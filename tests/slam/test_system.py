@@ -173,7 +173,7 @@ def test_a_second_pass_needs_no_more_keyframes() -> None:
 @pytest.mark.parametrize(
     "override",
     [
-        "features.octaves=2",
+        "features.layer_shares=[0.4, 0.3, 0.3]",
         "tracking.match.mutual=false",
         "tracking.match.max_angle_rad=0.4",
         "tracking.match.ratio=1.0",

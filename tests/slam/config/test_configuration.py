@@ -226,7 +226,11 @@ def test_an_older_file_is_read_with_the_present_names_of_its_settings(tmp_path: 
     older = Path(__file__).with_name("before_renaming.yaml")
     differing = differences(resolve(SystemConfig, older), SystemConfig())
     set_by_conftest, of_the_camera_now = "semantics.segmenter.name", "features.disparity_sigma_px"
-    other_defaults = {"semantics.segmenter.min_score", "semantics.object_score"}
+    other_defaults = {
+        "semantics.segmenter.min_score",
+        "semantics.object_score",
+        "features.thresholds",
+    }
     assert set(differing) <= {set_by_conftest, of_the_camera_now, *other_defaults}
     read = from_text(SystemConfig, older.read_text(encoding="utf-8"), "here")
     assert read == resolve(SystemConfig, older)

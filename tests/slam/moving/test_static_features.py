@@ -31,7 +31,8 @@ def test_excluded_keypoints_are_replenished() -> None:
     assert len(found) == len(FEATURES)
     assert not left_of(280, found).any()
     np.testing.assert_array_equal(found.image_pixels[: len(kept)], kept)
-    assert len(np.unique(found.image_pixels, axis=0)) == len(found)
+    places = np.column_stack([found.image_pixels, found.scales])
+    assert len(np.unique(places, axis=0)) == len(found)
     assert (np.bitwise_count(found.descriptors).sum(axis=1) > 50).all()
     columns = np.histogram(found.image_pixels[:, 0], bins=5, range=(280, 620))[0]
     assert columns.min() > 0.5 * columns.max()

@@ -27,7 +27,8 @@ from bmask_slam.world.world_map import WorldMap
 T_WORLD_LAST = se3_exp(np.array([0.05, -0.03, 0.1, 0.1, -0.2, 0.05]))
 STEP = np.array([0.01, -0.07, 0.05, 0.03, 0.01, -0.02])
 """4 degrees and 4 cm: about 40 px."""
-EXTRACTOR = BriskExtractor(CAMERA, FeatureConfig())
+EXTRACTOR = BriskExtractor(CAMERA, FeatureConfig(layer_shares=(1.0,)))
+"""Its keypoints all have one standard deviation."""
 
 
 def blurred(frame: Frame) -> Frame:

@@ -51,6 +51,15 @@ PAPER_DUE = KeyframeEvidence(
         ({"close_tracked": 99, "close_new": 70, "shared": 1.0}, ""),
         ({"close_tracked": 0, "tracked": 20, "mapping_idle": False}, "close points run out"),
         ({"close_tracked": 0, "frames_since": 2}, ""),
+        # a fast turn: the view is nearly gone
+        ({"frames_since": 1, "shared": 0.25}, ""),
+        ({"frames_since": 1, "shared": 0.24}, "new view"),
+        ({"frames_since": 1, "shared": 0.24, "mapping_idle": False}, "new view"),
+        ({"frames_since": 1, "shared": 0.24, "tracked": 49}, ""),
+        (
+            {"frames_since": 1, "shared": 0.2, "close_tracked": 9, "tracked": 49},
+            "close points run out",
+        ),
     ],
 )
 def test_orb_rule(change: dict[str, float], reason: str) -> None:
