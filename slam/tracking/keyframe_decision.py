@@ -45,7 +45,7 @@ class KeyframeConfig:
     max_shared: float = 0.5
     late_frames: int = 10
     late_shared: float = 0.6
-    urgent_shared: float = 0.25
+    urgent_shared: float = 0.4
     known_shared: float = 0.25
     min_close_tracked: int = 100
     min_close_new: int = 70

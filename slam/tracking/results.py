@@ -75,11 +75,8 @@ def lost(T_world_camera: Array, features: Features, matches: int = 0) -> Tracked
 
 
 def more(first: Tracked, second: Tracked, enough: int) -> Tracked:
-    """That of two results with enough firm landmarks, then with more of all; else the first.
-
-    Landmarks that rest on the flow alone count at most as many as the others.
-    """
-    found = [(r.firm >= enough, len(r.landmark_ids), len(r.landmark_ids)) for r in (first, second)]
+    """That of two results with enough firm landmarks, then with more of all; else the first."""
+    found = [(r.firm >= enough, len(r.landmark_ids)) for r in (first, second)]
     return second if found[1] > found[0] else first
 
 
