@@ -33,7 +33,7 @@ class FeatureConfig:
     """
 
     thresholds: tuple[int, ...] = (50, 35, 25, 18, 13, 9)
-    layer_shares: tuple[float, ...] = (0.75, 0.25)
+    layer_shares: tuple[float, ...] = (1.0,)
     max_keypoints: int = 850
     bucket_px: int = 40
     border_px: int = 20
