@@ -154,7 +154,7 @@ def test_depth_and_disparity_of_a_plane() -> None:
 
 
 def test_sigmas_grow_with_the_square_root_of_scale() -> None:
-    frontal = extract(FRONTAL)
+    frontal = extract(FRONTAL, dataclasses.replace(CONFIG, layer_shares=(0.7, 0.3)))
     np.testing.assert_allclose(frontal.sigmas_px[:, 2], KINECT_DISPARITY_SIGMA_PX, rtol=1e-3)
     np.testing.assert_array_equal(frontal.sigmas_px[:, 0], frontal.sigmas_px[:, 1])
     expected = CONFIG.pixel_sigma * np.sqrt(frontal.scales)

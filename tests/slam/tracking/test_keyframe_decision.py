@@ -15,6 +15,7 @@ ORB = KeyframeConfig(
     max_shared=0.7,
     late_frames=30,
     late_shared=0.8,
+    urgent_shared=0.25,
     min_close_tracked=100,
     min_close_new=70,
 )
