@@ -198,7 +198,7 @@ def main() -> None:
 
 
 def measure_real_cameras(arguments: argparse.Namespace) -> None:
-    """The tables of docs/results/real-cameras.md and README, and the labels of real rooms.
+    """The tables of docs/results/real-cameras.md, dense.md and README, and labels of real rooms.
 
     None where there are no data.
     """
@@ -211,6 +211,8 @@ def measure_real_cameras(arguments: argparse.Namespace) -> None:
         print(rooms)
         for section in ("table", "loops"):
             replace_section(report, make_section(report, section, arguments.work))
+        dense = REPORTS["dense"]
+        replace_section(dense, make_section(dense, "rooms", arguments.work))
     printed = ["--report-only", "--work", str(arguments.work), "--readme", str(ROOT / "README.md")]
     print(call([*command, *printed]).partition("\n\n")[0])
 

@@ -46,6 +46,7 @@ class MapKeywords(TypedDict, total=False):
     voxel_m: float
     source: str
     device: str
+    keep_volume: bool
     quiet: bool
 
 
@@ -105,7 +106,7 @@ def map_run(
     Args:
         run: a run folder or a `Run`.
         segmenter: "light", "none", ..., or options; None: that of the run.
-        mesh: also write dense/mesh.ply. plan: also write dense/plan.png, a floor plan.
+        mesh: also write dense/mesh.ply and .glb. plan: also write dense/plan.png, a floor plan.
         options: see `MapKeywords`; without ``quiet=False`` there is no progress bar.
 
     Raises:

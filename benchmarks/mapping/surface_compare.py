@@ -1,6 +1,9 @@
 """The surface of a run beside Open3D's TSDF volume of the same frames and poses.
 
-    python -m benchmarks.mapping.surface_compare RUN[=TRUE_SEQUENCE] ... [--out DIR]
+    python -m benchmarks.mapping.surface_compare [RUN[=true] ...] [--work DIR]
+
+Without RUN it renders two rooms with different seeds, and runs them, the kitchen and Bonn by
+default options, where these are not in DIR yet; ``make bench`` does that.
 
 Open3D integrates all tracked frames at 1 cm with its default truncation of 8 voxels, and shows what
 at least three frames saw; "with masks" means that the run's own segmenter cuts what can move out of
@@ -9,7 +12,7 @@ every frame. Each method runs in a process of its own, for its time and memory.
 Flat patches: balls of 10 cm around places where a keyframe's depth is flat; rms of the vertices
 about their own plane, median and 90th percentile, and the median angle of their normals to it.
 Ghosts: vertices that more frames see through than see. Coverage: share of the fused keyframes'
-points with a vertex within 2 cm. With TRUE_SEQUENCE, a rendered room: distance of the vertices to
+points with a vertex within 2 cm. With =true, a rendered room: distance of the vertices to
 the true surface, and the share of that which has a vertex within 2 and 5 cm.
 """
 
@@ -19,6 +22,7 @@ import argparse
 import multiprocessing
 import resource
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,6 +37,8 @@ from scipy.spatial import cKDTree
 
 from benchmarks.mapping.dense_surface import VOXEL_M, read_truth, surface
 from benchmarks.mapping.open3d_tsdf import DepthView, integrated
+from benchmarks.paths import SHARED
+from benchmarks.suite.measure import call, render
 from bmask_slam.dense.folder import DenseFolder
 from bmask_slam.dense.keyframe_input import load_keyframe, undistort_images
 from bmask_slam.dense.map_run import map_run, open_fusion
@@ -50,6 +56,12 @@ TRUNCATION_VOXELS, MIN_FRAMES = 8.0, 3.0
 PATCHES, PATCH_M, FLAT = 400, 0.1, (0.002, 0.004)
 """A keyframe's patch is flat if its rms is below 2 mm and 4 mm a square metre of depth."""
 GHOST_STEP, GHOST_SAMPLE = 3, 40_000
+RENDERED = {
+    "office": ("office-300", ("--frames", "300", "--true-depth")),
+    "living_room": ("living_room-3", ("--frames", "200", "--seed", "3", "--true-depth")),
+}
+REAL = {"redkitchen": "600", "bonn_crowd": "280"}
+"""Real sequences, and how many of their frames."""
 
 
 def ours(run: Path, out: Path) -> None:
@@ -263,7 +275,8 @@ def measure(
         if true is not None:
             row |= truth_errors(mesh, true)
         rows[name] = row | used
-        print(run_path.name, name, {k: round(v, 3) for k, v in rows[name].items()}, flush=True)
+        shown = {k: round(v, 3) for k, v in rows[name].items()}
+        print(run_path.name, name, shown, file=sys.stderr, flush=True)
     return rows
 
 
@@ -277,17 +290,35 @@ def table(title: str, rows: dict[str, dict[str, float]]) -> Iterator[str]:
     yield ""
 
 
+def runs_of(work: Path) -> list[str]:
+    """The runs to compare, made where they are missing, as the command line would name them."""
+    found = []
+    for name, (folder, options) in RENDERED.items():
+        render(work / folder, name, options)
+        found.append(f"{_run(work / folder, work, '300')}=true")
+    return [str(_run(SHARED / name, work, most)) for name, most in REAL.items()] + found
+
+
+def _run(sequence: Path, work: Path, most: str) -> Path:
+    out = work / "surfaces" / sequence.name
+    if not (out / "map").exists():
+        command = ["-m", "bmask_slam", "run", str(sequence), "--max-frames", most]
+        call([*command, "--out", str(out), "--overwrite", "--quiet"])
+    return out
+
+
 def main() -> None:
     """Parse, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("runs", nargs="+", help="run folders; NAME=true for rendered rooms")
-    parser.add_argument("--out", type=Path, default=Path("runs/bench/surfaces"))
+    parser.add_argument("runs", nargs="*", help="run folders; NAME=true for rendered rooms")
+    parser.add_argument("--work", type=Path, default=Path("runs/bench"), help="for runs and meshes")
     parser.add_argument("--methods", default=";".join(METHODS), help="which (default: %(default)s)")
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    for given in args.runs:
+    out = args.work / "surfaces" / "meshes"
+    out.mkdir(parents=True, exist_ok=True)
+    for given in args.runs or runs_of(args.work):
         path, _, true = given.partition("=")
-        rows = measure(Path(path), args.out, args.methods.split(";"), bool(true))
+        rows = measure(Path(path), out, args.methods.split(";"), bool(true))
         print("\n".join(table(Path(path).name, rows)), flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Point clouds written block by block as PLY and PCD, and meshes as PLY: whole or not at all."""
+"""Point clouds written block by block as PLY and PCD: whole or not at all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from bmask_slam.graph.arrays import Bytes, Ints
+from bmask_slam.graph.arrays import Bytes
 from bmask_slam.graph.whole_file import whole_file
 from bmask_slam.mapping.products.cloud import Cloud
 
@@ -132,24 +132,3 @@ def _pcd_header(count: int) -> str:
         "DATA binary",
     ]
     return "\n".join(lines) + "\n"
-
-
-_FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
-
-
-def write_mesh(path: Path, vertices: Cloud, triangles: Ints) -> Path:
-    """Write a mesh of N vertices, with the columns of a cloud, and triangles (M, 3) of them."""
-    faces = np.empty(len(triangles), _FACE)
-    faces["count"], faces["vertices"] = 3, triangles
-    lines = ["ply", "format binary_little_endian 1.0", "comment bmask-slam, world frame, metres"]
-    lines += [f"element vertex {len(vertices)}", *ply_properties()]
-    lines += [
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
-    with whole_file(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(lines).encode("ascii"))
-        file.write(ply_rows(vertices).tobytes())
-        file.write(faces.tobytes())
-    return path

@@ -21,8 +21,16 @@ MIN_SIGMA_M = 0.01
 BEHIND_SIGMAS, BEHIND_VOXELS = 3.0, (3, 8)
 SILHOUETTE_PX = 3
 """Silhouettes of depth are not exact to a pixel."""
-PAINT_PX, FAINT = 8, 0.01
-"""Colours so near to a rim or hole, which may be those of what is in front, hardly count."""
+PAINT_PX, GLARE, FAINT = 8, 250, 0.01
+"""Colours so near to a rim or hole, which may be those of what is in front, and colours as bright
+as the camera can tell, hardly count."""
+SIGHT = (0.05, 4.0)
+"""Least and largest weight cos(angle) / z^2, in 1/m^2, of a view's colour."""
+DARKEST, BRIGHTEST = 16.0, 240.0
+"""Colours beyond these are cut off by the camera, or noise."""
+MIN_PIXELS, MAX_GAIN = 100, 2.5
+PULL = 0.95
+"""Share of a difference that is made up for: else errors of the gains would add up on the way."""
 UNEXPLAINED = 0.25
 """How much a frame counts as a witness of a surface that the keyframes did not see."""
 NX, NY, NZ, OFFSET, WEIGHT, Z, BEHIND, WITNESS = range(8)
@@ -81,7 +89,9 @@ def depth_frame(
     pixels = pixels.reshape(-1, 8)
     paint = torch.empty((len(pixels), 4))
     paint[:, :3] = torch.from_numpy(rgb).reshape(-1, 3)
-    paint[:, 3] = torch.where(_least_around(pixels[:, Z], z.shape, PAINT_PX) > 0, 1, FAINT)
+    clear = (_least_around(pixels[:, Z], z.shape, PAINT_PX) > 0) & (paint[:, :3] < GLARE).all(1)
+    best = (cosine / z.square()).reshape(-1).nan_to_num_().clamp_(*SIGHT)
+    paint[:, 3] = best * torch.where(clear, 1, FAINT)
     free_m = _least_around(pixels[:, Z], z.shape, SILHOUETTE_PX)
     return DepthFrame(pixels, free_m, paint, T_world_camera)
 
@@ -106,3 +116,19 @@ def _rims(rho: Tensor) -> Tensor:
         at[:, 1:].logical_or_(apart)
         at[:, :-1].logical_or_(apart)
     return found
+
+
+def gains(seen: Tensor, known: Tensor) -> Tensor:
+    """Factors (3,) of red, green and blue for a frame, so that it looks as the surface does.
+
+    ``seen`` (N, 3) are colours of pixels of the frame, ``known`` (N, 4) those of the surface there
+    and their weights. gain = (median of known / seen)^PULL, at most MAX_GAIN either way; 1 where
+    too few are known. Colours are sRGB, about light^(1 / 2.2): a factor of the light is one of them
+    too.
+    """
+    inside = (known[:, 3] > 0) & (seen >= DARKEST).all(1) & (seen <= BRIGHTEST).all(1)
+    inside &= (known[:, :3] >= DARKEST).all(1) & (known[:, :3] <= BRIGHTEST).all(1)
+    if int(inside.sum()) < MIN_PIXELS:
+        return torch.ones(3)
+    ratio = known[inside, :3] / seen[inside]
+    return ratio.median(0).values.pow(PULL).clamp(1 / MAX_GAIN, MAX_GAIN)

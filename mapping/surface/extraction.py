@@ -14,14 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Ints, Mask
-from bmask_slam.mapping.surface.volume import (
-    BRICK,
-    COLOUR_VOXELS,
-    EDGE,
-    SurfaceVolume,
-    block_indices,
-    block_keys,
-)
+from bmask_slam.mapping.surface.blocks import BRICK, EDGE, block_indices, block_keys
+from bmask_slam.mapping.surface.volume import COLOUR_VOXELS, SurfaceVolume
 
 CORNERS = np.array(list(product((0, 1), repeat=3)))
 EDGES = [(a, b) for a, b in combinations(range(8), 2) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1]
@@ -142,6 +136,7 @@ def _blocks_with_halo(
             inside = tuple(slice(EDGE * c, EDGE + c) for c in corner)
             _copy(volume, places[at[found]], cells, (found, *inside), min_witnesses)
         yield cells
+        volume.release()
 
 
 def _copy(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,6 +12,17 @@ from torch import Tensor
 from bmask_slam.graph.arrays import Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.geometry import inverse
+from bmask_slam.mapping.surface.blocks import (
+    BRICK,
+    BRICK_VOXELS,
+    BRICKS,
+    EDGE,
+    block_indices,
+    block_keys,
+    lattice,
+    open_tables,
+    voxel_places,
+)
 from bmask_slam.mapping.surface.depth_frame import (
     BEHIND,
     NX,
@@ -19,11 +33,9 @@ from bmask_slam.mapping.surface.depth_frame import (
     WITNESS,
     DepthFrame,
     Z,
+    gains,
 )
 
-EDGE, BRICK = 8, 4
-"""Edges in voxels of a block, the unit of memory, and of a brick, the unit of work."""
-BRICKS, BRICK_VOXELS = (EDGE // BRICK) ** 3, BRICK**3
 FRONT_VOXELS = 8
 """Distances in front of a surface are cut off at so many voxels."""
 COLOUR_VOXELS = 2.0
@@ -31,7 +43,12 @@ COLOUR_VOXELS = 2.0
 FREE_SHARE = 0.02
 """A ray passes a voxel freely if the surface is farther by the cut-off and this share of depth."""
 AT_ONCE, MAX_RAY_STEP_PX, NEAREST_M = 1024, 4, 0.1
-TABLES = ("distance", "weight", "witnesses", "free", "colour")
+HALF_MAX = 6e4
+"""Weights of colours are cut off here, below the largest float16."""
+SAMPLES = 4800
+"""About so many pixels tell about a frame's exposure."""
+RELEASE_FRAMES = 32
+"""So often the memory of the tables is given back."""
 
 
 class SurfaceVolume:
@@ -41,6 +58,8 @@ class SurfaceVolume:
     i * voxel_m. What lies in front of a measured surface is also counted as free, wherever there is
     a block, so that what moved away can be found.
 
+    The tables lie in files without names, see ``FileTable``: in memory is what the last frames saw.
+
     Attributes:
         voxel_m: edge of a voxel.
         distance: (8 B, 64) float32, metres, positive in front of the surface.
@@ -49,17 +68,45 @@ class SurfaceVolume:
         colour: (8 B, 64, 4) float16, 0 to 255, and the sum of its weights.
     """
 
-    def __init__(self, voxel_m: float, camera: Camera, blocks: int = 1024) -> None:
-        """``blocks``: how many the tables hold before they grow."""
+    distance: Tensor
+    weight: Tensor
+    witnesses: Tensor
+    free: Tensor
+    colour: Tensor
+
+    def __init__(
+        self,
+        voxel_m: float,
+        camera: Camera,
+        blocks: int = 1024,
+        folder: Path | None = None,
+        kept: Ints | None = None,
+    ) -> None:
+        """An empty volume, or that in the files of a folder.
+
+        The tables hold so many ``blocks`` before they grow. Their files in ``folder`` (None: the
+        system's for such) vanish with the volume; with ``kept`` they stay, and hold the blocks with
+        these keys (B,). Raises InputError: the files cannot be made.
+        """
         self.voxel_m, self._camera = voxel_m, camera
         self._number: dict[int, int] = {}
-        self._origin = torch.zeros((blocks, 3))
-        size, half = (blocks * BRICKS, BRICK_VOXELS), torch.float16
-        self.distance, self.weight = torch.zeros(size), torch.zeros(size)
-        self.witnesses, self.free = torch.zeros(size, dtype=half), torch.zeros(size, dtype=half)
-        self.colour = torch.zeros((*size, 4), dtype=half)
-        self._voxels = _lattice(BRICK, 1) * voxel_m
-        self._bricks = _lattice(EDGE, BRICK) * voxel_m
+        self._origin = torch.zeros((0, 3))
+        self._tables = open_tables(folder, kept is not None)
+        self._frames = 0
+        self._voxels = lattice(BRICK, 1) * voxel_m
+        self._bricks = lattice(EDGE, BRICK) * voxel_m
+        self._reserve(max(blocks, 0 if kept is None else len(kept)))
+        self._add_blocks([] if kept is None else kept.tolist())
+
+    def release(self) -> None:
+        """Give back the memory of the tables; what is used again is read again."""
+        for table in self._tables.values():
+            table.release()
+
+    def close(self) -> None:
+        """Let kept files end where the blocks do; the volume is not used any more."""
+        for table in self._tables.values():
+            table.cut(len(self) * BRICKS)
 
     def __len__(self) -> int:
         return len(self._number)
@@ -69,25 +116,42 @@ class SurfaceVolume:
         """Keys (B,) of the blocks in the order of the tables, see ``block_keys``."""
         return np.fromiter(self._number, np.int64, len(self))
 
-    def integrate(self, frame: DepthFrame) -> None:
-        """Add what a frame measured."""
-        self._make_blocks(frame)
+    def integrate(self, frame: DepthFrame, only: Tensor | None = None) -> Ints:
+        """Add what a frame measured, if given to those blocks (B,) only that exist and are marked.
+
+        Returns the numbers of the blocks that changed.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        frame = self._as_seen_before(frame)
+        if only is None:
+            self._make_blocks(frame)
         T_camera_world = torch.from_numpy(inverse(frame.T_world_camera)).to(torch.float32)
         bricks = self._seen(frame, T_camera_world)
+        if only is not None:
+            bricks = bricks[only.index_select(0, bricks // BRICKS)]
         for start in range(0, len(bricks), AT_ONCE):
             self._update(bricks[start : start + AT_ONCE], frame, T_camera_world)
+        self._frames += 1
+        if self._frames % RELEASE_FRAMES == 0:
+            self.release()
+        return torch.unique_consecutive(bricks // BRICKS).numpy()
+
+    def clear(self, blocks: Tensor) -> None:
+        """Forget what is known of the blocks that are marked (B,)."""
+        numbers = torch.nonzero(blocks)[:, 0]
+        bricks = (numbers[:, None] * BRICKS + torch.arange(BRICKS)).reshape(-1)
+        for table in self._tables.values():
+            table.rows.index_fill_(0, bricks, 0)
 
     def _make_blocks(self, frame: DepthFrame) -> None:
         """Make the blocks around the surface that the frame saw."""
         camera, edge_m = self._camera, EDGE * self.voxel_m
-        image = frame.pixels.reshape(camera.height, camera.width, -1)
-        farthest_m = max(float(image[..., Z].max()), NEAREST_M)
+        farthest_m = max(float(frame.pixels[:, Z].max()), NEAREST_M)
         step = int(np.clip(0.5 * edge_m * camera.fx / farthest_m, 1, MAX_RAY_STEP_PX))
-        some = image[::step, ::step]
-        v, u = torch.nonzero(some[..., WEIGHT]).mul_(step).to(torch.float32).unbind(-1)
-        known = some[some[..., WEIGHT] > 0]
-        rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
-        rays = torch.nn.functional.pad(rays, (0, 1), value=1)
+        pixel, rays = self._rays(frame, step)
+        known = frame.pixels[pixel]
         T = torch.from_numpy(frame.T_world_camera).to(torch.float32)
         keys = []
         for share in (-1.0, -0.5, 0.0, 0.5, 1.0):
@@ -95,23 +159,52 @@ class SurfaceVolume:
             points = rays * (known[:, Z] + share * reach)[:, None] @ T[:3, :3].T + T[:3, 3]
             keys.append(block_keys(torch.floor(points / edge_m).to(torch.int64)))
         new = [k for k in torch.unique(torch.cat(keys)).tolist() if k not in self._number]
+        self._reserve(len(self) + len(new))
+        self._add_blocks(new)
+
+    def _add_blocks(self, keys: list[int]) -> None:
+        """Number new blocks, for which there is room."""
         first = len(self)
-        self._reserve(first + len(new))
-        self._number.update(zip(new, range(first, first + len(new)), strict=True))
-        indices = block_indices(torch.tensor(new, dtype=torch.int64))
-        self._origin[first : len(self)] = indices.to(torch.float32) * edge_m
+        self._number.update(zip(keys, range(first, first + len(keys)), strict=True))
+        indices = block_indices(torch.tensor(keys, dtype=torch.int64))
+        self._origin[first : len(self)] = indices.to(torch.float32) * (EDGE * self.voxel_m)
+
+    def _rays(self, frame: DepthFrame, step: int) -> tuple[Tensor, Tensor]:
+        """Every ``step``-th pixel (N,) that tells something, and its ray (N, 3) with z = 1."""
+        camera = self._camera
+        image = frame.pixels[:, WEIGHT].reshape(camera.height, camera.width)
+        v, u = torch.nonzero(image[::step, ::step]).mul_(step).unbind(-1)
+        rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
+        return v * camera.width + u, torch.nn.functional.pad(rays, (0, 1), value=1)
+
+    def _as_seen_before(self, frame: DepthFrame) -> DepthFrame:
+        """The frame in the exposure of the surface."""
+        step = max(int(np.sqrt(len(frame.pixels) / SAMPLES)), 1)
+        pixel, rays = self._rays(frame, step)
+        T = torch.from_numpy(frame.T_world_camera).to(torch.float32)
+        points = rays * frame.pixels[pixel, Z, None] @ T[:3, :3].T + T[:3, 3]
+        gain = gains(frame.paint[pixel, :3], self.colours_at(points))
+        return replace(frame, paint=frame.paint * torch.nn.functional.pad(gain, (0, 1), value=1))
+
+    def colours_at(self, points_world: Tensor) -> Tensor:
+        """Colours (N, 3) of the voxels at points (N, 3), and their weights: (N, 4)."""
+        keys, row = voxel_places(torch.floor(points_world / self.voxel_m + 0.5).to(torch.int64))
+        keys, which = torch.unique(keys, return_inverse=True)
+        number = torch.tensor([self._number.get(k, -1) for k in keys.tolist()])[which]
+        row += number.clamp(min=0) * (BRICKS * BRICK_VOXELS)
+        return self.colour.view(-1, 4)[row].to(torch.float32) * (number >= 0)[:, None]
 
     def _reserve(self, blocks: int) -> None:
         """Let the tables hold so many blocks."""
-        if blocks <= len(self._origin):
+        held = len(self._origin)
+        if blocks <= held:
             return
-        blocks = max(blocks, len(self._origin) * 3 // 2)
-        for name in (*TABLES, "_origin"):
-            old = getattr(self, name)
-            rows = blocks * (len(old) // len(self._origin) if name != "_origin" else 1)
-            new = torch.zeros((rows, *old.shape[1:]), dtype=old.dtype)
-            new[: len(old)] = old
-            setattr(self, name, new)
+        blocks = max(blocks, held * 3 // 2)
+        origin, self._origin = self._origin, torch.zeros((blocks, 3))
+        self._origin[:held] = origin
+        for name, table in self._tables.items():
+            table.grow(blocks * BRICKS)
+            setattr(self, name, table.rows)
 
     def _seen(self, frame: DepthFrame, T_camera_world: Tensor) -> Tensor:
         """Numbers (N,) of the bricks that are at a surface of the frame or in front of it."""
@@ -179,7 +272,7 @@ class SurfaceVolume:
         added = weight * paint[:, 3]
         total = old[:, 3] + added
         new = old + (added / total)[:, None] * (paint - old)
-        new[:, 3] = total
+        new[:, 3] = total.clamp_(max=HALF_MAX)
         colour.index_copy_(0, voxels, new.to(torch.float16))
 
     def _average(self, voxels: Tensor, d: Tensor, added: Tensor, behind: Tensor) -> None:
@@ -201,21 +294,3 @@ def _add(table: Tensor, rows: Tensor, values: Tensor | int) -> None:
     """Add values to rows (N,), all different, of a table, seen as one column."""
     column = table.view(-1)
     column.index_copy_(0, rows, column.index_select(0, rows) + values)
-
-
-def _lattice(edge: int, step: int) -> Tensor:
-    """Points (N, 3) of a cube, ``step`` apart, the last index first."""
-    axis = torch.arange(0, edge, step, dtype=torch.float32)
-    return torch.cartesian_prod(axis, axis, axis)
-
-
-def block_keys(index: Tensor) -> Tensor:
-    """Keys (N,) of indices (N, 3), with 21 bits for each axis."""
-    shifted = index + (1 << 20)
-    return (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]
-
-
-def block_indices(keys: Tensor) -> Tensor:
-    """Indices (N, 3) of keys (N,)."""
-    mask = (1 << 21) - 1
-    return torch.stack([keys >> 42, (keys >> 21) & mask, keys & mask], dim=-1) - (1 << 20)

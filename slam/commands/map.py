@@ -28,7 +28,7 @@ def add_map(commands: Commands) -> None:
     parser.add_argument(
         "--voxel", type=float, default=0.01, metavar="M", help="a point a cube (default: 0.01)"
     )
-    parser.add_argument("--mesh", action="store_true", help="also a mesh (mesh.ply)")
+    parser.add_argument("--mesh", action="store_true", help="also a mesh (mesh.ply, mesh.glb)")
     parser.add_argument("--plan", action="store_true", help="also a floor plan (plan.png)")
     add_segmenter_arguments(parser, "the run's own")
     parser.add_argument(
@@ -44,6 +44,12 @@ def add_map(commands: Commands) -> None:
         help="stereo: rectified pairs, with the right images of right.txt; motion: a plane sweep "
         "between keyframes; both: the sensor, and where it has nothing the pair or else the sweep "
         "(default: sensor)",
+    )
+    parser.add_argument(
+        "--keep-volume",
+        action="store_true",
+        help="keep the surface's volume (some hundred MB): the next map with it integrates only "
+        "what moved since",
     )
     parser.add_argument("--device", default="cpu", help="where depth is fused (default: cpu)")
     parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
@@ -66,6 +72,7 @@ def _map(arguments: argparse.Namespace) -> int:
         device=arguments.device,
         mesh=arguments.mesh,
         plan=arguments.plan,
+        keep_volume=arguments.keep_volume,
     )
     with console_log(), counting_bar(arguments.quiet) as progress:
         summary = map_run(options, progress)

@@ -10,7 +10,8 @@ cloud.ply, .pcd     the cloud, with normals, label, probability and sigma of eac
 semantic.ply, .pcd  the same in the colours of the labels, if there are labels
 objects/ID-CLASS    a cloud of each object of the run
 moving/ID, .ply     with --moving: excluded points of each keyframe, and the cloud of all of them
-mesh.ply            the mesh, with the same columns
+volume/             with --keep-volume: the surface's voxels, and which frames are in them
+mesh.ply, .glb      the mesh, with the same columns; for viewers
 plan.png            the map from above
 view_*.png          pictures of cloud and mesh
 legend.json         colours of the labels
@@ -57,7 +58,7 @@ _NO_EVIDENCE = InstanceEvidence(
     np.zeros((0, 0), np.float32), np.zeros(0, np.int64), np.zeros(0, np.uint16)
 )
 PARTS = ("depth", "colours", "moving", "labels")
-OLD_PARTS = ("submaps",)
+OLD_PARTS = ("submaps", "volume")
 METHOD = 4
 """Version of the method; to be raised when the same settings give other submaps than before."""
 
@@ -221,6 +222,10 @@ class DenseFolder:
     def fused(self, keyframe_id: int) -> InverseDepthMap:
         """The fused inverse depth of a finished keyframe."""
         return read_depth_map(self._file("depth", keyframe_id))
+
+    def written_ns(self, keyframe_id: int) -> int:
+        """When the fused depth of a finished keyframe was written, in ns."""
+        return self._file("depth", keyframe_id).stat().st_mtime_ns
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file, or replace it."""

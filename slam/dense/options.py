@@ -36,6 +36,7 @@ class MapOptions:
         source: where depth comes from, see `mapping.inverse_depth.dense_mapper.DenseConfig`.
         device: torch's name of the device that computes the fusion.
         mesh, plan: whether to make them.
+        keep_volume: keep the surface's volume, so that the next map only integrates what moved.
     """
 
     run: Path
@@ -48,6 +49,7 @@ class MapOptions:
     device: str = "cpu"
     mesh: bool = False
     plan: bool = False
+    keep_volume: bool = False
 
 
 def resolve_options(options: MapOptions, labels: LabelSet) -> MapOptions:

@@ -18,8 +18,9 @@ from bmask_slam.graph.files.file_names import file_stem
 from bmask_slam.graph.geometry import make_pose
 from bmask_slam.graph.whole_file import remove
 from bmask_slam.mapping.products.cloud import Cloud
-from bmask_slam.mapping.products.cloud_files import CloudWriter, write_mesh
+from bmask_slam.mapping.products.cloud_files import CloudWriter
 from bmask_slam.mapping.products.floor_plan import FloorPlan, plan_frame, up_direction
+from bmask_slam.mapping.products.mesh_files import write_glb, write_mesh
 from bmask_slam.mapping.products.object_clouds import ObjectClouds, ObjectRegion
 from bmask_slam.mapping.products.pictures import (
     nearest_points,
@@ -75,7 +76,7 @@ def write_products(
     names, folder = table.stuff_fusion.names, fused.folder
     written = _write_clouds(fused, cloud, names)
     if fused.options.mesh:
-        written += _write_mesh(fused, cloud, surface.triangles)
+        written += _write_mesh(fused, cloud, surface.triangles, up_guess)
     if fused.options.plan:
         points, normals = (a.astype(float) for a in (cloud.points, cloud.normals))
         plan = FloorPlan(plan_frame(points, normals, up_guess, PLAN_CELL_M), names)
@@ -220,14 +221,16 @@ def _regions(fused: FusedMap) -> list[ObjectRegion]:
     ]
 
 
-def _write_mesh(fused: FusedMap, cloud: Cloud, triangles: Ints) -> list[Path]:
-    """Write the mesh and a picture of its shape, lit from the camera."""
+def _write_mesh(fused: FusedMap, cloud: Cloud, triangles: Ints, up_guess: Array) -> list[Path]:
+    """Write the mesh, for viewers too, and a picture of its shape, lit from the camera."""
+    up_world = up_direction(cloud.normals[::SAMPLE_STEP].astype(float), up_guess)
     path, T_world_camera = fused.folder.path, _middle(fused.keyframes())
     seen = nearest_points(cloud.points, fused.run.camera, T_world_camera, fused.options.voxel_m)
     lit = np.abs(cloud.normals @ T_world_camera[:3, 2].astype(np.float32))[:, None]
     image = painted(seen, (lit * np.full(3, 255)).astype(np.uint8))
     return [
         write_mesh(path / "mesh.ply", cloud, triangles),
+        write_glb(path / "mesh.glb", cloud, triangles, up_world),
         write_picture(path / "view_mesh.png", image),
     ]
 

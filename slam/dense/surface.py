@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+import shutil
+from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +19,7 @@ from bmask_slam.dense.options import MapOptions, fusion_config
 from bmask_slam.dense.saved_map import MappedRun, SavedMap
 from bmask_slam.graph.arrays import Array, Ints
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.graph.trajectory import nearest_indices, read_tum
 from bmask_slam.mapping.inverse_depth.depth_map import from_sensor
 from bmask_slam.mapping.inverse_depth.regularisation import regularise
@@ -26,6 +30,7 @@ from bmask_slam.mapping.surface.extraction import (
     extract,
     without_crumbs,
 )
+from bmask_slam.mapping.surface.following import FollowingSurface, read_kept
 from bmask_slam.mapping.surface.gate import KeyframeSurface
 from bmask_slam.mapping.surface.volume import SurfaceVolume
 from bmask_slam.run_folder.frame_file import FRAMES, read_frames
@@ -36,6 +41,10 @@ from bmask_slam.world.world_map import Keyframe
 
 logger = logging.getLogger(__name__)
 
+Progress = Callable[[int, int], None]
+
+VOLUME, INDEX = "volume", "index"
+"""The folder of a volume that is kept, and its file of what is in it."""
 AHEAD = 3
 """Frames that are prepared while another is integrated."""
 
@@ -58,28 +67,128 @@ class FusedMap:
         return [k for k in self.run.keyframes if self.folder.is_done(k.id)]
 
 
-def make_surface(
-    fused: FusedMap, progress: Callable[[int, int], None] = lambda done, total: None
-) -> Surface:
+def make_surface(fused: FusedMap, progress: Progress = lambda done, total: None) -> Surface:
     """The surface of the keyframes and, where their images are known, of all tracked frames.
 
     A frame is used where it is not in front of the keyframes' surface, from which people were cut
-    out. What they did not see is kept where enough frames saw it.
+    out. What they did not see is kept where enough frames saw it. If the volume of an earlier call
+    was kept, only frames whose poses moved are read again, and those that share blocks with them.
+
+    Raises:
+        InputError: images of a keyframe cannot be used, or the disk is full.
     """
-    run, voxel_m = fused.run, fused.options.voxel_m
+    run, options = fused.run, fused.options
+    frames = tracked_frames(run) if isinstance(run, MappedRun) else []
+    if options.source not in ("sensor", "both"):
+        frames = []
     with one_thread():
-        volume = SurfaceVolume(voxel_m, run.camera)
-        for keyframe in fused.keyframes():
-            volume.integrate(_keyframe(fused, keyframe))
-        frames = tracked_frames(run) if isinstance(run, MappedRun) else []
-        if fused.options.source not in ("sensor", "both") or not frames:
-            return without_crumbs(extract(volume, 1), voxel_m)
-        gate = KeyframeSurface(extract(volume, 1).vertices, run.camera)
-        for number, frame in enumerate(_prepared(fused, frames, gate)):
+        return _SurfaceMaker(fused).make(dict(frames), progress)
+
+
+class _SurfaceMaker:
+    """Integrates the keyframes of a dense map, then frames. A keyframe's number is -1 - its id."""
+
+    def __init__(self, fused: FusedMap) -> None:
+        """Raises InputError: the volume cannot be stored."""
+        self._fused = fused
+        self._gate: KeyframeSurface | None = None
+        self._keyframes = {-1 - k.id: k for k in fused.keyframes()}
+        self._folder = fused.folder.path / VOLUME
+        refuse_link(self._folder)
+        arrays = read_kept(self._folder / INDEX, self._made_of()) if self._kept else None
+        if self._kept and arrays is None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder.mkdir()
+        keys = np.zeros(0, np.int64) if arrays is None else arrays["keys"]
+        volume = self._volume(self._folder, keys) if self._kept else self._volume()
+        self._surface = FollowingSurface(volume, self._load)
+        if arrays is not None:
+            self._surface.restore(arrays)
+
+    @property
+    def _kept(self) -> bool:
+        return self._fused.options.keep_volume
+
+    def make(self, frames: dict[int, Array], progress: Progress) -> Surface:
+        """The surface of all keyframes and of frames at T_world_camera (4, 4)."""
+        surface, voxel_m = self._surface, self._fused.options.voxel_m
+        poses = {n: k.T_world_camera for n, k in self._keyframes.items()} | frames
+        alone = FollowingSurface(self._volume(), self._load) if len(surface) else surface
+        for number in self._keyframes:
+            alone.add(number, self._keyframe(number, poses[number]))
+        if frames:
+            seen = extract(alone.volume, 1).vertices
+            self._gate = KeyframeSurface(seen, self._fused.run.camera)
+        read = surface.follow(poses, [n for n in surface if n not in poses])
+        if read:
+            logger.info("%d frames and keyframes were integrated again", read)
+        new = {n: T for n, T in frames.items() if n not in surface}
+        for number, frame in self._prepared(new):
             if frame is not None:
-                volume.integrate(frame)
-            progress(number + 1, len(frames))
-        return without_crumbs(extract(volume, MIN_WITNESSES), voxel_m)
+                surface.add(number, frame)
+            progress(len(surface), len(poses))
+        found = extract(surface.volume, MIN_WITNESSES if frames else 1)
+        if self._kept:
+            surface.save(self._folder / INDEX, self._made_of())
+        return without_crumbs(found, voxel_m)
+
+    def _volume(self, folder: Path | None = None, kept: Ints | None = None) -> SurfaceVolume:
+        folder = self._fused.folder.path if folder is None else folder
+        options, camera = self._fused.options, self._fused.run.camera
+        return SurfaceVolume(options.voxel_m, camera, folder=folder, kept=kept)
+
+    def _made_of(self) -> dict[str, Any]:
+        """What a kept volume must be of, beside the settings of the folder: all but poses."""
+        ids = sorted(k.id for k in self._keyframes.values())
+        return {
+            "camera": repr(self._fused.run.camera),
+            "keyframes": [[number, self._fused.folder.written_ns(number)] for number in ids],
+        }
+
+    def _load(self, number: int, T_world_camera: Array) -> DepthFrame | None:
+        if number < 0:
+            return self._keyframe(number, T_world_camera)
+        return self._frame(number, T_world_camera)
+
+    def _keyframe(self, number: int, T_world_camera: Array) -> DepthFrame:
+        fused, number = self._fused, -1 - number
+        folder, camera = fused.folder, fused.run.camera
+        depth, rgb = folder.fused(number), folder.colours(number)
+        pixels = folder.evidence(number).pixels
+        if {depth.rho.shape, rgb.shape[:2], pixels.shape} != {(camera.height, camera.width)}:
+            raise InputError(
+                f"{folder.path}: the images of keyframe {number} are not of the camera's size; "
+                "remove the folder and map again"
+            )
+        return depth_frame(depth, rgb, T_world_camera, camera, fused.options.voxel_m)
+
+    def _prepared(self, frames: dict[int, Array]) -> Iterator[tuple[int, DepthFrame | None]]:
+        """The frames in order, some prepared ahead by a second thread."""
+        with ThreadPoolExecutor(1) as thread:
+            waiting: deque[tuple[int, Future[DepthFrame | None]]] = deque()
+            for number, T in frames.items():
+                waiting.append((number, thread.submit(self._frame, number, T)))
+                if len(waiting) > AHEAD:
+                    done, frame = waiting.popleft()
+                    yield done, frame.result()
+            yield from ((number, frame.result()) for number, frame in waiting)
+
+    def _frame(self, index: int, T_world_camera: Array) -> DepthFrame | None:
+        """A frame after Step 3 and the gate; None if its images cannot be read."""
+        run, options = self._fused.run, self._fused.options
+        assert isinstance(run, MappedRun)
+        assert self._gate is not None
+        try:
+            rgb, depth_m = undistort_images(run.sequence.load(index), run.camera)
+        except InputError as error:
+            logger.warning("%s; not in the surface", error)
+            return None
+        measured = regularise(from_sensor(depth_m, run.camera, fusion_config(options).measurement))
+        verdict = self._gate.judge(measured.depth_m(), T_world_camera)
+        measured = measured.without(verdict.in_front)
+        frame = depth_frame(measured, rgb, T_world_camera, run.camera, options.voxel_m)
+        mark_unexplained(frame, verdict.unexplained)
+        return frame
 
 
 def tracked_frames(run: MappedRun) -> list[tuple[int, Array]]:
@@ -111,47 +220,3 @@ def frames_a_keyframe(fused: FusedMap) -> float:
     run = fused.run
     frames = len(tracked_frames(run)) if isinstance(run, MappedRun) else 0
     return max(frames / max(len(fused.keyframes()), 1), 1.0)
-
-
-def _keyframe(fused: FusedMap, keyframe: Keyframe) -> DepthFrame:
-    folder, camera, voxel_m = fused.folder, fused.run.camera, fused.options.voxel_m
-    depth, rgb = folder.fused(keyframe.id), folder.colours(keyframe.id)
-    pixels = folder.evidence(keyframe.id).pixels
-    if {depth.rho.shape, rgb.shape[:2], pixels.shape} != {(camera.height, camera.width)}:
-        raise InputError(
-            f"{folder.path}: the images of keyframe {keyframe.id} are not of the camera's size; "
-            "remove the folder and map again"
-        )
-    return depth_frame(depth, rgb, keyframe.T_world_camera, camera, voxel_m)
-
-
-def _prepared(
-    fused: FusedMap, frames: list[tuple[int, Array]], gate: KeyframeSurface
-) -> Iterator[DepthFrame | None]:
-    """The frames in order, some prepared ahead by a second thread."""
-    with ThreadPoolExecutor(1) as thread:
-        waiting = [thread.submit(_frame, fused, *frame, gate) for frame in frames[:AHEAD]]
-        for number in range(len(frames)):
-            if number + AHEAD < len(frames):
-                waiting.append(thread.submit(_frame, fused, *frames[number + AHEAD], gate))
-            yield waiting.pop(0).result()
-
-
-def _frame(
-    fused: FusedMap, index: int, T_world_camera: Array, gate: KeyframeSurface
-) -> DepthFrame | None:
-    """A frame after Step 3 and the gate; None if its images cannot be read."""
-    run = fused.run
-    assert isinstance(run, MappedRun)
-    try:
-        rgb, depth_m = undistort_images(run.sequence.load(index), run.camera)
-    except InputError as error:
-        logger.warning("%s; not in the surface", error)
-        return None
-    measurement = fusion_config(fused.options).measurement
-    measured = regularise(from_sensor(depth_m, run.camera, measurement))
-    verdict = gate.judge(measured.depth_m(), T_world_camera)
-    measured = measured.without(verdict.in_front)
-    frame = depth_frame(measured, rgb, T_world_camera, run.camera, fused.options.voxel_m)
-    mark_unexplained(frame, verdict.unexplained)
-    return frame

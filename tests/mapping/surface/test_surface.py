@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
 from bmask_slam.mapping.open3d_loader import load_open3d
 from bmask_slam.mapping.products.cloud import Cloud
-from bmask_slam.mapping.products.cloud_files import write_mesh
+from bmask_slam.mapping.products.mesh_files import write_glb, write_mesh
 from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame, mark_unexplained
 from bmask_slam.mapping.surface.extraction import Surface, extract, without_crumbs
 from bmask_slam.mapping.surface.gate import KeyframeSurface
@@ -156,3 +158,30 @@ def test_the_mesh_is_read_back_by_others(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(mesh.triangles), found.triangles)
     np.testing.assert_allclose(np.asarray(mesh.vertices), found.vertices, atol=1e-6)
     np.testing.assert_allclose(np.asarray(mesh.vertex_normals), found.normals, atol=1e-6)
+
+
+def test_a_mesh_for_viewers_stands_upright(tmp_path: Path) -> None:
+    """A floor of the world with y down: up in glTF is y."""
+    found = surface_of([frame(np.full((30, 40), 0.5), np.eye(4), 180)] * 3)
+    count = len(found.vertices)
+    ones, labels = np.ones(count, np.float32), np.full(count, 7, np.uint16)
+    cloud = Cloud(found.vertices, found.normals, found.colours, 0.01 * ones, labels, ones, labels)
+    up_world = np.array([0.0, -0.8, -0.6])
+    path = write_glb(tmp_path / "mesh.glb", cloud, found.triangles, up_world)
+    mesh = load_open3d().io.read_triangle_mesh(str(path))
+    turned = np.asarray(mesh.vertices)  # in an order of its own
+    np.testing.assert_allclose(np.sort(turned[:, 1]), np.sort(found.vertices @ up_world), atol=1e-5)
+    assert turned[:, 2].max() < 0  # the first camera looks along -z
+    assert len(mesh.triangles) == len(found.triangles)
+    mesh.compute_triangle_normals()
+    facing = np.asarray(mesh.triangle_normals)
+    np.testing.assert_allclose(facing @ [0, 0.6, 0.8], 1, atol=1e-4)  # to the camera
+    linear = ((180 / 255 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(np.asarray(mesh.vertex_colors), linear, atol=1e-3)
+    data = path.read_bytes()
+    assert struct.unpack("<4sII", data[:12]) == (b"glTF", 2, len(data))
+    text = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    sigma = text["bufferViews"][text["meshes"][0]["primitives"][0]["attributes"]["_SIGMA"]]
+    first = data.index(b"BIN\0") + 4 + sigma["byteOffset"]
+    values = np.frombuffer(data, "<f4", count, first)
+    np.testing.assert_array_equal(values, cloud.sigmas_m)

@@ -17,7 +17,10 @@ from true_run import FRAMES, make_run
 from bmask_slam.cli import main
 from bmask_slam.dense.folder import LABEL_FILE, DenseFolder
 from bmask_slam.dense.keyframe_input import load_keyframe
+from bmask_slam.dense.options import MapOptions
 from bmask_slam.dense.saved_map import MappedRun, open_run
+from bmask_slam.dense.surface import FusedMap, make_surface
+from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.array_file import nested, write_arrays
 from bmask_slam.graph.files.ply import read_ply
@@ -56,7 +59,15 @@ def mapped(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_products_are_written(mapped: Path) -> None:
     names = {p.name for p in (mapped / "dense").iterdir()}
-    expected = {"cloud.ply", "cloud.pcd", "semantic.ply", "mesh.ply", "plan.png", "legend.json"}
+    expected = {
+        "cloud.ply",
+        "cloud.pcd",
+        "semantic.ply",
+        "mesh.ply",
+        "mesh.glb",
+        "plan.png",
+        "legend.json",
+    }
     assert expected | {"dense.json", "view_first.png", "view_overview_semantic.png"} <= names
     assert not [n for n in names if n.startswith(".")]
     for name in ("plan.png", "view_first.png"):
@@ -238,6 +249,40 @@ def test_the_surface_follows_poses_that_moved(mapped: Path, tmp_path: Path) -> N
     assert np.quantile(apart, 0.95) < 0.02
     stayed = cKDTree(clouds[0]).query(clouds[1][clouds[1][:, 2] < 4])[0]
     assert np.mean(stayed > 0.03) > 0.3
+
+
+def test_a_kept_volume_reads_only_what_moved(
+    mapped: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The last frames are 10 cm off until a loop is closed."""
+    run = tmp_path / "run"
+    shutil.copytree(mapped, run)
+    opened = open_run(run)
+    assert opened.sequence.groundtruth is not None
+    truth = opened.sequence.groundtruth.poses_world_camera
+    true = inverse(truth[0]) @ truth
+    drifted = true.copy()
+    drifted[-8:, :3, 3] += (0.0, 0.0, 0.1)
+    labels = CocoSegmenter(truth_file(opened)).labels
+
+    def surface_with(poses: Array, keep: bool) -> tuple[Array, list[str]]:
+        write_tum(run / "trajectory.txt", Trajectory(opened.sequence.timestamps_s, poses))
+        options = MapOptions(run, voxel_m=0.05, keep_volume=keep)
+        caplog.clear()
+        with caplog.at_level(logging.INFO):
+            found = make_surface(FusedMap(opened, labels, DenseFolder.open(run), options))
+        return found.vertices.astype(float), [m for m in caplog.messages if "again" in m]
+
+    off, messages = surface_with(drifted, True)
+    assert not messages
+    same, messages = surface_with(drifted, True)
+    assert not messages
+    np.testing.assert_array_equal(same, off)
+    corrected, messages = surface_with(true, True)
+    assert len(messages) == 1
+    expected, _ = surface_with(true, False)
+    assert np.quantile(cKDTree(expected).query(corrected)[0], 0.99) < 0.002
+    assert np.quantile(cKDTree(expected).query(off)[0], 0.95) > 0.01
 
 
 def test_a_run_can_fuse_keyframes_while_tracking(

@@ -1,0 +1,177 @@
+"""A surface that follows its frames: where a pose moved, blocks are integrated again."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bmask_slam.graph.arrays import Array, Arrays, Ints, Mask
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.files.array_file import (
+    FileKind,
+    Header,
+    check_like,
+    read_arrays,
+    write_arrays,
+)
+from bmask_slam.graph.geometry import transform
+from bmask_slam.mapping.surface.depth_frame import DepthFrame
+from bmask_slam.mapping.surface.volume import SurfaceVolume
+
+REACH_M = 2.0
+"""Poses are as far apart as the camera is, or points at its image's edges so far ahead."""
+
+LoadFrame = Callable[[int, Array], DepthFrame | None]
+"""A frame by its number again, at a pose T_world_camera (4, 4); None if it cannot be used."""
+VOLUME_FILE = FileKind("surface volume", 1)
+_NUMBERS = np.zeros(0, np.int64)
+_NOTHING: Arrays = {
+    **dict.fromkeys(("keys", "numbers", "sizes"), _NUMBERS),
+    "poses": np.zeros((0, 4, 4)),
+    "packed": np.zeros(0, np.uint8),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What a frame did: its pose, and the numbers of the blocks that it changed, as packed bits."""
+
+    T_world_camera: Array
+    packed: bytes
+
+    @classmethod
+    def of(cls, T_world_camera: Array, blocks: Ints) -> _Part:
+        marks = np.zeros(int(blocks.max(initial=-1)) + 1, bool)
+        marks[blocks] = True
+        return cls(T_world_camera, zlib.compress(np.packbits(marks).tobytes(), 1))
+
+    def mark(self, blocks: Tensor) -> None:
+        """Mark the blocks (B,) in place."""
+        bits = torch.from_numpy(self._bits(len(blocks)))
+        blocks[: len(bits)] |= bits
+
+    def on(self, blocks: Tensor) -> bool:
+        """Whether it changed a marked block (B,)."""
+        bits = torch.from_numpy(self._bits(len(blocks)))
+        return bool((blocks[: len(bits)] & bits).any())
+
+    def _bits(self, most: int) -> Mask:
+        bits = np.unpackbits(np.frombuffer(zlib.decompress(self.packed), np.uint8))
+        return bits[:most].astype(bool)
+
+
+class FollowingSurface:
+    """A volume and the poses at which its frames are in it.
+
+    Attributes:
+        volume: of the frames.
+    """
+
+    def __init__(self, volume: SurfaceVolume, load: LoadFrame) -> None:
+        self.volume, self._load = volume, load
+        self._parts: dict[int, _Part] = {}
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._parts)
+
+    def add(self, number: int, frame: DepthFrame) -> None:
+        """Integrate a frame that is not in it yet. Raises InputError: the disk is full."""
+        self._parts[number] = _Part.of(frame.T_world_camera, self.volume.integrate(frame))
+
+    def follow(self, poses: Mapping[int, Array], removed: Collection[int] = ()) -> int:
+        """Bring frames to their poses T_world_camera (4, 4) of now, and take some out.
+
+        Frames that moved by more than a voxel, and those removed, leave the blocks that they
+        changed, which are cleared; whatever else had changed these is integrated into them again,
+        all frames in the order in which they came. Returns how many were read again.
+
+        Raises:
+            InputError: a frame cannot be read, or the disk is full.
+        """
+        gone = [n for n in removed if n in self._parts]
+        known = {n: T for n, T in poses.items() if n in self._parts and n not in gone}
+        least_m = self.volume.voxel_m
+        moved = {
+            n: T
+            for n, T in known.items()
+            if displacement_m(self._parts[n].T_world_camera, T) > least_m
+        }
+        if not moved and not gone:
+            return 0
+        stale = torch.zeros(len(self.volume), dtype=torch.bool)
+        for number in (*moved, *gone):
+            self._parts[number].mark(stale)
+        self.volume.clear(stale)
+        for number in gone:
+            del self._parts[number]
+        read = 0
+        for number, part in list(self._parts.items()):
+            if number not in moved and not part.on(stale):
+                continue
+            frame = self._load(number, moved.get(number, part.T_world_camera))
+            if frame is None:
+                del self._parts[number]
+            elif number in moved:
+                self.add(number, frame)
+            else:
+                self.volume.integrate(frame, stale)
+            read += 1
+        return read
+
+    def save(self, path: Path, made_of: Header) -> None:
+        """Write which frames are in the kept volume of this folder, and of what they are made.
+
+        The volume is not used any more. Raises InputError: the disk is full.
+        """
+        self.volume.close()
+        parts = list(self._parts.values())
+        poses = [part.T_world_camera for part in parts]
+        arrays: Arrays = {
+            "keys": self.volume.keys,
+            "numbers": np.array(list(self._parts), np.int64),
+            "poses": np.stack(poses) if poses else np.zeros((0, 4, 4)),
+            "sizes": np.array([len(part.packed) for part in parts], np.int64),
+            "packed": np.frombuffer(b"".join(part.packed for part in parts), np.uint8),
+        }
+        write_arrays(path, VOLUME_FILE, {"made_of": made_of}, arrays)
+
+    def restore(self, arrays: Arrays) -> None:
+        """Know the frames that ``save`` wrote, whose volume this has."""
+        ends = np.cumsum(arrays["sizes"])
+        packed = arrays["packed"].tobytes()
+        for number, T, size, end in zip(
+            arrays["numbers"].tolist(), arrays["poses"], arrays["sizes"], ends, strict=True
+        ):
+            self._parts[number] = _Part(T, packed[end - size : end])
+
+
+def read_kept(path: Path, made_of: Header) -> Arrays | None:
+    """What ``save`` wrote; None if it is missing, broken or made of something else.
+
+    The file is removed: from here on the volume beside it is not what it says.
+    """
+    try:
+        header, arrays = read_arrays(path, VOLUME_FILE)
+        check_like(arrays, _NOTHING, path)
+    except InputError:
+        return None
+    path.unlink()
+    total = arrays["sizes"].sum() == len(arrays["packed"]) and (arrays["sizes"] >= 0).all()
+    alike = len(arrays["numbers"]) == len(arrays["poses"]) == len(arrays["sizes"])
+    return arrays if total and alike and header.get("made_of") == made_of else None
+
+
+def displacement_m(T_world_a: Array, T_world_b: Array) -> float:
+    """How far the camera, or a point REACH_M ahead at the edges of its view, moved at the most."""
+    points = REACH_M * np.array([[0.0, 0, 0], [1, 0, 1], [-1, 0, 1], [0, 1, 1], [0, -1, 1]])
+    apart = transform(T_world_a, points) - transform(T_world_b, points)
+    return float(np.linalg.norm(apart, axis=1).max())

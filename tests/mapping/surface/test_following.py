@@ -1,0 +1,169 @@
+"""A volume whose frames move: a loop, removed frames, exposure, and tables in files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from surface_scene import CAMERA, as_map, plane_rho, poses
+
+from bmask_slam.graph.arrays import Array, Ints
+from bmask_slam.graph.geometry import make_pose
+from bmask_slam.mapping.surface.depth_frame import DepthFrame, depth_frame
+from bmask_slam.mapping.surface.extraction import Surface, extract
+from bmask_slam.mapping.surface.following import FollowingSurface, displacement_m, read_kept
+from bmask_slam.mapping.surface.volume import SurfaceVolume
+
+VOXEL_M, WALL_M, ERROR_M = 0.05, 2.0, 0.1
+BACK = np.diag([-1.0, 1.0, -1.0, 1.0])
+AHEAD = poses(np.random.default_rng(3), 5)
+BEHIND = [BACK @ T for T in AHEAD]
+TRUE = dict(enumerate([*AHEAD[:3], *BEHIND, *AHEAD[3:]]))
+"""Out, around, and back to where it began."""
+DRIFT = np.array([0.0, 0.0, ERROR_M])
+
+
+def drifted(number: int) -> Array:
+    """The error has grown to 10 cm when the start is seen again; a loop removes it."""
+    T = TRUE[number].copy()
+    T[:3, 3] += DRIFT * (0, 0, 0, 0, 0, 0, 0, 0.5, 1, 1)[number]
+    return T
+
+
+def seen_from(number: int, T_estimated: Array, colour: int = 100) -> DepthFrame:
+    """What the true camera sees of walls at z = 2 m and -2 m, placed where it is believed."""
+    side = np.sign(TRUE[number][2, 2])
+    rho = plane_rho(TRUE[number], (0.0, 0.0, side), WALL_M)
+    rgb = np.full((30, 40, 3), colour, np.uint8)
+    return depth_frame(as_map(rho, 0.002), rgb, T_estimated, CAMERA, VOXEL_M)
+
+
+def scratch(poses_of: dict[int, Array]) -> Surface:
+    volume = SurfaceVolume(VOXEL_M, CAMERA)
+    for number, T in poses_of.items():
+        volume.integrate(seen_from(number, T))
+    return extract(volume)
+
+
+def off_m(surface: Surface) -> float:
+    return float(np.quantile(np.abs(np.abs(surface.vertices[:, 2]) - WALL_M), 0.9))
+
+
+def test_a_loop_that_corrects_ten_centimetres_moves_the_surface() -> None:
+    read: list[int] = []
+
+    def load(number: int, T: Array) -> DepthFrame:
+        read.append(number)
+        return seen_from(number, T)
+
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA, blocks=8), load)
+    for number in TRUE:
+        surface.add(number, seen_from(number, drifted(number)))
+    assert off_m(extract(surface.volume)) > 0.03
+    assert surface.follow(TRUE) == len(read)
+    corrected, expected = extract(surface.volume), scratch(TRUE)
+    assert off_m(corrected) < 0.002
+    assert len(corrected.vertices) == len(expected.vertices)
+    np.testing.assert_allclose(corrected.vertices, expected.vertices, atol=1e-4)
+    np.testing.assert_allclose(corrected.weights, expected.weights, rtol=1e-3)
+    np.testing.assert_array_equal(corrected.views, expected.views)
+    assert read == sorted(read)
+    assert set(read) >= {0, 1, 2, 8, 9}
+    assert surface.follow(TRUE) == 0
+
+
+def test_only_what_saw_changed_blocks_is_read_again() -> None:
+    read: list[int] = []
+
+    def load(number: int, T: Array) -> DepthFrame:
+        read.append(number)
+        return seen_from(number, T)
+
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), load)
+    for number, T in TRUE.items():
+        surface.add(number, seen_from(number, T))
+    surface.follow({9: drifted(9), 8: TRUE[8]})
+    assert read == [0, 1, 2, 8, 9]
+
+
+def test_a_removed_frame_leaves_no_trace() -> None:
+    surface = FollowingSurface(SurfaceVolume(VOXEL_M, CAMERA), seen_from)
+    for number in TRUE:
+        surface.add(number, seen_from(number, drifted(number)))
+    surface.follow({}, removed=[7, 8, 9])
+    assert 9 not in surface
+    left = extract(surface.volume)
+    assert np.abs(np.abs(left.vertices[:, 2]) - WALL_M).max() < 0.002
+    assert left.views.max() == 4  # of those that look back
+
+
+def test_a_turn_moves_what_is_far_away() -> None:
+    c, s = np.cos(0.1), np.sin(0.1)
+    turned = make_pose(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.zeros(3))
+    assert 0.2 < displacement_m(np.eye(4), turned) < 0.3
+
+
+def test_exposures_are_made_alike() -> None:
+    """One wall in three frames, of which the camera made one half as bright: no step is left."""
+    volume = SurfaceVolume(VOXEL_M, CAMERA)
+    for number, colour in ((0, 160), (1, 80), (2, 160)):
+        volume.integrate(seen_from(number, TRUE[number], colour))
+    assert np.abs(extract(volume, 1).colours.astype(int) - 160).max() <= 6
+
+
+def test_colours_are_found_where_they_are() -> None:
+    """Of every voxel at its own centre, and not of the next."""
+    volume = SurfaceVolume(VOXEL_M, CAMERA)
+    volume.integrate(seen_from(0, TRUE[0]))
+    volume.colour[...] = 0
+    bricks, voxels = torch.nonzero(volume.weight > 0)[::97].unbind(-1)
+    volume.colour[bricks, voxels] = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float16)
+    places = volume._origin[bricks // 8] + volume._bricks[bricks % 8] + volume._voxels[voxels]
+    assert (volume.colours_at(places) == torch.tensor([1.0, 2.0, 3.0, 4.0])).all()
+    assert (volume.colours_at(places + VOXEL_M)[:, 3] == 0).all()
+    assert (volume.colours_at(places + 100.0) == 0).all()
+
+
+def test_memory_that_was_given_back_is_read_again() -> None:
+    volume = SurfaceVolume(VOXEL_M, CAMERA, blocks=8)
+    for number, T in TRUE.items():
+        volume.integrate(seen_from(number, T))
+        volume.release()
+    other = scratch(TRUE)
+    for name, values in vars(extract(volume)).items():
+        np.testing.assert_array_equal(values, getattr(other, name))
+
+
+def test_a_kept_volume_is_followed_from_where_it_was(tmp_path: Path) -> None:
+    """As without a break; kept for something else, or broken, it is not used."""
+    read: list[int] = []
+
+    def load(number: int, T: Array) -> DepthFrame:
+        read.append(number)
+        return seen_from(number, T)
+
+    def volume(keys: Ints) -> SurfaceVolume:
+        return SurfaceVolume(VOXEL_M, CAMERA, blocks=8, folder=tmp_path, kept=keys)
+
+    before = FollowingSurface(volume(np.zeros(0, np.int64)), load)
+    for number in TRUE:
+        before.add(number, seen_from(number, drifted(number)))
+    without_break = scratch({n: drifted(n) for n in TRUE})
+    before.save(tmp_path / "index", {"camera": "this"})
+    kept = (tmp_path / "index").read_bytes()
+    assert read_kept(tmp_path / "index", {"camera": "another"}) is None
+    (tmp_path / "index").write_bytes(kept[:-9])
+    assert read_kept(tmp_path / "index", {"camera": "this"}) is None
+    (tmp_path / "index").write_bytes(kept)
+    arrays = read_kept(tmp_path / "index", {"camera": "this"})
+    assert arrays is not None
+    assert not (tmp_path / "index").exists()
+    after = FollowingSurface(volume(arrays["keys"]), load)
+    after.restore(arrays)
+    for name, values in vars(extract(after.volume)).items():
+        np.testing.assert_array_equal(values, getattr(without_break, name))
+    assert after.follow({9: drifted(9)}) == 0
+    after.follow(TRUE)
+    assert off_m(extract(after.volume)) < 0.002
+    assert set(read) >= {0, 7, 8, 9}
