@@ -29,6 +29,7 @@ from bmask_slam.commands.segmentation import add_evaluate_segmentation, add_segm
 from bmask_slam.commands.sequences import add_download, add_info, add_render
 from bmask_slam.commands.view import add_view
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import import_extra
 from bmask_slam.runtime.memory import is_out_of_memory, memory_limit_bytes
 from bmask_slam.runtime.stop_request import SIGNALS
 
@@ -38,6 +39,9 @@ first steps:
   bmask-slam render office --frames 200 --out office   make a small sequence with exact truth
   bmask-slam run office                                run on it; results go to runs/office
   bmask-slam evaluate runs/office --reference office   compare a trajectory with a reference
+
+exit status: 0 done, 1 broken input or a part that failed (one line says what), 2 a wrong command
+line, 128 + N ended by signal N (130: Ctrl-C); what was done until then is saved
 """
 SPACE, RIGHTS, DESCRIPTORS, DEVICE = (
     "free some space",
@@ -63,8 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit status is 0, 1 for broken input, 2 for a wrong command line, and
     128 + signal when a signal ended it.
     """
-    arguments = make_parser().parse_args(argv)
     try:
+        arguments = make_parser().parse_args(argv)
         _check_memory()
         with _terminations():
             code = int(arguments.handler(arguments))
@@ -150,6 +154,16 @@ def _fail(message: str) -> int:
     return 1
 
 
+class _PrintCompletion(argparse.Action):
+    """Prints the tab completion of a shell, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *given: Any) -> None:
+        _, shell, _ = given
+        shtab: Any = import_extra("shtab", "--print-completion", "completion")
+        print(shtab.complete(parser, shell))
+        parser.exit()
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands; each stores its function as ``handler``."""
     parser = argparse.ArgumentParser(
@@ -159,6 +173,12 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"bmask-slam {__version__}")
+    parser.add_argument(
+        "--print-completion",
+        action=_PrintCompletion,
+        choices=("bash", "zsh", "tcsh"),
+        help="tab completion for a shell; see docs/install.md",
+    )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     add_run(commands)
     add_live(commands)

@@ -19,6 +19,7 @@ from repository import ROOT
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PROJECT = PYPROJECT["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 FOLDERS: dict[str, str] = PYPROJECT["tool"]["setuptools"]["package-dir"]
 USERS_OWN = ("graph.py", "slam.py", "mapping.py", "semantics.py")
 PUBLIC_NAMES = "SlamSystem, SystemConfig, Camera, Frame, open_sequence, run, evaluate, Run"
@@ -180,6 +181,11 @@ def _constraints() -> dict[str, str]:
     return {_canonical(name): version for name, version in pins}
 
 
+def _libraries_of_extras() -> list[str]:
+    extras = (v for k, v in EXTRAS.items() if k not in ("all", "dev", "docs"))
+    return [text for texts in extras for text in texts]
+
+
 def _canonical(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
@@ -188,10 +194,12 @@ def test_every_requirement_is_a_range_that_its_constraint_is_in() -> None:
     from packaging.requirements import Requirement
 
     pins = _constraints()
-    for text in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]:
+    extras = {k: v for k, v in EXTRAS.items() if k != "realsense"}  # which is in no other extra
+    for text in [*PROJECT["dependencies"], *(t for texts in extras.values() for t in texts)]:
         requirement = Requirement(text)
-        assert requirement.specifier.contains(pins[_canonical(requirement.name)]), text
-    for text in PROJECT["dependencies"]:
+        if requirement.name != PROJECT["name"]:
+            assert requirement.specifier.contains(pins[_canonical(requirement.name)]), text
+    for text in [*PROJECT["dependencies"], *_libraries_of_extras()]:
         operators = {s.operator for s in Requirement(text).specifier}
         assert operators == {">=", "<"}, f"{text}: give a lower and an upper bound"
 
@@ -209,10 +217,9 @@ def test_every_import_is_a_declared_dependency() -> None:
         "PIL": "pillow",
         "ruamel": "ruamel.yaml",
     }
-    optional = [t for k, v in PROJECT["optional-dependencies"].items() if k != "dev" for t in v]
     declared, extras = (
         {_canonical(re.split(r"[><=]", text)[0]) for text in texts}
-        for texts in (PROJECT["dependencies"], optional)
+        for texts in (PROJECT["dependencies"], _libraries_of_extras())
     )
     needed = set()
     for path in (p for k in FOLDERS.values() for p in (ROOT / k).rglob("*.py")):
@@ -223,3 +230,15 @@ def test_every_import_is_a_declared_dependency() -> None:
                 needed.add(str(node.module).partition(".")[0])
     needed -= {*sys.stdlib_module_names, *FOLDERS}
     assert {_canonical(distributions.get(name, name)) for name in needed} - extras == declared
+
+
+def test_what_all_installs_has_the_packages_that_the_project_is_fixed_to() -> None:
+    from packaging.requirements import Requirement
+
+    (text,) = EXTRAS["all"]
+    named = Requirement(text).extras
+    assert named == set(EXTRAS) - {"all", "dev", "docs", "realsense", "ros2"}
+    assert f"{PROJECT['name']}[all]" in EXTRAS["dev"]  # which make demo installs
+    texts = [*PROJECT["dependencies"], *(text for name in named for text in EXTRAS[name])]
+    installed = {_canonical(Requirement(text).name) for text in texts}
+    assert {"gtsam", "numpy", "opencv-python-headless", "filterpy", "torch", "open3d"} <= installed

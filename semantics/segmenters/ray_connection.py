@@ -8,6 +8,7 @@ import socket
 from typing import Any
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import import_extra
 
 LOCAL = "local"
 TIMEOUT_S = 5.0
@@ -23,10 +24,7 @@ def connect(address: str, local_cpus: int | None = None) -> Any:
         InputError: Ray is not installed, or there is no cluster at the address.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray  # noqa: PLC0415 - optional, and slow to load
-    except ImportError as error:
-        raise InputError("--ray: needs Ray: pip install 'bmask-slam[ray]'") from error
+    ray: Any = import_extra("ray", "--ray", "ray")
     if ray.is_initialized():
         return ray
     _check_address(address)

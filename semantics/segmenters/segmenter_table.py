@@ -9,6 +9,7 @@ from pathlib import Path
 
 from bmask_slam.graph.data_files import data_path
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import import_extra
 from bmask_slam.semantics.labels import read_label_set
 from bmask_slam.semantics.segmenters.own_class import OwnClass, names_class, own_segmenter
 from bmask_slam.semantics.segmenters.segmenter import (
@@ -128,6 +129,8 @@ def _network(options: SegmenterOptions, find_weights: FindWeights) -> Segmenter:
     """A network segmenter; torch is imported here since that takes a second."""
     if options.weights is None and options.name != "light":
         raise InputError(f"segmenter {options.name!r}: give --weights, a file or torchvision:NAME")
+    instead = "take --segmenter none: no labels, objects or masks"
+    import_extra("torch", f"segmenter {options.name!r}", "semantics", instead)
     from bmask_slam.semantics.network.yolox.selection import SelectionConfig  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.light_segmenter import LightSegmenter  # noqa: PLC0415
     from bmask_slam.semantics.segmenters.network_segmenter import NetworkSegmenter  # noqa: PLC0415

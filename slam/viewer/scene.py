@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from bmask_slam.graph.arrays import Array, Bytes, Floats, Image
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import import_extra
 from bmask_slam.graph.files.file_names import refuse_link
 from bmask_slam.semantics.objects.boxes3d import OrientedBox
 from bmask_slam.tracking.results import FrameResult, TrackingStatus
@@ -79,7 +80,7 @@ class Scene:
             InputError: Rerun is not installed, the recording's folder is not there, or the port is
                 taken.
         """
-        self._rr = _import_rerun()
+        self._rr: Any = import_extra("rerun", "the viewer", "view")
         self._viewer: WebViewer | None = None
         self._stream = self._rr.RecordingStream(f"bmask-slam {name}")
         if options.record is not None:
@@ -208,13 +209,3 @@ def _quaternion(rotation: Array) -> Array:
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - only where boxes are drawn
 
     return np.asarray(Rotation.from_matrix(rotation).as_quat(), float)
-
-
-def _import_rerun() -> Any:
-    try:
-        import rerun  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        raise InputError(
-            "the viewer needs Rerun, which is not installed; pip install 'bmask-slam[view]'"
-        ) from error
-    return rerun

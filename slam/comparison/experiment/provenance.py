@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +74,7 @@ def _paths_as_text(value: Any) -> Any:
 @cache
 def code_hash() -> str:
     """Hash of the code that a run uses, the network's weights, and the libraries' versions."""
-    versions = ",".join(f"{name} {version(name)}" for name in LIBRARIES)
-    parts = [versions]
+    parts = [",".join(f"{name} {number}" for name, number in versions(LIBRARIES).items())]
     for folder in LAYERS:
         used = (p for p in folder.rglob("*.py") if p.relative_to(folder).parts[0] not in NOT_HASHED)
         parts += _contents(used, folder)

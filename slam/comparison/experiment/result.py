@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import BeforeValidator
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import import_extra
 from bmask_slam.graph.files.json_file import check_json, read_json
 from bmask_slam.graph.whole_file import whole_file
 
@@ -123,10 +124,7 @@ class Comparison:
         Raises:
             InputError: pandas is not installed.
         """
-        try:
-            import pandas  # noqa: PLC0415 - optional
-        except ImportError as error:
-            raise InputError("a frame of the results needs pandas: pip install pandas") from error
+        frames: Any = import_extra("pandas", "a frame of the results", "pandas")
         kinds = {method.name: method.kind.value for method in self.methods}
         rows = [
             {
@@ -140,7 +138,7 @@ class Comparison:
             }
             for cell in self.cells
         ]
-        return pandas.DataFrame(rows)
+        return frames.DataFrame(rows)
 
 
 def write_results(path: Path, comparison: Comparison) -> None:

@@ -13,8 +13,8 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import import_extra
 from bmask_slam.graph.files.reading import MAX_RATIO, SMALL_BYTES
-from bmask_slam.live.sources.checks import import_optional
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _CURE = (
@@ -87,8 +87,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """
     if not path.exists():
         raise InputError(f"{path}: no such bag")
-    typesys = import_optional("rosbags.typesys", "ros", str(path))
-    highlevel = import_optional("rosbags.highlevel", "ros", str(path))
+    typesys = import_extra("rosbags.typesys", str(path), "ros")
+    highlevel = import_extra("rosbags.highlevel", str(path), "ros")
     allowance = Allowance(path)
     _bound_unpacking(path)
     with _translated(path), allowance.in_use():
@@ -154,9 +154,9 @@ def _unpack(make: Callable[[], Any], data: bytes) -> bytes:
 def _bound_unpacking(path: Path) -> None:
     """Let rosbags unpack by ``_unpack``: its own functions have no limit."""
     names = ("rosbag1.reader", "rosbag2.reader", "rosbag2.storage_mcap")
-    modules: list[Any] = [import_optional(f"rosbags.{name}", "ros", str(path)) for name in names]
+    modules: list[Any] = [import_extra(f"rosbags.{name}", str(path), "ros") for name in names]
     one, two, mcap = modules
-    lz4 = import_optional("lz4.frame", "ros", str(path))
+    lz4 = import_extra("lz4.frame", str(path), "ros")
     zstd = two.zstd
     if isinstance(zstd, ModuleType):
         one.decompressors["bz2"] = lambda data: _unpack(bz2.BZ2Decompressor, data)
@@ -195,10 +195,10 @@ def format_topics(bag: Bag) -> str:
 @contextmanager
 def _translated(path: Path) -> Iterator[None]:
     """Convert what rosbags raises for bags that it cannot read into InputError."""
-    one, two = (import_optional(f"rosbags.rosbag{k}", "ros", str(path)) for k in (1, 2))
-    reader = import_optional("rosbags.rosbag2.reader", "ros", str(path))
-    sqlite = import_optional("rosbags.rosbag2.storage_sqlite3", "ros", str(path))
-    highlevel = import_optional("rosbags.highlevel", "ros", str(path))
+    one, two = (import_extra(f"rosbags.rosbag{k}", str(path), "ros") for k in (1, 2))
+    reader = import_extra("rosbags.rosbag2.reader", str(path), "ros")
+    sqlite = import_extra("rosbags.rosbag2.storage_sqlite3", str(path), "ros")
+    highlevel = import_extra("rosbags.highlevel", str(path), "ros")
     known = (highlevel.AnyReaderError, one.ReaderError, two.ReaderError)
     inside = (reader.zstd.ZstdError, sqlite.apsw.Error, struct.error, EOFError, OSError)
     damaged = (ArithmeticError, AssertionError, LookupError, MemoryError, RuntimeError)

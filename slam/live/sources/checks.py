@@ -1,9 +1,6 @@
-"""What a source needs before it is used: its library, and images that fit the camera."""
+"""What a source needs before it is used: images that fit the camera."""
 
 from __future__ import annotations
-
-import importlib
-from types import ModuleType
 
 from numpy.typing import NDArray
 
@@ -12,20 +9,6 @@ from bmask_slam.graph.errors import InputError
 
 SCALE_TOLERANCE = 0.1
 """Largest relative difference between a calibrated depth scale and the nominal one."""
-
-
-def import_optional(name: str, extra: str, source: str) -> ModuleType:
-    """A module of a library that the pip extra ``extra`` installs.
-
-    Raises:
-        InputError: it is not installed; the text names the source that needs it and the cure.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(
-            f"{source}: needs {name.partition('.')[0]} ({error}); pip install 'bmask-slam[{extra}]'"
-        ) from error
 
 
 def check_sizes(rgb: NDArray, stored: NDArray, camera: Camera, where: str) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.camera import Camera, distortion_terms
 from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.extras import import_extra
 from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
-from bmask_slam.live.sources.checks import check_depth_scale, import_optional
+from bmask_slam.live.sources.checks import check_depth_scale
 from bmask_slam.live.sources.pairing import MAX_DIFFERENCE_S
 from bmask_slam.sequences import read_camera
 from bmask_slam.sequences.camera_presets import is_preset
@@ -36,7 +37,7 @@ class RealSenseSource(CameraSource):
                 be described by OpenCV's model.
         """
         super().__init__("realsense", silence_s)
-        self._rs: Any = import_optional("pyrealsense2", "realsense", "realsense:")
+        self._rs: Any = import_extra("pyrealsense2", "realsense:", "realsense")
         rs = self._rs
         self._pipeline, self._align = rs.pipeline(), rs.align(rs.stream.color)
         streams = rs.config()

@@ -64,6 +64,15 @@ def test_python_m_bmask_slam() -> None:
     assert done.stdout == f"bmask-slam {bmask_slam.__version__}\n"
 
 
+def test_completion_knows_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    status, output, _ = call(capsys, "--print-completion", "bash")
+    assert status == 0
+    for command in ("run", "evaluate-segmentation", "compare"):
+        assert command in output
+    assert "--checkpoint-every" in output
+    assert subprocess.run(["bash", "-n"], input=output, text=True, check=True).returncode == 0
+
+
 def test_no_command_and_a_wrong_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert call(capsys)[0] == 2
     status, _, errors = call(capsys, "rum")

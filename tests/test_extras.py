@@ -1,0 +1,92 @@
+"""The core runs without the libraries of the extras; what needs one says how to install it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+LIBRARIES = ("torch", "open3d", "safetensors", "libusb_package", "rerun", "ray", "rosbags", "shtab")
+CALLS = """
+import contextlib, io, json, sys, time
+for name in LIBRARIES:
+    sys.modules[name] = None  # as if it were not installed
+started = time.process_time()
+import bmask_slam.cli
+print(json.dumps(time.process_time() - started))
+import bmask_slam.comparison.comparing, bmask_slam.live.live_slam
+for words in json.loads(sys.stdin.read()):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = bmask_slam.cli.main(words)
+    print(json.dumps([status, out.getvalue(), err.getvalue()]))
+"""
+SECONDS = 1.0
+
+
+@pytest.fixture(scope="module")
+def answers(office: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list]:
+    """Exit status, stdout and stderr of commands, by their first words, without the libraries."""
+    folder = tmp_path_factory.mktemp("core")
+    run, sequence = str(folder / "run"), str(office)
+    commands = {
+        "run": ["run", sequence, "--segmenter", "none", "--out", run, "--quiet"],
+        "evaluate": ["evaluate", run, "--reference", sequence],
+        "optimise": ["optimise", run, "--out", str(folder / "better"), "--quiet"],
+        "export": ["export", run, "--format", "g2o", "--out", str(folder / "run.g2o")],
+        "info": ["info", sequence],
+        "run light": ["run", sequence, "--out", str(folder / "light"), "--quiet"],
+        "run --map": ["run", sequence, "--segmenter", "none", "--map", "--out", f"{run}2"],
+        "map": ["map", run],
+        "train": ["train", "--data", "a.json", "--images", "a", "--out", str(folder / "w")],
+        "render": ["render", "office", "--out", str(folder / "office"), "--quiet"],
+        "view": ["view", run, "--record", str(folder / "run.rrd")],
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", f"LIBRARIES = {LIBRARIES}\n{CALLS}"],
+        input=json.dumps(list(commands.values())),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    seconds, *answers = map(json.loads, done.stdout.splitlines())
+    return {"import": seconds, **dict(zip(commands, answers, strict=True))}
+
+
+def test_the_core_is_imported_within_a_second(answers: dict[str, list]) -> None:
+    assert answers["import"] < SECONDS
+
+
+@pytest.mark.parametrize("name", ["run", "evaluate", "optimise", "export", "info"])
+def test_the_core_needs_no_extra(answers: dict[str, list], name: str) -> None:
+    status, output, errors = answers[name]
+    assert status == 0, errors
+    assert output
+
+
+@pytest.mark.parametrize(
+    ("name", "library", "extra"),
+    [
+        ("run light", "torch", "semantics"),
+        ("run --map", "torch", "dense"),
+        ("map", "torch", "dense"),
+        ("train", "torch", "semantics"),
+        ("render", "libusb_package", "render"),
+        ("view", "rerun", "view"),
+    ],
+)
+def test_what_is_missing_is_one_line_with_its_cure(
+    answers: dict[str, list], name: str, library: str, extra: str
+) -> None:
+    status, _, errors = answers[name]
+    assert status == 1
+    (line,) = errors.splitlines()
+    assert f"needs {library}, which is not installed" in line
+    assert f"pip install 'bmask-slam[{extra}]'" in line
+
+
+def test_a_run_without_torch_can_go_without_labels(answers: dict[str, list]) -> None:
+    assert "or take --segmenter none" in answers["run light"][2]
