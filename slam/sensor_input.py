@@ -74,6 +74,18 @@ class SensorInput(ABC):
             positions = np.column_stack([positions, sigmas])
         self._add("position", timestamps_s, positions)
 
+    def add_imu(
+        self, timestamps_s: ArrayLike, rate_rad_s: ArrayLike, force_m_s2: ArrayLike
+    ) -> None:
+        """Add an IMU's rates and specific forces, (3,) or (N, 3) each, in its own frame.
+
+        ``sensors.imu`` says how it is mounted, and its noise.
+        """
+        rates, forces = np.array(rate_rad_s, float, ndmin=2), np.array(force_m_s2, float, ndmin=2)
+        if rates.shape != forces.shape:
+            raise InputError(f"add_imu: {len(rates)} rates and {len(forces)} forces; give as many")
+        self._add("imu", timestamps_s, np.hstack([rates, forces]))
+
     def _add(self, sensor: str, timestamps_s: ArrayLike, values: ArrayLike) -> None:
         stamps_s, rows = np.array(timestamps_s, float, ndmin=1), np.array(values, float, ndmin=2)
         if stamps_s.shape != (len(rows),):

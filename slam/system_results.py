@@ -11,11 +11,11 @@ import numpy as np
 
 from bmask_slam.back_end.map_backend import MapBackend
 from bmask_slam.back_end.mapper import Mapper
-from bmask_slam.back_end.sensor_fusion import example_state
 from bmask_slam.events import totals
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import check_like, nested
+from bmask_slam.graph.inertial.tables import example_arrays
 from bmask_slam.graph.trajectory import Trajectory
 from bmask_slam.labelling.results import LandmarkCloud, MapObjects
 from bmask_slam.labelling.semantic_mapper import SemanticMapper
@@ -27,6 +27,7 @@ from bmask_slam.run_folder.covariance_file import (
 )
 from bmask_slam.run_folder.map_file import MAP, SavedRun, write_map
 from bmask_slam.run_folder.semantic_files import semantic_writers
+from bmask_slam.sensing.sensor_fusion import example_state
 from bmask_slam.system_config import SystemConfig
 
 OLDER_ARRAYS = ("semantics.labels.counts", "semantics.objects.labels.counts")
@@ -44,7 +45,7 @@ OPTIONAL_ARRAYS = (
     *("votes.coded", "votes.cell_px", "votes.codes_shape", "votes.codes"),
 )
 """Ends of the names of arrays that older files lack, and whose readers do without."""
-SENSOR_ARRAYS = ("mapper.sensors.", "mapper.graph.own_")
+SENSOR_ARRAYS = ("mapper.sensors.", "mapper.graph.own_", "mapper.graph.imu_")
 """Beginnings of the names of arrays that are there with other sensors or own factors only."""
 
 
@@ -161,7 +162,7 @@ def checked_state(state: Arrays, own: Arrays, path: Path) -> Arrays:
     ``own`` is the state of an empty system. Raises InputError for arrays of other names or types.
     """
     graph: Arrays = {"own_factors": np.zeros(0, np.str_), "own_factor_ids": np.zeros(0, np.int64)}
-    graph["own_next"] = np.array(0)
+    graph |= {"own_next": np.array(0), **example_arrays()}
     own = {**nested(mapper=nested(sensors=example_state(), graph=graph)), **own}
     state = {name: array for name, array in state.items() if name not in OLDER_ARRAYS}
     state = {name: a for name, a in own.items() if name.startswith(NEWER_ARRAYS)} | state

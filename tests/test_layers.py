@@ -27,14 +27,14 @@ from source_tree import (
 # or a module that stands alone); [...] are the other modules of the folder, which make one room.
 ROOMS = {
     "the layers": "graph  semantics  mapping  slam",
-    "graph": """arrays  errors  whole_file  files  [...]  factors  sensors  marginals  smoother
-                batch  pose_graph  g2o  calibration""",
+    "graph": """arrays  errors  whole_file  files  [...]  inertial  factors  sensors  marginals
+                smoother  batch  pose_graph  g2o  calibration""",
     "semantics": """[...]  instances  network  weights  segmenters  beliefs  objects  tracks
                     training""",
     "semantics/network": "config  backbone  [...]  yolox",
     "mapping": "[...]  inverse_depth  surface  products",
     "slam": """events  evaluation  config  sequences  features  world  rendering  datasets
-               tracking  loops  moving  runtime  back_end  labelling  system_config
+               tracking  loops  moving  runtime  sensing  back_end  labelling  system_config
                system_interface  run_folder  system_results  sensor_input  system  dense
                calibration  refinement  viewer  offline  live  comparison  api  commands  cli
                job_process  __init__  __main__""",

@@ -32,6 +32,7 @@ from bmask_slam.graph.factors.graph_update import LOOP, GraphUpdate, RelativePos
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
 from bmask_slam.graph.factors.own_factors import own_gtsam_factors
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.inertial.preintegration import inertial_graph, insert_states, read_states
 from bmask_slam.graph.smoother.removal import remove
 
 
@@ -241,11 +242,14 @@ class _Adjuster:
         factors = self._maker.observations(table.all())
         chosen = [self._tables.pose_factors[number].factor for number in numbers]
         factors += [self._maker.pose_factor(factor) for factor in chosen]
-        return make_graph([*factors, *own_gtsam_factors(self._tables)])
+        inertial = inertial_graph(self._tables.inertial)[0]
+        return make_graph([*factors, *own_gtsam_factors(self._tables), *inertial])
 
     def _values(self) -> gtsam.Values:
         keyframes, landmarks = self._tables.keyframes, self._tables.landmarks
-        return make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
+        values = make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
+        insert_states(values, self._tables.inertial, inertial_graph(self._tables.inertial)[1])
+        return values
 
     def _run(self, graph: gtsam.NonlinearFactorGraph, max_iterations: int) -> float:
         """Iterate, write the values into the factor tables; returns the final cost."""
@@ -262,5 +266,9 @@ class _Adjuster:
             raise RuntimeError(f"the cost is {cost}")
         self._done += steps
         poses, points = read_values(optimiser.values())
-        self._tables.keyframes.values, self._tables.landmarks.values = poses, points
+        landmarks = self._tables.landmarks
+        self._tables.keyframes.values = poses
+        landmarks.values = points[: len(landmarks.ids)]
+        if not read_states(optimiser.values(), self._tables.inertial):
+            raise RuntimeError("an inertial state is not finite")
         return cost

@@ -14,13 +14,9 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.graph.arrays import Array, Ints, Mask, no_ids
-from bmask_slam.graph.factors.graph_update import (
-    PARTIAL,
-    Observations,
-    PosePrior,
-    RelativePose,
-)
+from bmask_slam.graph.factors.graph_update import PARTIAL, Observations, PosePrior, RelativePose
 from bmask_slam.graph.factors.marginalised_landmarks import MarginalisedLandmarks
+from bmask_slam.graph.inertial.tables import InertialTables
 
 NO_SLOT = -1
 
@@ -235,11 +231,13 @@ class FactorTables:
         self.marginalised = MarginalisedLandmarks()
         self.own_factors: dict[int, OwnFactor] = {}
         self.next_own = 0  # number that no own factor has had
+        self.inertial = InertialTables()
         self._next_number = 0
 
     def __len__(self) -> int:
         """Number of factors."""
-        return len(self.observations) + len(self.pose_factors) + len(self.own_factors)
+        others = len(self.own_factors) + len(self.inertial.factors)
+        return len(self.observations) + len(self.pose_factors) + others
 
     def add_pose_factors(self, factors: Iterable[RelativePose | PosePrior]) -> list[int]:
         """Add relative poses and priors; returns their numbers."""

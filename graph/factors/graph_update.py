@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bmask_slam.graph.arrays import Array, Ints, no_ids, no_pairs
+from bmask_slam.graph.inertial.tables import InertialUpdate
 
 RelativePoseName = tuple[int, int, str]
 """keyframe_a, keyframe_b, kind."""
@@ -155,6 +156,7 @@ class GraphUpdate:
         own_factors: numbers and `graph.factors.factor_tables.OwnFactor` of a user's factors, whose
             variables are in the graph.
         remove_own_factors: numbers.
+        inertial: what changes in velocities, biases and inertial factors.
 
     Ids to remove that are not in the graph are ignored.
     """
@@ -174,3 +176,4 @@ class GraphUpdate:
     marginalise_landmarks: Ints = field(default_factory=no_ids)
     own_factors: tuple[tuple[int, Any], ...] = ()
     remove_own_factors: tuple[int, ...] = ()
+    inertial: InertialUpdate = field(default_factory=InertialUpdate)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.sensors.accelerometer import AccelerometerConfig
+from bmask_slam.graph.sensors.imu import ImuConfig
 from bmask_slam.graph.sensors.odometry import OdometryConfig
 from bmask_slam.graph.sensors.position import PositionConfig
 
@@ -21,12 +22,13 @@ class SensorsConfig:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     accelerometer: AccelerometerConfig = field(default_factory=AccelerometerConfig)
     position: PositionConfig = field(default_factory=PositionConfig)
+    imu: ImuConfig = field(default_factory=ImuConfig)
     late_s: float = 10.0
 
     @property
     def enabled(self) -> tuple[str, ...]:
         """Names of the sensors that are used."""
-        sensors = ("odometry", "accelerometer", "position")
+        sensors = ("odometry", "accelerometer", "position", "imu")
         return tuple(name for name in sensors if getattr(self, name).enabled)
 
     def check_enabled(self, sensor: str) -> None:

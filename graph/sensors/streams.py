@@ -18,13 +18,16 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "odometry": ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"),
     "accelerometer": ("timestamp", "ax", "ay", "az"),
     "position": ("timestamp", "x", "y", "z", "sigma"),
+    "imu": ("timestamp", "wx", "wy", "wz", "ax", "ay", "az"),
 }
 """The sensors and their columns: seconds, metres, unit quaternions, m/s^2. Odometry is T_odom_base,
 of which only the motion from one time to another is used; acceleration is specific force, which
 points up at rest; a position is that of the antenna in a local frame with z up (ENU), its sigma
-that of each coordinate."""
-FILES = {sensor: f"{sensor}.txt" for sensor in COLUMNS}
-"""The file of each sensor beside rgb.txt."""
+that of each coordinate; an IMU's rates w are in rad/s, its forces a in m/s^2."""
+FILES = {sensor: f"{sensor}.txt" for sensor in COLUMNS} | {"imu": "imu.csv"}
+"""The file of each sensor beside rgb.txt. The stamps of imu.csv are in nanoseconds, as EuRoC's."""
+UNITS_S = {"imu": 1e-9}
+"""Of the stamps in a sensor's file, if they are not in seconds."""
 OPTIONAL = {"position": 1}
 """How many of the last columns a line may lack: NaN, and the configuration says it."""
 LOCAL_SPAN_M = 1e5
@@ -82,6 +85,7 @@ def read_measurements(path: Path, sensor: str) -> Measurements:
         if not len(names) - optional <= len(words) <= len(names):
             raise InputError(f"{where}: {len(words)} columns in {line[:60]!r}; {form}")
         row = [finite_number(word, where) for word in words]
+        row[0] *= UNITS_S.get(sensor, 1.0)
         row += [math.nan] * (len(names) - len(row))
         _check_row(sensor, row, where)
         rows.append(row)
@@ -89,6 +93,8 @@ def read_measurements(path: Path, sensor: str) -> Measurements:
         raise InputError(f"{path}: no measurement in the file; {form}, or remove the file")
     table = np.array(rows)
     stamps, first = np.unique(table[:, 0], return_index=True)
+    if sensor in UNITS_S and len(stamps) > 1 and np.median(np.diff(stamps)) < 1e-7:
+        raise InputError(f"{path}: stamps are not in nanoseconds, as EuRoC's; multiply them")
     check_seconds(stamps, path)
     if sensor == "position":
         _check_local(table, path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -11,15 +11,30 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Ints, no_ids
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.factors.factor_tables import NO_SLOT, FactorTables
+from bmask_slam.graph.factors.graph_update import GraphUpdate
 from bmask_slam.graph.factors.gtsam_factors import FactorMaker, make_graph, make_values, read_values
 from bmask_slam.graph.factors.keys import (
-    KEYFRAME_BASE,
+    LANDMARK_BASE,
+    VELOCITY_BASE,
     keyframe_keys,
     landmark_keys,
     variable_named_in,
 )
-from bmask_slam.graph.factors.own_factors import Variable, failing, own_gtsam_factors
+from bmask_slam.graph.factors.own_factors import (
+    Variable,
+    exchange_own_factors,
+    failing,
+    own_gtsam_factors,
+)
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.inertial.preintegration import (
+    inertial_factors,
+    inertial_graph,
+    insert_states,
+    predict_new_states,
+    read_states,
+)
+from bmask_slam.graph.inertial.tables import InertialChange
 from bmask_slam.graph.marginals.covariances import Marginals, marginals_of
 
 
@@ -40,6 +55,7 @@ class Change:
             user's new factors.
         keyframe_ids, landmark_ids: new variables.
         removed_slots: of factors that were removed.
+        inertial: new inertial factors and variables.
         max_iterations: how many further steps may follow.
     """
 
@@ -50,6 +66,25 @@ class Change:
     removed_slots: list[int] = field(default_factory=list)
     max_iterations: int = 0
     own: tuple[int, ...] = ()
+    inertial: InertialChange = field(default_factory=InertialChange)
+
+
+def with_others(
+    change: Change, update: GraphUpdate, tables: FactorTables
+) -> tuple[Change, list[int]]:
+    """Carry out what an update does to users' and inertial factors, once its keyframes are there.
+
+    Returns the change with them, and the numbers of the users' factors that were lost.
+    """
+    lost, slots, added = exchange_own_factors(update, tables)
+    inertial = tables.inertial
+    inertial.add(update.inertial)
+    inertial.prune(tables.keyframes.ids)
+    predict_new_states(inertial, tables.keyframes)
+    new = inertial.change()
+    slots = sorted([*change.removed_slots, *slots, *new.removed_slots])
+    change = replace(change, own=added, inertial=new, max_iterations=update.max_iterations)
+    return replace(change, removed_slots=slots), lost
 
 
 class Solver:
@@ -85,12 +120,15 @@ class Solver:
         own = sorted(tables.own_factors.items())
         for _, one in own:
             one.slot = NO_SLOT
+        tables.inertial.prune(tables.keyframes.ids)
+        tables.inertial.slots = {}
         everything = Change(
             tables.observations.all_rows(),
             sorted(tables.pose_factors),
             tables.keyframes.ids,
             tables.landmarks.ids,
             own=tuple(number for number, one in own if tables.has_variables(one)),
+            inertial=tables.inertial.change(),
         )
         self._apply(tables, everything)
 
@@ -116,8 +154,10 @@ class Solver:
         if not np.isfinite(after):
             raise SolverError(f"the cost is {after}", None)
         poses, points = read_values(values)
+        points = points[: len(tables.landmarks.ids)]
         self.elapsed_s += time.perf_counter() - started_s
         self._check_finite(tables, poses, points)
+        self._check_inertial(read_states(values, tables.inertial))
         tables.keyframes.values, tables.landmarks.values = poses, points
         return before, after
 
@@ -149,9 +189,13 @@ class Solver:
         """All factors and values, in an order that depends on the tables' contents alone."""
         numbers = sorted(tables.pose_factors)
         factors = self._factors(tables, tables.observations.all_rows(), numbers)
-        graph = make_graph([*factors, *own_gtsam_factors(tables)])
+        tables.inertial.prune(tables.keyframes.ids)
+        inertial, variables = inertial_graph(tables.inertial)
+        graph = make_graph([*factors, *own_gtsam_factors(tables), *inertial])
         keyframes, landmarks = tables.keyframes, tables.landmarks
-        return graph, make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
+        values = make_values(keyframes.ids, keyframes.values, landmarks.ids, landmarks.values)
+        insert_states(values, tables.inertial, variables)
+        return graph, values
 
     def _factors(self, tables: FactorTables, rows: Ints, numbers: list[int]) -> list:
         factors = self._maker.observations(tables.observations.select(rows))
@@ -162,17 +206,23 @@ class Solver:
     def _apply(self, tables: FactorTables, change: Change) -> None:
         own = [tables.own_factors[number] for number in change.own]
         factors = self._factors(tables, change.rows, change.numbers)
-        graph = make_graph([*factors, *(one.factor for one in own)])
+        inertial = inertial_factors(tables.inertial, change.inertial.names)
+        graph = make_graph([*factors, *(one.factor for one in own), *inertial])
         values = make_values(
             change.keyframe_ids,
             tables.keyframes.get(change.keyframe_ids),
             change.landmark_ids,
             tables.landmarks.get(change.landmark_ids),
         )
-        slots, poses, points = self._run(graph, values, change)
-        if len(poses) != len(tables.keyframes.ids) or len(points) != len(tables.landmarks.ids):
+        insert_states(values, tables.inertial, change.inertial)
+        slots, estimate = self._run(graph, values, change)
+        poses, points = read_values(estimate)
+        count = len(tables.landmarks.ids)
+        expected = len(tables.keyframes.ids), count + len(tables.inertial.states)
+        if (len(poses), len(points)) != expected:
             self._isam = None
             raise SolverError("ISAM2 and the factor tables have different variables", None)
+        points = points[:count]
         self._check_finite(tables, poses, points)
         tables.observations.set_slots(change.rows, np.array(slots[: len(change.rows)], np.int64))
         later = iter(slots[len(change.rows) :])
@@ -180,11 +230,13 @@ class Solver:
             tables.pose_factors[number].slot = next(later)
         for one in own:
             one.slot = next(later)
+        tables.inertial.slots |= dict(zip(change.inertial.names, later, strict=True))
+        self._check_inertial(read_states(estimate, tables.inertial))
         tables.keyframes.values, tables.landmarks.values = poses, points
 
     def _run(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, change: Change
-    ) -> tuple[list[int], Array, Array]:
+    ) -> tuple[list[int], gtsam.Values]:
         assert self._isam is not None
         removed, started_s = change.removed_slots, time.perf_counter()
         try:
@@ -199,7 +251,7 @@ class Solver:
             for _ in range(change.max_iterations):
                 if self._isam.update().getVariablesRelinearized() == 0:
                     break
-            return slots, *read_values(self._isam.calculateEstimate())
+            return slots, self._isam.calculateEstimate()
         except Exception as error:  # a user's factor may raise any
             raise self._failure(error) from error
         finally:
@@ -207,8 +259,12 @@ class Solver:
 
     def _failure(self, error: Exception) -> SolverError:
         self._isam = None
-        first_line = str(error).strip().split("\n\n")[0].replace("\n", " ")
-        return SolverError(first_line, variable_named_in(str(error)))
+        first = str(error).strip().split("\n\n")[0].replace("\n", " ")
+        return SolverError(first, variable_named_in(str(error)))
+
+    def _check_inertial(self, finite: bool) -> None:
+        if not finite:
+            raise self._failure(ValueError("an inertial state is not finite"))
 
     def _check_finite(self, tables: FactorTables, poses: Array, points: Array) -> None:
         for name, ids, values in (
@@ -222,15 +278,15 @@ class Solver:
 
 
 def poses_last(graph: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
-    """The elimination order constraint for ISAM2: the poses of new factors come last.
+    """The elimination order constraint for ISAM2: poses (and inertial states) come last.
 
     By default all variables of a change come last, and a removed keyframe concerns hundreds of
-    landmarks. A pose that is eliminated before them connects all that it observes to each other:
-    where a place is visited again that takes four times the time and the memory.
+    landmarks. A pose that is eliminated before them connects all that it observes to each other,
+    which takes four times the time and the memory where a place is visited again.
     """
     groups = gtsam.KeyGroupMap()
     for key in graph.keyVector():
-        if key >= KEYFRAME_BASE:
+        if key >= VELOCITY_BASE or key < LANDMARK_BASE:
             groups.insert2(key, 1)
     return groups
 

@@ -24,8 +24,9 @@ from bmask_slam.graph.factors.graph_estimate import (
     RelativePoseErrors,
 )
 from bmask_slam.graph.factors.graph_update import GraphUpdate, Observations, RelativePose
-from bmask_slam.graph.factors.own_factors import exchange_own_factors, without_own
+from bmask_slam.graph.factors.own_factors import without_own
 from bmask_slam.graph.factors.smoother_config import SmootherConfig
+from bmask_slam.graph.inertial.tables import InertialTables
 from bmask_slam.graph.marginals.covariances import Marginals
 from bmask_slam.graph.marginals.landmark_marginalisation import (
     Marginalisation,
@@ -35,7 +36,7 @@ from bmask_slam.graph.marginals.landmark_marginalisation import (
 )
 from bmask_slam.graph.marginals.summaries import mark_retracted, mark_returned, with_returning
 from bmask_slam.graph.smoother.anchoring import anchor_components, release_anchors, with_first_prior
-from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError
+from bmask_slam.graph.smoother.isam2 import Change, Solver, SolverError, with_others
 from bmask_slam.graph.smoother.removal import Removal, remove
 from bmask_slam.graph.smoother.repair import repair, solve_without_own
 from bmask_slam.graph.smoother.storage import (
@@ -83,10 +84,8 @@ class Smoother:
         report.refused, report.refused_factors = validated.refused, validated.refused_factors
         report.add_removal(removal)
         entered = self._enter(validated, [before, removal, marginalised], report)
-        report.lost_own, slots, report.new_own = exchange_own_factors(update, tables)
-        slots = sorted([*entered.removed_slots, *slots])
-        change = dataclasses.replace(entered, own=report.new_own, removed_slots=slots)
-        change = dataclasses.replace(change, max_iterations=update.max_iterations)
+        change, report.lost_own = with_others(entered, update, tables)
+        report.new_own = change.own
         try:
             self._solver.update(self._tables, change)
         except SolverError as failure:
@@ -189,8 +188,7 @@ class Smoother:
     def restart(self) -> None:
         """Discard ISAM2; the next update rebuilds it from the current values.
 
-        A loaded smoother starts this way too: a run that restarts where it saves continues exactly
-        like one that is loaded from the file.
+        So a run that restarts where it saves goes on exactly as one that is loaded from the file.
         """
         self._solver.reset()
 
@@ -261,6 +259,8 @@ class Smoother:
         for attempt in range(self._config.max_repairs):
             report.failed = failure.variable or report.failed
             logger.warning("GTSAM failed near %s (%s)", report.failed_variable or "?", failure)
+            if attempt == 1:
+                self._tables.inertial = InertialTables()  # the graph goes on without an IMU
             named = failure.variable if attempt else None
             done = repair(named, new_keyframes, self._tables, self._camera, self._config)
             report.add_repair(done)

@@ -18,6 +18,7 @@ from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations, PosePrior, RelativePose
 from bmask_slam.graph.files.array_file import FileKind, Header, fitting, read_arrays, write_arrays
 from bmask_slam.graph.files.json_file import check_json
+from bmask_slam.graph.inertial.tables import read_inertial
 from bmask_slam.graph.smoother.marginalised_storage import (
     SHAPES,
     marginalised_arrays,
@@ -78,6 +79,7 @@ def graph_arrays(tables: FactorTables) -> Arrays:
         "pose_factor_robust": np.array([getattr(f, "robust", "") or "" for f in factors], np.str_),
         **marginalised_arrays(tables),
         **_own_arrays(tables),
+        **tables.inertial.arrays(),
     }
 
 
@@ -159,6 +161,7 @@ def _tables(arrays: Arrays) -> FactorTables:
             factor = RelativePose(a, b, T, covariance, robust or None, kind)
         tables.add_pose_factors([factor])
     tables.marginalised = read_marginalised(arrays)
+    tables.inertial = read_inertial(arrays, tables.keyframes.ids)
     if "own_factors" in arrays or "own_next" in arrays:
         from bmask_slam.graph.factors.own_factors import read_own  # noqa: PLC0415 - loads GTSAM
 

@@ -24,7 +24,6 @@ from bmask_slam.back_end.landmark_management import (
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
 from bmask_slam.back_end.pruning import MapPruner
 from bmask_slam.back_end.segment_joining import anchors, join_segment
-from bmask_slam.back_end.sensor_fusion import SensorFusion
 from bmask_slam.back_end.triangulation import triangulate_landmarks
 from bmask_slam.events import Ends, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
@@ -37,6 +36,7 @@ from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.graph.smoother.smoother import Smoother
 from bmask_slam.loops.closing import LoopCloser
 from bmask_slam.loops.verification import LoopConstraint
+from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.tracking.results import Tracked
 from bmask_slam.tracking.tracker import Tracker
@@ -250,6 +250,7 @@ class Mapper:
             self.update_ms.append(estimate.update_ms)
         self.events.graph(estimate)
         read_back(self.world, estimate)
+        self.sensors.follow(self)
 
     def _change_graph(self, **changes: Any) -> None:
         """An update that moves much of the graph: ISAM2 is iterated until it converges."""

@@ -9,6 +9,7 @@ from bmask_slam.back_end.reinterpretation import KeyframeMotion
 from bmask_slam.graph.arrays import Array, Floats, Image, Ints
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.files.array_file import FileKind
+from bmask_slam.graph.inertial.tables import InertialState
 from bmask_slam.graph.sensors.streams import Measurements
 from bmask_slam.live.replica import WorldDelta
 from bmask_slam.semantics.instances.instances import Instance, PackedMask
@@ -184,7 +185,8 @@ class Finish:
 class MapChanged:
     """From the map: changes, after a keyframe's landmarks were made or the graph was optimised.
 
-    ``done``: the keyframe is finished; ``update_ms`` is then the time that it took.
+    ``done``: the keyframe is finished; ``update_ms`` is then the time that it took. ``newest``: how
+    the camera moved at the newest keyframe, with an IMU.
     """
 
     keyframe_id: int
@@ -192,6 +194,7 @@ class MapChanged:
     done: bool
     update_ms: float = 0.0
     loops_closed: int = 0
+    newest: InertialState | None = None
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,11 @@ from bmask_slam.graph.geometry import (
     quaternion_from_rotation,
     se3_exp,
     so3_exp,
+    so3_log,
 )
 from bmask_slam.graph.sensors.accelerometer import UP
 from bmask_slam.graph.sensors.config import SensorsConfig
+from bmask_slam.graph.sensors.imu import ImuConfig
 from bmask_slam.graph.sensors.mounting import T_of
 from bmask_slam.graph.sensors.odometry import OdometryConfig, step_covariances
 from bmask_slam.graph.sensors.position import PositionConfig
@@ -76,6 +78,31 @@ def accelerometer(
     return np.column_stack([np.arange(len(force)) / hertz, force])
 
 
+def imu(T_world_camera: Array, hertz: float, config: ImuConfig, rng: np.random.Generator) -> Array:
+    """Rows (N, 7) of an IMU at poses (N, 4, 4) of an even rate: rates and forces with their biases.
+
+    Rates are those from the pose before to the one after, forces the second differences of the
+    IMU's position, so that their integrals lead back to the poses.
+    """
+    T = T_world_camera @ T_of(config.imu_in_camera)
+    R, p = T[:, :3, :3], T[:, :3, 3]
+    padded = np.concatenate([R[:1], R, R[-1:]])
+    rates = so3_log(padded[:-2].mT @ padded[2:]) * hertz / 2
+    p = np.concatenate([2 * p[:1] - p[1:2], p, 2 * p[-1:] - p[-2:-1]])
+    force_world = np.diff(p, 2, axis=0) * hertz**2 + config.gravity_m_s2 * UP
+    forces = (R.mT @ force_world[:, :, None])[:, :, 0]
+    walks = (config.sigma_gyroscope_walk, config.sigma_accelerometer_walk)
+    whites = (config.sigma_gyroscope, config.sigma_accelerometer)
+    begins = (config.sigma_gyroscope_bias, config.sigma_accelerometer_bias)
+    columns = [np.arange(len(T)) / hertz]
+    for exact, white, walk, begin in zip((rates, forces), whites, walks, begins, strict=True):
+        steps = walk / np.sqrt(hertz) * rng.standard_normal(exact.shape)
+        bias = begin * rng.standard_normal(3) + np.cumsum(steps, axis=0)
+        noise = white * np.sqrt(hertz) * rng.standard_normal(exact.shape)
+        columns.append(exact + bias + noise)
+    return np.column_stack(columns)
+
+
 class SensorsOf(Protocol):
     """What is to be rendered, as `RenderConfig` says it."""
 
@@ -102,10 +129,22 @@ def write_sensors(folder: Path, wanted: SensorsOf, poses: Array, path: CameraPat
             mounting = T_of(config.accelerometer.accelerometer_in_camera)
             count = int(len(poses) / wanted.fps * FORCE_HZ)
             fine = camera_poses(path, FORCE_HZ, wanted.seed, sweeping=wanted.sweeping)[:count]
-            rows = accelerometer(fine, mounting, FORCE_HZ, rng)
+            if name == "imu":
+                rows = imu(fine, FORCE_HZ, config.imu, rng)
+            else:
+                rows = accelerometer(fine, mounting, FORCE_HZ, rng)
+        (folder / FILES[name]).write_text(_text(name, rows), encoding="utf-8")
+
+
+def _text(name: str, rows: Array) -> str:
+    """The file of a sensor; an IMU's as EuRoC writes it."""
+    if name == "imu":
+        lines = ["#timestamp [ns]," + ",".join(COLUMNS[name][1:])]
+        lines += [f"{row[0] * 1e9:.0f}," + ",".join(f"{x:.9f}" for x in row[1:]) for row in rows]
+    else:
         lines = [f"# {name}, rendered", f"# {' '.join(COLUMNS[name])}"]
         lines += [f"{row[0]:.6f} " + " ".join(f"{x:.9f}" for x in row[1:]) for row in rows.tolist()]
-        (folder / FILES[name]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return "\n".join(lines) + "\n"
 
 
 def check_sensors(names: tuple[str, ...]) -> None:

@@ -249,7 +249,8 @@ class MapServer:
         mapper = self.system.mapper
         delta = self._deltas.delta(mapper.world, mapper.history)
         loops = len(mapper.loops.closed)
-        self._send(MapChanged(keyframe_id, delta, done, update_ms, loops))
+        newest = mapper.sensors.newest
+        self._send(MapChanged(keyframe_id, delta, done, update_ms, loops, newest))
 
     def _count_visibility(self, visibility: VisibilityCounts) -> None:
         landmarks = self.system.mapper.world.landmarks

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from bmask_slam.back_end.map_backend import add_keyframe, without_image
-from bmask_slam.back_end.sensor_fusion import SensorFusion
 from bmask_slam.events import Event, EventLog
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array, Ints, Mask
@@ -34,6 +33,7 @@ from bmask_slam.live.processes.map_worker import MapWorker
 from bmask_slam.live.replica import apply_delta
 from bmask_slam.loops.verification import LoopConstraint
 from bmask_slam.semantics.instances.instances import PackedMask
+from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.sequences.frame import Frame
 from bmask_slam.system_config import SystemConfig
 from bmask_slam.tracking.results import Tracked
@@ -250,6 +250,7 @@ class RemoteMapper:
             self.places.add(keyframe_id, self.world.keyframes[keyframe_id].features.descriptors)
         self.changes += 1
         self.loops_closed = message.loops_closed
+        self.sensors.newest = message.newest
         if not message.done:
             return
         self.update_ms.append(message.update_ms)

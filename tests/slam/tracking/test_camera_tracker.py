@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from synthetic_view import CAMERA, T_NEW_OLD, add_keyframe, make_features, points_before
 
-from bmask_slam.back_end.sensor_fusion import SensorFusion
 from bmask_slam.events import EventLog
 from bmask_slam.features.brisk import BriskExtractor, FeatureConfig, Features
 from bmask_slam.features.descriptor_index import DescriptorIndex
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.geometry import se3_exp, se3_log
 from bmask_slam.graph.sensors.config import SensorsConfig
+from bmask_slam.sensing.sensor_fusion import SensorFusion
 from bmask_slam.tracking.camera_tracker import CameraTracker
 from bmask_slam.tracking.relocalisation import RelocalisationConfig
 from bmask_slam.tracking.results import Tracked, TrackingStatus, lost, untracked

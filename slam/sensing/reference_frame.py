@@ -26,6 +26,7 @@ from bmask_slam.graph.factors.graph_update import (
 )
 from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.geometry import inverse, make_pose
+from bmask_slam.graph.inertial.tables import InertialUpdate
 from bmask_slam.graph.sensors.accelerometer import (
     UP,
     Plumb,
@@ -61,6 +62,7 @@ class SensorChanges:
     relative_poses: tuple[RelativePose, ...] = ()
     remove_keyframes: Ints = field(default_factory=no_ids)
     remove_relative_poses: tuple[RelativePoseName, ...] = ()
+    inertial: InertialUpdate = field(default_factory=InertialUpdate)
 
     def __bool__(self) -> bool:
         return any(len(getattr(self, f.name)) for f in fields(self))
@@ -76,7 +78,7 @@ class SensorChanges:
     def _joined(self, first: Any, second: Any) -> dict[str, Any]:
         pairs = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in fields(self)}
         return {
-            name: a + b if isinstance(a, tuple) else np.concatenate([a, b])
+            name: np.concatenate([a, b]) if isinstance(a, np.ndarray) else a + b
             for name, (a, b) in pairs.items()
         }
 

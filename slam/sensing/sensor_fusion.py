@@ -13,11 +13,12 @@ from typing import Protocol
 
 import numpy as np
 
-from bmask_slam.back_end.reference_frame import Made, ReferenceFrame, SensorChanges
 from bmask_slam.events import EventLog
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.factors.checks import chi2_quantile
+from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import (
+    ANCHOR,
     FIRST_FRAME,
     GRAVITY,
     ODOMETRY,
@@ -25,15 +26,24 @@ from bmask_slam.graph.factors.graph_update import (
     RelativePose,
     RelativePoseName,
 )
+from bmask_slam.graph.factors.observability import diagonal_covariance
 from bmask_slam.graph.files.array_file import nested, part
+from bmask_slam.graph.geometry import inverse
+from bmask_slam.graph.inertial.tables import InertialState
 from bmask_slam.graph.sensors.accelerometer import Plumb
 from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.odometry import Motion, motion_between
 from bmask_slam.graph.sensors.streams import COLUMNS, Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.sensing.inertial_fusion import inertial_update, motion_by_imu, newest_state
+from bmask_slam.sensing.reference_frame import Made, ReferenceFrame, SensorChanges
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
+MIN_SHARED = 15
+"""A new keyframe that shares fewer landmarks with the one before is held to it weakly ..."""
+WEAK_COVARIANCE = diagonal_covariance(0.05, 0.1)
+"""... as a keyframe that a removal left underconstrained."""
 DEGREES = {ODOMETRY: 6, GRAVITY: 2, POSITION: 3}
 """The kinds of factors, and the degrees of freedom of their errors."""
 KINDS = tuple(DEGREES)
@@ -55,6 +65,7 @@ class SensorFusion:
         config: of all sensors.
         streams: their measurements.
         refused: by sensor, how many measurements came too late.
+        newest: how the camera moved at the newest keyframe, with an IMU.
     """
 
     def __init__(self, config: SensorsConfig, events: EventLog) -> None:
@@ -64,6 +75,7 @@ class SensorFusion:
         self._events = events
         self._made: Made = {}
         self._plumbs: dict[int, Plumb] = {}
+        self.newest: InertialState | None = None
         self._first_keyframe = 0  # of this session
 
     def add(self, new: Measurements, world: WorldMap) -> None:
@@ -87,11 +99,16 @@ class SensorFusion:
             self.streams.add(Measurements(new.sensor, new.rows[~late]))
 
     def motion(self, begin_s: float, end_s: float) -> Motion | None:
-        """The camera's motion by odometry from one time to a later one, which may be now."""
-        config = self.config.odometry
-        if end_s - begin_s > config.max_blackout_s:
-            return None
-        return motion_between(self.streams, begin_s, end_s, config, config.max_gap_s)
+        """The camera's motion from one time to a later one, which may be now.
+
+        By odometry, or, after keyframes and for a short time, by an IMU.
+        """
+        config, moved = self.config.odometry, None
+        if end_s - begin_s <= config.max_blackout_s:
+            moved = motion_between(self.streams, begin_s, end_s, config, config.max_gap_s)
+        if moved is None and self.newest is not None:
+            moved = motion_by_imu(self.streams, self.newest, begin_s, end_s, self.config.imu)
+        return moved
 
     def forget_factors(self) -> None:
         """The graph was emptied: all factors are to be made anew."""
@@ -102,7 +119,7 @@ class SensorFusion:
 
         Its measurements replace the present ones and are of its keyframes only; factors stay.
         """
-        self.streams, self.refused = SensorStreams(), {}
+        self.streams, self.refused, self.newest = SensorStreams(), {}, None
         self._first_keyframe = first_keyframe
         self._made = dict.fromkeys(self._made, np.nan)  # stamps are of the other recording
 
@@ -119,7 +136,26 @@ class SensorFusion:
             present = [k for k in world.in_segment(segment) if k.id >= self._first_keyframe]
             moved = SensorChanges(relative_poses=tuple(self._odometry(present)))
             found = found.with_more(moved).with_more(frame.changes())
+            found = found.with_more(self._inertial(present, tables))
         return found
+
+    def _inertial(self, keyframes: list[Keyframe], tables: FactorTables) -> SensorChanges:
+        """Factors of an IMU; a new keyframe that shares too little is held weakly beside them."""
+        update = inertial_update(keyframes, tables.inertial, self.streams, self.config.imu)
+        weak = []
+        by_id = {k.id: k for k in keyframes}
+        for factor in update.factors:
+            a, b = by_id[factor.keyframe_a], by_id[factor.keyframe_b]
+            shared = np.intersect1d(a.landmark_ids, b.landmark_ids)
+            if len(shared) < MIN_SHARED and not tables.keyframes.contains(np.array([b.id])).all():
+                T_a_b = inverse(a.T_world_camera) @ b.T_world_camera
+                weak.append(RelativePose(a.id, b.id, T_a_b, WEAK_COVARIANCE, kind=ANCHOR))
+        return SensorChanges(relative_poses=tuple(weak), inertial=update)
+
+    def follow(self, owner: GraphOwner) -> None:
+        """The graph was optimised: keep how the camera moves, for a blackout."""
+        if self.streams or owner.smoother.tables.inertial:
+            self.newest = newest_state(owner.world, owner.smoother.tables)
 
     def _odometry(self, keyframes: list[Keyframe]) -> Iterator[RelativePose]:
         """Motion between keyframes in a row."""
@@ -163,6 +199,7 @@ class SensorFusion:
             "first_keyframe": np.array(self._first_keyframe),
             "made": np.array(ids, np.int64).reshape(-1, 3),
             "made_s": np.array(list(self._made.values()), float),
+            "newest": np.zeros(0) if self.newest is None else self.newest.numbers,
             "plumb_ids": np.array(list(self._plumbs), np.int64),
             "plumbs": np.array(
                 [[*p.mean, *p.turn.ravel(), p.sigma_rad] for p in self._plumbs.values()], float
@@ -175,6 +212,7 @@ class SensorFusion:
         state = {**{n: a for n, a in example_state().items() if "." not in n}, **state}
         self.streams.restore(part(state, "streams"))
         self._first_keyframe = int(state["first_keyframe"])
+        self.newest = InertialState.of(state["newest"]) if len(state["newest"]) else None
         made = zip(state["made"].tolist(), state["made_s"].tolist(), strict=True)
         self._made = {(a, b, KINDS[kind]): t for (kind, a, b), t in made}
         plumbs = zip(state["plumb_ids"].tolist(), state["plumbs"], strict=True)
@@ -188,7 +226,8 @@ def example_state() -> Arrays:
     rows = {sensor: np.zeros((0, len(names))) for sensor, names in COLUMNS.items()}
     made: Arrays = {"made": np.zeros((0, 3), np.int64), "made_s": np.zeros(0)}
     plumbs: Arrays = {"plumb_ids": np.zeros(0, np.int64), "plumbs": np.zeros((0, 13))}
-    return {**nested(streams=rows), "first_keyframe": np.array(0), **made, **plumbs}
+    first: Arrays = {"first_keyframe": np.array(0), "newest": np.zeros(0)}
+    return {**nested(streams=rows), **first, **made, **plumbs}
 
 
 def _is_known(name: RelativePoseName, world: WorldMap) -> bool:

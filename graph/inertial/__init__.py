@@ -1,0 +1,1 @@
+"""Inertial measurements in the graph: velocities, biases, gravity, and the factors between them."""

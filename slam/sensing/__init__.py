@@ -1,0 +1,1 @@
+"""Measurements of other sensors: which of them become factors of which keyframes."""
