@@ -147,10 +147,7 @@ class Mapper:
         self._cull_keyframe(keyframe)
 
     def close_loops(self, keyframe: Keyframe) -> list[LoopConstraint]:
-        """Look for known places from a keyframe; confirmed loops move the map and fuse landmarks.
-
-        New loops that do not fit the graph then are removed, and wait for more support.
-        """
+        """Close a keyframe's loops that are confirmed; those that do not fit wait for more."""
         confirmed = self.loops.loops_of(keyframe, self.world)
         if not confirmed:
             return []
@@ -182,9 +179,10 @@ class Mapper:
         self.smoother = Smoother(self.camera, self._graph_config)
         self.smoother.tables.next_own, own = old.next_own, tuple(old.own_factors.items())
         update = self._factor_selector.whole_update(self.world)
-        self.sensors.forget_factors()
         update = replace(update, relative_poses=loops, own_factors=own)
-        self._apply(self.smoother.update(self.sensors.changes(self).added_to(update)))
+        update = self.sensors.carry_over(old, self.smoother.tables, self.world).added_to(update)
+        self._apply(self.smoother.update(update))
+        self.add_waiting_measurements()
         return joined
 
     def pruner(self) -> MapPruner:
@@ -223,7 +221,7 @@ class Mapper:
     def finish(self) -> None:
         """Full bundle adjustment, again without outliers; the map is then final."""
         if self.world.keyframes:
-            self.add_last_measurements()
+            self.add_waiting_measurements(last=True)
             self._apply(self.smoother.optimise_batch(drop_outliers=True), timed=False)
             self.sensors.report(self.smoother)
 
@@ -238,9 +236,9 @@ class Mapper:
         update = replace(update, own_factors=own, remove_own_factors=removed)
         self._apply(self.smoother.update(update), timed=False)
 
-    def add_last_measurements(self) -> None:
-        """Make factors of the measurements that waited for the next keyframe."""
-        changes = self.sensors.changes(self, last=True)
+    def add_waiting_measurements(self, last: bool = False) -> None:
+        """Make factors of what waited for the next keyframe; ``last``: there will be none."""
+        changes = self.sensors.changes(self, last)
         if changes:
             update = changes.added_to(self._factor_selector.map_update(self.world))
             self._apply(self.smoother.update(update), timed=False)

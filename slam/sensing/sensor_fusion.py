@@ -35,8 +35,8 @@ from bmask_slam.graph.sensors.config import SensorsConfig
 from bmask_slam.graph.sensors.odometry import Motion, motion_between
 from bmask_slam.graph.sensors.streams import COLUMNS, Measurements, SensorStreams
 from bmask_slam.graph.smoother.smoother import Smoother
-from bmask_slam.sensing.inertial_fusion import inertial_update, motion_by_imu, newest_state
-from bmask_slam.sensing.reference_frame import Made, ReferenceFrame, SensorChanges
+from bmask_slam.sensing.inertial_fusion import carried, inertial_update, motion_by_imu, newest_state
+from bmask_slam.sensing.reference_frame import Made, ReferenceFrame, SensorChanges, carried_frames
 from bmask_slam.world.frame_history import FrameHistory
 from bmask_slam.world.world_map import Keyframe, WorldMap
 
@@ -110,9 +110,23 @@ class SensorFusion:
             moved = motion_by_imu(self.streams, self.newest, begin_s, end_s, self.config.imu)
         return moved
 
-    def forget_factors(self) -> None:
-        """The graph was emptied: all factors are to be made anew."""
-        self._made = {}
+    def carry_over(self, old: FactorTables, new: FactorTables, world: WorldMap) -> SensorChanges:
+        """What the graph that replaces another one keeps of it, after segments were moved.
+
+        Inertial factors are put into the new tables. Factors of earlier recordings, whose
+        measurements are gone, are returned with their reference frames; all others are made anew.
+        """
+        new.inertial.add(carried(old, world))
+        kept = [
+            factor
+            for kind in KINDS
+            for factor in old.relative_poses(kind)
+            if all(k >= FIRST_FRAME or k < self._first_keyframe for k in factor.keyframe_ids)
+            and _is_known(factor.name, world)
+        ]
+        found = carried_frames(kept, old, world)
+        self._made = {factor.name: np.nan for factor in found.relative_poses}
+        return found
 
     def begin_session(self, first_keyframe: int) -> None:
         """Another recording, whose keyframes have ids from ``first_keyframe`` on.

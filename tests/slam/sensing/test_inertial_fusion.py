@@ -1,0 +1,138 @@
+"""An IMU through the whole system: a covered camera, saved states, gaps, joined segments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_view import CAMERA, render_or_black
+
+from bmask_slam.config.configuration import resolve
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.factors.graph_update import GraphUpdate
+from bmask_slam.graph.geometry import inverse, make_pose, se3_log, so3_exp
+from bmask_slam.graph.smoother.smoother import Smoother
+from bmask_slam.rendering.sensors import imu
+from bmask_slam.system import SlamSystem
+from bmask_slam.system_config import SystemConfig
+from bmask_slam.tracking.results import TrackingStatus
+
+HERTZ, FPS = 200.0, 10.0
+MOUNTING = (0.05, -0.1, 0.02, 0.5, -0.5, 0.5, -0.5)
+SETTINGS = [
+    *("keyframes.min_interval_frames=1", "keyframes.max_shared=2.0", "keyframes.late_shared=2.0"),
+    *(f"sensors.imu.imu_in_camera={list(MOUNTING)}", "mapping.redundant_share=2.0"),
+]
+CONFIG = resolve(SystemConfig, None, SETTINGS)
+R_UPRIGHT_WORLD = so3_exp(np.array([-1.5, 0.2, 0.4]))
+DARK = range(20, 30)
+BIAS = np.array([0.01, -0.02, 0.015])
+
+
+def poses(times_s: Array) -> Array:
+    """A camera that swings before the plane; the first pose is the world's origin."""
+    t = np.atleast_1d(times_s)[:, None]
+    p = [0.25, 0.15, 0.2] * np.sin(t * [1.1, 1.7, 1.3] + [0.0, 0.5, 1.0])
+    path = make_pose(so3_exp([0.1, 0.12, 0.2] * np.sin(t * [1.6, 1.2, 0.9] + [0.3, 0.1, 0.8])), p)
+    return np.asarray(inverse(path[0]) @ path)
+
+
+STAMPS_S = np.arange(33) / FPS
+POSES = poses(STAMPS_S)
+
+
+def readings() -> Array:
+    """Rows (N, 7) of an IMU without noise, with a bias of its gyroscope."""
+    fine = poses(np.arange(-0.1, 3.5, 1 / HERTZ))
+    quiet = {name: 0.0 for name in vars(CONFIG.sensors.imu) if name.startswith("sigma")}
+    upright = make_pose(R_UPRIGHT_WORLD, np.zeros(3)) @ fine
+    rows = imu(upright, HERTZ, replace(CONFIG.sensors.imu, **quiet), np.random.default_rng(0))
+    rows[:, 0] -= 0.1
+    rows[:, 1:4] += BIAS
+    return rows
+
+
+def run(system: SlamSystem, frames: range) -> list[TrackingStatus]:
+    statuses = []
+    for k in frames:
+        frame = render_or_black(None if k in DARK else POSES[k], k)
+        statuses.append(system.process(replace(frame, timestamp_s=float(STAMPS_S[k]))).status)
+    return statuses
+
+
+def with_imu(rows: Array) -> SlamSystem:
+    system = SlamSystem(CAMERA, CONFIG)
+    system.add_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:])
+    return system
+
+
+@pytest.fixture(scope="module")
+def bridged() -> tuple[SlamSystem, SlamSystem, list[TrackingStatus]]:
+    """A run whose camera is covered for a second, and one that was restored in the middle."""
+    first, second = with_imu(readings()), SlamSystem(CAMERA, CONFIG)
+    statuses = run(first, range(23))
+    first.restart()
+    second.restore(first.state(), Path("run/checkpoint"))
+    for system in (first, second):
+        more = run(system, range(23, 33))
+        system.finish()
+        system.mapper.update_ms = []
+    return first, second, statuses + more
+
+
+def test_the_imu_alone_gives_the_pose_of_a_covered_camera_for_a_second(
+    bridged: tuple[SlamSystem, SlamSystem, list[TrackingStatus]],
+) -> None:
+    system, _, statuses = bridged
+    reckoned = [k for k, s in enumerate(statuses) if s is TrackingStatus.DEAD_RECKONING]
+    assert reckoned == list(DARK)
+    assert len(system.segments()) == 1
+    trajectory = system.trajectory()
+    assert len(trajectory) == len(POSES)
+    off = se3_log(inverse(POSES) @ trajectory.poses_world_camera)
+    assert np.abs(off[:, 3:]).max() < 0.02
+    assert np.abs(off[:, :3]).max() < 0.01
+
+
+def test_gravity_and_biases_are_found(
+    bridged: tuple[SlamSystem, SlamSystem, list[TrackingStatus]],
+) -> None:
+    """In the world, the first camera's; a wrong mounting or sign turns both."""
+    inertial = bridged[0].mapper.smoother.tables.inertial
+    assert len(inertial.factors) > 15
+    np.testing.assert_allclose(inertial.down[0], R_UPRIGHT_WORLD.T @ [0, 0, -1], atol=0.02)
+    last = inertial.states[max(inertial.states)]
+    np.testing.assert_allclose(last[6:], BIAS, atol=3e-3)
+    step = poses(STAMPS_S[-1:] + 0.01) - poses(STAMPS_S[-1:] - 0.01)
+    np.testing.assert_allclose(last[:3], step[0, :3, 3] / 0.02, atol=0.03)
+
+
+def test_a_restored_system_goes_on_identically_with_an_imu(
+    bridged: tuple[SlamSystem, SlamSystem, list[TrackingStatus]],
+) -> None:
+    first, second = (system.state() for system in bridged[:2])
+    assert "mapper.graph.imu_readings" in first
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], name)
+
+
+def test_a_saved_graph_has_the_imu_and_loses_it_with_its_keyframes(
+    bridged: tuple[SlamSystem, SlamSystem, list[TrackingStatus]], tmp_path: Path
+) -> None:
+    smoother = bridged[0].mapper.smoother
+    smoother.save(tmp_path / "graph")
+    again = Smoother.load(tmp_path / "graph")
+    pairs = sorted(smoother.tables.inertial.factors)
+    assert sorted(again.tables.inertial.factors) == pairs
+    again.update(GraphUpdate())
+    middle = pairs[5][1]
+    again.update(GraphUpdate(remove_keyframes=np.array([middle])))
+    left = again.tables.inertial
+    assert not [pair for pair in left.factors if middle in pair]
+    assert len(left.factors) == len(pairs) - 2
+    assert middle not in left.states
+    assert ("bias", pairs[6][1], 0) in left.slots
+    assert np.isfinite(again.marginals().keyframes).all()
