@@ -40,8 +40,8 @@ ROOMS = {
                job_process  __init__  __main__""",
     "slam/run_folder": "[...]  scene  export",
     "slam/rendering": "engine  things  rooms  [...]",
-    "slam/live": """[...]  sources  processes  system  start  health  display  recorder  live_slam
-                    play""",
+    "slam/live": """[...]  sources  bag_sensors  processes  system  start  health  display
+                    recorder  live_slam  play""",
     "slam/comparison": "experiment  jobs  statistics  report  [...]",
 }
 MAX_MODULES, MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS = 12, 300, 40, 6

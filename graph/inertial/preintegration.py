@@ -142,8 +142,8 @@ def inertial_factors(tables: InertialTables, names: Iterable[Name]) -> list[gtsa
 def _factor(tables: InertialTables, name: Name) -> gtsam.NonlinearFactor:
     what, a, b = name
     if what == GRAVITY:
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, _DOWN_RAD)
-        return gtsam.PriorFactorUnit3(gravity_key(a), gtsam.Unit3(tables.down[a]), noise)
+        loose = gtsam.noiseModel.Isotropic.Sigma(2, _DOWN_RAD)
+        return gtsam.PriorFactorUnit3(gravity_key(a), gtsam.Unit3(tables.down[a]), loose)
     if what == BIAS:
         model = next(f.model for pair, f in sorted(tables.factors.items()) if pair[0] == a)
         sigmas = np.repeat([model.accelerometer_bias, model.gyroscope_bias], 3)

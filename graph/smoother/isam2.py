@@ -77,8 +77,7 @@ def with_others(
     Returns the change with them, and the numbers of the users' factors that were lost.
     """
     lost, slots, added = exchange_own_factors(update, tables)
-    inertial = tables.inertial
-    inertial.add(update.inertial)
+    (inertial := tables.inertial).add(update.inertial)
     inertial.prune(tables.keyframes.ids)
     predict_new_states(inertial, tables.keyframes)
     new = inertial.change()

@@ -17,17 +17,21 @@ from bmask_slam.commands.arguments import (
     format_summary,
     view_options,
 )
+from bmask_slam.graph.errors import InputError
 
 if TYPE_CHECKING:
+    from bmask_slam.graph.sensors.streams import Measurements
     from bmask_slam.live.live_slam import LiveOptions, LiveSlam
     from bmask_slam.live.sources.opening import SourceOptions
     from bmask_slam.live.sources.source import Source
+    from bmask_slam.system_config import SystemConfig
 
 TEXT = "track a source of frames as they come"
 MORE = """\
 Tracking is here; the map with its graph and loops, segmentation and the dense map have processes
 of their own. The run folder is that of `run`, with health.json, which is rewritten every second."""
 
+SENSORS = ("imu", "odometry", "position", "accelerometer")
 SOURCE_HELP = """\
 folder in TUM layout, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the RealSense that is
 plugged in, or opencv:N for device N of OpenNI 2"""
@@ -73,6 +77,9 @@ def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--depth-topic", metavar="T", help=text)
     text = "of a bag: the colour camera (default: the camera_info beside the colour topic)"
     parser.add_argument("--camera-info-topic", metavar="T", help=text)
+    for sensor in SENSORS:
+        text = f"of a bag: {sensor}, with its sensors.{sensor} settings (default: none)"
+        parser.add_argument(f"--{sensor}-topic", metavar="T", default="", help=text)
 
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
@@ -93,7 +100,6 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
 
 
 def _live(arguments: argparse.Namespace) -> int:
-    from bmask_slam.graph.sensors.streams import read_folder
     from bmask_slam.live.live_slam import LiveSlam
     from bmask_slam.live.play import PlayOptions, play
     from bmask_slam.live.sources.opening import open_source
@@ -104,7 +110,7 @@ def _live(arguments: argparse.Namespace) -> int:
         options = _live_options(arguments, source)
         with LiveSlam(source.camera, config, options) as slam:
             slam.source_counts = source.counts
-            for measured in read_folder(options.images, config.sensors.enabled):
+            for measured in measured_beside(arguments, options.images, config):
                 slam.add_measurements(measured)
             if slam.viewer_url:
                 print(f"in a browser: {slam.viewer_url}", flush=True)
@@ -114,6 +120,26 @@ def _live(arguments: argparse.Namespace) -> int:
     else:
         _print_summary(slam, source)
     return 128 + ended_by if ended_by else 0
+
+
+def measured_beside(
+    arguments: argparse.Namespace, folder: Path | None, config: SystemConfig
+) -> list[Measurements]:
+    """What other sensors measured, from the files of a folder or the topics of a bag."""
+    from bmask_slam.graph.sensors.streams import read_folder
+    from bmask_slam.live.bag_sensors import SensorTopics, read_sensors
+    from bmask_slam.live.sources.bags import is_bag
+
+    topics = {sensor: getattr(arguments, f"{sensor}_topic") for sensor in SENSORS}
+    given = [f"--{sensor}-topic" for sensor, topic in topics.items() if topic]
+    path = Path(arguments.source)
+    if given and not is_bag(path):
+        raise InputError(f"{arguments.source}: no bag; leave {given[0]} out")
+    return (
+        read_sensors(path, SensorTopics(**topics))
+        if given
+        else read_folder(folder, config.sensors.enabled)
+    )
 
 
 def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:

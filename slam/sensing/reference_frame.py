@@ -49,6 +49,8 @@ SIGMA_RAD, SIGMA_M = 1.0, 100.0
 SLACK_S, MAX_GAP_S = 0.1, 0.3
 """The time around a keyframe may lack so much at its end; longer gaps between frames are left out.
 """
+IMU_SIGMA_RAD = 0.005
+"""Of up by an IMU."""
 RETIRED_FRAME = FIRST_FRAME + (1 << 20)
 """Reference frames from here on are of segments that were joined to others."""
 Made = dict[RelativePoseName, float]
@@ -215,7 +217,12 @@ class ReferenceFrame:
 
     @cached_property
     def _upright(self) -> Upright | None:
-        config = self.config.accelerometer
+        config, down = self.config.accelerometer, self.tables.inertial.down.get(self.segment)
+        if down is not None and self._keyframes:
+            first = self._keyframes[0]  # one factor is enough: the IMU holds the others
+            up = -first.T_world_camera[:3, :3].T @ down
+            self.plumbs[first.id] = Plumb(up, np.zeros((3, 3)), IMU_SIGMA_RAD)
+            return Upright(-down, np.zeros(3), np.zeros((3, 3)))
         if not config.enabled or not len(self.streams.of("accelerometer")):
             return None
         for keyframe in self._keyframes:

@@ -17,8 +17,18 @@ from bmask_slam.back_end.landmark_management import MappingConfig
 from bmask_slam.back_end.mapper import Mapper
 from bmask_slam.back_end.segment_joining import join_segment
 from bmask_slam.features.brisk import Features
-from bmask_slam.graph.factors.graph_update import ANCHOR
+from bmask_slam.graph.factors.graph_update import (
+    ANCHOR,
+    GRAVITY,
+    ODOMETRY,
+    GraphUpdate,
+    PosePrior,
+    RelativePose,
+    reference_frame_id,
+)
 from bmask_slam.graph.geometry import inverse, se3_exp, transform
+from bmask_slam.graph.inertial.tables import ImuModel, InertialFactor, InertialUpdate
+from bmask_slam.sensing.reference_frame import RETIRED_FRAME
 from bmask_slam.tracking.results import Tracked, TrackingStatus
 from bmask_slam.tracking.tracker import Tracker, TrackingConfig
 from bmask_slam.world.world_map import WorldMap
@@ -127,3 +137,38 @@ def test_anchors_that_a_joined_map_does_not_need_are_released() -> None:
     mapper.join(1, in_segment, recognised)
     assert len(mapper.smoother.estimate().keyframe_ids) == 6
     assert mapper.smoother.relative_poses(ANCHOR) == ()
+
+
+def test_factors_of_earlier_recordings_stay_when_segments_are_joined() -> None:
+    """Their measurements are gone. What is of the moved segment moves with it."""
+    mapper, in_segment, recognised = segments_with_few_points_in_common(20)
+    T = {k.id: k.T_world_camera for k in mapper.world.keyframes.values()}
+    frame, T_frame = reference_frame_id(1), T_SEGMENT_WORLD @ T_NEW_OLD
+    covariance = np.eye(6) * 1e-4
+    moved = RelativePose(3, 4, inverse(T[3]) @ T[4], covariance, None, ODOMETRY)
+    up = RelativePose(frame, 4, inverse(T_frame) @ T[4], covariance, None, GRAVITY)
+    loose = ImuModel(np.eye(4), 10.0, 100.0, 1.0, 1.0, 1.0, 1.0, 9.81)
+    imu = InertialFactor(3, 4, 1, np.array([[0.1, 0, 0, 9.81, 0, 0, 0, 0, 0, 0]]), loose)
+    states = {3: np.r_[0.5, 0, 0, np.zeros(6)], 4: np.r_[0.5, 0, 0, np.zeros(6)]}
+    mapper.smoother.update(
+        GraphUpdate(
+            keyframe_ids=np.array([frame]),
+            poses_world_camera=T_frame[None],
+            priors=(PosePrior(frame, T_frame, covariance),),
+            relative_poses=(moved, up),
+            inertial=InertialUpdate((imu,), states=states, down={1: np.array([0, 0, -1.0])}),
+        )
+    )
+    before = mapper.smoother.tables.inertial
+    mapper.begin_session()
+    mapper.join(1, in_segment, recognised)
+    tables = mapper.smoother.tables
+    assert [f.name for f in tables.relative_poses(ODOMETRY)] == [moved.name]
+    assert [f.name for f in tables.relative_poses(GRAVITY)] == [(RETIRED_FRAME, 4, GRAVITY)]
+    (T_found,) = tables.keyframes.get(np.array([RETIRED_FRAME]))
+    np.testing.assert_allclose(T_found, T_NEW_OLD, atol=0.01)
+    R_world_segment = T_SEGMENT_WORLD[:3, :3].T
+    assert tables.inertial.down.keys() == {0}
+    np.testing.assert_allclose(tables.inertial.down[0], R_world_segment @ before.down[1], atol=0.01)
+    turned = R_world_segment @ before.states[4][:3]
+    np.testing.assert_allclose(tables.inertial.states[4][:3], turned, atol=0.05)
