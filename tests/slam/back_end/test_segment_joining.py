@@ -147,8 +147,9 @@ def test_factors_of_earlier_recordings_stay_when_segments_are_joined() -> None:
     covariance = np.eye(6) * 1e-4
     moved = RelativePose(3, 4, inverse(T[3]) @ T[4], covariance, None, ODOMETRY)
     up = RelativePose(frame, 4, inverse(T_frame) @ T[4], covariance, None, GRAVITY)
-    loose = ImuModel(np.eye(4), 10.0, 100.0, 1.0, 1.0, 1.0, 1.0, 9.81)
-    imu = InertialFactor(3, 4, 1, np.array([[0.1, 0, 0, 9.81, 0, 0, 0, 0, 0, 0]]), loose)
+    loose = ImuModel(np.eye(4), 0.5, 5.0, 0.1, 0.1, 1.0, 1.0, 9.81)
+    readings = np.tile([0.01, 0, 0, 9.81, 0, 0, 0, 0, 0, 0], (10, 1))
+    imu = InertialFactor(3, 4, 1, readings, loose)
     states = {3: np.r_[0.5, 0, 0, np.zeros(6)], 4: np.r_[0.5, 0, 0, np.zeros(6)]}
     mapper.smoother.update(
         GraphUpdate(
