@@ -16,8 +16,8 @@ from typing import Any
 
 from bmask_slam import InputError, LiveOptions, LiveSlam
 from bmask_slam.graph.geometry import quaternion_from_rotation
-from bmask_slam.live.sources import ros_images as ros
 from bmask_slam.run_folder.open_files import free_run_path
+from bmask_slam.sequences.bags import ros_images as ros
 from bmask_slam.sequences.images import depth_in_metres
 
 

@@ -26,7 +26,7 @@ from bmask_slam.commands.optimise import add_optimise
 from bmask_slam.commands.results import add_export, add_query
 from bmask_slam.commands.run import add_run
 from bmask_slam.commands.segmentation import add_evaluate_segmentation, add_segment, add_train
-from bmask_slam.commands.sequences import add_download, add_info, add_render
+from bmask_slam.commands.sequences import add_convert, add_download, add_info, add_render
 from bmask_slam.commands.view import add_view
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
@@ -184,6 +184,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_live(commands)
     add_evaluate(commands)
     add_render(commands)
+    add_convert(commands)
     add_info(commands)
     add_download(commands)
     add_optimise(commands)

@@ -38,6 +38,7 @@ ROOMS = {
                system_interface  run_folder  system_results  sensor_input  system  dense
                calibration  refinement  viewer  offline  live  comparison  api  commands  cli
                job_process  __init__  __main__""",
+    "slam/sequences": "[...]  bags  formats  sequence  info  right_images  __init__",
     "slam/run_folder": "[...]  scene  export",
     "slam/rendering": "engine  things  rooms  [...]",
     "slam/live": """[...]  sources  bag_sensors  processes  system  start  health  display

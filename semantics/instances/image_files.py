@@ -38,10 +38,18 @@ def read_colour(path: Path) -> Image:
     Raises:
         InputError: a missing, truncated or unreadable file, or more than 8 bits a channel.
     """
-    bgr = decode_image(path, _COLOUR)
+    return _as_colour(decode_image(path, _COLOUR), str(path))
+
+
+def decode_colour(data: bytes, where: str) -> Image:
+    """``read_colour`` of the bytes of a file; ``where`` names their origin in errors."""
+    return _as_colour(decode_bytes(data, _COLOUR, where), where)
+
+
+def _as_colour(bgr: NDArray, where: str) -> Image:
     if bgr.dtype != np.uint8:
         raise InputError(
-            f"{path}: {8 * bgr.dtype.itemsize} bits a channel where colour is expected; "
+            f"{where}: {8 * bgr.dtype.itemsize} bits a channel where colour is expected; "
             "list 8-bit colour images (are rgb and depth swapped?)"
         )
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

@@ -18,7 +18,6 @@ from bmask_slam.graph.calibration.registration import EdgeScores, strength_of
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.trajectory import Trajectory, nearest_indices
 from bmask_slam.sequences import Sequence
-from bmask_slam.sequences.images import read_depth, read_rgb
 from bmask_slam.tracking.rolling_shutter import velocities
 
 FRAMES = 32
@@ -57,8 +56,8 @@ def edge_scores(sequence: Sequence, path: Trajectory) -> EdgeScores:
     step = max(round(camera.width / WIDTH_STEPS), 1)
     scores, flows = [], []
     for i, twist in zip(chosen.tolist(), twists, strict=True):
-        depth_m = read_depth(sequence.pairs.depth_files[i], camera).astype(float)
-        edges = edges_of(read_rgb(sequence.pairs.rgb_files[i], camera), depth_m)
+        depth_m = sequence.recording.read_depth(sequence.pairs.depth_files[i], camera).astype(float)
+        edges = edges_of(sequence.recording.read_rgb(sequence.pairs.rgb_files[i], camera), depth_m)
         scores.append(correlation(edges, step))
         flows.append(_flow(edges, depth_m, twist, camera))
     size = 2 * RADIUS + 1
@@ -80,8 +79,8 @@ def best_scale(sequence: Sequence, path: Trajectory) -> tuple[float, float]:
     step = 2 * max(round(camera.width / WIDTH_STEPS), 1)
     total = np.zeros((len(SCALES), 2 * RADIUS + 1, 2 * RADIUS + 1))
     for i in chosen[::2].tolist():
-        depth_m = read_depth(sequence.pairs.depth_files[i], camera).astype(float)
-        edges = edges_of(read_rgb(sequence.pairs.rgb_files[i], camera), depth_m)
+        depth_m = sequence.recording.read_depth(sequence.pairs.depth_files[i], camera).astype(float)
+        edges = edges_of(sequence.recording.read_rgb(sequence.pairs.rgb_files[i], camera), depth_m)
         total += [correlation(_scaled(edges, scale), step) for scale in SCALES]
     strengths = [strength_of(scores) for scores in total]
     best = int(np.argmax(strengths))

@@ -16,7 +16,7 @@ from bmask_slam.graph.camera import NO_DEPTH_DISTORTION, Camera
 from bmask_slam.graph.factors.factor_tables import FactorTables
 from bmask_slam.graph.factors.graph_update import Observations
 from bmask_slam.sequences import Sequence
-from bmask_slam.sequences.images import SURFACE_STEP, read_depth
+from bmask_slam.sequences.images import SURFACE_STEP
 from bmask_slam.tracking.rolling_shutter import share_of_rows
 
 MIN_VIEWS = 2
@@ -183,7 +183,8 @@ def _raw_inverse_depth(sequence: Sequence, index: int) -> Array:
     camera = dataclasses.replace(
         sequence.camera, depth_offset_m=0.0, depth_distortion=NO_DEPTH_DISTORTION
     )
-    return 1.0 / read_depth(sequence.pairs.depth_files[index], camera).astype(float)
+    file = sequence.pairs.depth_files[index]
+    return 1.0 / sequence.recording.read_depth(file, camera).astype(float)
 
 
 def _change_around(sequence: Sequence, index: int) -> tuple[Array, float]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 if TYPE_CHECKING:
     from bmask_slam.evaluation import Row
     from bmask_slam.semantics.segmenters.segmenter_table import SegmenterOptions
+    from bmask_slam.sequences.bags.topics import BagTopics
     from bmask_slam.system_config import SystemConfig
     from bmask_slam.viewer.scene import ViewOptions
 
@@ -28,6 +29,24 @@ def add_camera_argument(parser: argparse.ArgumentParser) -> None:
     """Add --camera."""
     text = "camera.yaml in place of its own, or a model such as kinect-v1 for what that leaves out"
     parser.add_argument("--camera", type=Path, metavar="F", help=text)
+
+
+def add_topic_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the topics of a bag."""
+    known = "default: those of the known cameras' drivers"
+    text = f"of a bag: colour images ({known})"
+    parser.add_argument("--rgb-topic", metavar="T", help=text)
+    parser.add_argument("--depth-topic", metavar="T", help=f"of a bag: depth images ({known})")
+    text = "of a bag: the colour camera (default: the camera_info beside the colour topic)"
+    parser.add_argument("--camera-info-topic", metavar="T", help=text)
+
+
+def bag_topics(arguments: argparse.Namespace) -> BagTopics:
+    """The topics that were asked for."""
+    from bmask_slam.sequences.bags.topics import BagTopics
+
+    names = (arguments.rgb_topic, arguments.depth_topic, arguments.camera_info_topic)
+    return BagTopics(*(name or "" for name in names))
 
 
 def add_segmenter_arguments(parser: argparse.ArgumentParser, default: str) -> None:

@@ -12,7 +12,9 @@ from bmask_slam.commands.arguments import (
     add_camera_argument,
     add_config_arguments,
     add_segmenter_arguments,
+    add_topic_arguments,
     add_view_arguments,
+    bag_topics,
     chosen_config,
     format_summary,
     view_options,
@@ -33,8 +35,8 @@ of their own. The run folder is that of `run`, with health.json, which is rewrit
 
 SENSORS = ("imu", "odometry", "position", "accelerometer")
 SOURCE_HELP = """\
-folder in TUM layout, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the RealSense that is
-plugged in, or opencv:N for device N of OpenNI 2"""
+recording in any layout of docs/data.md, ROS 1 .bag, ROS 2 bag folder, .mcap, realsense: for the
+RealSense that is plugged in, or opencv:N for device N of OpenNI 2"""
 
 
 def add_live(commands: Commands) -> None:
@@ -71,12 +73,7 @@ def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="end when a folder that is followed, or a camera, gives nothing for S s (default: 10)",
     )
-    text = "of a bag: colour images (default: /camera/rgb/image_color)"
-    parser.add_argument("--rgb-topic", metavar="T", help=text)
-    text = "of a bag: depth images, registered to colour (default: /camera/depth/image)"
-    parser.add_argument("--depth-topic", metavar="T", help=text)
-    text = "of a bag: the colour camera (default: the camera_info beside the colour topic)"
-    parser.add_argument("--camera-info-topic", metavar="T", help=text)
+    add_topic_arguments(parser)
     for sensor in SENSORS:
         text = f"of a bag: {sensor}, with its sensors.{sensor} settings (default: none)"
         parser.add_argument(f"--{sensor}-topic", metavar="T", default="", help=text)
@@ -84,18 +81,15 @@ def _add_source_arguments(parser: argparse.ArgumentParser) -> None:
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
     """How the source is to be read."""
-    from bmask_slam.live.sources.bag_source import BagTopics
     from bmask_slam.live.sources.opening import SourceOptions
 
-    names = ("rgb", "depth", "camera_info")
-    topics = {name: getattr(arguments, f"{name}_topic") for name in names}
     return SourceOptions(
         camera=arguments.camera,
         realtime=arguments.realtime,
         max_frames=arguments.max_frames,
         follow=arguments.follow,
         silence_s=arguments.silence,
-        topics=BagTopics(**{name: topic for name, topic in topics.items() if topic}),
+        topics=bag_topics(arguments),
     )
 
 
@@ -128,7 +122,7 @@ def measured_beside(
     """What other sensors measured, from the files of a folder or the topics of a bag."""
     from bmask_slam.graph.sensors.streams import read_folder
     from bmask_slam.live.bag_sensors import SensorTopics, read_sensors
-    from bmask_slam.live.sources.bags import is_bag
+    from bmask_slam.sequences.bags.bag_file import is_bag
 
     topics = {sensor: getattr(arguments, f"{sensor}_topic") for sensor in SENSORS}
     given = [f"--{sensor}-topic" for sensor, topic in topics.items() if topic]
@@ -145,16 +139,21 @@ def measured_beside(
 def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     """Where the run is written, and what the source says about itself."""
     from bmask_slam.live.live_slam import LiveOptions
-    from bmask_slam.live.sources.bags import is_bag
     from bmask_slam.run_folder.open_files import free_run_path
+    from bmask_slam.sequences.bags.bag_file import is_bag
+    from bmask_slam.sequences.formats.layouts import is_recording_file
 
-    folder = Path(arguments.source)
+    recording: Path | None = Path(arguments.source)
+    if not recording.is_dir() and not is_recording_file(recording):
+        recording = None
+    elif is_bag(recording):
+        recording = bag_topics(arguments).of_path(recording)
     return LiveOptions(
         out=arguments.out or free_run_path(f"{source.name}-live"),
         overwrite=arguments.overwrite,
         reference=source.groundtruth,
         view=view_options(arguments, arguments.view),
-        images=folder if folder.is_dir() and not is_bag(folder) else None,
+        images=recording,
         title=source.name,
         dense=arguments.map,
         calibrate=arguments.calibrate,

@@ -8,6 +8,7 @@ from pathlib import Path
 from bmask_slam.commands.arguments import Commands
 
 MOST = 10
+DRIVE = ("nav2", "octomap")
 QUERY = "say where a run has found the objects of a label"
 QUERY_MORE = """\
 For each object: position and size in metres in the run's world frame (the first keyframe's
@@ -20,7 +21,8 @@ From a run folder: its trajectory as tum, kitti or euroc, its graph with landmar
 of them as g2o, its landmarks as ply, those on objects in the objects' colours as objects-ply, and
 room, surfaces, objects and their relations as scene-graph (JSON). From a trajectory: tum, kitti,
 euroc, or its positions as ply. From a g2o file with landmarks: ply. KITTI's format has no stamps:
-they go to a second file."""
+they go to a second file. With a dense map: a map to drive on for nav2 (.yaml
+and .pgm) or octomap (.bt)."""
 
 
 def add_query(commands: Commands) -> None:
@@ -63,16 +65,35 @@ def add_export(commands: Commands) -> None:
     parser = commands.add_parser("export", help=EXPORT, description=f"{EXPORT}. {EXPORT_MORE}")
     parser.set_defaults(handler=_export)
     parser.add_argument("input", type=Path, metavar="INPUT", help="run folder, trajectory, or g2o")
-    formats = ("tum", "kitti", "euroc", "g2o", "ply", "scene-graph", "objects-ply")
+    formats = ("tum", "kitti", "euroc", "g2o", "ply", "scene-graph", "objects-ply", *DRIVE)
     parser.add_argument("--format", choices=formats, required=True, help="what to write")
     parser.add_argument("--out", type=Path, required=True, metavar="F", help="file to write")
     parser.add_argument(
         "--times", type=Path, metavar="F", help="stamps of a KITTI trajectory, one a line"
     )
+    text = "of nav2 and octomap: edge of a cell in metres (default: 0.05)"
+    parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help=text)
+    text = "of nav2: obstacles stand from LOW to HIGH metres above the floor (default: 0.1 1.5)"
+    parser.add_argument(
+        "--heights", nargs=2, type=float, default=(0.1, 1.5), metavar=("LOW", "HIGH"), help=text
+    )
     parser.add_argument("--quiet", action="store_true", help="print only the paths")
 
 
+def _export_drive_map(arguments: argparse.Namespace) -> int:
+    from bmask_slam.dense.drive_map import DriveMapOptions, export_drive_map
+    from bmask_slam.runtime.progress import console_log
+
+    options = DriveMapOptions(arguments.resolution, *arguments.heights)
+    with console_log():
+        files, text = export_drive_map(arguments.input, arguments.format, arguments.out, options)
+    print("\n".join(map(str, files)) + ("" if arguments.quiet else f"\n\n{text}"))
+    return 0
+
+
 def _export(arguments: argparse.Namespace) -> int:
+    if arguments.format in DRIVE:
+        return _export_drive_map(arguments)
     from bmask_slam.run_folder.export import export
     from bmask_slam.runtime.progress import console_log
 

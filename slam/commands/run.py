@@ -12,6 +12,8 @@ from bmask_slam.commands.arguments import (
     add_camera_argument,
     add_config_arguments,
     add_segmenter_arguments,
+    add_topic_arguments,
+    bag_topics,
     chosen_config,
     format_summary,
 )
@@ -53,7 +55,9 @@ def add_run(commands: Commands) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(handler=_run)
-    parser.add_argument("sequence", type=Path, nargs="?", help="folder in TUM layout")
+    parser.add_argument(
+        "sequence", type=Path, nargs="?", help="recording: TUM's or another layout, or ROS bag"
+    )
     parser.add_argument("--out", type=Path, help="run folder (default: runs/<sequence>, numbered)")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that --out holds")
     add_config_arguments(parser)
@@ -66,6 +70,7 @@ def add_run(commands: Commands) -> None:
     parser.add_argument("--stride", type=int, metavar="N", help="take every N-th frame")
     _add_map_arguments(parser)
     add_segmenter_arguments(parser, "light")
+    add_topic_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="print only the run folder's path")
 
 
@@ -113,6 +118,8 @@ def _run_or_resume(arguments: argparse.Namespace, chosen: ChosenConfig) -> RunSu
     from bmask_slam.offline.runner import RunOptions, resume, run
 
     given: dict[str, Any] = {"quiet": arguments.quiet}
+    if arguments.sequence:
+        arguments.sequence = bag_topics(arguments).of_path(arguments.sequence)
     given |= {name: v for name in OPTIONS if (v := getattr(arguments, name)) is not None}
     if arguments.resume:
         if not chosen.is_default:
@@ -121,7 +128,7 @@ def _run_or_resume(arguments: argparse.Namespace, chosen: ChosenConfig) -> RunSu
             raise InputError("--overwrite: would delete what --resume needs; give one of the two")
         return resume(arguments.resume, given)
     if not arguments.sequence:
-        raise InputError("run: no sequence; give a folder in TUM layout, or --resume RUN")
+        raise InputError("run: no sequence; give a recording, or --resume RUN")
     given |= {"config": chosen.config, "config_name": chosen.name}
     return run(RunOptions(**given, overwrite=arguments.overwrite))
 

@@ -6,8 +6,16 @@ import argparse
 from dataclasses import fields
 from pathlib import Path
 
-from bmask_slam.commands.arguments import Commands, add_camera_argument
+from bmask_slam.commands.arguments import (
+    Commands,
+    add_camera_argument,
+    add_topic_arguments,
+    bag_topics,
+)
 
+CONVERT_MORE = """\
+Depth is registered to colour where the recording has it otherwise; colour that is a file of its own
+is copied as it is. docs/data.md has the layouts."""
 DOWNLOAD = "fetch published recordings (TUM, Bonn, ICL-NUIM) from where they were published"
 DOWNLOAD_MORE = """\
 A download that was interrupted goes on where it stopped. Size and SHA-256 are checked where they
@@ -68,14 +76,14 @@ def add_info(commands: Commands) -> None:
     text = "say what a sequence holds: frames, camera, depth, ground truth; of a bag its topics"
     parser = commands.add_parser("info", help=text, description=text)
     parser.set_defaults(handler=_info)
-    parser.add_argument("sequence", type=Path, help="folder in TUM layout, or ROS bag")
+    parser.add_argument("sequence", type=Path, help="recording, or ROS bag")
     add_camera_argument(parser)
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from bmask_slam.live.sources.bags import format_topics, is_bag, open_bag
     from bmask_slam.runtime.progress import console_log
     from bmask_slam.sequences import format_info, open_sequence, sequence_info
+    from bmask_slam.sequences.bags.bag_file import format_topics, is_bag, open_bag
 
     if is_bag(arguments.sequence):
         with open_bag(arguments.sequence) as bag:
@@ -84,6 +92,33 @@ def _info(arguments: argparse.Namespace) -> int:
     with console_log():
         info = sequence_info(open_sequence(arguments.sequence, camera=arguments.camera))
     print(format_info(info))
+    return 0
+
+
+def add_convert(commands: Commands) -> None:
+    """Add the command to the parser."""
+    text = "write a recording in another layout, or a ROS bag, as a folder in TUM layout"
+    parser = commands.add_parser("convert", help=text, description=f"{text}. {CONVERT_MORE}")
+    parser.set_defaults(handler=_convert)
+    parser.add_argument("sequence", type=Path, metavar="A", help="recording, as run takes it")
+    parser.add_argument("out", type=Path, metavar="B", help="folder to make")
+    add_camera_argument(parser)
+    add_topic_arguments(parser)
+    parser.add_argument("--max-frames", type=int, metavar="N", help="only the first N images")
+    parser.add_argument("--quiet", action="store_true", help="print only the folder's path")
+
+
+def _convert(arguments: argparse.Namespace) -> int:
+    from bmask_slam.runtime.progress import console_log, counting_bar
+    from bmask_slam.sequences.formats.convert import convert
+
+    source = bag_topics(arguments).of_path(arguments.sequence)
+    with console_log(), counting_bar(arguments.quiet) as progress:
+        done = convert(source, arguments.out, arguments.camera, arguments.max_frames, progress)
+    folder = arguments.out
+    print(
+        folder if arguments.quiet else f"{done}\nSequence {folder}; next: bmask-slam run {folder}"
+    )
     return 0
 
 

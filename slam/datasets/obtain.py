@@ -8,8 +8,6 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from bmask_slam.datasets.catalogue import Recording
 from bmask_slam.datasets.unpack import unpack
 from bmask_slam.datasets.web_file import WebFile, download
@@ -17,8 +15,10 @@ from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import target_below
 from bmask_slam.graph.files.reading import read_lines
 from bmask_slam.graph.files.yaml_file import format_yaml
-from bmask_slam.graph.trajectory import Trajectory, read_tum, write_tum
+from bmask_slam.graph.trajectory import write_tum
 from bmask_slam.graph.whole_file import whole_file
+from bmask_slam.sequences.formats.numbered import FPS_HZ
+from bmask_slam.sequences.formats.numbered_folders import icl_truth
 from bmask_slam.sequences.lists import read_associations
 
 logger = logging.getLogger(__name__)
@@ -26,10 +26,6 @@ logger = logging.getLogger(__name__)
 SUMS = "SHA256SUMS"
 RECEIVED = "received.txt"
 LISTS = ("rgb.txt", "associations.txt")
-ICL_FPS = 30.0
-ICL_FIRST_POSE = 1
-"""ICL-NUIM counts images from 0 and poses from 1."""
-ICL_FLIP = np.diag([1.0, -1.0, 1.0, 1.0])
 Progress = Callable[[str, int, int], None]
 """Called with the name of the step, the bytes done and all bytes (0: unknown)."""
 
@@ -135,24 +131,17 @@ def _completed(unpacked: Path, recording: Recording) -> Path:
 def _icl_to_tum_layout(folder: Path) -> None:
     """Write rgb.txt, depth.txt and groundtruth.txt in a folder of ICL-NUIM's files.
 
-    Its lists hold frame numbers, at 30 Hz. Its camera has y upward (fy < 0), so that its world is
-    mirrored compared with images whose y points down: ``T_world_camera`` becomes ``F T F`` with
-    F = diag(1, -1, 1, 1).
+    Its lists hold frame numbers.
 
     Raises:
         InputError: the lists or the poses are missing or broken.
     """
-    poses = sorted(folder.glob("*.gt.freiburg"))
-    if len(poses) != 1:
-        raise InputError(f"{folder}: {len(poses)} files *.gt.freiburg, expected one")
+    truth = icl_truth(folder)
     images = read_associations(folder / "associations.txt")
     for name, listed in zip(("rgb.txt", "depth.txt"), images, strict=True):
         lines = [
-            f"{number / ICL_FPS:.6f} {path.relative_to(folder).as_posix()}"
+            f"{number / FPS_HZ:.6f} {path.relative_to(folder).as_posix()}"
             for number, path in zip(listed.timestamps_s, listed.files, strict=True)
         ]
         (folder / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    truth = read_tum(poses[0])
-    stamps_s = (truth.timestamps_s - ICL_FIRST_POSE) / ICL_FPS
-    mirrored = ICL_FLIP @ truth.poses_world_camera @ ICL_FLIP
-    write_tum(folder / "groundtruth.txt", Trajectory(stamps_s, mirrored))
+    write_tum(folder / "groundtruth.txt", truth)

@@ -15,8 +15,8 @@ import numpy as np
 from bmask_slam.graph.arrays import Array
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.sensors.streams import Measurements, measurements
-from bmask_slam.live.sources.bags import open_bag
-from bmask_slam.live.sources.ros_images import stamp_s
+from bmask_slam.sequences.bags.bag_file import open_bag
+from bmask_slam.sequences.bags.ros_images import stamp_s
 
 _IMU, _ODOMETRY = "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 _FIX, _POSE = "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PoseStamped"

@@ -10,6 +10,8 @@ from bmask_slam import __version__
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.file_names import is_folder
 from bmask_slam.graph.files.reading import read_text
+from bmask_slam.sequences.bags.topics import split_path
+from bmask_slam.sequences.formats.layouts import is_recording_file
 
 CONFIG = "config.yaml"
 _MAX_LINE = 5000
@@ -18,7 +20,7 @@ _SEQUENCE = re.compile(r"^# .*?, sequence (?P<path>.+), stride (?P<stride>[0-9]{
 
 @dataclass(frozen=True)
 class Origin:
-    """The sequence folder of a run, absolute, and its stride; None for a camera or a bag."""
+    """The sequence of a run, folder, file or bag, absolute, and its stride; None for a camera."""
 
     sequence: Path | None
     stride: int = 1
@@ -55,15 +57,21 @@ def _may_be_sequence(folder: Path) -> bool:
     return is_folder(folder) and not (folder / CONFIG).exists()
 
 
+def _is_there(sequence: Path) -> bool:
+    """Whether a folder or a file that is a recording lies there; topics may follow a bag's path."""
+    file, _ = split_path(sequence)
+    return is_folder(file) or (is_recording_file(sequence) and file.is_file())
+
+
 def find_sequence(run: Path) -> Path:
-    """The sequence folder that a run was made from.
+    """The sequence that a run was made from: a folder, a file or a bag.
 
     Raises:
         InputError: config.yaml names none, or one that is not there.
     """
     sequence = read_origin(run).sequence
-    if sequence is None or not is_folder(sequence):
+    if sequence is None or not _is_there(sequence):
         named = f"names {str(sequence)!r}, which is not there" if sequence else "names no sequence"
-        cure = "give the folder of the run's images as --sequence"
+        cure = "give the run's images as --sequence"
         raise InputError(f"{run / CONFIG}: {named}; {cure}")
     return sequence

@@ -108,6 +108,27 @@ def find_camera(folder: Path, given: Path | None = None) -> tuple[Camera, str]:
     return camera, source
 
 
+def recorded_camera(
+    own: Camera, source: str, folder: Path, given: Path | Camera | None = None
+) -> tuple[Camera, str]:
+    """The camera of a recording that tells its ``own``, and a description of its source.
+
+    A camera or file that is given has precedence, then a camera.yaml in the folder. A preset, given
+    or that of the recording's name, adds what the files do not say.
+
+    Raises:
+        InputError: a broken camera.yaml.
+    """
+    if isinstance(given, Camera):
+        return given, "given"
+    file = folder / "camera.yaml" if given is None or is_preset(given) else given
+    if file == given or file.is_file():
+        return read_camera(file), str(file)
+    preset = str(given) if given is not None else preset_of_folder(folder)
+    camera, added = completed(own, (), preset)
+    return camera, ", ".join(filter(None, (source, added)))
+
+
 def given_camera(given: Path, own: Camera | None = None) -> Camera:
     """The camera of a device: the file ``given``, or its ``own`` with what a preset adds.
 

@@ -26,7 +26,7 @@ def read_rgb(path: Path, camera: Camera) -> Image:
             another size than the camera's.
     """
     rgb = read_colour(path)
-    _check_size(path, rgb, camera)
+    check_size(path, rgb, camera)
     return rgb
 
 
@@ -37,18 +37,23 @@ def read_depth(path: Path, camera: Camera) -> Floats:
         InputError: as for ``read_rgb``, and for anything but one channel of 16 bits.
     """
     stored = decode_image(path, cv2.IMREAD_UNCHANGED)
+    check_depth_type(path, stored, camera)
+    check_size(path, stored, camera)
+    return depth_in_metres(stored, camera)
+
+
+def check_depth_type(path: Path, stored: NDArray, camera: Camera) -> None:
+    """Refuse what is not one channel of 16 bits or float32. Raises InputError."""
     if stored.ndim == 3:
         raise InputError(
             f"{path}: {stored.shape[2]} channels where depth is expected; "
             "list 16-bit single-channel depth images (are rgb and depth swapped?)"
         )
-    if stored.dtype != np.uint16:
+    if stored.dtype not in (np.uint16, np.float32):
         raise InputError(
             f"{path}: {8 * stored.dtype.itemsize}-bit depth, which is too coarse; "
             f"store 16-bit depth with {camera.depth_scale:g} to the metre"
         )
-    _check_size(path, stored, camera)
-    return depth_in_metres(stored, camera)
 
 
 def depth_in_metres(stored: NDArray, camera: Camera) -> Floats:
@@ -88,7 +93,8 @@ def depth_between(near_m: Floats, other_m: Floats, share: float) -> Floats:
     return np.where(one_surface, between, np.where(np.isnan(other_m), near_m, np.float32(np.nan)))
 
 
-def _check_size(path: Path, image: NDArray, camera: Camera) -> None:
+def check_size(path: Path, image: NDArray, camera: Camera) -> None:
+    """Refuse an image of another size than the camera's. Raises InputError."""
     height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise InputError(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +24,19 @@ MAX_DEPTH_STEP_S = 0.1
 
 @dataclass(frozen=True, eq=False)
 class ImageList:
-    """Stamped image files, sorted by stamp, each stamp once."""
+    """Stamped image files, sorted by stamp, each stamp once.
+
+    Attributes:
+        timestamps_s: (N,) increasing.
+        files: the N images.
+        unordered: how many stood behind one with a later stamp.
+        repeated: how many were left out since another has their stamp.
+    """
 
     timestamps_s: Array
     files: tuple[Path, ...]
+    unordered: int = 0
+    repeated: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,24 +91,42 @@ def colour_images(source: Path) -> list[tuple[str, Path]]:
     return [(image_name(path, source), path) for path in files]
 
 
+def read_lists(folder: Path) -> tuple[ImageList, ImageList]:
+    """Colour and depth images of a TUM folder; rgb.txt and depth.txt win over associations.txt.
+
+    Raises:
+        InputError: a missing or broken list.
+    """
+    if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():
+        return read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
+    if (folder / "associations.txt").is_file():
+        return read_associations(folder / "associations.txt")
+    missing = "rgb.txt" if not (folder / "rgb.txt").is_file() else "depth.txt"
+    raise InputError(
+        f"{folder / missing}: no such list; a sequence needs rgb.txt and depth.txt with lines "
+        "'timestamp file', or associations.txt with 'timestamp rgb timestamp depth'"
+    )
+
+
 def read_pairs(folder: Path, max_difference_s: float, depth_time_offset_s: float) -> ImagePairs:
-    """The image pairs of a TUM folder; rgb.txt and depth.txt have precedence over associations.txt.
+    """The image pairs of a TUM folder. Raises InputError as ``read_lists`` and ``pair_images``."""
+    return pair_images(*read_lists(folder), max_difference_s, depth_time_offset_s, folder)
+
+
+def pair_images(
+    rgb: ImageList,
+    depth: ImageList,
+    max_difference_s: float,
+    depth_time_offset_s: float,
+    folder: Path,
+) -> ImagePairs:
+    """Pair colour and depth one to one by nearest stamp.
 
     The capture time of a depth image, by which it is paired, is its stamp plus the offset.
 
     Raises:
-        InputError: a missing or broken list, or no two stamps within the limit.
+        InputError: no two stamps within the limit; ``folder`` begins the text.
     """
-    if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():
-        rgb, depth = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
-    elif (folder / "associations.txt").is_file():
-        rgb, depth = read_associations(folder / "associations.txt")
-    else:
-        missing = "rgb.txt" if not (folder / "rgb.txt").is_file() else "depth.txt"
-        raise InputError(
-            f"{folder / missing}: no such list; a sequence needs rgb.txt and depth.txt with lines "
-            "'timestamp file', or associations.txt with 'timestamp rgb timestamp depth'"
-        )
     depth_s = depth.timestamps_s + depth_time_offset_s
     i, j = associate_stamps(rgb.timestamps_s, depth_s, max_difference_s)
     if not len(i):
@@ -140,8 +167,8 @@ def read_list(path: Path) -> ImageList:
     """Read ``timestamp file`` lines in any order; files are relative to the list's folder.
 
     Raises:
-        InputError: an empty list, a line of another form, or stamps that are repeated, not finite
-            or not in seconds.
+        InputError: an empty list, a line of another form, or stamps that are not finite or not in
+            seconds.
     """
     rows = [
         (number, finite_number(columns[0], f"{path}:{number}"), columns[1])
@@ -178,17 +205,27 @@ def _lines(path: Path, count: int, form: str) -> list[tuple[int, list[str]]]:
     return lines
 
 
+def sorted_list(path: Path, stamps_s: Array, files: Sequence[Path]) -> ImageList:
+    """A list of images with stamps (N,) in any order; of several with one stamp the first is kept.
+
+    Both are counted, with a warning that names ``path``.
+
+    Raises:
+        InputError: stamps that are not in seconds.
+    """
+    stamps_s = np.asarray(stamps_s, float)
+    unordered = int(np.count_nonzero(stamps_s < np.maximum.accumulate(stamps_s)))
+    kept_s, first = np.unique(stamps_s, return_index=True)
+    repeated = len(stamps_s) - len(first)
+    check_seconds(kept_s, path)
+    if unordered or repeated:
+        text = "%s: %d stamps out of order were sorted, %d repeated ones left out"
+        logger.warning(text, path, unordered, repeated)
+    return ImageList(kept_s, tuple(files[k] for k in first), unordered, repeated)
+
+
 def _image_list(path: Path, rows: list[tuple[int, float, str]]) -> ImageList:
-    """Sort (line, stamp, file) rows by stamp; refuse repeated stamps and other units."""
-    rows = sorted(rows, key=lambda row: row[1])
-    for (other_line, other_s, _), (line, stamp_s, _) in pairwise(rows):
-        if stamp_s == other_s:
-            raise InputError(
-                f"{path}:{line}: timestamp {stamp_s:.6f} is already on line {other_line}; "
-                "stamps must increase, correct or remove one of the lines"
-            )
-    stamps_s = np.array([row[1] for row in rows])
-    check_seconds(stamps_s, path)
+    """Sort (line, stamp, file) rows by stamp; refuse other units and bad names."""
     for line, _, name in rows:
         check_name(name, f"{path}:{line}")
-    return ImageList(stamps_s, tuple(path.parent / row[2] for row in rows))
+    return sorted_list(path, np.array([row[1] for row in rows]), [path.parent / r[2] for r in rows])

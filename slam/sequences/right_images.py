@@ -11,9 +11,10 @@ from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.files.yaml_file import read_yaml
 from bmask_slam.graph.trajectory import associate_stamps
-from bmask_slam.sequences import Sequence, read_camera
+from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.images import read_rgb
 from bmask_slam.sequences.lists import read_list
+from bmask_slam.sequences.sequence import Sequence
 
 logger = logging.getLogger(__name__)
 

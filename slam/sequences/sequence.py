@@ -14,12 +14,13 @@ import numpy as np
 from bmask_slam.graph.arrays import Array, Floats
 from bmask_slam.graph.camera import Camera
 from bmask_slam.graph.errors import InputError
-from bmask_slam.graph.trajectory import Trajectory, read_tum
-from bmask_slam.sequences.cameras import find_camera
+from bmask_slam.sequences.bags.topics import split_path
+from bmask_slam.sequences.formats.layouts import open_recording
 from bmask_slam.sequences.frame import Frame
-from bmask_slam.sequences.images import depth_between, read_depth, read_rgb
-from bmask_slam.sequences.lists import ImagePairs, image_name, read_pairs
+from bmask_slam.sequences.images import depth_between
+from bmask_slam.sequences.lists import image_name, pair_images
 from bmask_slam.sequences.prefetch import prefetched
+from bmask_slam.sequences.recording import Recording
 
 logger = logging.getLogger(__name__)
 
@@ -46,32 +47,31 @@ class Sequence:
     """Registered RGB-D frames in the order of their stamps; made by ``open_sequence``.
 
     Attributes:
-        name: the folder's name.
-        folder: its folder.
+        name: the name of the folder or file.
+        folder: the folder or file; `open_sequence` opens it again.
+        recording: its images, and how they are decoded.
         camera: the colour camera to which depth is registered.
         camera_source: source of the camera's parameters.
-        pairs: the image files with their stamps.
+        pairs: the images with their stamps.
         groundtruth: T_world_camera of the colour camera, or None.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        camera: Camera,
-        camera_source: str,
-        pairs: ImagePairs,
-        groundtruth: Trajectory | None,
-        config: SequenceConfig,
-    ) -> None:
-        self.name = folder.resolve().name
-        self.folder = folder
+    def __init__(self, recording: Recording, camera: Camera, config: SequenceConfig) -> None:
+        """Raises InputError: no colour and depth image belong together."""
+        self.folder = recording.path
+        self.name = split_path(recording.path)[0].resolve().stem
+        if recording.path.is_dir():
+            self.name = recording.path.resolve().name
+        self.recording = recording
         self.camera = camera
-        self.camera_source = camera_source
-        self.pairs = pairs
-        self.groundtruth = groundtruth
+        self.camera_source = recording.camera_source
+        self.groundtruth = recording.groundtruth
         self.config = config
+        limit_s, offset_s = config.max_time_difference_s, camera.depth_time_offset_s
+        lists = recording.rgb, recording.depth
+        self.pairs = pair_images(*lists, limit_s, offset_s, recording.path)
         self._skipped: dict[int, str] = {}
-        self._read_depth = lru_cache(2)(lambda path: read_depth(path, self.camera))
+        self._read_depth = lru_cache(2)(lambda path: recording.read_depth(path, camera))
 
     def __len__(self) -> int:
         return len(self.pairs.timestamps_s)
@@ -96,7 +96,7 @@ class Sequence:
         return Frame(
             index,
             float(self.pairs.timestamps_s[index]),
-            read_rgb(self.pairs.rgb_files[index], self.camera),
+            self.recording.read_rgb(self.pairs.rgb_files[index], self.camera),
             depth_m,
             image_name(self.pairs.rgb_files[index], self.folder),
             lag_s,
@@ -104,10 +104,7 @@ class Sequence:
 
     def with_camera(self, camera: Camera) -> Sequence:
         """The same images, paired by another camera's ``depth_time_offset_s``."""
-        limit_s = self.config.max_time_difference_s
-        pairs = read_pairs(self.folder, limit_s, camera.depth_time_offset_s)
-        source, truth = self.camera_source, self.groundtruth
-        return Sequence(self.folder, camera, source, pairs, truth, self.config)
+        return Sequence(self.recording, camera, self.config)
 
     def _depth(self, index: int) -> tuple[Floats, float]:
         """The depth, interpolated at the colour image's stamp where depth has a time offset.
@@ -192,28 +189,20 @@ class Sequence:
 def open_sequence(
     path: Path, config: SequenceConfig | None = None, camera: Path | Camera | None = None
 ) -> Sequence:
-    """Open a folder in TUM layout; lines of its lists may be in any order.
+    """Open a recording in any layout of docs/data.md: TUM's, others' folders, files, ROS bags.
 
-    It holds ``rgb.txt`` and ``depth.txt`` (or ``associations.txt``) and optionally
-    ``groundtruth.txt`` and ``camera.yaml``, which ``camera``, a file or a camera, replaces.
-    All checks that need not decode every image are done here.
+    ``camera``, a file or a camera, replaces its own. Images may be in any order. All checks that
+    need not decode every image are done here.
 
     Raises:
         InputError: naming the file, the value and the cure.
     """
-    folder, config = Path(path), config or SequenceConfig()
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the folder that holds rgb.txt")
-    if isinstance(camera, Camera):
-        found, source = camera, "given"
-    else:
-        found, source = find_camera(folder, camera)
-    pairs = read_pairs(folder, config.max_time_difference_s, found.depth_time_offset_s)
-    truth_path = folder / "groundtruth.txt"
-    truth = read_tum(truth_path) if truth_path.is_file() else None
-    sequence = Sequence(folder, found, source, pairs, truth, config)
+    recording = open_recording(Path(path), camera)
+    sequence = Sequence(recording, recording.camera, config or SequenceConfig())
     _check_images(sequence)
-    logger.info("%s: %d frames, ground truth: %s", folder, len(sequence), truth is not None)
+    truth = sequence.groundtruth is not None
+    text = "%s, %s: %d frames, ground truth: %s"
+    logger.info(text, path, recording.layout, len(sequence), truth)
     return sequence
 
 
@@ -224,7 +213,7 @@ def _check_images(sequence: Sequence) -> None:
         zip(sequence.pairs.rgb_files, sequence.pairs.depth_files, strict=True)
     ):
         for file in files:
-            if not file.is_file():
+            if not sequence.recording.exists(file):
                 sequence.skip(index, f"{file}: no such image; restore it or correct the list")
     if np.isnan(first.depth_m).all() and not _has_depth(sequence):
         raise InputError(

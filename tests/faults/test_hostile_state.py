@@ -21,8 +21,8 @@ from bmask_slam.dense.saved_map import read_saved_map
 from bmask_slam.graph.arrays import Arrays
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import se3_exp
-from bmask_slam.live.sources.bags import format_topics, open_bag
 from bmask_slam.semantics.weights.checkpoints import load_network
+from bmask_slam.sequences.bags.bag_file import format_topics, open_bag
 from bmask_slam.system import SlamSystem
 from bmask_slam.system_config import SystemConfig
 

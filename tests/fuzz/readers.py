@@ -26,6 +26,7 @@ from fake_run import FakeSystem, make_sequence
 from recorded_bags import write_bag
 from safetensors.torch import save
 from small_comparison import make_comparison
+from small_layouts import SMALL_LAYOUTS, SmallLayout, write_small
 from synthetic_view import CAMERA, render_or_black
 
 from bmask_slam.comparison.experiment.experiment_file import read_experiment
@@ -58,9 +59,7 @@ from bmask_slam.graph.trajectory_formats import (
     write_kitti,
 )
 from bmask_slam.live.sources.bag_source import BagSource
-from bmask_slam.live.sources.bags import open_bag
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
-from bmask_slam.live.sources.ros_images import camera_of, colour_image, depth_image
 from bmask_slam.mapping.inverse_depth.depth_map import DEPTH_FILE, read_depth_map
 from bmask_slam.mapping.products.submaps import SUBMAP_FILE, read_submap
 from bmask_slam.offline.checkpoint import CHECKPOINT_FILE, read_checkpoint
@@ -82,6 +81,8 @@ from bmask_slam.semantics.weights.checkpoints import load_network, read_state
 from bmask_slam.semantics.weights.stuff_weights import load_stuff
 from bmask_slam.semantics.weights.yolox_onnx import load_onnx
 from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.bags.bag_file import open_bag
+from bmask_slam.sequences.bags.ros_images import camera_of, colour_image, depth_image
 from bmask_slam.sequences.cameras import read_camera
 from bmask_slam.sequences.lists import read_associations, read_pairs
 from bmask_slam.system import SlamSystem
@@ -489,6 +490,48 @@ def follow(path: Path) -> None:
         pass
 
 
+def read_first(path: Path) -> None:
+    """Open a recording that is a file, and read a frame."""
+    open_sequence(path).load(0)
+
+
+LAYOUT_FILES = (
+    ("7-Scenes", "frame-000001.pose.txt"),
+    ("ScanNet", "intrinsic/intrinsic_depth.txt"),
+    ("Replica", "cam_params.json"),
+    ("Replica", "traj.txt"),
+    ("ICL-NUIM", "livingRoom0.gt.freiburg"),
+    ("EuRoC", "mav0/cam0/data.csv"),
+    ("EuRoC", "mav0/depth0/sensor.yaml"),
+    ("EuRoC", "mav0/state_groundtruth_estimate0/data.csv"),
+    ("Open3D", "camera_intrinsic.json"),
+    ("Polycam", "keyframes/cameras/1000000.json"),
+)
+
+
+def small_layout(name: str) -> SmallLayout:
+    return next(small for small in SMALL_LAYOUTS if small.name == name)
+
+
+def packed_file(layout: SmallLayout, folder: Path) -> bytes:
+    return write_small(layout, folder).read_bytes()
+
+
+def file_of(layout: str, file: str, folder: Path) -> bytes:
+    """A file of a small recording in a layout."""
+    parent = folder / file.replace("/", "-")
+    return (write_small(small_layout(layout), parent) / file).read_bytes()
+
+
+def in_layout(layout: str, file: str, path: Path) -> None:
+    """A recording in a layout with another file in the place of one of its own."""
+    data = path.read_bytes()
+    path.unlink()
+    whole = write_small(small_layout(layout), path.parent / "in")
+    (whole / file).write_bytes(data)
+    open_sequence(whole)
+
+
 def open_folder(path: Path) -> None:
     """A sequence whose list it is."""
     (path.parent / "depth.txt").write_bytes(path.read_bytes())
@@ -728,6 +771,21 @@ def binary_readers(folder: Path) -> list[Reader]:
         Reader("surfaces", "1.png", read_surface_image, surface_images(), surfaces_maker),
         Reader("archive", "a.tgz", unpacked, packed, zip_maker),
         Reader("ROS 1 bag", "a.bag", read_bag, (recorded["a.bag"],)),
+        Reader("bag as a sequence", "a.bag", read_first, (recorded["a.bag"],)),
+        *(
+            Reader(small.name, small.file, read_first, (packed_file(small, folder),))
+            for small in SMALL_LAYOUTS
+            if Path(small.file).suffix
+        ),
+        *(
+            Reader(
+                f"{layout}: {file}",
+                Path(file).name,
+                partial(in_layout, layout, file),
+                (file_of(layout, file, folder),),
+            )
+            for layout, file in LAYOUT_FILES
+        ),
         Reader("bag as a source", "a.bag", follow_bag, (recorded["a.bag"],)),
         Reader("ROS message", "m.json", read_message, MESSAGES, json_maker(*MESSAGES)),
         Reader("mcap", "a.mcap", read_bag, (recorded["a.mcap"],)),

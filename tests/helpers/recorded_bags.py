@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from synthetic_view import CAMERA, render_plane
 
-from bmask_slam.graph.geometry import se3_exp
+from bmask_slam.graph.geometry import quaternion_from_rotation, se3_exp
 from bmask_slam.sequences.frame import Frame
 
 STEP_S = 1 / 30
@@ -105,10 +105,29 @@ class BagMaker:
         if hasattr(stand_in, "format"):
             kind = "CompressedImage"
         name = f"sensor_msgs/msg/{kind}"
+        self.write_message(topic, name, self._message(name, stamp_s, stand_in, frame_id))
+
+    def write_transform(self, topic: str, T: np.ndarray, frames: tuple[str, str] | None) -> None:
+        """A transform T_parent_child: of two frames as in /tf_static, else as RealSense's SDK."""
+        types = self._types.types
+        x, y, z, w = quaternion_from_rotation(T[:3, :3])
+        transform = types["geometry_msgs/msg/Transform"](
+            types["geometry_msgs/msg/Vector3"](*T[:3, 3]),
+            types["geometry_msgs/msg/Quaternion"](x, y, z, w),
+        )
+        if frames is None:
+            self.write_message(topic, "geometry_msgs/msg/Transform", transform)
+            return
+        stamp = types["builtin_interfaces/msg/Time"](0, 0)
+        header = types["std_msgs/msg/Header"](*((0,) if self.is1 else ()), stamp, frames[0])
+        one = types["geometry_msgs/msg/TransformStamped"](header, frames[1], transform)
+        self.write_message(topic, "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"]([one]))
+
+    def write_message(self, topic: str, name: str, message: Any) -> None:
+        """A message of any type."""
         if topic not in self._connections:
             connect = self._writer.add_connection
             self._connections[topic] = connect(topic, name, typestore=self._types)
-        message = self._message(name, stamp_s, stand_in, frame_id)
         store = self._types
         serialize = store.serialize_ros1 if self.is1 else store.serialize_cdr
         self._received_ns += 1_000_000

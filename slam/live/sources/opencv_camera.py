@@ -10,8 +10,8 @@ import numpy as np
 
 from bmask_slam.graph.errors import InputError
 from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
-from bmask_slam.live.sources.checks import check_depth_scale, check_sizes
 from bmask_slam.sequences.cameras import given_camera
+from bmask_slam.sequences.checks import check_depth_scale, check_sizes
 from bmask_slam.sequences.images import depth_in_metres
 
 DEPTH_SCALE = 1000.0

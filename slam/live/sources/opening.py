@@ -6,13 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live.sources.bag_source import BagSource, BagTopics
-from bmask_slam.live.sources.bags import is_bag
+from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import FollowOptions, GrowingFolder
 from bmask_slam.live.sources.opencv_camera import OpenCvSource
 from bmask_slam.live.sources.realsense_camera import RealSenseSource
 from bmask_slam.live.sources.source import Limited, RecordedSource, Source
 from bmask_slam.sequences import open_sequence
+from bmask_slam.sequences.bags.bag_file import is_bag
+from bmask_slam.sequences.bags.topics import BagTopics
+from bmask_slam.sequences.formats.layouts import is_recording_file
 
 REALSENSE, OPENCV = "realsense:", "opencv:"
 
@@ -39,7 +41,7 @@ class SourceOptions:
 
 
 def open_source(text: str, options: SourceOptions) -> Source:
-    """Open a folder in TUM layout, a bag, ``realsense:`` or ``opencv:N``.
+    """Open a recording in any layout, a bag, ``realsense:`` or ``opencv:N``.
 
     Raises:
         InputError: the name is none of these, or the source cannot be opened.
@@ -55,12 +57,12 @@ def open_source(text: str, options: SourceOptions) -> Source:
     elif options.follow:
         follow = FollowOptions(silence_s=options.silence_s)
         source = GrowingFolder(path, options.camera, follow)
-    elif path.is_dir():
+    elif path.is_dir() or is_recording_file(path):
         sequence = open_sequence(path, camera=options.camera)
         source = RecordedSource(sequence, options.realtime)
     else:
         raise InputError(
-            f"{text}: not a source; give a folder in TUM layout, a .bag, a bag folder, a .mcap, "
+            f"{text}: not a source; give a recording, a .bag, a bag folder, a .mcap, "
             "realsense: or opencv:N"
         )
     return source if options.max_frames is None else Limited(source, options.max_frames)

@@ -12,11 +12,11 @@ from bmask_slam.graph.camera import Camera, distortion_terms
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.extras import import_extra
 from bmask_slam.live.sources.camera_source import CameraImages, CameraSource
-from bmask_slam.live.sources.checks import check_depth_scale
 from bmask_slam.live.sources.pairing import MAX_DIFFERENCE_S
 from bmask_slam.sequences import read_camera
 from bmask_slam.sequences.camera_presets import is_preset
 from bmask_slam.sequences.cameras import given_camera
+from bmask_slam.sequences.checks import check_depth_scale
 from bmask_slam.sequences.images import depth_in_metres
 
 SIZE = (640, 480)

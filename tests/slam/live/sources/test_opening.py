@@ -14,14 +14,17 @@ from synthetic_view import CAMERA, render_plane
 
 from bmask_slam.cli import main, make_parser
 from bmask_slam.commands import live as live_command
+from bmask_slam.dense.keyframe_input import frame_index
+from bmask_slam.dense.saved_map import open_run
 from bmask_slam.graph.errors import InputError
 from bmask_slam.graph.geometry import inverse, se3_exp
 from bmask_slam.graph.trajectory import read_tum
-from bmask_slam.live.sources.bag_source import BagSource, BagTopics
+from bmask_slam.live.sources.bag_source import BagSource
 from bmask_slam.live.sources.growing_folder import GrowingFolder
 from bmask_slam.live.sources.opening import SourceOptions, open_source
 from bmask_slam.live.sources.source import RecordedSource, Source
 from bmask_slam.sequences import Sequence, open_sequence, write_camera
+from bmask_slam.sequences.bags.topics import BagTopics
 
 FRAMES = 8
 TRUTH = [se3_exp(np.array([0, 0.01 * k, 0, 0.02 * k, 0, 0])) for k in range(FRAMES)]
@@ -95,7 +98,7 @@ def test_a_folder_counts_unpaired_images(recording: Sequence) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("nowhere", "not a source; give a folder"),
+        ("nowhere", "not a source; give a recording"),
         ("nowhere.bag", "no such bag"),
         ("opencv:x", "write e.g. opencv:0"),
         ("opencv:0", "give --camera F"),
@@ -116,8 +119,23 @@ def test_live_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, capsys) -
     T_first_last = inverse(found.poses_world_camera[0]) @ found.poses_world_camera[-1]
     expected = inverse(TRUTH[0]) @ TRUTH[-1]
     assert np.allclose(T_first_last, expected, atol=0.002)
+    mapped = open_run(tmp_path / "run")  # as bmask-slam map does: the run knows its bag
+    assert mapped.sequence.folder == bag.absolute()
+    assert frame_index(mapped, mapped.keyframes[0]) == 0
     source = json.loads((tmp_path / "run" / "health.json").read_text())["source"]
     assert (source["unpaired_rgb"], source["duplicates"], source["gaps"]) == (1, 1, 0)
+
+
+def test_run_and_map_on_a_bag(recording: Sequence, bag: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "run"
+    words = ["run", f"{bag}", "--segmenter", "none", "--calibrate", "off", "--out", f"{out}"]
+    assert main([*words, "--rgb-topic", RGB]) == 0
+    found = read_tum(out / "trajectory.txt")
+    assert np.allclose(found.timestamps_s, 1000 + np.delete(recording.timestamps_s, 2), atol=1e-6)
+    T_first_last = inverse(found.poses_world_camera[0]) @ found.poses_world_camera[-1]
+    assert np.allclose(T_first_last, inverse(TRUTH[0]) @ TRUTH[-1], atol=0.002)
+    assert main(["map", str(out), "--quiet"]) == 0
+    assert (out / "dense" / "cloud.ply").is_file()
 
 
 def test_the_commands_options_reach_the_source() -> None:

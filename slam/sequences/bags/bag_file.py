@@ -5,7 +5,7 @@ from __future__ import annotations
 import bz2
 import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -58,7 +58,14 @@ class Bag:
         )
 
     def messages(self, *names: str) -> Iterator[tuple[str, Any]]:
-        """The messages of these topics, each with its topic's name, in the order of recording.
+        """The messages of these topics, each with its topic's name. Raises as ``records``."""
+        for name, _, message in self.records(names):
+            yield name, message
+
+    def records(
+        self, names: Collection[str], start_ns: int | None = None
+    ) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time of recording in nanoseconds and message, in the order of recording.
 
         Raises:
             InputError: the bag is damaged; the messages before the damage were yielded.
@@ -67,15 +74,15 @@ class Bag:
         if not chosen:
             return
         with _translated(self.path):
-            raw = iter(self._reader.messages(chosen))
+            raw = iter(self._reader.messages(chosen, start=start_ns))
         while True:
             with _translated(self.path), self._allowance.in_use():
                 found = next(raw, None)
                 if found is None:
                     return
-                connection, _, data = found
+                connection, time_ns, data = found
                 message = self._reader.deserialize(data, connection.msgtype)
-            yield connection.topic, message
+            yield connection.topic, time_ns, message
 
 
 @contextmanager

@@ -11,7 +11,12 @@ import pytest
 from recorded_bags import camera_info, compressed, image, view
 
 from bmask_slam.graph.errors import InputError
-from bmask_slam.live.sources.ros_images import camera_of, colour_image, depth_encoding, depth_image
+from bmask_slam.sequences.bags.ros_images import (
+    camera_of,
+    colour_image,
+    depth_encoding,
+    depth_image,
+)
 
 FRAME = view(3)
 RGB, DEPTH_M = FRAME.rgb, FRAME.depth_m

@@ -1,0 +1,1 @@
+"""Recordings of ROS as sequences."""

@@ -1,0 +1,118 @@
+"""A bag as a recording: images in any order of asking, read from the bag as they are needed."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bmask_slam.graph.arrays import Image
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences.bags.bag_file import Bag, open_bag
+from bmask_slam.sequences.bags.ros_images import colour_image, depth_image, stamp_s
+from bmask_slam.sequences.bags.topics import find_camera, find_topics, split_path
+from bmask_slam.sequences.lists import sorted_list
+from bmask_slam.sequences.recording import Recording
+
+logger = logging.getLogger(__name__)
+
+KEPT_MESSAGES = 12
+"""Messages that are kept in memory, for colour and depth images that come in another order."""
+BEFORE_NS, AHEAD_NS = 200_000_000, 2_000_000_000
+"""A new place is read from so long before; one that lies less ahead is reached by reading on."""
+RGB, DEPTH = "rgb", "depth"
+
+
+class _Place(NamedTuple):
+    """Where a message is: its topic, its time of recording and its stamp."""
+
+    topic: str
+    time_ns: int
+    stamp_s: float
+
+
+def open_bag_recording(path: Path, camera: Path | Camera | None) -> Recording:
+    """A bag, or a path with topics as ``BagTopics.of_path`` makes it.
+
+    The bag is read once for the stamps in its messages, by which its images are sorted.
+
+    Raises:
+        InputError: a bag that cannot be read, no known topics, or no usable camera.
+    """
+    bag_path, requested = split_path(path)
+    with open_bag(bag_path) as bag:
+        topics = find_topics(bag, requested)
+        found, form = find_camera(bag, topics, camera)
+        places: dict[str, list[_Place]] = {RGB: [], DEPTH: []}
+        for name, time_ns, message in bag.records((topics.rgb, topics.depth)):
+            kind = RGB if name == topics.rgb else DEPTH
+            places[kind].append(_Place(name, time_ns, stamp_s(message.header)))
+    source = "given" if camera is not None else f"{topics.camera_info} of {bag_path}"
+    files = {kind: [path / kind / f"{p.stamp_s:.9f}" for p in places[kind]] for kind in places}
+    lists = {
+        kind: sorted_list(bag_path / kind, np.array([p.stamp_s for p in places[kind]]), files[kind])
+        for kind in places
+    }
+    index = {f: p for kind in places for f, p in zip(files[kind], places[kind], strict=True)}
+    messages = _BagMessages(bag_path, index, (topics.rgb, topics.depth))
+    logger.info("%s: colour on %s, depth on %s", bag_path, topics.rgb, topics.depth)
+    return Recording(
+        "ROS bag", path, lists[RGB], lists[DEPTH], found, source,
+        form=form, colour=messages.colour, stored_depth=messages.depth, exists=index.__contains__,
+    )  # fmt: skip
+
+
+class _BagMessages:
+    """The messages of two topics: read on where the next one is near, else from its place."""
+
+    def __init__(self, path: Path, index: dict[Path, _Place], topics: tuple[str, ...]) -> None:
+        self._path, self._index, self._topics = path, index, topics
+        self._lock, self._open = threading.Lock(), ExitStack()
+        weakref.finalize(self, self._open.close)
+        self._bag: Bag | None = None
+        self._stream: Iterator[tuple[str, int, Any]] = iter(())
+        self._read_to_ns = 0
+        self._kept: OrderedDict[tuple[str, float], Any] = OrderedDict()
+
+    def colour(self, file: Path) -> Image:
+        """A colour image (H, W, 3), red first. Raises InputError."""
+        return colour_image(self._message(file), str(file)).copy()  # messages are read-only
+
+    def depth(self, file: Path) -> NDArray:
+        """Stored depth (h, w). Raises InputError."""
+        return depth_image(self._message(file), str(file))
+
+    def _message(self, file: Path) -> Any:
+        place = self._index[file]
+        key = place.topic, place.stamp_s
+        with self._lock:
+            if key not in self._kept:
+                self._read_to(place, key)
+            return self._kept[key]
+
+    def _read_to(self, place: _Place, key: tuple[str, float]) -> None:
+        """Read on until a message is among the kept ones. Raises InputError if it is not there."""
+        if not self._read_to_ns <= place.time_ns <= self._read_to_ns + AHEAD_NS:
+            self._bag = self._bag or self._open.enter_context(open_bag(self._path))
+            self._stream = self._bag.records(self._topics, place.time_ns - BEFORE_NS)
+        for topic, time_ns, message in self._stream:
+            self._read_to_ns = time_ns
+            self._kept[topic, stamp_s(message.header)] = message
+            while len(self._kept) > KEPT_MESSAGES:
+                self._kept.popitem(last=False)
+            if key in self._kept and time_ns >= place.time_ns:
+                return
+            if time_ns > place.time_ns:
+                break
+        self._read_to_ns = 0
+        if key not in self._kept:
+            raise InputError(f"{self._path}: no message of {place.stamp_s:.6f} s on {place.topic}")

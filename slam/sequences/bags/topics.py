@@ -1,0 +1,261 @@
+"""Which topics of a bag are its colour and depth images, and of which cameras they are."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bmask_slam.graph.arrays import Array
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import inverse, make_pose, rotation_from_quaternion
+from bmask_slam.sequences.bags.bag_file import IMAGE_TYPES, INFO_TYPE, Bag
+from bmask_slam.sequences.bags.ros_images import (
+    DEPTH_SCALES,
+    camera_of,
+    colour_image,
+    depth_encoding,
+    depth_image,
+)
+from bmask_slam.sequences.camera_presets import is_preset
+from bmask_slam.sequences.cameras import given_camera, read_camera
+from bmask_slam.sequences.checks import check_depth_scale, check_sizes
+from bmask_slam.sequences.recording import DepthForm
+
+logger = logging.getLogger(__name__)
+
+SEPARATOR = "::"
+REGISTERED = ("aligned", "registered", "depth_to_rgb", "depth_to_color")
+"""In the names of topics of depth that is registered to colour."""
+_FIELDS = {
+    INFO_TYPE: {"width", "height", "distortion_model", "d", "k", "p"},
+    IMAGE_TYPES[0]: {"header", "encoding", "height", "width", "step", "is_bigendian", "data"},
+    IMAGE_TYPES[1]: {"header", "format", "data"},
+}
+_SDK = "/device_0/sensor_{}/{}_0/"
+_SDK_COLOUR, _SDK_DEPTH = _SDK.format(1, "Color"), _SDK.format(0, "Depth")
+_SDK_UNITS = "/device_0/sensor_0/option/Depth_Units/value"
+_STATIC = "/tf_static"
+MAX_STATIC = 100
+"""Messages of /tf_static that are read; there is one for each node that knows a transform."""
+
+
+@dataclass(frozen=True)
+class BagTopics:
+    """Topics of a bag's images; an empty name is found by KNOWN_TOPICS.
+
+    Attributes:
+        rgb, depth: topics of images, raw or compressed.
+        camera_info: topic of the colour camera's intrinsics; empty: the ``camera_info`` beside the
+            colour topic.
+    """
+
+    rgb: str = ""
+    depth: str = ""
+    camera_info: str = ""
+
+    def of_path(self, path: Path) -> Path:
+        """A path that names a bag and these topics: lab.bag::/rgb::/depth."""
+        names = astuple(self)
+        return Path(SEPARATOR.join([str(path), *names])) if any(names) else path
+
+
+def split_path(path: Path) -> tuple[Path, BagTopics]:
+    """The bag and the topics of a path as ``BagTopics.of_path`` writes it."""
+    bag, *names = str(path).split(SEPARATOR)
+    return Path(bag), BagTopics(*names[:3])
+
+
+_CAMERA = ("/camera", "/camera/camera")
+KNOWN_TOPICS = (
+    ("TUM RGB-D", "/camera/rgb/image_color", "/camera/depth/image"),
+    *(("RealSense", f"{c}/color/image_raw", f"{c}/aligned_depth_to_color/image_raw")
+      for c in _CAMERA),
+    ("Azure Kinect", "/rgb/image_raw", "/depth_to_rgb/image_raw"),
+    ("OAK-D", "/oak/rgb/image_raw", "/oak/stereo/image_raw"),
+    ("OAK-D", "/oak/rgb/image_rect", "/oak/stereo/image_raw"),
+    *(("Astra, OpenNI 2", f"/camera/rgb/{image}", f"/camera/depth_registered/{depth}")
+      for image in ("image_raw", "image_rect_color")
+      for depth in ("image_raw", "image_rect", "hw_registered/image_rect")),
+    ("Orbbec", "/camera/color/image_raw", "/camera/depth_registered/image_raw"),
+    ("RealSense SDK", f"{_SDK_COLOUR}image/data", f"{_SDK_DEPTH}image/data"),
+    *(("RealSense, depth as it is", f"{c}/color/image_raw", f"{c}/depth/image_rect_raw")
+      for c in _CAMERA),
+    ("Azure Kinect, depth as it is", "/rgb/image_raw", "/depth/image_raw"),
+    ("Orbbec, Astra", "/camera/color/image_raw", "/camera/depth/image_raw"),
+    ("Astra, Xtion, Kinect", "/camera/rgb/image_raw", "/camera/depth/image_raw"),
+)  # fmt: skip
+"""Camera, colour and depth topics by the defaults of its driver; the first that a bag has is it.
+Those that a driver has registered come first."""
+
+
+def find_topics(bag: Bag, requested: BagTopics) -> BagTopics:
+    """The topics' names in the bag; an image topic may exist in a compressed form only.
+
+    Raises:
+        InputError: a topic is missing or has no messages; the text lists the image topics.
+    """
+    images = [t.name for t in bag.topics if t.messages and t.type in IMAGE_TYPES]
+    listed = ", ".join(images) or "none, the bag has no images"
+    for wish, option in ((requested.rgb, "--rgb-topic"), (requested.depth, "--depth-topic")):
+        if wish and not _form_of(wish, images):
+            raise InputError(f"{bag.path}: no images on {wish}; give {option}, one of: {listed}")
+    for _, rgb, depth in KNOWN_TOPICS:
+        rgb, depth = requested.rgb or rgb, requested.depth or depth  # noqa: PLW2901
+        found = _form_of(rgb, images), _form_of(depth, images)
+        if all(found):
+            return BagTopics(*found, requested.camera_info or _info_topic(rgb))
+    raise InputError(
+        f"{bag.path}: no images on the topics of any camera that is known; give --rgb-topic and "
+        f"--depth-topic, of: {listed}"
+    )
+
+
+def _form_of(wish: str, images: list[str]) -> str:
+    """A topic itself or in its compressed form; "" if the bag has neither."""
+    forms = (wish, f"{wish}/compressed", f"{wish}/compressedDepth")
+    return next((name for name in forms if name in images), "")
+
+
+def _info_topic(topic: str) -> str:
+    """The camera_info topic of an image topic, where image_transport or RealSense's SDK puts it."""
+    base = topic.removesuffix("/compressed").removesuffix("/compressedDepth")
+    if base.endswith("/image/data"):
+        return f"{base.removesuffix('/image/data')}/info/camera_info"
+    return f"{base.rpartition('/')[0]}/camera_info"
+
+
+def find_camera(
+    bag: Bag, topics: BagTopics, given: Path | Camera | None
+) -> tuple[Camera, DepthForm]:
+    """The given camera, or that of the camera_info, and what depth values mean.
+
+    Depth of another frame is registered by the camera_info beside it and by /tf_static, or by the
+    extrinsics that RealSense's SDK records.
+
+    Raises:
+        InputError: no usable intrinsics, or images of another size.
+    """
+    rgb, depth = first_message(bag, topics.rgb), first_message(bag, topics.depth)
+    scale = _depth_scale(bag, depth, topics.depth)
+    if isinstance(given, Camera):
+        camera = given
+    elif given is not None and not is_preset(given):
+        camera = read_camera(given)
+        check_depth_scale(camera, scale, str(given), f"{bag.path}'s depth")
+    else:
+        camera = _camera_of(bag, topics.rgb, topics.camera_info, scale)
+        camera = camera if given is None else given_camera(given, camera)
+    form = _depth_form(bag, topics, rgb.header.frame_id, depth.header.frame_id)
+    images = colour_image(rgb, topics.rgb), depth_image(depth, topics.depth)
+    check_sizes(*images, camera, f"{bag.path}: {topics.rgb} and {topics.depth}", form.camera)
+    return camera, form
+
+
+def _depth_scale(bag: Bag, depth: Any, topic: str) -> float:
+    """Stored depth of one metre: by the encoding, or by the unit that RealSense's SDK records."""
+    scale = DEPTH_SCALES[depth_encoding(depth, topic)]
+    for _, unit in bag.messages(_SDK_UNITS):
+        unit_m = float(getattr(unit, "data", 0.0))
+        return 1 / unit_m if 1e-6 <= unit_m <= 1 else scale
+    return scale
+
+
+def _camera_of(bag: Bag, topic: str, info: str, scale: float) -> Camera:
+    """The camera of an image topic by its camera_info. Raises InputError."""
+    rectified = "_rect" in topic.removesuffix("/compressed").rpartition("/")[2]
+    return camera_of(_camera_info(bag, info), scale, rectified, f"{bag.path}: {info}")
+
+
+def _depth_form(bag: Bag, topics: BagTopics, rgb_frame: str, depth_frame: str) -> DepthForm:
+    """How depth is brought to the colour camera, whose frames are those of the images' headers."""
+    sdk = topics.depth.startswith(_SDK_DEPTH)
+    if not sdk and (rgb_frame == depth_frame or any(word in topics.depth for word in REGISTERED)):
+        return DepthForm()
+    known = (_SDK_COLOUR, _SDK_DEPTH) if sdk else (rgb_frame, depth_frame)
+    T_colour_depth = _sdk_extrinsics(bag) if sdk else _static_extrinsics(bag, *known)
+    info = _info_topic(topics.depth)
+    if T_colour_depth is None or info not in _infos(bag):
+        logger.warning(
+            "%s: colour is in the frame %r, depth in %r, and the bag does not tell where they are; "
+            "depth must be registered to colour", bag.path, rgb_frame, depth_frame,
+        )  # fmt: skip
+        return DepthForm()
+    camera = _camera_of(bag, topics.depth, info, 1.0)
+    moved_mm = 1e3 * T_colour_depth[:3, 3]
+    logger.info("%s: depth is registered, its camera is %s mm beside colour's", bag.path, moved_mm)
+    return DepthForm(camera=camera, T_colour_depth=T_colour_depth)
+
+
+def _sdk_extrinsics(bag: Bag) -> Array | None:
+    """T_colour_depth by the transforms of RealSense's SDK, each T_stream_reference."""
+    poses = []
+    for stream in (_SDK_COLOUR, _SDK_DEPTH):
+        message = next((m for _, m in bag.messages(f"{stream}tf/0")), None)
+        if message is None or not hasattr(message, "rotation"):
+            return None
+        poses.append(_pose_of(message, bag))
+    return poses[0] @ inverse(poses[1])
+
+
+def _static_extrinsics(bag: Bag, rgb_frame: str, depth_frame: str) -> Array | None:
+    """T_rgb_depth by the tree of /tf_static; None if it does not hold both frames."""
+    parents: dict[str, tuple[str, Array]] = {}
+    for count, (_, message) in enumerate(bag.messages(_STATIC)):
+        if count == MAX_STATIC or not hasattr(message, "transforms"):
+            break
+        for one in message.transforms:
+            parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+            parents[child] = parent, _pose_of(one.transform, bag)
+    rgb, depth = (dict(_upwards(f.lstrip("/"), parents)) for f in (rgb_frame, depth_frame))
+    shared = next((frame for frame in rgb if frame in depth), None)
+    return None if shared is None else inverse(rgb[shared]) @ depth[shared]
+
+
+def _upwards(frame: str, parents: dict[str, tuple[str, Array]]) -> Iterator[tuple[str, Array]]:
+    """A frame and those above it, each with T_it_frame; ends where a tree runs in a circle."""
+    T_here_frame = np.eye(4)
+    for _ in range(len(parents) + 1):
+        yield frame, T_here_frame
+        if frame not in parents:
+            return
+        frame, T_parent_here = parents[frame]
+        T_here_frame = T_parent_here @ T_here_frame
+
+
+def _pose_of(transform: Any, bag: Bag) -> Array:
+    """A geometry_msgs/Transform as (4, 4). Raises InputError for what is no pose."""
+    q, t = transform.rotation, transform.translation
+    words = np.array([q.x, q.y, q.z, q.w, t.x, t.y, t.z], float)
+    if not (np.isfinite(words).all() and 0.5 < np.linalg.norm(words[:4]) < 2):
+        raise InputError(f"{bag.path}: a transform of {words.tolist()} is no pose; give --camera F")
+    return make_pose(rotation_from_quaternion(words[:4]), words[4:])
+
+
+def _infos(bag: Bag) -> list[str]:
+    return [topic.name for topic in bag.topics if topic.type == INFO_TYPE and topic.messages]
+
+
+def _camera_info(bag: Bag, name: str) -> Any:
+    available = _infos(bag)
+    if name not in available:
+        raise InputError(
+            f"{bag.path}: no camera_info on {name}; give --camera F or --camera-info-topic, one "
+            f"of: {', '.join(available) or 'none'}"
+        )
+    return first_message(bag, name)
+
+
+def first_message(bag: Bag, name: str) -> Any:
+    """The first message of a topic, checked for the fields that are read later."""
+    for _, message in bag.messages(name):
+        missing = _FIELDS[message.__msgtype__] - {field.lower() for field in vars(message)}
+        if missing:
+            raise InputError(f"{bag.path}: {name} has no {', '.join(sorted(missing))}")
+        return message
+    raise InputError(f"{bag.path}: no message on {name}, though its index says so; it is damaged")

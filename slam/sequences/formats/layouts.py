@@ -1,0 +1,102 @@
+"""The layouts that recordings come in, and which of them lies in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.trajectory import read_tum
+from bmask_slam.sequences.bags.bag_file import is_bag
+from bmask_slam.sequences.bags.bag_recording import open_bag_recording
+from bmask_slam.sequences.bags.topics import split_path
+from bmask_slam.sequences.cameras import find_camera
+from bmask_slam.sequences.formats.euroc import is_euroc, open_euroc
+from bmask_slam.sequences.formats.numbered_folders import (
+    is_icl_nuim,
+    is_open3d,
+    is_replica,
+    is_scannet,
+    is_seven_scenes,
+    open_icl_nuim,
+    open_open3d,
+    open_replica,
+    open_scannet,
+    open_seven_scenes,
+)
+from bmask_slam.sequences.formats.phones import is_polycam, is_r3d, open_polycam, open_r3d
+from bmask_slam.sequences.formats.sens_file import is_sens, open_sens
+from bmask_slam.sequences.lists import read_lists
+from bmask_slam.sequences.recording import Recording
+
+Given = Path | Camera | None
+
+
+class Layout(NamedTuple):
+    """How a layout is recognised and opened."""
+
+    is_one: Callable[[Path], bool]
+    open: Callable[[Path, Given], Recording]
+
+
+FOLDERS = (
+    Layout(is_icl_nuim, open_icl_nuim),
+    Layout(is_seven_scenes, open_seven_scenes),
+    Layout(is_scannet, open_scannet),
+    Layout(is_replica, open_replica),
+    Layout(is_euroc, open_euroc),
+    Layout(is_open3d, open_open3d),
+    Layout(is_polycam, open_polycam),
+)
+"""Folders other than TUM's, in the order in which they are tried."""
+FILES = (Layout(is_sens, open_sens), Layout(is_r3d, open_r3d))
+_LISTS = ("rgb.txt", "depth.txt", "associations.txt")
+
+
+def is_recording_file(path: Path) -> bool:
+    """Whether a path names a recording that is one file, or a bag; it need not be there."""
+    bag, _ = split_path(path)
+    return is_bag(bag) or any(layout.is_one(path) for layout in FILES)
+
+
+def open_recording(path: Path, camera: Given = None) -> Recording:
+    """Open what lies at a path, in any layout of docs/data.md.
+
+    Raises:
+        InputError: nothing there, no known layout, or files that are broken.
+    """
+    bag, _ = split_path(path)
+    if is_bag(bag):
+        return open_bag_recording(path, camera)
+    for layout in FILES:
+        if layout.is_one(path):
+            if not path.is_file():
+                raise InputError(f"{path}: is no plain file; give a recording of docs/data.md")
+            return layout.open(path, camera)
+    if not path.is_dir():
+        raise InputError(
+            f"{path}: no such folder; give the folder that holds rgb.txt, or a recording in "
+            "another layout of docs/data.md"
+        )
+    for layout in FOLDERS:
+        if layout.is_one(path):
+            return layout.open(path, camera)
+    return _open_tum(path, camera)
+
+
+def _open_tum(folder: Path, given: Given) -> Recording:
+    """A folder in the layout of the TUM RGB-D benchmark. Raises InputError."""
+    if not any((folder / name).is_file() for name in _LISTS):
+        raise InputError(
+            f"{folder}: no such list as rgb.txt, depth.txt or associations.txt, and none of the "
+            "other layouts of docs/data.md; a sequence needs rgb.txt and depth.txt with lines "
+            "'timestamp file'"
+        )
+    camera, source = (given, "given") if isinstance(given, Camera) else find_camera(folder, given)
+    truth = folder / "groundtruth.txt"
+    lists = read_lists(folder)
+    return Recording(
+        "TUM", folder, *lists, camera, source, read_tum(truth) if truth.is_file() else None
+    )

@@ -1,0 +1,141 @@
+"""Free space and obstacles; the files are read back as nav2 and OctoMap read them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from bmask_slam.graph.camera import Camera
+from bmask_slam.graph.errors import InputError
+from bmask_slam.graph.geometry import inverse, make_pose, se3_exp, transform
+from bmask_slam.mapping.products.occupancy import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    VoxelCarver,
+    VoxelMap,
+    grid_of,
+)
+from bmask_slam.mapping.products.occupancy_files import write_nav2, write_octomap
+
+CAMERA = Camera(64, 48, 40.0, 40.0, 31.5, 23.5)
+R = 0.1
+# Camera z is the map's x, camera x its -y, camera y its -z.
+LOOKS_ALONG_X = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+
+
+def load_nav2(path: Path) -> OccupancyGrid:
+    """As map_server: trinary, row 0 of the image on top, origin the lower left corner."""
+    said = YAML(typ="safe").load(path)
+    magic, size, top, data = (path.parent / said["image"]).read_bytes().split(b"\n", 3)
+    assert (magic, top, said["mode"], said["negate"]) == (b"P5", b"255", "trinary", 0)
+    width, height = map(int, size.split())
+    image = np.frombuffer(data, np.uint8).reshape(height, width)[::-1]
+    share = (255 - image.astype(float)) / 255
+    cells = np.full(image.shape, UNKNOWN, np.int8)
+    cells[share > said["occupied_thresh"]] = OCCUPIED
+    cells[share < said["free_thresh"]] = FREE
+    x, y, yaw = said["origin"]
+    assert yaw == 0
+    return OccupancyGrid(said["resolution"], np.array([x, y]), cells)
+
+
+def load_octomap(path: Path) -> tuple[int, float, dict[tuple[int, int, int], bool]]:
+    """Size, resolution and the voxels of a binary tree, by a recursion over its nodes."""
+    head, data = path.read_bytes().split(b"\ndata\n", 1)
+    lines = head.decode().splitlines()
+    assert lines[0] == "# Octomap OcTree binary file"
+    said = dict(line.split(maxsplit=1) for line in lines if not line.startswith("#"))
+    voxels: dict[tuple[int, int, int], bool] = {}
+    at, nodes = 0, 1
+
+    def read(depth: int, corner: np.ndarray) -> None:
+        nonlocal at, nodes
+        bits = data[at] | data[at + 1] << 8
+        at += 2
+        edge = 1 << (16 - depth - 1)
+        for child in range(8):
+            kind = bits >> 2 * child & 3
+            begin = corner + edge * np.array([child & 1, child >> 1 & 1, child >> 2 & 1])
+            nodes += kind > 0
+            if kind == 3:
+                read(depth + 1, begin)
+            elif kind:
+                for cell in np.ndindex(edge, edge, edge):
+                    voxels[tuple((begin + cell - (1 << 15)).tolist())] = kind == 2
+
+    read(0, np.zeros(3, int))
+    assert at == len(data)
+    assert nodes == int(said["size"])
+    return nodes, float(said["res"]), voxels
+
+
+@pytest.fixture
+def carved() -> VoxelMap:
+    """A camera 1 m above the floor that looks along x at a wall 2 m away; the world is turned."""
+    T_map_world = se3_exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, -1.0]))
+    T_map_camera = make_pose(LOOKS_ALONG_X, np.array([0.05, 0.05, 1.05]))
+    carver = VoxelCarver(R, T_map_world)
+    T_world_camera = inverse(T_map_world) @ T_map_camera
+    depth_m = np.full((48, 64), 2.0, np.float32)
+    depth_m[:, :16] = np.nan  # nothing is known to the left
+    carver.carve(depth_m, CAMERA, T_world_camera)
+    y, z = np.meshgrid(np.arange(-1.0, 1.0, 0.02), np.arange(0, 2.0, 0.02))
+    wall = np.stack([np.full(y.size, 2.06), y.ravel(), z.ravel()], axis=1)
+    carver.add_surface(transform(inverse(T_map_world), wall))
+    carver.add_surface(transform(inverse(T_map_world), np.array([[1.0, 0, 1.0]])))  # a stray point
+    return carver.voxels()
+
+
+def test_rays_free_what_lies_before_a_surface(carved: VoxelMap) -> None:
+    state = {
+        tuple(k): o for k, o in zip(carved.keys.tolist(), carved.occupied.tolist(), strict=True)
+    }
+    for x in range(1, 17):
+        assert state[x, 0, 10] is False
+    assert state[20, 0, 10] is True
+    assert (22, 0, 10) not in state  # behind the wall
+    assert (15, 7, 10) not in state  # without depth; y points to the left
+    assert state[15, -5, 10] is False
+    heights = [z for x, y, z in state if (x, y) == (10, 0)]
+    assert min(heights) == pytest.approx(10.5 - 23.5 / 40 * 10, abs=1)  # of the lowest ray
+
+
+def test_a_grid_is_free_where_the_floor_or_the_space_above_it_was_seen(carved: VoxelMap) -> None:
+    grid = grid_of(carved, 0.1, 1.5)
+    row, column = (0 - round(o / R) for o in (grid.origin_m[1], grid.origin_m[0]))
+    assert grid.cells[row, column + 20] == OCCUPIED
+    assert grid.cells[row, column + 16] == FREE  # rays go down to the floor here
+    assert grid.cells[row, column + 5] == UNKNOWN  # only what is high above the floor was seen
+    assert grid_of(carved, 2.5, 3.0).cells[row, column + 20] == FREE  # not so high
+
+
+def test_nav2_reads_the_grid_back(tmp_path: Path) -> None:
+    cells = np.array([[FREE, OCCUPIED, UNKNOWN], [UNKNOWN, FREE, FREE]], np.int8)
+    grid = OccupancyGrid(0.05, np.array([-1.5, 2.25]), cells)
+    yaml, pgm = write_nav2(tmp_path / "kitchen", grid, np.eye(4))
+    assert (yaml.name, pgm.name) == ("kitchen.yaml", "kitchen.pgm")
+    found = load_nav2(yaml)
+    assert np.array_equal(found.cells, cells)
+    assert np.array_equal(found.origin_m, grid.origin_m)
+    assert found.resolution_m == 0.05
+
+
+def test_octomap_reads_the_voxels_back(carved: VoxelMap, tmp_path: Path) -> None:
+    block = np.stack(np.meshgrid(*[np.arange(8, 16)] * 3), axis=-1).reshape(-1, 3)
+    for voxels in (carved, VoxelMap(0.2, np.eye(4), block, np.ones(len(block), bool))):
+        nodes = write_octomap(tmp_path / "a.bt", voxels)
+        size, resolution_m, found = load_octomap(tmp_path / "a.bt")
+        assert (size, resolution_m) == (nodes, voxels.resolution_m)
+        rows = zip(voxels.keys.tolist(), voxels.occupied.tolist(), strict=True)
+        assert found == {tuple(key): occupied for key, occupied in rows}
+    assert nodes == 14  # 512 voxels are one leaf below 13 nodes
+
+
+def test_a_map_without_anything_is_refused() -> None:
+    with pytest.raises(InputError, match="no surface"):
+        VoxelCarver(R, np.eye(4)).voxels()

@@ -1,0 +1,163 @@
+"""Each layout is recognised, and its frames, stamps, camera, depth and poses are read."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_layouts import (
+    COLOUR,
+    FRAMES,
+    POSES,
+    SMALL_LAYOUTS,
+    WALL_M,
+    SmallLayout,
+    colour,
+    hole,
+    raw_lzfse,
+    write_small,
+)
+
+from bmask_slam.cli import main
+from bmask_slam.graph.errors import InputError
+from bmask_slam.sequences import Sequence, open_sequence
+from bmask_slam.sequences.formats.lzfse import unpack_lzfse
+
+
+@pytest.fixture(params=SMALL_LAYOUTS, ids=lambda layout: layout.name)
+def layout(request) -> SmallLayout:
+    return request.param
+
+
+@pytest.fixture
+def path(layout: SmallLayout, tmp_path: Path) -> Path:
+    return write_small(layout, tmp_path)
+
+
+def check_frames(sequence: Sequence, layout: SmallLayout) -> None:
+    """Frames, camera and depth are those that were written."""
+    assert len(sequence) == FRAMES
+    expected_s = layout.begin_s + np.arange(FRAMES) / 30
+    assert np.allclose(sequence.timestamps_s, expected_s, atol=2e-6)
+    c = sequence.camera
+    assert (c.width, c.height) == (layout.camera.width, layout.camera.height)
+    assert np.allclose(c.K, layout.camera.K)
+    frame = sequence.load(2)
+    assert np.abs(frame.rgb.astype(int) - colour(2, layout.camera)).mean() < 4
+    middle = frame.depth_m[c.height // 2]
+    assert np.nanmin(middle) == pytest.approx(WALL_M, abs=1e-3)
+    assert np.nanmax(middle) == pytest.approx(WALL_M, abs=1e-3)
+    begin, edges = c.width // 8, hole(layout.depth)  # without the border that depth does not see
+    missing = np.flatnonzero(np.isnan(middle[begin : 5 * begin])) + begin
+    for found, written in ((missing[0], edges.start), (missing[-1] + 1, edges.stop)):
+        ray = (written - 0.5 - layout.depth.cx) / layout.depth.fx
+        moved_px = c.fx * (ray + layout.shift_m / WALL_M) + c.cx
+        assert found - 0.5 == pytest.approx(moved_px, abs=1.01)
+
+
+def check_poses(sequence: Sequence, layout: SmallLayout) -> None:
+    """T_world_camera, x right, y down, z forward."""
+    if not layout.poses:
+        assert sequence.groundtruth is None
+        return
+    truth = sequence.groundtruth
+    assert truth is not None
+    assert len(truth) == layout.poses
+    for stamp_s, T in zip(truth.timestamps_s, truth.poses_world_camera, strict=True):
+        k = round(30 * (stamp_s - layout.begin_s))
+        assert np.allclose(T, POSES[k], atol=1e-6)
+
+
+def test_a_layout_is_read(layout: SmallLayout, path: Path) -> None:
+    sequence = open_sequence(path)
+    assert sequence.recording.layout == layout.name
+    check_frames(sequence, layout)
+    check_poses(sequence, layout)
+    again = open_sequence(sequence.folder, camera=sequence.camera)  # as bmask-slam map does
+    assert np.array_equal(again.load(1).depth_m, sequence.load(1).depth_m, equal_nan=True)
+
+
+def test_a_layout_is_converted(layout: SmallLayout, path: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert main(["convert", str(path), str(out)]) == 0
+    assert f"{layout.name}: 3 colour and 3 depth images" in capsys.readouterr().out
+    before, after = open_sequence(path), open_sequence(out)
+    assert after.recording.layout == "TUM"
+    check_poses(after, layout)
+    assert np.allclose(after.timestamps_s, before.timestamps_s, atol=1e-9)
+    for k in range(FRAMES):
+        assert np.array_equal(after.load(k).rgb, before.load(k).rgb)
+        depths = after.load(k).depth_m, before.load(k).depth_m
+        assert np.allclose(*depths, atol=6e-4, equal_nan=True)
+    assert main(["convert", str(path), str(out)]) == 1
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_stamps_out_of_order_and_repeated_ones_are_counted(tmp_path: Path, caplog) -> None:
+    folder = write_small(SMALL_LAYOUTS[0], tmp_path)
+    first, second, third = (folder / "rgb.txt").read_text().splitlines()
+    (folder / "rgb.txt").write_text("\n".join([second, first, third, third]) + "\n")
+    with caplog.at_level(logging.WARNING):
+        sequence = open_sequence(folder)
+    assert len(sequence) == FRAMES
+    assert (sequence.recording.rgb.unordered, sequence.recording.rgb.repeated) == (1, 1)
+    assert "1 stamps out of order were sorted, 1 repeated ones left out" in caplog.text
+
+
+def test_a_camera_yaml_wins(tmp_path: Path) -> None:
+    folder = write_small(SMALL_LAYOUTS[7], tmp_path)
+    (folder / "camera.yaml").write_text(
+        "{width: 32, height: 24, fx: 31, fy: 30, cx: 15, cy: 11, depth_scale: 2000}"
+    )
+    sequence = open_sequence(folder)
+    assert (sequence.camera.fx, sequence.load(0).depth_m[0, 0]) == (31.0, 1.0)
+
+
+BROKEN = {
+    "seq-01": ("frame-000001.pose.txt", "1 0 0", "3 numbers where a 4x4 matrix"),
+    "scene": ("intrinsic/intrinsic_color.txt", "0 " * 16, "focal length.*not positive"),
+    "room0": ("traj.txt", "2 " * 16, "is no rotation"),
+    "lr0": ("associations.txt", "0 a 1\n", "not of the form"),
+    "V1": ("mav0/cam0/data.csv", "1,../../x.png\n", "leads out of the folder"),
+    "realsense": ("camera_intrinsic.json", '{"width": 1e9}', "camera_intrinsic.json.*restore it"),
+    "poly": ("keyframes/cameras/1000000.json", "[]", "1000000.json.*export it again"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_files_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    path = write_small(next(small for small in SMALL_LAYOUTS if small.file == name), tmp_path)
+    file, text, reason = BROKEN[name]
+    (path / file).write_text(text)
+    with pytest.raises(InputError, match=reason) as caught:
+        open_sequence(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("file", ["scene.sens", "a.r3d"])
+def test_a_file_that_is_cut_off_is_refused(file: str, tmp_path: Path) -> None:
+    path = write_small(next(small for small in SMALL_LAYOUTS if small.file == file), tmp_path)
+    data = path.read_bytes()
+    for size in (0, 10, 300, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:size])
+        with pytest.raises(InputError):
+            open_sequence(path)
+
+
+def test_lzfse_is_measured_before_it_is_unpacked() -> None:
+    assert unpack_lzfse(raw_lzfse(b"abcd"), 4, "here") == b"abcd"
+    bomb = b"bvxn" + (1 << 31).to_bytes(4, "little") + (4).to_bytes(4, "little") + b"abcdbvx$"
+    for data in (bomb, raw_lzfse(b"abcd")[:-4], b"", b"bvx1" + bytes(20)):
+        with pytest.raises(InputError):
+            unpack_lzfse(data, 4, "here")
+
+
+def test_what_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such list as rgb"):
+        open_sequence(tmp_path)
+    (tmp_path / "intrinsic.json").write_text(json.dumps({"width": COLOUR.width}))
+    with pytest.raises(InputError, match="none of the other layouts"):
+        open_sequence(tmp_path)
