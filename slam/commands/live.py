@@ -143,11 +143,10 @@ def _live_options(arguments: argparse.Namespace, source: Source) -> LiveOptions:
     from bmask_slam.sequences.bags.bag_file import is_bag
     from bmask_slam.sequences.formats.layouts import is_recording_file
 
-    recording: Path | None = Path(arguments.source)
-    if not recording.is_dir() and not is_recording_file(recording):
-        recording = None
-    elif is_bag(recording):
-        recording = bag_topics(arguments).of_path(recording)
+    path = Path(arguments.source)
+    recording = path if path.is_dir() or is_recording_file(path) else None
+    if is_bag(path):
+        recording = bag_topics(arguments).of_path(path)
     return LiveOptions(
         out=arguments.out or free_run_path(f"{source.name}-live"),
         overwrite=arguments.overwrite,
